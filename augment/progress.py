@@ -18,10 +18,7 @@ Item = TypeVar("Item")
 
 
 def progress(
-    items: Iterable[Item],
-    description: str,
-    total: int | None = None,
-    done: int = 0,
+    items: Iterable[Item], description: str, total: int | None = None, done: int = 0
 ) -> Iterator[Item]:
     """Yield items, and show on a terminal how many of them are done.
 
@@ -32,13 +29,7 @@ def progress(
     """
     is_shown = sys.stderr.isatty() and rank() == 0
     bar = tqdm(
-        items,
-        description,
-        total,
-        leave=False,
-        delay=PATIENCE,
-        disable=not is_shown,
-        initial=done,
+        items, description, total, leave=False, delay=PATIENCE, disable=not is_shown, initial=done
     )
     # tqdm itself shows no bar before the first item is done. This timer shows the bar.
     timer = Timer(PATIENCE, _show, [bar])

@@ -150,20 +150,20 @@ class AugmentationService:
         if self.scene is not None and self.labels.shape != (len(self.scene),):
             raise InputError(
                 f"labels has shape {tuple(self.labels.shape)}: "
-                f"give one label for each of the {len(self.scene)} examples",
+                f"give one label for each of the {len(self.scene)} examples"
             )
         if self.images is not None:
             require_kind("images", self.images, Tensor, "a tensor of bytes, or None")
             if self.images.dtype != torch.uint8 or self.images.shape[:2] != (len(self.labels), 3):
                 raise InputError(
                     f"images is {describe(self.images)}: give bytes (E, 3, H, W), one for each "
-                    "label",
+                    "label"
                 )
         source = "images" if self.settings.mode == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
             raise InputError(
                 f"{source} is None, and mode={self.settings.mode} needs examples: "
-                "give a scene, or images for a folder",
+                "give a scene, or images for a folder"
             )
         attack = self.settings.attack
         if self.scene is not None and self.settings.renders:
@@ -300,7 +300,7 @@ class AugmentationService:
             )
         if not torch.equal(torch.as_tensor(state["scene"]).cpu(), self._scene_hash):
             raise InputError(
-                "state is of another scene: resume with the same meshes, labels, views and light",
+                "state is of another scene: resume with the same meshes, labels, views and light"
             )
         values = state.get("values")
         self._last_values = None if values is None else values.to(self.labels.device)

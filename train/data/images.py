@@ -101,7 +101,7 @@ class ImageFiles:
                 path, error = next(iter(errors.items()))
                 raise InputError(
                     f"{self.folder / path} cannot be read ({error}): "
-                    "replace the file, or set skip_unreadable=True",
+                    "replace the file, or set skip_unreadable=True"
                 )
             yield images
         if errors:

@@ -82,7 +82,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     if len(labels) > 1 and not has_class_folders:
         raise InputError(
             f"{folder} has no class folders, and label names several classes: "
-            "move the images of the folder into one subfolder per class",
+            "move the images of the folder into one subfolder per class"
         )
     table = folder / TABLE
     rows = _read_table(table)
@@ -104,7 +104,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     if unknown:
         raise InputError(
             f"{table} names the source {min(unknown)!r} in the column hard_negatives, "
-            "but no image has this source: correct or remove this name",
+            "but no image has this source: correct or remove this name"
         )
     return photographs
 
@@ -166,7 +166,7 @@ def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]
     if not image_paths:
         raise InputError(
             f"{folder} holds no photographs: give a folder with image files whose names end in "
-            f"one of {', '.join(SUFFIXES)}",
+            f"one of {', '.join(SUFFIXES)}"
         )
     return image_paths, all_paths
 
@@ -231,10 +231,7 @@ def visible_files(folder: Path) -> Iterator[PurePosixPath]:
 
 
 def _has_class_folders(
-    folder: Path,
-    paths: Sequence[PurePosixPath],
-    classes: Sequence[str],
-    labels: Sequence[str],
+    folder: Path, paths: Sequence[PurePosixPath], classes: Sequence[str], labels: Sequence[str]
 ) -> bool:
     """Return whether a folder has a subfolder for each class, and check their names.
 
@@ -250,7 +247,7 @@ def _has_class_folders(
             raise InputError(
                 f"{folder / name} is not named after a class of the network "
                 f"(such as {suggestions}): rename the folder to its class, or "
-                f"to {OTHER_PREFIX}{name} if it shows hard negatives",
+                f"to {OTHER_PREFIX}{name} if it shows hard negatives"
             )
     if no_classes:
         count = f"{len(no_classes)} of {len(names)} folders in {folder}"
@@ -262,7 +259,7 @@ def _has_class_folders(
     if names and outside:
         raise InputError(
             f"{folder / outside[0]} lies beside class folders, not in one of them: "
-            "move the file into the folder of its class",
+            "move the file into the folder of its class"
         )
     return bool(names)
 
@@ -293,16 +290,13 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
     except (ValueError, LookupError, csv.Error, OSError) as error:
         raise InputError(
             f"{table} cannot be read ({single_line(error)}): write it as a UTF-8 text file "
-            "with the columns path and source_tag, separated by commas, and one row per image",
+            "with the columns path and source_tag, separated by commas, and one row per image"
         ) from error
     return rows
 
 
 def load_photographs(
-    folder: Path,
-    photographs: Sequence[Photograph],
-    size: int = 32,
-    skip_unreadable: bool = False,
+    folder: Path, photographs: Sequence[Photograph], size: int = 32, skip_unreadable: bool = False
 ) -> tuple[list[Photograph], Tensor, list[str]]:
     """Read photographs at the size of the input of a network.
 
@@ -333,7 +327,7 @@ def load_photographs(
         advice = ", or set skip_unreadable=True to skip them" if readable else ""
         raise InputError(
             f"{len(unreadable)} of {len(photographs)} photographs cannot be read, "
-            f"the first being {paths[first]} ({errors[first]}): replace them{advice}",
+            f"the first being {paths[first]} ({errors[first]}): replace them{advice}"
         )
     if unreadable:
         images = images[readable]

@@ -281,11 +281,7 @@ def _npz_split(images: np.ndarray, labels: np.ndarray, class_count: int) -> Spli
 
 
 def load_folder(
-    path: str,
-    size: int,
-    test_fraction: float,
-    skip_unreadable: bool = False,
-    workers: int = 0,
+    path: str, size: int, test_fraction: float, skip_unreadable: bool = False, workers: int = 0
 ) -> DataSet:
     """Load a data set from a folder with a subfolder of images for each class.
 

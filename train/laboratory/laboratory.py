@@ -216,7 +216,7 @@ def write_laboratory(settings: LabSettings) -> int:
         elif any(path.name != LOCK for path in out.iterdir()):
             raise InputError(
                 f"out={out} holds files, but the renders need an empty folder: "
-                "choose another folder, or set overwrite=true to replace earlier renders in it",
+                "choose another folder, or set overwrite=true to replace earlier renders in it"
             )
         rows = []
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
@@ -296,7 +296,7 @@ def _read_environment(path: Path) -> Float[np.ndarray, "H W 3"]:
     if not upper_half.max() > 0:
         raise InputError(
             f"environments: {path} has no light above the horizon: "
-            "give an environment map whose upper half is not black",
+            "give an environment map whose upper half is not black"
         )
     return radiance
 
@@ -315,12 +315,12 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
     if not label:
         raise InputError(
             f"meshes[{index}] has no label: write {{mesh: {settings.mesh}, label: CLASS}}, "
-            f"or label: {OTHER_PREFIX}NAME for an object of another class",
+            f"or label: {OTHER_PREFIX}NAME for an object of another class"
         )
     if Path(label).name != label or label == "..":
         raise InputError(
             f"meshes[{index}] has the label {label!r}, which cannot be the name of a folder: "
-            "remove slashes and dots",
+            "remove slashes and dots"
         )
     parts = lab_parts(load_object(settings).mesh, settings.albedo_scale)
     return Subject(label, settings.mesh, parts)

@@ -96,9 +96,7 @@ class Shot:
 
 
 def draw_shots(
-    settings: LabSettings,
-    environments: Mapping[str, np.ndarray],
-    slides: Sequence[np.ndarray] = (),
+    settings: LabSettings, environments: Mapping[str, np.ndarray], slides: Sequence[np.ndarray] = ()
 ) -> Iterator[Shot]:
     """Draw the same number of random shots for each pattern and each environment map.
 

@@ -106,7 +106,7 @@ class Initial:
                     difference = "other classes"
                 raise InputError(
                     f"network={self.source} was trained with {difference}: "
-                    f"give this run the same {key}",
+                    f"give this run the same {key}"
                 )
         with checkpoints.checks_architecture(self.source):
             network.load_state_dict(self.weights)
@@ -379,7 +379,7 @@ def build_service(
     if len(positive_classes) == len(data.classes) and has_complementary_labels:
         raise InputError(
             f"label={settings.label} has all classes of the network, but some renders show none "
-            "of them: remove the objects without a class, or give them a label",
+            "of them: remove the objects without a class, or give them a label"
         )
     return AugmentationService(
         settings.augment,
@@ -435,7 +435,7 @@ def load_renders(settings: ExperimentSettings, data: sets.DataSet) -> tuple[Tens
             name = min(missing)
             raise InputError(
                 f"{folder} has no image of label={name}: "
-                f"add a sub-folder {name} with images of this class",
+                f"add a sub-folder {name} with images of this class"
             )
     labels = [label_of_class.get(item.label, label_of_negative) for item in found]
     return images, torch.tensor(labels)

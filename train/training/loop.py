@@ -400,7 +400,7 @@ class Trainer:
             reason = single_line(error)
             raise InputError(
                 f"this run cannot continue from the checkpoint in {self.folder} ({reason}): "
-                f"restore {run_folder.LAST}, or start in another folder",
+                f"restore {run_folder.LAST}, or start in another folder"
             ) from error
         if self.epoch:
             # It is read before the training, so that no time is lost if it is damaged.

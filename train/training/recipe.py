@@ -1,7 +1,6 @@
 """Build the optimizer, compute the learning rate, and freeze layers."""
 
 import math
-from collections.abc import Callable
 from statistics import fmean
 
 import torch
@@ -23,44 +22,21 @@ START_FACTOR = 0.1
 WARMUP = 0.2
 
 
-def _step(done: float) -> float:
-    """Return the factor of the learning rate in the schedule "step".
-
-    The factor is 0.2 to the power of the number of milestones that are reached.
-    """
-    return STEP_FACTOR ** sum(done >= milestone for milestone in MILESTONES)
-
-
-def _cosine(done: float) -> float:
-    """Return the factor of the learning rate in the schedule "cosine".
-
-    The factor falls from 1 to 0: (1 + cos(pi * done)) / 2.
-    """
-    return (1 + math.cos(math.pi * done)) / 2
-
-
-def _one_cycle(done: float) -> float:
-    """Return the factor of the learning rate: linear from START_FACTOR to 1, and then to 0."""
-    if done < WARMUP:
-        return START_FACTOR + (1 - START_FACTOR) * done / WARMUP
-    return (1 - done) / (1 - WARMUP)
-
-
-# Function of each schedule. It computes the factor of the learning rate from the fraction
-# of the training that is done.
-SCHEDULE_FACTORS: dict[str, Callable[[float], float]] = {
-    "step": _step,
-    "cosine": _cosine,
-    "one_cycle": _one_cycle,
-}
-
-
 def learning_rate(settings: TrainSettings, done: float) -> float:
     """Compute the learning rate at a time of the training.
 
-    `done` is the fraction of the training that is done.
+    `done` is the fraction of the training that is done. In the schedule "one_cycle", the rate
+    rises linearly to the highest rate, and then falls to 0.
     """
-    return settings.learning_rate * SCHEDULE_FACTORS[settings.schedule](done)
+    if settings.schedule == "step":
+        factor = STEP_FACTOR ** sum(done >= milestone for milestone in MILESTONES)
+    elif settings.schedule == "cosine":
+        factor = (1 + math.cos(math.pi * done)) / 2
+    elif done < WARMUP:
+        factor = START_FACTOR + (1 - START_FACTOR) * done / WARMUP
+    else:
+        factor = (1 - done) / (1 - WARMUP)
+    return settings.learning_rate * factor
 
 
 def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Optimizer:

@@ -95,7 +95,7 @@ class Run:
             if not resumes:
                 raise InputError(
                     f"out={folder} holds a run already: set train.resume=true to continue it, "
-                    "overwrite=true to replace it, or run to another folder",
+                    "overwrite=true to replace it, or run to another folder"
                 )
             earlier = require_same_run(folder, settings)
         self._is_resumed = earlier is not None
@@ -437,7 +437,7 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
     if name != own_name:
         raise InputError(
             f"model.name={name} is not the architecture of network={initial.source}: "
-            "leave model.name out",
+            "leave model.name out"
         )
     statistics = {key: initial.architecture.get(key) for key in ("mean", "std")}
     return {"name": own_name, CLASSIFIER: True, **statistics}

@@ -17,10 +17,10 @@ from train.train_settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
 from train.training.augmentations import PGD, Baseline
 from train.training.losses import TrainingLoss, ranking_loss
 from train.training.recipe import (
-    SCHEDULE_FACTORS,
     build_optimizer,
     feature_norm,
     freeze,
+    learning_rate,
     scale_learning_rate,
 )
 
@@ -57,7 +57,8 @@ def kl_divergence(targets: Tensor, logits: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("epochs", [10, 150])
 def test_the_step_schedule_falls_to_a_fifth_at_30_60_and_80_percent(epochs):
-    rates = [SCHEDULE_FACTORS["step"](epoch / epochs) for epoch in range(epochs)]
+    settings = TrainSettings(schedule="step", learning_rate=1.0)
+    rates = [learning_rate(settings, epoch / epochs) for epoch in range(epochs)]
     tenth = epochs // 10
     expected = 3 * tenth * [1.0] + 3 * tenth * [0.2] + 2 * tenth * [0.04] + 2 * tenth * [0.008]
     assert rates == pytest.approx(expected)
@@ -75,8 +76,9 @@ PROGRESS = np.linspace(0, 1, 1001)
     ],
 )
 def test_a_continuous_schedule_is_its_closed_form(schedule, expected):
-    factors = [SCHEDULE_FACTORS[schedule](progress) for progress in PROGRESS]
-    np.testing.assert_allclose(factors, expected, atol=1e-12)
+    settings = TrainSettings(schedule=schedule, learning_rate=0.5)
+    rates = [learning_rate(settings, progress) for progress in PROGRESS]
+    np.testing.assert_allclose(rates, 0.5 * expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.1])
