@@ -33,8 +33,8 @@ from train.run_config import format_command, require_same_run
 from train.run_folder import FAILURE, locked, state
 from train.settings import ExperimentSettings
 from train.system import is_verbose, shortened
-from train.training.inputs import with_label
-from train.training.run import Run, load_inputs, make_runs
+from train.training.inputs import load_inputs, with_label
+from train.training.run import Run, make_runs
 from train.user_errors import user_message, writable_folder
 
 # Largest number of lines of the table of finished runs, if --verbose is not set.
