@@ -292,15 +292,11 @@ class AugmentationService:
         """
         expected = "the result of state_dict of a service with the same scene"
         require_kind("state", state, Mapping, expected)
-        if "scene" not in state or state.keys() - {"scene", "values"}:
-            found = ", ".join(str(key) for key in state) or "nothing"
+        stored = state.get("scene")
+        if stored is None or not torch.equal(torch.as_tensor(stored).cpu(), self._scene_hash):
             raise InputError(
-                f"state has the keys {found}, which are not those of a service: "
-                "give the result of state_dict of a service with the same scene"
-            )
-        if not torch.equal(torch.as_tensor(state["scene"]).cpu(), self._scene_hash):
-            raise InputError(
-                "state is of another scene: resume with the same meshes, labels, views and light"
+                "state is of another scene, or not of a service: "
+                "resume with the same meshes, labels, views and light"
             )
         values = state.get("values")
         self._last_values = None if values is None else values.to(self.labels.device)

@@ -609,7 +609,7 @@ def load_cifar(path: Path, split: str) -> Split:
     data = load_npz(str(path))
     if split == TEST:
         return data.test
-    return data.train[held_out_rows(data.train, VALIDATION_FRACTION, seed=0)]
+    return data.train[held_out_rows(data.train, VALIDATION_FRACTION)]
 
 
 def difference_rows(

@@ -81,12 +81,16 @@ class DataSettings(Settings):
         None,
         "Fraction of the training images of each class to validate on. "
         "null: what `network` left out, otherwise 0.1.",
+        above=0,
+        below=1,
     )
     path: str = setting("", "File or folder of the data.", may_be_empty=True)
     test_fraction: float = setting(
         0.1,
         "Fraction of the images to test on, if the folder has no sub-folder `test`: "
         "of each class, or of photographs without labels 1,000 at most.",
+        above=0,
+        below=1,
     )
     workers: int = setting(
         2,

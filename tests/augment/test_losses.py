@@ -14,7 +14,7 @@ from augment.attacks.objective import (
     logit_gap,
 )
 from augment.classifier import log_odds
-from train.training.losses import kl_divergence, ranking_loss
+from train.training.recipe import kl_divergence, ranking_loss
 
 EPS = torch.finfo(torch.float64).eps
 ROWS = torch.arange(6)

@@ -1,9 +1,7 @@
 """A service renders examples for training, in random or adversarial light."""
 
 import math
-from dataclasses import dataclass
 
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -107,9 +105,6 @@ def logits_of(model: nn.Module, images: Tensor) -> Tensor:
     return logits
 
 
-# --------------------------------------------------------------- what is returned
-
-
 @pytest.mark.parametrize("settings", [{"mode": "none"}, {"mode": "random", "examples": 0}])
 def test_without_an_arm_or_examples_there_are_no_renders_and_no_scene_is_needed(model, settings):
     no_labels = torch.zeros(0, dtype=torch.int64)
@@ -133,8 +128,6 @@ def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
     assert not torch.equal(resumed.regenerate(model, 4).images, images)
     assert not torch.equal(serve(seed=2, **settings).regenerate(model, 3).images, images)
 
-
-# --------------------------------------------------------------- the mode "folder"
 
 FOLDER_SIZE = 7
 ROUND_COUNT = 21
@@ -175,9 +168,6 @@ def test_all_images_of_a_folder_are_shown_before_any_is_shown_again(folder_image
     assert rounds[4].diagnostics["attack_success"] == pytest.approx(float(error_rate))
 
 
-# --------------------------------------------------------------- the mode "random"
-
-
 @pytest.mark.parametrize(
     ("classified", "rows"), [(250, list(range(EXAMPLE_COUNT))), (4, [0, 33, 66, 99])]
 )
@@ -204,79 +194,55 @@ def test_random_light_changes_by_half_of_a_unit_or_by_its_radius(serve, model):
     assert in_a_ball.diagnostics["light_change"] == pytest.approx(1.5, rel=8 * EPS32)
 
 
-# --------------------------------------------------------------- the mode "adversarial"
-
 PAPER_STEPS = 10
 PAPER_STEP_SIZE = 0.05
 
 
-@dataclass
-class PaperLoop:
-    """The paper's loop, in which every example is classified in every step.
+def papers_loop(
+    model: nn.Module, scene: Scene, labels: Tensor, step: str
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Run the paper's loop, in which every example is classified in every step.
 
-    After `run`, its attributes have one value for each example.
+    Return the images, and the values of each example whose means the service reports.
     """
-
-    model: nn.Module
-    scene: Scene
-    labels: Tensor
-    step: str
-
-    def run(self) -> None:
-        """Attack all examples."""
-        self.lights = LIGHT.repeat(len(self.scene), 1, 1)
-        self.step_counts = torch.zeros_like(self.labels)
-        self.classify()
-        self.loss_before = self.losses.detach()
-        self.success_before = self.success
-        for _ in range(PAPER_STEPS):
-            move = self.direction()
-            is_done = self.success[:, None, None]
-            moved = self.lights + PAPER_STEP_SIZE * move
-            self.lights = torch.where(is_done, self.lights, moved).detach()
-            self.step_counts += ~self.success
-            self.classify()
-
-    def classify(self) -> None:
-        """Compute the images, losses and successes in the present lights."""
-        self.lights.requires_grad_(True)
-        self.images = render(self.scene, self.lights)
-        logits = self.model(self.images)
+    lights = LIGHT.repeat(len(scene), 1, 1)
+    step_counts = torch.zeros_like(labels)
+    before = []
+    for number in range(PAPER_STEPS + 1):
+        lights.requires_grad_(True)
+        images = render(scene, lights)
+        logits = model(images)
         # Float32 loses digits of 1 − p, which is the gradient of a class with the probability p.
-        self.losses = F.cross_entropy(logits.double(), self.labels, reduction="none")
-        self.success = logits.argmax(1) != self.labels
-
-    def direction(self) -> Tensor:
-        """Return the scaled gradient (E, 49, 3) of the losses."""
-        (gradient,) = torch.autograd.grad(self.losses.sum(), self.lights)
-        if self.step == "sign":
-            return gradient.sign()
-        return gradient / gradient.flatten(1).norm(dim=1)[:, None, None]
-
-    def diagnostics(self) -> dict[str, Tensor]:
-        """Return the values of each example whose means the service reports."""
-        return {
-            "attack_success_before": self.success_before,
-            "loss_before": self.loss_before,
-            "attack_success": self.success,
-            "loss": self.losses.detach(),
-            "steps": self.step_counts,
-            "used_all_steps": self.step_counts == PAPER_STEPS,
-            "light_change": (self.lights - LIGHT).detach().flatten(1).norm(dim=1),
-        }
+        losses = F.cross_entropy(logits.double(), labels, reduction="none")
+        success = logits.argmax(1) != labels
+        before.append((success, losses.detach()))
+        if number == PAPER_STEPS:
+            break
+        (gradient,) = torch.autograd.grad(losses.sum(), lights)
+        unit = gradient / gradient.flatten(1).norm(dim=1)[:, None, None]
+        moved = lights + PAPER_STEP_SIZE * (gradient.sign() if step == "sign" else unit)
+        lights = torch.where(success[:, None, None], lights, moved).detach()
+        step_counts += ~success
+    return images.detach(), {
+        "attack_success_before": before[0][0],
+        "loss_before": before[0][1],
+        "attack_success": success,
+        "loss": losses.detach(),
+        "steps": step_counts,
+        "used_all_steps": step_counts == PAPER_STEPS,
+        "light_change": (lights - LIGHT).detach().flatten(1).norm(dim=1),
+    }
 
 
 @pytest.mark.parametrize("step", ["unit", "sign"])
 def test_adversarial_images_are_those_of_the_papers_loop(serve, model, scene, labels, step):
     settings = TrainingAttackSettings(step=step, max_steps=PAPER_STEPS, batch_size=32)
     renders = serve(attack=settings).regenerate(model, 0)
-    loop = PaperLoop(model.eval(), scene, labels, step)
-    loop.run()
+    images, diagnostics = papers_loop(model.eval(), scene, labels, step)
     model.train()
     # Ten steps of products in another order, through a network that amplifies their rounding.
-    images = loop.images.detach()
     torch.testing.assert_close(renders.images, images, rtol=0, atol=10 * 64 * EPS32)
-    for name, values in loop.diagnostics().items():
+    for name, values in diagnostics.items():
         expected = pytest.approx(float(values.double().mean()), rel=1e-4)
         assert renders.diagnostics[name] == expected, name
     assert 0 < renders.diagnostics["attack_success"] < 1
@@ -325,9 +291,6 @@ def test_a_resumed_service_continues_the_last_attack(serve, model):
     assert torch.equal(resumed.regenerate(model, 1).images, expected)
 
 
-# --------------------------------------------------------------- errors
-
-
 @pytest.mark.parametrize("mode", ["random", "adversarial"])
 def test_a_label_beyond_the_classes_of_the_network_is_refused(serve, model, labels, mode):
     with pytest.raises(InputError, match="label=53"):
@@ -347,9 +310,6 @@ def test_a_label_beyond_the_classes_of_the_network_is_refused(serve, model, labe
 def test_settings_that_are_out_of_range_or_contradict_are_refused(settings, message):
     with pytest.raises(InputError, match=message):
         AugmentationSettings(**settings)
-
-
-# --------------------------------------------------------------- shape and albedo
 
 
 @pytest.mark.parametrize("mode", ["random", "adversarial"])
@@ -378,8 +338,6 @@ def test_both_arms_change_shape_and_albedo_within_their_norm_balls(model, mode):
         assert diagnostics["loss"] > diagnostics["loss_before"]
 
 
-# --------------------------------------------------------------- in other loops
-
 BRIEF = TrainingAttackSettings(max_steps=2)
 
 
@@ -407,27 +365,18 @@ def test_a_service_from_meshes_renders_as_one_around_the_same_scene(model):
     assert torch.equal(same.regenerate(model, 0).images, renders.images)
 
 
-@pytest.mark.parametrize("kind", [int, np.int64], ids=["number", "NumPy"])
-@pytest.mark.parametrize("renders_first", [True, False])
-def test_a_data_set_with_numbers_as_labels_goes_into_batches_with_renders(kind, renders_first):
-    photographs = [(torch.zeros(3, 8, 8), kind(1))] * 5
+def test_a_data_set_with_numbers_as_labels_goes_into_batches_with_renders():
+    photographs = [(torch.zeros(3, 8, 8), 1)] * 5
     renders = Renders(torch.ones(3, 3, 8, 8), torch.tensor([2, 3, 4]), {})
-    parts = [renders, photographs] if renders_first else [photographs, renders]
-    expected = [2, 3, 4] + [1] * 5 if renders_first else [1] * 5 + [2, 3, 4]
-    batches = list(DataLoader(ConcatDataset(parts), batch_size=4))
-    images = torch.cat([images for images, _ in batches])
-    labels = torch.cat([labels for _, labels in batches])
-    assert labels.tolist() == expected
-    assert labels.dtype == torch.int64
-    is_render = torch.tensor(expected) > 1
-    assert torch.equal(images.flatten(1).amax(1), is_render.float())
+    images, labels = zip(*DataLoader(ConcatDataset([photographs, renders]), 4), strict=True)
+    labels = torch.cat(labels)
+    assert labels.tolist() == [1] * 5 + [2, 3, 4]
+    assert torch.equal(torch.cat(images).flatten(1).amax(1), (labels > 1).float())
 
 
-# --------------------------------------------------------------- hard negatives
-
-
-def probability_rises(model: nn.Module, before: Tensor, after: Tensor) -> Tensor:
-    """Return how much the probability (E, classes) rises from one image to the other."""
+def probability_rises(model: nn.Module, scene: Scene, after: Tensor) -> Tensor:
+    """Return how much the probability (E, classes) rises above that in the light of the scene."""
+    before = render_in(scene, LIGHT)
     return logits_of(model, after).softmax(1) - logits_of(model, before).softmax(1)
 
 
@@ -439,7 +388,7 @@ def test_hard_negatives_are_attacked_towards_the_label_and_the_label_away_from_i
     mixed = torch.where(is_plate, labels, complementary_label(0))
     renders = serve(labels=mixed, positive_classes=(0,)).regenerate(model, 0)
     assert torch.equal(renders.labels, mixed)
-    rises = probability_rises(model, render_in(scene, LIGHT), renders.images)[:, 0]
+    rises = probability_rises(model, scene, renders.images)[:, 0]
     for change in (-rises[is_plate], rises[~is_plate]):
         assert (change >= -1e-5).all()
         assert (change > 0).any()
@@ -463,7 +412,7 @@ def test_hard_negatives_of_several_classes_are_attacked_towards_each_in_turn(
     is_plate = labels == 0
     mixed = torch.where(is_plate, complementary_label(1), labels)
     images = serve(labels=mixed, positive_classes=(1, 2)).regenerate(model, 0).images
-    rises = probability_rises(model, render_in(scene, LIGHT), images)
+    rises = probability_rises(model, scene, images)
     turns = torch.arange(EXAMPLE_COUNT) % 2
     for turn, target in ((0, 1), (1, 2)):
         towards = rises[is_plate & (turns == turn), target]
@@ -473,9 +422,6 @@ def test_hard_negatives_of_several_classes_are_attacked_towards_each_in_turn(
         is_chosen = is_plate & (turns == turn)
         torch.testing.assert_close(images[is_chosen], alone[is_chosen])
     assert (rises[~is_plate, 2] <= 1e-5).all()
-
-
-# --------------------------------------------------------------- shown examples
 
 
 def test_attack_examples_show_the_images_and_predictions_before_and_after(serve, scene, model):

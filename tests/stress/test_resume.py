@@ -1,6 +1,7 @@
 """Runs that are interrupted and resumed end like an uninterrupted run, bit for bit.
 
-By default, one run is killed. `-m slow` tries every signal, full disks and damaged files.
+Every signal, full disks and damaged files are tried, in processes of their own. Without `-m slow`,
+tests/train/training/test_run.py interrupts runs within the process of the tests.
 """
 
 import resource
@@ -20,6 +21,8 @@ from train.data.sets import content_hash
 from train.run_folder import METRICS, read_metrics
 
 from .conftest import MAX_SECONDS, TRAINING, Process, end, run_here, start_command
+
+pytestmark = pytest.mark.slow
 
 EPOCHS = 8
 EPOCH_SECONDS = 0.1  # An epoch takes about as long.
@@ -122,13 +125,6 @@ INTERRUPTED_OFTEN = [
 ]
 
 
-def test_a_run_that_is_killed_once_is_resumed_to_the_same_end(data, tmp_path, assert_resumed):
-    run = tmp_path / "run"
-    interrupt(data, run, KILLED, np.random.default_rng(0))
-    assert_resumed(run)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("signals", "seed"), INTERRUPTED_OFTEN)
 def test_a_run_that_is_interrupted_three_times_is_resumed_to_the_same_end(
     data, tmp_path, assert_resumed, signals, seed
@@ -141,7 +137,6 @@ def test_a_run_that_is_interrupted_three_times_is_resumed_to_the_same_end(
     assert_resumed(run)
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="only Linux limits another process")
 @pytest.mark.parametrize("epoch", [1, 3, 6])
 def test_a_full_disk_is_an_error_in_one_sentence_and_the_run_is_resumed_later(
@@ -182,7 +177,6 @@ def empty(content: bytes) -> bytes:
     return b""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "damage"),
     [

@@ -68,6 +68,10 @@ class ImageFiles:
         indices = torch.arange(len(self))[rows].tolist()
         return replace(self, paths=tuple(self.paths[index] for index in indices))
 
+    def to(self, device: torch.device) -> "ImageFiles":
+        """Return the files themselves, which are read on the CPU."""
+        return self
+
     def file_sizes(self) -> list[tuple[str, int]]:
         """Return the path and the size in bytes of each image file."""
         return [(str(path), (self.folder / path).stat().st_size) for path in self.paths]

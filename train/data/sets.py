@@ -94,19 +94,16 @@ class Split:
 
     def to(self, device: torch.device) -> "Split":
         """Copy the labels, and the images if they are in memory, to a device."""
-        images = self.images
-        if not isinstance(images, ImageFiles):
-            images = images.to(device)
-        return Split(images, self.labels.to(device))
+        return Split(self.images.to(device), self.labels.to(device))
 
     def squares(self, rows: Iterable[Tensor]) -> Iterator[Tensor]:
         """Yield images of the split, batch by batch.
 
         Images on disk are reduced to their central squares.
         """
-        if isinstance(self.images, ImageFiles):
-            return self.images.squares(rows)
         images = self.images
+        if isinstance(images, ImageFiles):
+            return images.squares(rows)
         return (images[batch] for batch in rows)
 
     def sample(self, count: int) -> UInt8[Tensor, "_ 3 H W"]:
@@ -156,21 +153,13 @@ def relabeled(data: DataSet, classes: Sequence[str], subject: str) -> DataSet:
     return replace(data, classes=tuple(classes), train=train, test=test)
 
 
-def held_out_rows(
-    split: Split, fraction: float, seed: int, argument: str = "fraction"
-) -> Bool[Tensor, " N"]:
+def held_out_rows(split: Split, fraction: float, argument: str = "fraction") -> Bool[Tensor, " N"]:
     """Draw a fraction of the images of every class at random, to hold them out.
 
-    With the same seed, a larger fraction holds out the same images and
-    additional ones.
+    A larger fraction holds out the same images and additional ones.
     """
-    if not 0 < fraction < 1:
-        raise InputError(
-            f"{argument}={fraction} must lie between 0 and 1: choose a fraction such as 0.1",
-            argument,
-        )
     is_held_out = torch.zeros(len(split), dtype=torch.bool)
-    draws = generator(seed, "validation")
+    draws = generator(0, "validation")
     for label in split.labels.unique():
         indices_of_class = torch.nonzero(split.labels == label).squeeze(1)
         class_size = len(indices_of_class)
@@ -328,7 +317,7 @@ def load_folder(
     if split_names:
         found = find_photographs(root / "test", classes, classes[0])
         return DataSet(classes, train, _read(root / "test", found, classes, *options))
-    is_test = held_out_rows(train, test_fraction, seed=0, argument="test_fraction")
+    is_test = held_out_rows(train, test_fraction, "test_fraction")
     return DataSet(classes, train[~is_test], train[is_test])
 
 
@@ -342,7 +331,7 @@ def load_unlabeled(
     found = find_unlabeled(Path(path))
     split = _read(Path(path), found, None, size, skip_unreadable, workers)
     fraction = min(test_fraction, HELD_OUT / len(split))
-    is_test = held_out_rows(split, fraction, seed=0, argument="test_fraction")
+    is_test = held_out_rows(split, fraction, "test_fraction")
     return DataSet((), split[~is_test], split[is_test], labeled=False)
 
 

@@ -15,7 +15,7 @@ from augment.random_streams import stream_seed
 from train import console
 from train.data.sets import Split
 from train.device import MixedPrecision
-from train.training.losses import kl_divergence
+from train.training.recipe import kl_divergence
 
 # Factors of the interpolation that are tried: 0 gives the weights before the training, and
 # 1 the weights after it.

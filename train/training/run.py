@@ -105,7 +105,7 @@ class Run:
             threads = threads or OmegaConf.select(earlier, "hardware.threads")
         fraction, record = inputs.choose_validation(settings, self.data, initial)
         with keyed(fraction="data.validation"):
-            self.held_out = held_out_rows(self.data.train, fraction, seed=0)
+            self.held_out = held_out_rows(self.data.train, fraction)
         self.trainer = _build_trainer(settings, self.data, folder, initial, record, threads)
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()

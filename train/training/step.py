@@ -21,8 +21,7 @@ from train.processes import wrap_ddp
 from train.train_settings import RELIGHT, TrainSettings
 from train.training.augmentations import Baseline, RelitBatches
 from train.training.averages import Averages
-from train.training.losses import TrainingLoss, share_layers
-from train.training.recipe import build_optimizer, learning_rate
+from train.training.recipe import TrainingLoss, build_optimizer, learning_rate, share_layers
 from train.user_errors import keyed
 
 

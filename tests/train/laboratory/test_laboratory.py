@@ -56,15 +56,8 @@ def draw(
 ) -> list[Shot]:
     """Draw shots in the light of patterns, or of environment maps by their names."""
     maps = environments or {}
-    lab_settings = LabSettings(
-        "out",
-        setups=setups,
-        patterns=list(families),
-        environments=list(maps),
-        brightness=list(brightness),
-        seed=seed,
-        **changes,
-    )
+    changes |= {"patterns": [*families], "environments": [*maps], "brightness": [*brightness]}
+    lab_settings = LabSettings("out", setups=setups, seed=seed, **changes)
     return list(draw_shots(lab_settings, maps, pictures))
 
 
@@ -168,26 +161,15 @@ def test_renders_that_replace_others_count_as_complete_only_at_their_end(
     assert not list(folder.rglob("*.json"))
 
 
-class TestAnEnvironment:
-    @pytest.fixture
-    def path(self, tmp_path) -> Path:
-        return tmp_path / "noon.npy"
-
-    @pytest.fixture
-    def lab_settings(self, path, tmp_path) -> LabSettings:
-        folder = tmp_path / "lab"
-        return settings(folder, patterns=["solid"], environments=[str(path)], setups=2)
-
-    def test_is_used_beside_patterns_and_names_the_source(self, path, lab_settings):
-        np.save(path, np.ones((8, 16, 3), np.float32))
-        lab.write_laboratory(lab_settings)
-        sources = {row["source_tag"] for row in rows(Path(lab_settings.out))}
-        assert sources == {"noon", "solid"}
-
-    def test_is_refused_if_it_is_dark_above(self, path, lab_settings):
-        np.save(path, np.zeros((8, 16, 3), np.float32))
-        with pytest.raises(InputError, match=r"noon\.npy has no light above"):
-            lab.write_laboratory(lab_settings)
+def test_an_environment_is_used_beside_patterns_and_refused_if_it_is_dark_above(tmp_path):
+    path = tmp_path / "noon.npy"
+    options = {"patterns": ["solid"], "environments": [str(path)], "setups": 2}
+    np.save(path, np.ones((8, 16, 3), np.float32))
+    lab.write_laboratory(settings(tmp_path / "lab", **options))
+    assert {row["source_tag"] for row in rows(tmp_path / "lab")} == {"noon", "solid"}
+    np.save(path, np.zeros((8, 16, 3), np.float32))
+    with pytest.raises(InputError, match=r"noon\.npy has no light above"):
+        lab.write_laboratory(settings(tmp_path / "other", **options))
 
 
 @pytest.mark.parametrize("family", LAB_PATTERNS)
@@ -239,11 +221,8 @@ class TestShots:
     def shots(cls) -> list[Shot]:
         return draw(220, LAB_PATTERNS, seed=3)
 
-    def test_are_equally_many_of_each_family(self, shots):
-        expected = [name for name in LAB_PATTERNS for _ in range(20)]
-        assert [shot.lighting for shot in shots] == expected
-
     def test_of_a_family_are_evenly_from_dim_to_bright(self, shots):
+        assert [shot.lighting for shot in shots] == np.repeat([*LAB_PATTERNS], 20).tolist()
         edges = np.geomspace(0.2, 2.5, 21)
         brightness = np.array([shot.brightness for shot in shots]).reshape(-1, 20)
         assert (edges[:-1] <= brightness).all()
@@ -280,12 +259,9 @@ class TestShotsWithWallsAndTwoProjectors:
     def shots(cls) -> list[Shot]:
         return draw(60, ["rings+text"], walls=1.0, azimuth=[-180, 180], elevation=[5, 85])
 
-    def test_have_a_pattern_for_each_projector(self, shots):
+    def test_have_a_pattern_and_the_elevations_of_the_settings_for_each_projector(self, shots):
         for shot in shots:
             assert len(shot.projectors) == len(shot.patterns) == 2
-
-    def test_have_projectors_within_the_elevations_of_the_settings(self, shots):
-        for shot in shots:
             for position in shot.projectors:
                 assert 5 <= elevation(position - shot.center) <= 85
 

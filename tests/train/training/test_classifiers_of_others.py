@@ -186,15 +186,12 @@ def test_labeled_folders_are_scored_in_the_classes_of_the_network_before_and_aft
         ("train.distillation_weight=0", "set network and train.distillation_weight"),
     ],
 )
-def test_settings_that_do_not_fit_the_network_are_refused_in_one_sentence(tuned, change, message):
-    with pytest.raises(InputError, match=message) as caught:
+def test_settings_that_do_not_fit_the_network_are_refused(tuned, change, message):
+    with pytest.raises(InputError, match=message):
         tuned("unlabeled", "augment=random", change)
-    assert "\n" not in str(caught.value)
 
 
-def test_a_file_of_weights_alone_is_no_network_to_start_from(tuned, tmp_path):
-    weights = tmp_path / "weights.pt"
-    torch.save({"layer.weight": torch.zeros(1)}, weights)
+def test_a_file_of_weights_alone_is_no_network_to_start_from(tuned, weights):
     with pytest.raises(InputError, match=f"torchvision:resnet50 weights={weights}$"):
         tuned("unlabeled", "augment=random", f"network={weights}", "weights=null")
 
@@ -207,24 +204,13 @@ def test_photographs_that_stay_on_disk_train_and_score_a_network_of_their_size(t
     assert load_run(folder)(torch.rand(1, 3, 96, 96)).shape == (1, 1000)
 
 
-class TestANetworkOfTimm:
-    NAME = "mobilenetv3_small_050"
-
-    @pytest.fixture
-    def network(self) -> nn.Module:
-        timm = pytest.importorskip("timm")
-        torch.manual_seed(0)
-        return timm.create_model(self.NAME)
-
-    @pytest.fixture
-    def path(self, network, tmp_path) -> Path:
-        path = tmp_path / "network.safetensors"
-        safetensors.torch.save_file(network.state_dict(), path)
-        return path
-
-    def test_has_its_own_normalization_and_weights(self, network, path):
-        images = torch.rand(1, 3, 224, 224)
-        facts = network.pretrained_cfg
-        expected = normalized_logits(network, images, facts["mean"], facts["std"])
-        classifier = load_classifier(f"timm:{self.NAME}", path)
-        torch.testing.assert_close(classifier(images), expected, rtol=1e-4, atol=1e-5)
+def test_a_network_of_timm_has_its_own_normalization_and_weights(tmp_path):
+    timm = pytest.importorskip("timm")
+    torch.manual_seed(0)
+    network = timm.create_model("mobilenetv3_small_050")
+    safetensors.torch.save_file(network.state_dict(), tmp_path / "network.safetensors")
+    images = torch.rand(1, 3, 224, 224)
+    facts = network.pretrained_cfg
+    expected = normalized_logits(network, images, facts["mean"], facts["std"])
+    classifier = load_classifier("timm:mobilenetv3_small_050", tmp_path / "network.safetensors")
+    torch.testing.assert_close(classifier(images), expected, rtol=1e-4, atol=1e-5)

@@ -21,7 +21,7 @@ from train.train_settings import TrainSettings
 from train.training import run
 from train.training.augmentations import RelitBatches
 from train.training.averages import FACTORS, INTERPOLATION
-from train.training.losses import TrainingLoss
+from train.training.recipe import TrainingLoss
 
 NAME = "shufflenet_v2_x0_5"
 SIZE = 32

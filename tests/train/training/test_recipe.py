@@ -15,12 +15,13 @@ from renderer.image import to_unit
 from train.networks import WideResNet
 from train.train_settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
 from train.training.augmentations import PGD, Baseline
-from train.training.losses import TrainingLoss, ranking_loss
 from train.training.recipe import (
+    TrainingLoss,
     build_optimizer,
     feature_norm,
     freeze,
     learning_rate,
+    ranking_loss,
     scale_learning_rate,
 )
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
@@ -54,24 +55,17 @@ def modification_times(folder: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
-class ActingBatches:
-    """Give the batches of training, and call a function at one step."""
+def act_at(monkeypatch, round_number: int, step: int, act: Callable[[], None]) -> None:
+    """Let training call a function at one step."""
 
-    def __init__(self, act: Callable[[], None], round_number: int, step: int):
-        self.act = act
-        self.round_number = round_number
-        self.step = step
-
-    def __call__(self, images, batch_size, seed, now, *options):
+    def acting(images, batch_size, seed, now, *options):
         shown = batches.training_batches(images, batch_size, seed, now, *options)
-        for step, batch in enumerate(shown, 1):
-            if now.number == self.round_number and step == self.step:
-                self.act()
+        for number, batch in enumerate(shown, 1):
+            if (now.number, number) == (round_number, step):
+                act()
             yield batch
 
-
-def act_at(monkeypatch, round_number: int, step: int, act: Callable[[], None]) -> None:
-    monkeypatch.setattr(loop, "training_batches", ActingBatches(act, round_number, step))
+    monkeypatch.setattr(loop, "training_batches", acting)
 
 
 def train_with_signal(
@@ -201,15 +195,6 @@ def test_a_run_scores_the_network_in_memory_and_reads_no_checkpoint_back(
     run = loaded_run(tiny(*WITHOUT_RENDERS), tmp_path)
     monkeypatch.setattr(checkpoints, "load", Mock(side_effect=AssertionError))
     assert run.train()["test/epoch"] == 1
-
-
-def test_resuming_a_finished_run_trains_no_further_and_scores_the_same(tiny, tmp_path):
-    completed_run(tiny(*WITHOUT_RENDERS), tmp_path)
-    log = metrics(tmp_path)
-    last = (tmp_path / run_folder.LAST).read_bytes()
-    completed_run(tiny(*WITHOUT_RENDERS, "train.resume=true"), tmp_path)
-    assert metrics(tmp_path) == log
-    assert (tmp_path / run_folder.LAST).read_bytes() == last
 
 
 @pytest.mark.parametrize(
@@ -370,26 +355,6 @@ def test_meshes_and_hard_negatives_are_rendered_with_their_own_labels(
     assert len(renders.images.unique(dim=0)) == 16
 
 
-class TestARunFolder:
-    def test_has_the_last_and_the_selected_network(self, finished):
-        last = torch.load(finished / "last.pt", weights_only=True)
-        best = torch.load(finished / "best.pt", weights_only=True)
-        assert last["epoch"] == 3
-        assert last["seed"] == 7
-        assert last["mode"] == "adversarial"
-        assert last["precision"] == "float32"
-        assert last["model"].keys() == best["model"].keys()
-        assert "optimizer" not in best
-
-    def test_has_metrics_of_each_epoch(self, finished):
-        *epochs, _ = read_metrics(finished)
-        assert list(finished.glob("events.out.tfevents.*"))
-        assert [line["epoch"] for line in epochs] == [1, 2, 3]
-        for line in epochs:
-            assert {"train/loss", "validation/accuracy", "seconds/attack"} <= line.keys()
-            assert {"augment/attack_success_before", "augment/attack_success"} <= line.keys()
-
-
 def test_several_folders_of_photographs_are_scored_in_sub_folders_of_their_names(
     tiny, photos, tmp_path
 ):
@@ -413,37 +378,35 @@ def test_without_a_label_and_renders_photographs_are_scored_for_each_class_with_
     assert summary["label"] == ["apple", "orange"]
 
 
-class TestTheSelectedNetwork:
-    def test_is_the_best_on_validation_and_scored_once_after_the_last_epoch(self, tiny, tmp_path):
-        data = load_data(tiny())
-        epochs_of_looks = []
+def test_the_selected_network_is_the_best_on_validation_and_scored_once_after_the_last_epoch(
+    tiny, tmp_path
+):
+    data = load_data(tiny())
+    epochs_of_looks = []
 
-        class GuardedData:
-            classes = data.classes
-            train = data.train
-            size = data.size
-            labeled = True
-            rendered = False
+    class GuardedData(SimpleNamespace):
+        @property
+        def test(self):
+            epochs_of_looks.append(checkpoints.load(tmp_path / run_folder.LAST)["epoch"])
+            return data.test
 
-            @property
-            def test(self):
-                epochs_of_looks.append(checkpoints.load(tmp_path / run_folder.LAST)["epoch"])
-                return data.test
+    guarded = GuardedData(
+        classes=data.classes, train=data.train, size=data.size, labeled=True, rendered=False
+    )
+    scores = completed_run(tiny("augment=none"), tmp_path, guarded)
+    assert epochs_of_looks == [3]
 
-        scores = completed_run(tiny("augment=none"), tmp_path, GuardedData())
-        assert epochs_of_looks == [3]
+    *epochs, _ = read_metrics(tmp_path)
+    accuracies = [line["validation/accuracy"] for line in epochs]
+    best_epoch = accuracies.index(max(accuracies)) + 1
+    assert checkpoints.load(tmp_path / run_folder.BEST)["epoch"] == best_epoch
+    assert scores["test/epoch"] == best_epoch
 
-        *epochs, _ = read_metrics(tmp_path)
-        accuracies = [line["validation/accuracy"] for line in epochs]
-        best_epoch = accuracies.index(max(accuracies)) + 1
-        assert checkpoints.load(tmp_path / run_folder.BEST)["epoch"] == best_epoch
-        assert scores["test/epoch"] == best_epoch
-
-        network = load_run(tmp_path)
-        is_correct = network(data.test.images / 255).argmax(1) == data.test.labels
-        assert scores["test/accuracy"] == pytest.approx(is_correct.double().mean().item())
-        assert network.classes == ("apple", "orange", "pear")
-        assert network.size == 16
+    network = load_run(tmp_path)
+    is_correct = network(data.test.images / 255).argmax(1) == data.test.labels
+    assert scores["test/accuracy"] == pytest.approx(is_correct.double().mean().item())
+    assert network.classes == ("apple", "orange", "pear")
+    assert network.size == 16
 
 
 class TestAFolderOfRenders:

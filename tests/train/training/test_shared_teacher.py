@@ -8,7 +8,7 @@ from torch import nn
 
 from train.device import MixedPrecision
 from train.train_settings import TrainSettings
-from train.training.losses import SharedTeacher, share_layers
+from train.training.recipe import SharedTeacher, share_layers
 
 SIZE = 4
 LAST_LAYER_ONLY = TrainSettings(freeze="all_but_last", eval_mode=True)
