@@ -5,7 +5,7 @@ from renderer.camera import orbit_cameras as orbit_cameras
 from renderer.errors import InputError as InputError
 from renderer.fit import FittedScene as FittedScene
 from renderer.fit import fit_scene as fit_scene
-from renderer.io.export import export_mesh as export_mesh
+from renderer.io.meshes import export_mesh as export_mesh
 from renderer.io.meshes import load_mesh as load_mesh
 from renderer.light import harmonics as harmonics
 from renderer.light import skylight as skylight

@@ -57,9 +57,6 @@ _MATTE = np.array([[1, 0, 0]], dtype=np.float32)
 # Gloss texture with one texel that leaves roughness and
 # metallic unchanged. The stored value 255 means the factor 1.
 _NEUTRAL_GLOSS = np.full((1, 1, 2), 255, dtype=np.uint8)
-# Factors that pack the red, green and blue bytes of a texel into one integer:
-# red in bits 0 to 7, green in bits 8 to 15, and blue in bits 16 to 23.
-_PACKING = np.array([1, 2**8, 2**16], dtype=np.int32)
 
 
 @dataclass(frozen=True)
@@ -261,29 +258,6 @@ class Mesh:
         """True if the three corners of each face have the same color."""
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
 
-    def moved(self, vertices: np.ndarray) -> Mesh:
-        """Return a copy of the mesh with other vertex positions.
-
-        Args:
-            vertices: Vertex positions of the copy, shape (V, 3).
-
-        Returns:
-            Copy of the mesh, which shares the packed textures with this mesh.
-        """
-        moved_mesh = replace(self, vertices=vertices)
-        # Packing takes long. A cached property stores its value in `__dict__`.
-        moved_mesh.__dict__["packed_textures"] = self.packed_textures
-        return moved_mesh
-
-    @cached_property
-    def packed_textures(self) -> tuple[np.ndarray, ...]:
-        """Textures with one integer per texel, int32, shape (H, W) each.
-
-        Red is in bits 0 to 7, green in bits 8 to 15, and blue in bits 16 to 23. Looking up one
-        integer per texel is faster than looking up three bytes.
-        """
-        return tuple(texture.astype(np.int32) @ _PACKING for texture in self.textures)
-
     @cached_property
     def closed(self) -> bool:
         """True if no camera outside of the mesh can see a face from behind.
@@ -353,36 +327,41 @@ def require_mesh(name: str, value: object) -> None:
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     """Join several meshes to one mesh, which has the faces of all meshes in order.
 
-    Vertices are not merged.
+    Vertices are not merged. Meshes that share a texture also share it in the result.
     """
     faces, texture_ids, normal_ids = [], [], []
-    # The indices of a mesh grow by the numbers of vertices, textures and normals before it.
-    vertex_count = texture_count = normal_count = 0
+    # The indices of a mesh grow by the numbers of vertices and normals before it.
+    vertex_count = normal_count = 0
+    # Number of each pair of texture and gloss texture, by their identities.
+    numbers: dict[tuple[int, int], int] = {}
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
     for mesh in meshes:
         faces.append(mesh.faces + vertex_count)
         normal_ids.append(mesh.normal_ids + normal_count)
-        is_plain = mesh.texture_ids == NO_TEXTURE
-        texture_ids.append(np.where(is_plain, NO_TEXTURE, mesh.texture_ids + texture_count))
         vertex_count += len(mesh.vertices)
-        texture_count += len(mesh.textures)
         normal_count += mesh.normal_ids.max() + 1
-    gloss = None
-    if any(mesh.gloss is not None for mesh in meshes):
-        rows = [_MATTE.repeat(len(m.faces), 0) if m.gloss is None else m.gloss for m in meshes]
-        gloss = np.concatenate(rows)
-    gloss_textures: tuple[np.ndarray, ...] = ()
-    if any(mesh.gloss_textures for mesh in meshes):
-        lists = [m.gloss_textures or (_NEUTRAL_GLOSS,) * len(m.textures) for m in meshes]
-        gloss_textures = tuple(texture for textures in lists for texture in textures)
+        # The last entry belongs to the index -1, which is NO_TEXTURE.
+        new_ids = [NO_TEXTURE]
+        neutral = (_NEUTRAL_GLOSS,) * len(mesh.textures)
+        for pair in zip(mesh.textures, mesh.gloss_textures or neutral, strict=True):
+            key = (id(pair[0]), id(pair[1]))
+            if key not in numbers:
+                numbers[key] = len(pairs)
+                pairs.append(pair)
+            new_ids.insert(-1, numbers[key])
+        texture_ids.append(np.array(new_ids, dtype=np.int32)[mesh.texture_ids])
+    has_gloss_textures = any(mesh.gloss_textures for mesh in meshes)
+    matte = [_MATTE.repeat(len(mesh.faces), 0) for mesh in meshes]
+    gloss = [m if mesh.gloss is None else mesh.gloss for mesh, m in zip(meshes, matte, strict=True)]
     return Mesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
         faces=np.concatenate(faces),
         corner_colors=np.concatenate([mesh.corner_colors for mesh in meshes]),
         corner_uvs=np.concatenate([mesh.corner_uvs for mesh in meshes]),
-        texture_ids=np.concatenate(texture_ids).astype(np.int32),
-        textures=tuple(texture for mesh in meshes for texture in mesh.textures),
-        gloss=gloss,
-        gloss_textures=gloss_textures,
+        texture_ids=np.concatenate(texture_ids),
+        textures=tuple(pair[0] for pair in pairs),
+        gloss=None if all(mesh.gloss is None for mesh in meshes) else np.concatenate(gloss),
+        gloss_textures=tuple(pair[1] for pair in pairs) if has_gloss_textures else (),
         normal_ids=np.concatenate(normal_ids),
     )
 

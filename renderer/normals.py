@@ -22,17 +22,13 @@ from jaxtyping import Float, Float64, Int, Num
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import require_finite
+from renderer.errors import require_bounded
 from renderer.vectors import unit
 
 # `vertex_normals` adds up the area vectors of the faces around a vertex.
 # They cancel if their sum is shorter than this fraction of the sum of
 # their lengths. Such a short sum consists of rounding errors only.
 CANCELLATION = 64 * torch.finfo(torch.float64).eps
-# Ratio of the vertices of a mesh to the corners of the given
-# faces. From this ratio on, it is faster to process only the
-# vertices of these faces than all vertices of the mesh.
-SPARSE_VERTEX_RATIO = 2
 # A triangle counts as a sliver if the sine of the angle at its first corner is
 # at most this number. Below it, a plain float64 cross product of the two edges
 # would have a rounding error of more than about 64 units in the last place.
@@ -96,12 +92,11 @@ def doubled_area_vectors(
 def area_vectors(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
 ) -> Float64[Tensor, "3 F"]:
-    """Compute a vector along the normal of each face, with a length in proportion to its area.
+    """Compute a vector along the normal of each face, whose length is twice the face area.
 
-    The vectors are differentiable with respect to the vertices. The ratio of length to area
-    is a power of two that all faces share.
+    The vectors are differentiable with respect to the vertices.
     """
-    require_finite(vertices=vertices)
+    require_bounded(vertices=vertices)
     return _AreaVectors.apply(vertices, faces)
 
 
@@ -117,22 +112,14 @@ class _AreaVectors(torch.autograd.Function):
     def forward(
         ctx: Any, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
     ) -> Float[Tensor, "3 F"]:
-        """Compute the area vector u × v of each face from its edges u and v.
-
-        Edges in float64 are first divided by a power of two that all faces share. Products of large
-        edges then do not overflow. The area vectors become smaller by the square of this power.
-        """
+        """Compute the area vector u × v of each face from its edges u and v."""
         corners = vertices.index_select(0, faces.T.flatten()).T.contiguous().double()
         # Positions of the corners of F faces, shape (3 components, 3 corners, F).
         corners = corners.unflatten(1, (3, -1))
         # The edges from the first corner of each face to the second
         # and the third corner, shape (3 components, 2 edges, F).
         edges = corners[:, 1:] - corners[:, :1]
-        # The products are computed in float64, in which
-        # products of numbers from float32 cannot overflow.
-        is_float64 = vertices.dtype == torch.float64
-        scale = _power_of_two(edges) if is_float64 else edges.new_ones(())
-        edge_u, edge_v = edges.div_(scale).unbind(1)
+        edge_u, edge_v = edges.unbind(1)
         area_vectors = _cross(edge_u, edge_v)
         squared_u, squared_v = edges.square().sum(0)
         # The length |u × v| is |u| |v| times the
@@ -141,9 +128,9 @@ class _AreaVectors(torch.autograd.Function):
         is_sliver = area_vectors.square().sum(0) <= max_squared_length
         slivers = torch.nonzero(is_sliver).squeeze(1)
         if len(slivers):
-            first, second, third = (corners[:, :, slivers] / scale).unbind(1)
+            first, second, third = corners[:, :, slivers].unbind(1)
             area_vectors[:, slivers] = _exact_cross(first, second, third)
-        ctx.save_for_backward(faces, edge_u, edge_v, scale)
+        ctx.save_for_backward(faces, edge_u, edge_v)
         ctx.vertex_shape = vertices.shape
         ctx.dtype = vertices.dtype
         return area_vectors
@@ -152,39 +139,18 @@ class _AreaVectors(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, upstream: Float[Tensor, "3 F"]) -> tuple[Tensor, None]:
         """Compute the gradient of the loss with respect to the vertices."""
-        faces, edge_u, edge_v, scale = ctx.saved_tensors
+        faces, edge_u, edge_v = ctx.saved_tensors
         # With g for `upstream`, the gradient of g · (u × v) is v × g
         # with respect to u, and g × u with respect to v. The edge u
         # ends at the second corner, and the edge v at the third corner.
         second, third = _cross(edge_v, upstream), _cross(upstream, edge_u)
         # The first corner is the start of both edges, so the signs are reversed. Shape
         # (3 components, 3 F corners): all first corners, then all second and all third corners.
-        corner_gradients = torch.cat([-second - third, second, third], dim=1).div_(scale)
-        gradient = _sum_at_vertices(corner_gradients, faces, ctx.vertex_shape[0], ctx.dtype)
-        return gradient.T, None
-
-
-def _sum_at_vertices(
-    corner_gradients: Float[Tensor, "3 D"],
-    faces: Int[Tensor, "F 3"],
-    vertex_count: int,
-    dtype: torch.dtype,
-) -> Float[Tensor, "3 V"]:
-    """Add up the gradients of all face corners that lie at the same vertex.
-
-    The columns are all first corners, then all second and all third corners.
-    """
-    vertex_of_corner = faces.T.flatten()
-    if vertex_count < SPARSE_VERTEX_RATIO * len(vertex_of_corner):
-        zeros = corner_gradients.new_zeros(3, vertex_count)
-        return zeros.index_add_(1, vertex_of_corner, corner_gradients).to(dtype)
-    # Most vertices have no face here. Adding up the gradients of the other
-    # vertices alone avoids a float64 tensor of the size of the mesh.
-    used_vertices, corner_to_used = vertex_of_corner.unique(return_inverse=True)
-    zeros = corner_gradients.new_zeros(3, len(used_vertices))
-    sums = zeros.index_add_(1, corner_to_used, corner_gradients)
-    gradient = torch.zeros(3, vertex_count, dtype=dtype, device=sums.device)
-    return gradient.index_copy_(1, used_vertices, sums.to(dtype))
+        corner_gradients = torch.cat([-second - third, second, third], dim=1)
+        # Add up the gradients of all corners that lie at the same vertex.
+        zeros = corner_gradients.new_zeros(3, ctx.vertex_shape[0])
+        gradient = zeros.index_add_(1, faces.T.flatten(), corner_gradients)
+        return gradient.to(ctx.dtype).T, None
 
 
 def _length(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
@@ -193,20 +159,6 @@ def _length(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
     torch.norm would be fifty times slower along an axis of length three.
     """
     return vectors.square().sum(0).sqrt()
-
-
-def _power_of_two(edges: Tensor) -> Float[Tensor, ""]:
-    """Find the smallest power of two above the magnitudes of all components of some edges.
-
-    Edges that are divided by this power have components between -1 and 1, so
-    products of them do not overflow. The division has no rounding error. The power is 1 if
-    there are no edges, or if all are zero.
-    """
-    if not edges.numel():
-        return edges.new_ones(())
-    # frexp gives the exponent e of a number x > 0 with 2^(e - 1) <= x < 2^e.
-    _, exponent = torch.frexp(edges.abs().max())
-    return torch.ldexp(edges.new_ones(()), exponent)
 
 
 def _cross(u: Float[Tensor, "3 N"], v: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:

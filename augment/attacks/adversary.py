@@ -28,9 +28,9 @@ from renderer.errors import (
     single_line,
 )
 from renderer.image import to_bytes
-from renderer.io.export import export_mesh
 from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.io.images import gray_or_image, write_image
+from renderer.io.meshes import export_mesh
 from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
 from renderer.light.files import load_light, read_light, save_light

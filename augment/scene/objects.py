@@ -234,7 +234,7 @@ def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObjec
     mesh = select_faces(item.mesh, slice(item.own))
     # Round the vertices to float32, as `normalize` does.
     vertices = (mesh.vertices @ rotation.T).astype(np.float32)
-    return _with_mesh(item, mesh.moved(vertices.astype(np.float64)))
+    return _with_mesh(item, replace(mesh, vertices=vertices.astype(np.float64)))
 
 
 def add_specular_layer(item: SceneObject, gloss: Gloss) -> SceneObject:

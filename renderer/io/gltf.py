@@ -31,17 +31,11 @@ STRIP = 5
 FAN = 6
 # Alpha from which on a texel with 8 bits counts as opaque.
 ALMOST_ONE = 1 - 0.5 / 255
-# Widths of the attributes of vertices that are read (3.7.2.1), by the first part of their names.
-ATTRIBUTES = {
-    "POSITION": (3,),
-    "NORMAL": (3,),
-    "TEXCOORD": (2,),
-    "COLOR": (3, 4),
-    "JOINTS": (4,),
-    "WEIGHTS": (4,),
-}
 # Beginnings of the names of attributes that joints use.
 SKINNING = ("JOINTS", "WEIGHTS")
+# Widths of the attributes of vertices that are read (3.7.2.1), by the first part of their names.
+ATTRIBUTES = {"POSITION": (3,), "NORMAL": (3,), "TEXCOORD": (2,), "COLOR": (3, 4)}
+ATTRIBUTES |= dict.fromkeys(SKINNING, (4,))
 DRACO = "KHR_draco_mesh_compression"
 # Bytes that a face and a vertex take while the parts are read and joined.
 FACE_BYTES = 2000
@@ -53,21 +47,35 @@ SKINNED_VERTEX_BYTES = 1000
 MAX_WEIGHT_ERROR = 0.01
 
 
-class _Primitive(NamedTuple):
-    """Part in its own axes, with V vertices and F faces.
+class _Surface(NamedTuple):
+    """Faces whose corners have values, in their own axes.
 
     Attributes:
-        positions: Positions of the vertices, shape (V, 3).
-        faces: Vertex indices of the corners, shape (F, 3).
+        positions: Positions of the V vertices, shape (V, 3).
+        faces: Vertex indices of the corners of the F faces, shape (F, 3).
         corners: Texture coordinates (2), alpha, linear color (3) and normal (3)
             of the corners, shape (F, 3, 9). Normals of 0 if the file has none.
-        material: Material of the part.
-        joints: Attributes JOINTS_n and WEIGHTS_n of the vertices.
     """
 
     positions: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
     corners: Float[np.ndarray, "F 3 9"]
+
+    def select(self, faces: np.ndarray) -> "_Surface":
+        """Keep some of the faces, and all vertices."""
+        return self._replace(faces=self.faces[faces], corners=self.corners[faces])
+
+
+class _Primitive(NamedTuple):
+    """Part with one material.
+
+    Attributes:
+        surface: Surface in its own axes.
+        material: Material of the part.
+        joints: Attributes JOINTS_n and WEIGHTS_n of the vertices.
+    """
+
+    surface: _Surface
     material: Material
     joints: dict[str, np.ndarray]
 
@@ -144,7 +152,7 @@ def _read_part(
     normals = attributes.get("NORMAL", np.zeros_like(positions))
     values = np.concatenate([uvs, colors[:, 3:], colors[:, :3], normals], axis=1)
     joints = {key: v for key, v in attributes.items() if key.startswith(SKINNING)}
-    return _Primitive(positions, faces, values[faces], material, joints)
+    return _Primitive(_Surface(positions, faces, values[faces]), material, joints)
 
 
 def _attributes(
@@ -217,17 +225,18 @@ def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.n
 
 def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
     """Place a part in the scene, once for each copy that a node shows, and cut out its holes."""
-    if not len(part.faces):
-        return []
     poses = file.instances(index)
-    vertices = part.positions
+    surface = part.surface
+    if not len(surface.faces):
+        return []
     node = file.tree["nodes"][index]
     if "skin" in node:
         if len(poses) > 1:
             raise ValueError("it shows several copies of a mesh that joints move")
-        vertices, pose = _posed(file, file.entry("skins", node["skin"]), part)
+        positions, pose = _posed(file, file.entry("skins", node["skin"]), part)
+        surface = surface._replace(positions=positions)
         poses = pose[None]
-    vertices, faces, corners = _visible(part, vertices)
+    vertices, faces, corners = _visible(part.material, surface)
     if not len(faces):
         return []
     material = part.material
@@ -269,7 +278,7 @@ def _posed(
             raise ValueError(f"a skin has {len(bind)} matrices for {len(matrices)} joints")
         matrices = matrices @ bind
     names = [name for name in part.joints if name.startswith("JOINTS")]
-    none = np.zeros((len(part.positions), 0), np.int64)
+    none = np.zeros((len(part.surface.positions), 0), np.int64)
     joints = np.hstack([none, *(part.joints[name] for name in names)])
     weights = np.hstack([none, *(part.joints[n.replace("JOINTS", "WEIGHTS")] for n in names)])
     # A joint with the weight 0 may be any number, so it is replaced by joint 0.
@@ -279,7 +288,7 @@ def _posed(
             f"a vertex has the joint {joints.max()}, but its skin has {len(matrices)} joints"
         )
     # Weighted sum of the matrices of the joints, and of the weights, for each vertex.
-    blended = np.zeros((len(part.positions), 4, 4))
+    blended = np.zeros((len(part.surface.positions), 4, 4))
     for joint, weight in zip(joints.T, weights.T, strict=True):
         blended += weight[:, None, None] * matrices[joint]
     sums = weights.sum(axis=1)
@@ -289,18 +298,17 @@ def _posed(
         worst = sums[deviations.argmax()]
         raise ValueError(f"the weights of a vertex add up to {worst:g} instead of 1")
     blended /= sums[:, None, None]
-    positions = np.einsum("vij,vj->vi", blended[:, :3, :3], part.positions) + blended[:, :3, 3]
-    return positions, matrices[0]
+    linear, shift = blended[:, :3, :3], blended[:, :3, 3]
+    return np.einsum("vij,vj->vi", linear, part.surface.positions) + shift, matrices[0]
 
 
-def _visible(part: _Primitive, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, faces and corners of the visible surface of a part (3.9.6)."""
-    material = part.material
+def _visible(material: Material, surface: _Surface) -> _Surface:
+    """Return the visible part of a surface (3.9.6)."""
     if material.mode == "OPAQUE":
-        return vertices, part.faces, part.corners
+        return surface
     cutoff = ALMOST_ONE if material.mode == "BLEND" else material.cutoff
-    visible = cut_out(vertices, part.faces, part.corners, material.alpha, cutoff)
-    if material.mode == "BLEND" and visible[1] is not part.faces:
+    visible = _cut_out(surface, material.alpha, cutoff)
+    if material.mode == "BLEND" and visible is not surface:
         raise ValueError(
             "its surface is transparent (alphaMode BLEND with alpha below 1): "
             "make it opaque, or use alphaMode MASK"
@@ -363,26 +371,19 @@ class _AlphaTexture:
         return bounds / FULL
 
 
-def cut_out(
-    vertices: Float[np.ndarray, "V D"],
-    faces: Int[np.ndarray, "F 3"],
-    corners: Float[np.ndarray, "F 3 C"],
-    texels: UInt8[np.ndarray, "H W"] | None,
-    cutoff: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Remove the parts of F faces whose alpha is below a value.
+def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: float) -> _Surface:
+    """Remove the parts of a surface whose alpha is below a value.
 
-    Alpha is the interpolated product of the texture and of the alpha of corners.
-    All values are interpolated linearly at new vertices. Faces that share an
-    edge also share the new vertices on it. The first three values of a corner are u, v and alpha.
-    Without texels, the alpha of the texture is 1. The result is new vertices, faces and corners.
+    Alpha is the interpolated product of the texture, or 1 without texels, and of the alpha of
+    corners. All values are interpolated linearly at new vertices. Faces that share an edge also
+    share the new vertices on it.
     """
-    given = vertices, faces, corners
+    surface = given
     texture = _AlphaTexture(np.full((1, 1), FULL, np.uint8) if texels is None else texels)
     while True:
-        positions = texture.position(corners)
+        positions = texture.position(surface.corners)
         low, high = texture.ranges(positions)
-        alphas = corners[..., ALPHA]
+        alphas = surface.corners[..., ALPHA]
         is_shown = high * alphas.max(axis=1) >= cutoff
         is_crossed = is_shown & (low * alphas.min(axis=1) < cutoff)
         lengths = np.linalg.norm(positions - np.roll(positions, -1, axis=1), axis=2)
@@ -390,26 +391,20 @@ def cut_out(
         # Without a texture, alpha is linear in each face, so faces need not be divided.
         if texels is None or not is_large.any():
             break
-        if len(faces) > MAX_FACES:
+        if len(surface.faces) > MAX_FACES:
             raise ValueError(
                 f"the border of its alpha needs more than {MAX_FACES} faces: use fewer texels "
                 "or fewer repetitions of the texture"
             )
-        vertices, faces, corners = _halve(
-            vertices, faces[is_shown], corners[is_shown], lengths[is_shown], is_large[is_shown]
-        )
-    crossed = np.flatnonzero(is_crossed)
-    flat_alpha = texture.at(positions[crossed].reshape(-1, 2)).reshape(-1, 3)
-    excess = flat_alpha * alphas[crossed] - cutoff
+        surface = _halve(surface.select(is_shown), lengths[is_shown], is_large[is_shown])
+    flat_alpha = texture.at(positions[is_crossed].reshape(-1, 2)).reshape(-1, 3)
+    excess = flat_alpha * alphas[is_crossed] - cutoff
     if is_shown.all() and not (excess < 0).any():
         return given
-    kept = is_shown & ~is_crossed
-    vertices, cut_faces, cut_corners = _cut(vertices, faces[crossed], corners[crossed], excess)
-    return (
-        vertices,
-        np.concatenate([faces[kept], cut_faces]),
-        np.concatenate([corners[kept], cut_corners]),
-    )
+    kept = surface.select(is_shown & ~is_crossed)
+    vertices, faces, corners = _cut(surface.select(is_crossed), excess)
+    faces = np.concatenate([kept.faces, faces])
+    return _Surface(vertices, faces, np.concatenate([kept.corners, corners]))
 
 
 def _interpolate(values: np.ndarray, others: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -418,18 +413,13 @@ def _interpolate(values: np.ndarray, others: np.ndarray, share: np.ndarray) -> n
     return values + share * (others - values)
 
 
-def _halve(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    corners: np.ndarray,
-    lengths: np.ndarray,
-    is_large: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _halve(surface: _Surface, lengths: np.ndarray, is_large: np.ndarray) -> _Surface:
     """Halve some faces at an edge that is the longest of all faces around it, so no crack opens.
 
     Such an edge is at the end of a path from each large face over the longest edge to the next
     face (Rivara 1984). `lengths` are those of the sides 0-1, 1-2 and 2-0, shape (F, 3).
     """
+    vertices, faces, corners = surface
     ends, edge_of_side = shared_edges(faces)
     # A seam of the texture has two lengths. Edges of one length are ordered by their numbers.
     edge_length = np.zeros(len(ends))
@@ -452,20 +442,19 @@ def _halve(
     values = np.take_along_axis(corners[halved], order[..., None], axis=1)
     values = np.concatenate([values, values[:, :2].mean(axis=1, keepdims=True)], axis=1)
     halves = [[0, 3, 2], [3, 1, 2]]
-    return (
+    return _Surface(
         np.concatenate([vertices, vertices[ends[is_wanted]].mean(axis=1)]),
         np.concatenate([faces[~halved], *(points[:, half] for half in halves)]),
         np.concatenate([corners[~halved], *(values[:, half] for half in halves)]),
     )
 
 
-def _cut(
-    vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray, excess: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _cut(surface: _Surface, excess: np.ndarray) -> _Surface:
     """Keep the parts of faces where a linear function is not negative.
 
     Its values at the corners are `excess`, shape (F, 3).
     """
+    vertices, faces, corners = surface
     is_kept = excess >= 0
     count = is_kept.sum(axis=1)
     whole, crossed = count == 3, (count == 1) | (count == 2)
@@ -491,7 +480,7 @@ def _cut(
     ids = np.concatenate([odd_faces, len(vertices) + point_of_side.reshape(-1, 2)], axis=1)
     one = count[crossed] == 1
     pieces = [(one, (0, 3, 4)), (~one, (3, 1, 2)), (~one, (3, 2, 4))]
-    return (
+    return _Surface(
         np.concatenate([vertices, _interpolate(low, high, share[first])]),
         np.concatenate([faces[whole], *(ids[rows][:, piece] for rows, piece in pieces)]),
         np.concatenate([corners[whole], *(values[rows][:, piece] for rows, piece in pieces)]),

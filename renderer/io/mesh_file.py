@@ -1,11 +1,11 @@
 """What readers of mesh files share: the files beside a mesh, numbers in text, polygons, colors."""
 
 import io
+import itertools
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
@@ -106,7 +106,7 @@ class MeshFile:
                 pixels = np.array(eight_bits(image).convert("RGBA"))
             if pixels[..., 3].min() < 255:
                 self.assume(f"the alpha of {name} is ignored")
-            self._textures[key] = pixels[..., :3]
+            self._textures[key] = np.ascontiguousarray(pixels[..., :3])
         return self._textures[key]
 
     def ignore(self, feature: str) -> None:
@@ -175,12 +175,14 @@ def parse_numbers(text: bytes, dtype: type) -> np.ndarray:
             raise ValueError("a word is not a number: export the file again") from error
 
 
-def words_per_line(text: bytes) -> np.ndarray:
-    """Count the words of each line of a text that ends with a line break."""
-    characters = np.frombuffer(b"\n" + text, dtype=np.uint8)
-    is_blank = characters <= ord(" ")
-    lines = np.cumsum(characters == ord("\n"))[1:][is_blank[:-1] & ~is_blank[1:]] - 1
-    return np.bincount(lines, minlength=text.count(b"\n"))
+def words_of_lines(text: bytes) -> list[list[bytes]]:
+    """Split text into the words of each line, without comments."""
+    return [line.split() for line in without_comments(text).split(b"\n")]
+
+
+def numbers_of(lines: Iterable[list[bytes]]) -> np.ndarray:
+    """Parse the words of all lines as float64, shape (N,)."""
+    return parse_numbers(b" ".join(itertools.chain.from_iterable(lines)), np.float64)
 
 
 def triangles_of(
@@ -262,6 +264,12 @@ def unit_colors(colors: np.ndarray, file: MeshFile) -> np.ndarray:
     return colors.astype(np.float64).clip(0, 1)
 
 
+def require_opaque(alpha: np.ndarray) -> None:
+    """Refuse alpha in [0, 1] that is not 1 everywhere."""
+    if alpha.min(initial=1) < OPAQUE:
+        raise ValueError("the file has transparent colors, which are not supported")
+
+
 def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Multiply the linear values of sRGB-encoded colors, and encode the product."""
     factors = [decode(torch.from_numpy(colors), "srgb") for colors in (first, second)]
@@ -291,18 +299,13 @@ def triangulate(
     first_triangles = np.cumsum(triangle_counts) - triangle_counts
     steps = np.arange(len(polygons)) - first_triangles[polygons]
     # Each fan of triangles is around the first corner of the polygon.
-    fans = np.stack([0 * steps, steps + 1, steps + 2], axis=1)
-    triangles = starts[polygons, None] + fans
+    triangles = starts[polygons, None] + np.stack([0 * steps, steps + 1, steps + 2], axis=1)
     if (sizes == 3).all():
         return triangles, polygons, 0
     points = _projected(corners, starts, sizes)
-    is_fan = _are_counterclockwise(points, triangles, first_triangles) | (sizes == 3)
-    # The fan around the second corner covers a quadrilateral
-    # that is concave at the second or the fourth corner.
-    is_bent = ~is_fan[polygons]
-    turned_fans = (fans[is_bent] + 1) % sizes[polygons[is_bent], None]
-    triangles[is_bent] = starts[polygons[is_bent], None] + turned_fans
-    is_fan |= _are_counterclockwise(points, triangles, first_triangles)
+    # A fan of counter-clockwise triangles covers the polygon.
+    is_fan = np.minimum.reduceat(_doubled_areas(points, triangles), first_triangles) >= 0
+    is_fan |= sizes == 3
     parts = [triangles[is_fan[polygons]]]
     owners = [polygons[is_fan[polygons]]]
     crossing_count = 0
@@ -340,13 +343,6 @@ def _doubled_areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
 
 
-def _are_counterclockwise(
-    points: np.ndarray, triangles: np.ndarray, first_triangles: np.ndarray
-) -> np.ndarray:
-    """Tell which polygons have only counter-clockwise triangles, which then cover the polygon."""
-    return np.minimum.reduceat(_doubled_areas(points, triangles), first_triangles) >= 0
-
-
 def _clip_ears(points: np.ndarray) -> tuple[np.ndarray, bool]:
     """Divide a counter-clockwise polygon (N, 2), and tell whether it intersects itself."""
     count = len(points)
@@ -361,7 +357,7 @@ def _clip_ears(points: np.ndarray) -> tuple[np.ndarray, bool]:
     # The ears leave out some corners on straight edges. Each triangle
     # at such an edge is divided, so that it has these corners, too.
     kept = np.unique(triangles)
-    for start, end in pairwise([*kept, kept[0] + count]):
+    for start, end in itertools.pairwise([*kept, kept[0] + count]):
         if end == start + 1:
             continue
         chain = np.arange(start, end + 1) % count

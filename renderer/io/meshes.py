@@ -1,31 +1,50 @@
-"""Read meshes with their colors and textures from files.
+"""Read meshes with their colors and textures from files, and write them to .glb files.
 
 The library trimesh reads the formats for which there is no reader of our own.
 """
 
 import io
+import json
+import math
+import struct
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import trimesh
-from trimesh.resolvers import FilePathResolver
+import torch
+from jaxtyping import Float, Int
+from PIL import Image
 
+from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import (
     MAX_MAGNITUDE,
     InputError,
+    as_list,
     as_path,
     require_choice,
     require_file,
     require_flag,
+    require_whole,
     single_line,
 )
+from renderer.image import decode
+from renderer.io.files import atomic_write
 from renderer.io.gltf import read_gltf
 from renderer.io.images import eight_bits, identify
-from renderer.io.mesh_file import OPAQUE, MeshFile, Part, colored_mesh, require_bounded, unit_colors
+from renderer.io.mesh_file import (
+    MeshFile,
+    Part,
+    colored_mesh,
+    require_bounded,
+    require_opaque,
+    unit_colors,
+)
 from renderer.io.obj import read_obj
 from renderer.io.ply_off_stl import read_off, read_ply, read_stl
-from renderer.mesh import NO_TEXTURE, Y_UP_TO_Z_UP, Mesh, concatenate, transformed
+from renderer.mesh import NO_TEXTURE, Y_UP_TO_Z_UP, Mesh, concatenate, require_mesh, transformed
 from renderer.normals import normal_groups
 
 # Suffixes of archive files, which are not read. trimesh could read them,
@@ -91,8 +110,14 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     if not parts:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     placed_meshes, normals = zip(*(part.placed() for part in parts), strict=True)
-    mesh = _share_textures(concatenate(placed_meshes))
-    mesh = _merge_vertices(mesh, np.concatenate(normals))
+    mesh = concatenate(placed_meshes)
+    # Vertices at the same position are merged, and vertices without faces are dropped.
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+    vertices, vertex_of_corner = np.unique(corners, axis=0, return_inverse=True)
+    faces = vertex_of_corner.reshape(-1, 3)
+    # The normals of the file decide which edges are sharp.
+    normal_ids = normal_groups(vertices, faces, np.concatenate(normals))
+    mesh = replace(mesh, vertices=vertices, faces=faces, normal_ids=normal_ids)
     # The matrices of a scene may have huge numbers or NaN. A
     # comparison with NaN is False, so `not` also finds NaN.
     if not (np.abs(mesh.vertices) <= MAX_MAGNITUDE).all():
@@ -109,53 +134,15 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     return transformed(mesh, Y_UP_TO_Z_UP) if is_y_up else mesh
 
 
-def _share_textures(mesh: Mesh) -> Mesh:
-    """Return a copy of a mesh in which the copies of a part have one texture."""
-    pairs = list(zip(mesh.textures, mesh.gloss_textures or mesh.textures, strict=True))
-    keys = [(id(texture), id(gloss_texture)) for texture, gloss_texture in pairs]
-    pair_of_key = dict(zip(keys, pairs, strict=True))
-    index_of_key = {key: index for index, key in enumerate(pair_of_key)}
-    # The last entry belongs to the index -1, which is NO_TEXTURE.
-    new_ids = np.array([*(index_of_key[key] for key in keys), NO_TEXTURE], dtype=np.int32)
-    gloss_textures = tuple(pair[1] for pair in pair_of_key.values())
-    return replace(
-        mesh,
-        texture_ids=new_ids[mesh.texture_ids],
-        textures=tuple(pair[0] for pair in pair_of_key.values()),
-        gloss_textures=gloss_textures if mesh.gloss_textures else (),
-    )
-
-
-def _merge_vertices(mesh: Mesh, normals: np.ndarray) -> Mesh:
-    """Return a copy of a mesh in which vertices at the same position are merged.
-
-    Vertices without faces are dropped. `normals` are those of the file, or zero, shape (F, 3, 3).
-    They decide which edges are sharp.
-    """
-    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
-    vertices, vertex_of_corner = np.unique(corners, axis=0, return_inverse=True)
-    faces = vertex_of_corner.reshape(-1, 3)
-    normal_ids = normal_groups(vertices, faces, normals)
-    return replace(mesh, vertices=vertices, faces=faces, normal_ids=normal_ids)
-
-
 def read_parts(path: Path, gloss: bool = False) -> list[Part]:
     """Read the parts of a mesh file, and warn once of what is ignored or assumed."""
     require_file(path, "give the path of a mesh file")
     suffix = path.suffix.lower().lstrip(".")
-    formats = (set(trimesh.available_formats()) | READERS.keys()) - ARCHIVES
-    if suffix not in formats:
-        known = ", ".join(sorted(formats))
-        raise InputError(f"{path} has no known mesh format: use one of {known}")
+    readers = READERS | dict.fromkeys(GLTF, partial(read_gltf, gloss=gloss))
     # trimesh and Pillow can raise almost any exception for a damaged file.
     try:
         file = MeshFile(path)
-        if suffix in GLTF:
-            parts = read_gltf(file, gloss)
-        elif suffix in READERS:
-            parts = READERS[suffix](file)
-        else:
-            parts = _read_parts(file, suffix)
+        parts = readers[suffix](file) if suffix in readers else _read_with_trimesh(file, suffix)
     except Exception as error:
         message = single_line(error)
         # The message of a missing key is only this key.
@@ -166,8 +153,15 @@ def read_parts(path: Path, gloss: bool = False) -> list[Part]:
     return parts
 
 
-def _read_parts(file: MeshFile, suffix: str) -> list[Part]:
-    """Read the parts of a mesh file with trimesh, such as a .dae file."""
+def _read_with_trimesh(file: MeshFile, suffix: str) -> list[Part]:
+    """Read the parts of a mesh file, such as a .dae file, with trimesh."""
+    # Importing trimesh takes half a second.
+    import trimesh
+
+    formats = set(trimesh.available_formats()) - ARCHIVES
+    if suffix not in formats:
+        known = ", ".join(sorted(formats | READERS.keys()))
+        raise ValueError(f"the mesh format {suffix} is unknown: use one of {known}")
     file.assume(f"trimesh reads the format {suffix}, and may leave out colors")
     files = _Images(file)
     scene = trimesh.load(
@@ -187,7 +181,7 @@ def _read_parts(file: MeshFile, suffix: str) -> list[Part]:
     return [parts[name]._replace(matrix=matrix) for matrix, name in placements if name in parts]
 
 
-class _Images(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyped, see pyproject.toml
+class _Images:
     """Reader through which trimesh reads the images that a mesh file refers to.
 
     Attributes:
@@ -195,7 +189,6 @@ class _Images(FilePathResolver):  # type: ignore[misc]  # trimesh counts as unty
     """
 
     def __init__(self, file: MeshFile) -> None:
-        super().__init__(str(file.path))
         self.file = file
         self.errors: list[Exception] = []
 
@@ -211,12 +204,12 @@ class _Images(FilePathResolver):  # type: ignore[misc]  # trimesh counts as unty
         return content
 
 
-def _as_part(geometry: trimesh.Trimesh, file: MeshFile) -> Part:
+def _as_part(geometry: Any, file: MeshFile) -> Part:
     """Convert a mesh of trimesh to a matte part in the same coordinates."""
     faces = np.array(geometry.faces, dtype=np.int64)
     require_bounded(coordinates=geometry.vertices)
     visual = geometry.visual
-    colors = np.full((1, 4), 255, dtype=np.uint8)
+    colors = None
     uvs = None
     textures = []
     if visual.kind == "vertex":
@@ -224,16 +217,221 @@ def _as_part(geometry: trimesh.Trimesh, file: MeshFile) -> Part:
     elif visual.kind == "face":
         colors = visual.face_colors[:, None]
     elif visual.kind == "texture":
-        factor = visual.material.baseColorFactor
-        colors = colors if factor is None else factor[None]
+        colors = visual.material.baseColorFactor
         uvs = None if visual.uv is None else visual.uv[faces, :2]
         if visual.material.baseColorTexture is not None:
             textures = [np.array(eight_bits(visual.material.baseColorTexture).convert("RGB"))]
-    unit = unit_colors(colors, file)
-    if unit[..., 3:].min(initial=1) < OPAQUE:
-        raise ValueError("the file has transparent colors, which are not supported")
-    texture_ids = np.zeros(len(faces), dtype=np.int64)
-    mesh = colored_mesh(geometry.vertices, faces, unit[..., :3], uvs, texture_ids, textures)
+    unit = unit_colors(np.ones(3) if colors is None else colors, file)
+    require_opaque(unit[..., 3:])
+    mesh = colored_mesh(geometry.vertices, faces, unit[..., :3], uvs, textures=textures)
     # trimesh computes `vertex_normals` if the file has none, but not before they are used.
     normals = geometry._cache.cache.get("vertex_normals")
     return Part(mesh, None if normals is None else normals[faces])
+
+
+# Types of the numbers and kinds of the rows of arrays in glTF (3.6.2.2).
+_TYPES = {"float32": 5126, "uint32": 5125}
+_KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+SPECULAR = "KHR_materials_specular"
+
+
+def export_mesh(
+    mesh: Mesh,
+    path: str | Path,
+    normals: str = "smooth",
+    cameras: Sequence[Camera] = (),
+    first: int | None = None,
+) -> None:
+    """Write a mesh to a .glb file.
+
+    `load_mesh` reads the same surface from the file, with float32 precision. In
+    the file, y points up and colors are linear. Faces with the same texture and
+    gloss are written together, so the order of the faces can change. Materials
+    are visible from both sides. A vertex is repeated if the faces around it have
+    different colors, texture coordinates or normals there.
+
+    Args:
+        mesh: Mesh to write.
+        path: File to write, with the suffix .glb. Its folder is created.
+        normals: Normals with which the renderer shades the mesh, "smooth" or
+            "flat".
+        cameras: Cameras to write as nodes of the file, in this order.
+        first: Number of faces at the beginning of the mesh that are written
+            before all other faces. None sorts all faces by texture and gloss.
+
+    Raises:
+        InputError: If an argument is invalid, or if the file cannot be written.
+
+    >>> import norm_balls as nb
+    >>> apple = nb.normalize(nb.solid("apple"))
+    >>> cameras = nb.orbit_cameras(views=3, width=2.2)
+    >>> nb.export_mesh(apple, "apple.glb", cameras=cameras)
+    """
+    require_mesh("mesh", mesh)
+    path = as_path("path", path)
+    cameras = as_list("cameras", cameras, Camera, "a list of cameras")
+    if first is not None:
+        require_whole("first", first, 0, len(mesh.faces))
+    unit_normals = mesh.written_normals(normals)
+    if path.suffix.lower() != ".glb":
+        raise InputError(
+            f"{path} cannot be written as a mesh: choose a file name that ends in .glb"
+        )
+    content = _glb(mesh, unit_normals, cameras, len(mesh.faces) if first is None else first)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, content)
+    except OSError as error:
+        raise InputError(f"the mesh file {path} cannot be written: {error}") from error
+
+
+class _Tree(dict[str, Any]):
+    """JSON object of a .glb file, with its buffer."""
+
+    def __init__(self) -> None:
+        super().__init__(asset={"version": "2.0"})
+        self.buffer = bytearray()
+
+    def add(self, kind: str, entry: dict[str, Any]) -> int:
+        """Append an entry to a list of the object, such as "materials", and return its index."""
+        entries = self.setdefault(kind, [])
+        entries.append(entry)
+        return len(entries) - 1
+
+    def add_bytes(self, content: bytes) -> int:
+        """Append bytes to the buffer, and return the index of their view."""
+        view = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": len(content)}
+        self.buffer += content + bytes(-len(content) % 4)
+        return self.add("bufferViews", view)
+
+    def add_array(self, values: np.ndarray) -> int:
+        """Append an array of float32 or uint32, and return the index of its accessor."""
+        rows = values.reshape(len(values), -1)
+        accessor = {
+            "bufferView": self.add_bytes(values.tobytes()),
+            "componentType": _TYPES[values.dtype.name],
+            "count": len(rows),
+            "type": _KINDS[rows.shape[1]],
+            "min": rows.min(axis=0).tolist(),
+            "max": rows.max(axis=0).tolist(),
+        }
+        return self.add("accessors", accessor)
+
+    def add_texture(self, texels: np.ndarray) -> dict[str, int]:
+        """Append an image, and return a reference to its texture."""
+        png = io.BytesIO()
+        Image.fromarray(texels).save(png, "PNG")
+        image = {"bufferView": self.add_bytes(png.getvalue()), "mimeType": "image/png"}
+        return {"index": self.add("textures", {"source": self.add("images", image)})}
+
+    def content(self) -> bytes:
+        """Return the content of the file (4.4)."""
+        self["buffers"] = [{"byteLength": len(self.buffer)}]
+        text = json.dumps(self).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text
+        chunks += struct.pack("<I4s", len(self.buffer), b"BIN\0") + self.buffer
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _glb(
+    mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], cameras: Sequence[Camera], first_count: int
+) -> bytes:
+    """Create the content of a .glb file, with y up and linear colors."""
+    tree = _Tree()
+    # Faces with the same key are written together. The key tells whether a face is one of the
+    # first ones, and has the index of the texture and, if the mesh has gloss, its three values.
+    is_later = np.arange(len(mesh.faces)) >= first_count
+    gloss = [] if mesh.gloss is None else [mesh.gloss]
+    keys = np.column_stack([is_later, mesh.texture_ids, *gloss])
+    # A row vector times this matrix is rotated in the opposite direction: from z up to y up.
+    rotation = Y_UP_TO_Z_UP[:3, :3]
+    primitives = []
+    for key in np.unique(keys, axis=0):
+        has_key = (keys == key).all(1)
+        # Eight values for each corner: color (3), texture coordinates (2) and normal (3).
+        values = [mesh.corner_colors[has_key], mesh.corner_uvs[has_key], normals[has_key]]
+        vertex_ids, values, faces = _split_vertices(
+            mesh.faces[has_key], np.concatenate(values, axis=-1)
+        )
+        attributes = {
+            "POSITION": mesh.vertices[vertex_ids] @ rotation,
+            # v points down in glTF.
+            "TEXCOORD_0": values[:, 3:5] * [1, -1] + [0, 1],
+            "COLOR_0": decode(torch.from_numpy(values[:, :3]), "srgb").numpy(),
+            "NORMAL": values[:, 5:] @ rotation,
+        }
+        primitive = {
+            "attributes": {n: tree.add_array(a.astype(np.float32)) for n, a in attributes.items()},
+            "indices": tree.add_array(faces.astype(np.uint32).ravel()),
+            "material": _add_material(tree, mesh, int(key[1]), key[2:].tolist()),
+        }
+        primitives.append(primitive)
+    tree.add("nodes", {"mesh": tree.add("meshes", {"primitives": primitives})})
+    for index, camera in enumerate(cameras):
+        # The axes of a camera in glTF are the same as ours: right, up and back. glTF stores
+        # matrices column by column.
+        matrix = (Y_UP_TO_Z_UP.T @ camera.pose()).T.ravel().tolist()
+        lens = tree.add("cameras", _gltf_camera(camera))
+        tree.add("nodes", {"camera": lens, "name": f"view {index}", "matrix": matrix})
+    tree["scene"] = tree.add("scenes", {"nodes": list(range(len(tree["nodes"])))})
+    return tree.content()
+
+
+def _add_material(tree: _Tree, mesh: Mesh, texture_id: int, gloss: list[float]) -> int:
+    """Add the material of one texture, or NO_TEXTURE, and gloss, which is empty if matte."""
+    roughness, metallic, *specular_factors = gloss or (1.0, 0.0)
+    model: dict[str, Any] = {"roughnessFactor": roughness, "metallicFactor": metallic}
+    if texture_id != NO_TEXTURE:
+        model["baseColorTexture"] = tree.add_texture(mesh.textures[texture_id])
+        if mesh.gloss_textures:
+            # glTF stores roughness in green and metallic in blue, so an empty red channel is
+            # inserted.
+            factors = np.insert(mesh.gloss_textures[texture_id], 0, 0, axis=2)
+            model["metallicRoughnessTexture"] = tree.add_texture(factors)
+    material = {"pbrMetallicRoughness": model, "doubleSided": True}
+    for specular_factor in specular_factors:
+        material["extensions"] = {SPECULAR: {"specularFactor": specular_factor}}
+        tree["extensionsUsed"] = [SPECULAR]
+    return tree.add("materials", material)
+
+
+def _gltf_camera(camera: Camera) -> dict[str, Any]:
+    """Describe a camera as glTF does.
+
+    The principal point of a perspective camera in glTF is the image center. If the camera has
+    another one, the image in glTF is larger and contains the image of the camera.
+    """
+    planes = {"znear": camera.near, "zfar": camera.far}
+    if isinstance(camera, PerspectiveCamera):
+        # Half of the width and of the height that the image shows at a depth
+        # of 1. Both grow with the distance of the principal point from the center.
+        half_width = math.tan(math.radians(camera.angle) / 2)
+        half_height = half_width / camera.pixel_aspect * (1 + abs(camera.principal_up))
+        half_width *= 1 + abs(camera.principal_right)
+        vertical_angle = 2 * math.atan(half_height)
+        aspect_ratio = half_width / half_height
+        perspective = {"yfov": vertical_angle, "aspectRatio": aspect_ratio, **planes}
+        return {"type": "perspective", "perspective": perspective}
+    half_width = camera.width / 2
+    orthographic = {"xmag": half_width, "ymag": half_width, **planes}
+    return {"type": "orthographic", "orthographic": orthographic}
+
+
+def _split_vertices(
+    faces: Int[np.ndarray, "F 3"], corner_values: Float[np.ndarray, "F 3 D"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Repeat vertices until all face corners at a vertex have the same values.
+
+    In a mesh, two faces may have different colors at the same vertex. In a file,
+    each vertex has only one color, one normal and so on. The result is the original vertex (N,)
+    and the values (N, D) of each new vertex, and the faces with new indices.
+    """
+    # Corners with the same key become one new vertex. The key
+    # of a corner is its original vertex, followed by its
+    # values. Converting the index to float64 does not round it.
+    keys = np.concatenate([faces[..., None], corner_values], axis=-1)
+    corner_keys = keys.reshape(-1, keys.shape[-1])
+    vertex_keys, corner_to_vertex = np.unique(corner_keys, axis=0, return_inverse=True)
+    original_vertices = vertex_keys[:, 0].astype(np.int64)
+    return original_vertices, vertex_keys[:, 1:], corner_to_vertex.reshape(-1, 3)

@@ -17,7 +17,7 @@ from functools import partial, reduce
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from renderer.errors import require_bounded
@@ -165,26 +165,21 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
     # decoding every texel.
     linear_values = decode(torch.arange(256, dtype=torch.float64) / 255, encoding).to(like)
     textures = []
-    for packed_texture in mesh.packed_textures:
-        packed_texels = torch.from_numpy(packed_texture).to(like.device).flatten()
-        look_up = partial(_look_up_packed, packed_texels, linear_values)
-        textures.append(Texture(*packed_texture.shape, look_up=look_up))
+    for texture in mesh.textures:
+        all_texels = torch.from_numpy(texture).to(like.device).flatten(0, 1)
+        look_up = partial(_look_up_bytes, all_texels, linear_values)
+        textures.append(Texture(*texture.shape[:2], look_up=look_up))
     return textures
 
 
-def _look_up_packed(
-    packed_texels: Int[Tensor, " _"],
+def _look_up_bytes(
+    all_texels: UInt8[Tensor, "_ 3"],
     linear_values: Float[Tensor, " 256"],
     texels: Int[Tensor, " N"],
 ) -> Float[Tensor, "3 N"]:
-    """Look up the linear values of N texels of a texture with one integer per texel.
-
-    Bits 0 to 7 of a texel are red, 8 to 15 green and 16 to 23 blue.
-    """
-    first_bits = torch.tensor([[0], [8], [16]], dtype=torch.int32, device=packed_texels.device)
-    # Values from 0 to 255: one row for each color, one column for each texel.
-    eight_bit_values = (packed_texels.index_select(0, texels) >> first_bits) & 255
-    return linear_values.index_select(0, eight_bit_values.long().flatten()).view(3, -1)
+    """Look up the linear values of N texels of a texture with 8 bits."""
+    eight_bit_values = all_texels.index_select(0, texels).int().flatten()
+    return linear_values.index_select(0, eight_bit_values).view(-1, 3).T
 
 
 def face_albedo(albedo: Float[Tensor, "F 3"], fragments: Fragments) -> Float[Tensor, "S 3"]:

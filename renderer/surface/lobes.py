@@ -67,14 +67,22 @@ class ViewFrame(NamedTuple):
     - sample axes, whose z-axis is the direction from the sample to the camera.
       `lobe_functions` describes lobes in these axes.
 
-    `tilt` is None if sample axes and view axes are the same. SH coefficients have
-    the shape (K, S) with K = (degree + 1)²; lobes have the shape (M, S) of
-    `lobe_functions`.
+    The rotation R_z(azimuth) R_y(polar) takes view axes to world axes. The rotation
+    R_x(a) R_y(b) takes sample axes to view axes. SH coefficients have the shape (K, S)
+    with K = (degree + 1)²; lobes have the shape (M, S) of `lobe_functions`.
+
+    Attributes:
+        normals: Unit normals in sample axes, shape (3, S).
+        tilt: Angles b and a, one for each sample or for all. None if sample axes and
+            view axes are the same.
+        polar: Angle of the z-axis of the view from that of the world, shape ().
+        azimuth: Angle of this axis about the z-axis of the world, shape ().
     """
 
-    normals: Tensor  # Unit normals in sample axes, shape (3, S).
-    tilt: Tilt | None
-    axis: ViewAxis
+    normals: Tensor
+    tilt: tuple[Angle, Angle] | None
+    polar: Angle
+    azimuth: Angle
 
     @staticmethod
     def from_directions(normals: Tensor, toward: Tensor) -> ViewFrame:
@@ -85,17 +93,30 @@ class ViewFrame(NamedTuple):
         """
         # The choice of view axes does not change the reflected light. The axes are
         # therefore computed without gradients.
-        mean_toward = unit(toward.detach().mean(0))
-        axis = ViewAxis.along(mean_toward)
-        normals_in_view = axis.to_view(normals)
+        x, y, z = unit(toward.detach().mean(0))
+        polar = Angle(sine=torch.hypot(x, y), cosine=z)
+        # x / sin(polar) would divide by 0 at the poles, but atan2 returns 0.
+        turn = torch.atan2(y, x)
+        azimuth = Angle(sine=turn.sin(), cosine=turn.cos())
+
+        def to_view(vectors: Tensor) -> Components:
+            """Rotate vectors, shape (S, 3), from world axes to view axes."""
+            x, y, z = vectors.T
+            return rotate_about_y(rotate_about_z((x, y, z), azimuth.reversed()), polar.reversed())
+
+        normals_in_view = to_view(normals)
         # If all samples share one direction to the camera, sample axes and view axes are
         # the same. A tilt is then only needed for the gradient of the direction.
         if len(toward) == 1 and not toward.requires_grad:
-            return ViewFrame(normals=torch.stack(normals_in_view), tilt=None, axis=axis)
-        toward_in_view = axis.to_view(toward)
-        tilt = Tilt.along(toward_in_view)
-        normals_in_sample = tilt.to_sample(normals_in_view)
-        return ViewFrame(normals=torch.stack(normals_in_sample), tilt=tilt, axis=axis)
+            return ViewFrame(torch.stack(normals_in_view), None, polar, azimuth)
+        # The tilt takes (0, 0, 1) to (sin b, -sin a cos b, cos a cos b), with cos b ≥ 0.
+        x, y, z = to_view(toward)
+        cosine = (1 - x**2).sqrt()
+        about_y = Angle(sine=x, cosine=cosine)
+        about_x = Angle(sine=-y / cosine, cosine=z / cosine)
+        without_x = rotate_about_x(normals_in_view, about_x.reversed())
+        in_sample = rotate_about_y(without_x, about_y.reversed())
+        return ViewFrame(torch.stack(in_sample), (about_y, about_x), polar, azimuth)
 
     @property
     def cosine(self) -> Tensor:
@@ -121,7 +142,7 @@ class ViewFrame(NamedTuple):
         # C² R_x(a) = R_z(a) C², so R_z(a) C R_z(b) C = C² R_x(a) R_y(b). The loop computes
         # the left side, which is the tilt and then two permutations.
         permutation = _axis_permutation(degree)
-        for angle in (self.tilt.about_y, self.tilt.about_x):
+        for angle in self.tilt:
             coefficients = _rotate_harmonics(_multiply_bands(permutation, coefficients), angle)
         return coefficients
 
@@ -149,97 +170,27 @@ class ViewFrame(NamedTuple):
         The coefficients have the shape (K, P), one function on the sphere per column.
         """
         permutation = _axis_permutation(math.isqrt(len(coefficients)) - 1)
-        axis = self.axis.for_columns(coefficients)
+        polar, azimuth = (a.for_columns(coefficients) for a in (self.polar, self.azimuth))
         # With a tilt, the function `harmonics` has permuted the axes cyclically two times. A
         # third permutation restores the order x, y, z.
         if self.tilt is not None:
             coefficients = _multiply_bands(permutation, coefficients)
         # The rotation to world axes is R_z(azimuth) R_y(polar). With the permutation C of
         # the axes, R_y(polar) is Cᵀ R_z(polar) C.
-        permuted = _rotate_harmonics(_multiply_bands(permutation, coefficients), axis.polar)
-        return _rotate_harmonics(_multiply_bands(permutation.T, permuted), axis.azimuth)
+        permuted = _rotate_harmonics(_multiply_bands(permutation, coefficients), polar)
+        return _rotate_harmonics(_multiply_bands(permutation.T, permuted), azimuth)
 
     def from_world(self, coefficients: Tensor) -> Tensor:
         """Rotate SH coefficients from world axes to the intermediate axes, inverting `to_world`."""
         permutation = _axis_permutation(math.isqrt(len(coefficients)) - 1)
-        axis = self.axis.for_columns(coefficients)
-        without_azimuth = _rotate_harmonics(coefficients, axis.azimuth.reversed())
+        polar, azimuth = (a.for_columns(coefficients) for a in (self.polar, self.azimuth))
+        without_azimuth = _rotate_harmonics(coefficients, azimuth.reversed())
         permuted = _multiply_bands(permutation, without_azimuth)
-        without_polar = _rotate_harmonics(permuted, axis.polar.reversed())
+        without_polar = _rotate_harmonics(permuted, polar.reversed())
         in_view = _multiply_bands(permutation.T, without_polar)
         # With a tilt, the intermediate axes are the view axes after two cyclic
         # permutations. Two are the inverse of one, which is the transposed matrix.
         return in_view if self.tilt is None else _multiply_bands(permutation.T, in_view)
-
-
-class ViewAxis(NamedTuple):
-    """Spherical coordinates of the z-axis of a view in world axes.
-
-    The rotation R_z(azimuth) R_y(polar) takes view axes to world axes. It first
-    rotates about the y-axis and then about the z-axis.
-    """
-
-    polar: Angle  # From the z-axis of the world. Its tensors have shape ().
-    azimuth: Angle  # About the z-axis of the world, from x toward y, shape ().
-
-    @staticmethod
-    def along(direction: Tensor) -> ViewAxis:
-        """Compute the spherical coordinates of a unit vector, shape (3,)."""
-        x, y, z = direction
-        polar = Angle(sine=torch.hypot(x, y), cosine=z)
-        # x / sin(polar) would divide by 0 at the poles, but atan2 returns 0.
-        azimuth = torch.atan2(y, x)
-        return ViewAxis(polar, Angle(sine=azimuth.sin(), cosine=azimuth.cos()))
-
-    def for_columns(self, coefficients: Tensor) -> ViewAxis:
-        """Convert both angles to the shape (1,) and to the dtype and device of coefficients."""
-        return ViewAxis(*(angle.for_columns(coefficients) for angle in self))
-
-    def to_view(self, vectors: Tensor) -> Components:
-        """Rotate vectors, shape (S, 3), from world axes to view axes."""
-        x, y, z = vectors.T
-        without_azimuth = rotate_about_z((x, y, z), self.azimuth.reversed())
-        return rotate_about_y(without_azimuth, self.polar.reversed())
-
-
-class Tilt(NamedTuple):
-    """Rotation from sample axes to view axes, one for each sample.
-
-    The z-axis points from the sample to the camera in sample axes, and in the
-    mean direction to the camera in view axes. The rotation R_x(a) R_y(b) first
-    rotates about the y-axis by the angle b, then about the x-axis by the angle a.
-    """
-
-    values: Tensor  # Rows sin b, cos b, sin a, cos a, shape (4, S), or (4, 1) for all samples.
-
-    @property
-    def about_y(self) -> Angle:
-        """Angle b about the y-axis, from z toward x. This rotation comes first."""
-        return Angle(sine=self.values[0], cosine=self.values[1])
-
-    @property
-    def about_x(self) -> Angle:
-        """Angle a about the x-axis, from y toward z. This rotation comes second."""
-        return Angle(sine=self.values[2], cosine=self.values[3])
-
-    @staticmethod
-    def along(directions: Components) -> Tilt:
-        """Compute the rotations that take the z-axis (0, 0, 1) to given unit vectors.
-
-        A rotation by the angle b about the y-axis and then by the angle a about the
-        x-axis takes (0, 0, 1) to (sin b, -sin a cos b, cos a cos b). The angle b is
-        chosen so that cos b ≥ 0.
-        """
-        x, y, z = directions
-        cosine_b = (1 - x**2).sqrt()
-        return Tilt(torch.stack([x, cosine_b, -y / cosine_b, z / cosine_b]))
-
-    def to_sample(self, vectors: Components) -> Components:
-        """Rotate one vector per sample from view axes to sample axes."""
-        # From sample axes to view axes, vectors rotate about y and then about x. The inverse
-        # rotates back about x first.
-        rotated_about_x = rotate_about_x(vectors, self.about_x.reversed())
-        return rotate_about_y(rotated_about_x, self.about_y.reversed())
 
 
 def _sine_exponents(orders: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_bounded
 from renderer.light import harmonics
-from renderer.normals import SPARSE_VERTEX_RATIO, area_vectors, vertex_normals
+from renderer.normals import area_vectors, vertex_normals
 from renderer.surface.gloss import SampleGloss, at_samples, toward_camera
 from renderer.surface.lobes import coat_irradiance_factors, roughness_polynomials
 from renderer.vectors import unit, unit_vectors
@@ -406,18 +406,9 @@ def normals_in_sight(
     is_seen = torch.zeros(count, dtype=torch.bool, device=faces.device)
     is_seen[seen_ids] = True
     # A normal is an average over all faces that share it, so these are all needed.
-    first, second, third = is_seen.index_select(0, normal_ids.flatten()).view(-1, 3).T
-    is_needed = first | second | third
-    needed_faces = faces[is_needed]
-    needed_ids = normal_ids[is_needed]
+    is_needed = is_seen.index_select(0, normal_ids.flatten()).view(-1, 3).any(1)
     vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
-    if count < SPARSE_VERTEX_RATIO * needed_faces.numel():
-        normals = vertex_normals(vertices, needed_faces, needed_ids, count)
-    else:
-        # If few of the normals are needed, it is faster to renumber and compute only these.
-        used_ids, renumbered_ids = needed_ids.unique(return_inverse=True)
-        normals = vertex_normals(vertices, needed_faces, renumbered_ids, len(used_ids))
-        seen_ids = torch.searchsorted(used_ids, seen_ids)
+    normals = vertex_normals(vertices, faces[is_needed], normal_ids[is_needed], count)
     return normals.T.index_select(1, seen_ids).unflatten(1, (3, -1)).permute(2, 1, 0)
 
 

@@ -16,8 +16,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
-from renderer.io.export import export_mesh
-from renderer.io.meshes import load_mesh
+from renderer.io.meshes import export_mesh, load_mesh
 from renderer.mesh import Mesh
 from renderer.pinhole import PinholeCamera
 from renderer.solids import solid

@@ -22,8 +22,7 @@ from renderer import errors
 from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io import gltf as gltf_reader
-from renderer.io.export import export_mesh
-from renderer.io.meshes import load_mesh, read_parts
+from renderer.io.meshes import export_mesh, load_mesh, read_parts
 from renderer.mesh import Mesh
 
 

@@ -17,8 +17,8 @@ from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.image import decode, encode, to_bytes
-from renderer.io.export import export_mesh
 from renderer.io.images import read_image
+from renderer.io.meshes import export_mesh
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import load_light
 from renderer.light.harmonics import equirectangular, project
