@@ -75,14 +75,9 @@ OPEN_MESHES = {
 }
 
 
-@pytest.mark.parametrize("name", CLOSED_MESHES)
-def test_a_mesh_is_closed_if_none_of_its_faces_is_visible_from_behind(name):
-    assert CLOSED_MESHES[name].closed is True
-
-
-@pytest.mark.parametrize("name", OPEN_MESHES)
-def test_a_mesh_is_open_if_a_face_may_be_visible_from_behind(name):
-    assert OPEN_MESHES[name].closed is False
+@pytest.mark.parametrize("name", CLOSED_MESHES | OPEN_MESHES)
+def test_a_mesh_is_closed_if_none_of_its_faces_may_be_visible_from_behind(name):
+    assert (CLOSED_MESHES | OPEN_MESHES)[name].closed is (name in CLOSED_MESHES)
 
 
 def test_a_normalized_mesh_is_centered_at_its_centroid_and_fits_the_unit_cube():
@@ -98,10 +93,6 @@ def test_a_normalized_mesh_is_centered_at_its_centroid_and_fits_the_unit_cube():
     assert np.abs(mesh.vertices).max() == 1
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert_allclose(shape.centroid, 0, atol=2**-25)
-
-
-def test_the_vertices_of_a_normalized_mesh_are_exact_in_float32():
-    mesh = normalize(mesh_of(trimesh.creation.cone(radius=0.3, height=2)))
     assert_array_equal(mesh.vertices, mesh.vertices.astype(np.float32))
 
 
@@ -140,7 +131,6 @@ MESHES = {
     "two that touch": concatenate([BOX_MESH, mesh_of(trimesh.creation.icosphere(1))]),
     "open": SHEET,
 }
-every_mesh = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 
 
 @pytest.mark.parametrize(("min_count", "expected_count"), [(0, 12), (11, 12), (12, 42), (42, 162)])
@@ -153,30 +143,18 @@ def test_an_icosahedron_is_subdivided_until_it_has_more_vertices_than_asked(
     assert len(mesh.faces) == 2 * expected_count - 4
 
 
-@every_mesh
-def test_a_subdivided_mesh_keeps_its_vertices(mesh):
-    finer = subdivide(mesh, len(mesh.vertices))
-    assert_array_equal(finer.vertices[: len(mesh.vertices)], mesh.vertices)
-
-
-@every_mesh
+@pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 def test_a_subdivided_face_has_its_corners_and_the_centers_of_its_edges(mesh):
     finer = subdivide(mesh, len(mesh.vertices))
+    assert_array_equal(finer.vertices[: len(mesh.vertices)], mesh.vertices)
     a, b, c = corners_of(mesh).swapaxes(0, 1)
-    ab = (a + b) / 2
-    bc = (b + c) / 2
-    ca = (c + a) / 2
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     quarters = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])
     expected = quarters.transpose(2, 0, 1, 3)
     assert_array_equal(corners_of(finer).reshape(-1, 4, 3, 3), expected)
-
-
-@every_mesh
-def test_subdivision_keeps_the_topology(mesh):
-    finer = subdivide(mesh, len(mesh.vertices))
-    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    finer_shape = trimesh.Trimesh(finer.vertices, finer.faces, process=False)
-    assert finer_shape.euler_number == shape.euler_number
+    # The topology stays.
+    shapes = [trimesh.Trimesh(m.vertices, m.faces, process=False) for m in (mesh, finer)]
+    assert shapes[0].euler_number == shapes[1].euler_number
     assert finer.closed is mesh.closed
 
 
@@ -195,10 +173,6 @@ def test_colors_and_texture_coordinates_are_linear_on_the_original_faces():
     assert len(finer.faces) == 16 * len(SHEET.faces)
     found = np.concatenate([finer.corner_colors, finer.corner_uvs], axis=-1)
     assert_allclose(found, linear_values(finer), rtol=0, atol=2 * EPS32)
-
-
-def test_subdivided_faces_keep_their_textures():
-    finer = subdivide(SHEET, 150)
     assert_array_equal(finer.texture_ids, SHEET.texture_ids.repeat(16))
     assert all(a is b for a, b in zip(finer.textures, SHEET.textures, strict=True))
 
@@ -209,29 +183,14 @@ CORNER = Mesh.plain(
 )
 
 
-def flat_faces(mesh: Mesh) -> np.ndarray:
-    """Return a mask (F,) of the faces in the plane z = 0."""
-    return (corners_of(mesh)[..., 2] == 0).all(axis=1)
-
-
 def test_a_face_is_refined_as_often_as_its_area_needs():
     finer = refine(CORNER, 0.6)
-    is_flat = flat_faces(finer)
+    is_flat = (corners_of(finer)[..., 2] == 0).all(axis=1)
     assert_allclose(finer.face_areas()[is_flat], [0.5] * 16)
     assert_allclose(finer.face_areas()[~is_flat], [0.5] * 4)
     assert_array_equal(refine(CORNER, 8.0).faces, CORNER.faces)
-
-
-def test_refined_faces_keep_the_orientation_and_the_vertices():
-    finer = refine(CORNER, 0.6)
     assert_array_equal(finer.vertices[:4], CORNER.vertices)
-    normals = finer.face_normals()[flat_faces(finer)]
-    assert_array_equal(normals, np.tile([0, 0, 1], (16, 1)))
-
-
-def test_refined_faces_interpolate_the_colors():
-    finer = refine(CORNER, 0.6)
-    is_flat = flat_faces(finer)
+    assert_array_equal(finer.face_normals()[is_flat], np.tile([0, 0, 1], (16, 1)))
     x, y, _ = corners_of(finer)[is_flat].reshape(-1, 3).T / 4
     colors = finer.corner_colors[is_flat].reshape(-1, 3)
     assert_allclose(colors, np.stack([1 - x - y, x, y], axis=1), atol=1e-7)

@@ -595,20 +595,10 @@ def small_file_of_many_copies() -> Gltf:
     return gltf
 
 
-def small_file_of_zeros() -> Gltf:
+def small_file_of_many_vertices(count: int, indices: np.ndarray | None) -> Gltf:
     gltf = Gltf()
-    accessor = {"componentType": 5126, "count": 2 * 10**9, "type": "VEC3"}
-    gltf.tree["accessors"].append(accessor)
-    gltf.mesh({"POSITION": 0})
-    return gltf
-
-
-def small_file_of_unused_vertices() -> Gltf:
-    """One face of 3 million vertices."""
-    gltf = Gltf()
-    accessor = {"componentType": 5126, "count": 3 * 10**6, "type": "VEC3"}
-    gltf.tree["accessors"].append(accessor)
-    gltf.mesh({"POSITION": 0}, np.uint16([0, 1, 2]))
+    gltf.tree["accessors"].append({"componentType": 5126, "count": count, "type": "VEC3"})
+    gltf.mesh({"POSITION": 0}, indices)
     return gltf
 
 
@@ -625,10 +615,11 @@ def small_file_of_a_large_image() -> Gltf:
     "create",
     [
         small_file_of_many_copies,
-        small_file_of_zeros,
-        small_file_of_unused_vertices,
+        lambda: small_file_of_many_vertices(2 * 10**9, None),
+        lambda: small_file_of_many_vertices(3 * 10**6, np.uint16([0, 1, 2])),
         small_file_of_a_large_image,
     ],
+    ids=["copies", "zeros", "unused vertices", "image"],
 )
 def test_a_small_file_that_needs_more_memory_than_is_free_is_refused(tmp_path, monkeypatch, create):
     (tmp_path / "meminfo").write_text("MemAvailable: 400000 kB\n")
@@ -690,9 +681,10 @@ def two_parents() -> Gltf:
     return with_entries(plain(), nodes=[*nodes, {"mesh": 0}])
 
 
-def compressed() -> Gltf:
+def changed(kind: str, **entries: Any) -> Gltf:
+    """Return a file with other entries in the first one of a list."""
     gltf = plain()
-    gltf.tree["bufferViews"][0]["extensions"] = {"EXT_meshopt_compression": {"buffer": 0}}
+    gltf.tree[kind][0] |= entries
     return gltf
 
 
@@ -710,24 +702,6 @@ def different_places() -> Gltf:
     return gltf.square(
         pbrMetallicRoughness={"baseColorTexture": color, "metallicRoughnessTexture": gloss}
     )
-
-
-def short_buffer() -> Gltf:
-    gltf = plain()
-    gltf.tree["bufferViews"][0]["byteLength"] = 10**6
-    return gltf
-
-
-def negative_offset() -> Gltf:
-    gltf = plain()
-    gltf.tree["accessors"][0]["byteOffset"] = -4
-    return gltf
-
-
-def overlapping(stride: int) -> Gltf:
-    gltf = plain()
-    gltf.tree["bufferViews"][0]["byteStride"] = stride
-    return gltf
 
 
 def short_morph_target() -> Gltf:
@@ -767,25 +741,25 @@ def one_matrix_for_two_joints() -> Gltf:
 
 
 REFUSED = {
-    "overlap in its buffer view": overlapping(0),
-    "elements of an array overlap": overlapping(8),
+    "overlap in its buffer view": changed("bufferViews", byteStride=0),
+    "elements of an array overlap": changed("bufferViews", byteStride=8),
     "a morph target has 1 entries": short_morph_target(),
     r"compressed \(KHR_draco": compressed_without_requirement(),
     "have different lengths": different_instances(),
     "number 0 of 0 skins": with_entries(plain(), nodes=[{"mesh": 0, "skin": 0}]),
     "1 matrices for 2 joints": one_matrix_for_two_joints(),
-    "an array ends behind its buffer view": negative_offset(),
+    "an array ends behind its buffer view": changed("accessors", byteOffset=-4),
     "KHR_draco_mesh_compression": with_entries(
         plain(), extensionsRequired=["KHR_draco_mesh_compression"]
     ),
-    "meshopt": compressed(),
+    "meshopt": changed("bufferViews", extensions={"EXT_meshopt_compression": {"buffer": 0}}),
     "KHR_texture_basisu": basis_texture(),
     "two parents": two_parents(),
     "child of itself": with_entries(plain(), nodes=[{"mesh": 0}, {"children": [1]}]),
     "number 7 of 1 nodes": with_entries(plain(), scenes=[{"nodes": [7]}]),
     "number -1 of 1 meshes": with_entries(plain(), nodes=[{"mesh": -1}]),
     "glTF 1.0": with_entries(plain(), asset={"version": "1.0"}),
-    "ends behind its buffer": short_buffer(),
+    "ends behind its buffer": changed("bufferViews", byteLength=10**6),
     "differ in texture coordinates": different_places(),
     "cuts out all faces": plain(
         pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0.4]}, alphaMode="MASK"
