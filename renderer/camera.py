@@ -224,8 +224,7 @@ class Camera(ABC):
             infinitely far away, so its position is (x, y, z, 0) with the unit vector
             (x, y, z) toward the camera. Float64, shape (4,).
         """
-        # This is the position of an orthographic camera. `PerspectiveCamera` overrides it.
-        return np.append(self.axes()[2], 0.0)
+        return self.differentiable_eye().detach().numpy()
 
     def differentiable_eye(self) -> Tensor:
         """Compute `eye` differentiably with respect to fields of the camera that are tensors.
@@ -381,10 +380,6 @@ class PerspectiveCamera(Camera):
 
     # The distance is a field of perspective cameras only.
     distance: float = field(kw_only=True)  # type: ignore[misc]
-
-    def eye(self) -> np.ndarray:
-        """Return the position of the camera as (x, y, z, 1), float64, shape (4,)."""
-        return self.pose()[:, 3]
 
     def differentiable_eye(self) -> Tensor:
         """Compute `eye`, (x, y, z, 1), differentiably."""

@@ -51,6 +51,7 @@ class GltfFile:
     Attributes:
         file: The file, with the files beside it.
         tree: JSON object of the file.
+        poses: Matrix (4, 4) from the axes of each node to the axes of the scene.
     """
 
     def __init__(self, file: MeshFile) -> None:
@@ -65,6 +66,7 @@ class GltfFile:
         version = self.tree["asset"]["version"]
         if not version.startswith("2."):
             raise ValueError(f"it is glTF {version}: export it as glTF 2.0")
+        self._roots, self.poses = self._trees()
 
     def entry(self, kind: str, index: int) -> dict[str, Any]:
         """Look up an entry of a list of the JSON object, such as number 2 of "meshes"."""
@@ -167,39 +169,30 @@ class GltfFile:
 
     # Nodes
 
-    @cached_property
-    def poses(self) -> dict[int, np.ndarray]:
-        """Matrix (4, 4) from the axes of each node to the axes of the scene.
+    def _trees(self) -> tuple[list[int], dict[int, np.ndarray]]:
+        """Return the nodes without a parent, and the poses of all nodes.
 
         The nodes are in an order in which parents come before their children.
         """
         nodes = self.tree.get("nodes", [])
-        poses = {}
-        roots = [index for index in range(len(nodes)) if index not in self.parents]
-        queue = [(root, np.eye(4)) for root in roots]
-        for index, parent_pose in queue:
-            poses[index] = parent_pose @ _local_matrix(nodes[index])
-            queue += [(child, poses[index]) for child in nodes[index].get("children", [])]
+        children = [child for node in nodes for child in node.get("children", [])]
+        # With two parents, 40 nodes could stand for 2^40 copies of a mesh.
+        if len(set(children)) < len(children):
+            raise ValueError("a node has two parents: the file is damaged")
+        roots = sorted(set(range(len(nodes))) - set(children))
+        poses = {root: _local_matrix(nodes[root]) for root in roots}
+        queue = roots[:]
+        for parent in queue:
+            for child in nodes[parent].get("children", []):
+                poses[child] = poses[parent] @ _local_matrix(self.entry("nodes", child))
+                queue.append(child)
         if len(poses) < len(nodes):
             raise ValueError("a node is a child of itself: the file is damaged")
-        return poses
-
-    @cached_property
-    def parents(self) -> dict[int, int]:
-        """Parent of each node that has one."""
-        parents: dict[int, int] = {}
-        for parent, node in enumerate(self.tree.get("nodes", [])):
-            for child in node.get("children", []):
-                self.entry("nodes", child)
-                if parents.setdefault(child, parent) != parent or node["children"].count(child) > 1:
-                    raise ValueError("a node has two parents: the file is damaged")
-        return parents
+        return roots, poses
 
     def scene_nodes(self) -> list[int]:
         """List the visible nodes of the default scene, parents before their children."""
-        # `poses` checks that the nodes form trees. Without this
-        # check, 40 nodes could stand for 2^40 copies of a mesh.
-        roots = [node for node in self.poses if node not in self.parents]
+        roots = self._roots
         if "scenes" in self.tree:
             roots = self.entry("scenes", self.tree.get("scene", 0)).get("nodes", [])
         # A dictionary without values. A scene may list a node and also its parent.

@@ -68,11 +68,6 @@ def texture_albedo(texture: Tensor) -> Tensor:
     return surface_albedo(MESH, FRAGMENTS, "linear", [torch.ones(3, 3, 3), texture])
 
 
-def operators(albedo_scale: Tensor) -> object:
-    """Build the operators of the mesh with an albedo scale, shape (1,)."""
-    return build_operators(MESH, [CAMERA], SETTINGS, RASTERIZER, albedo_scale.item())
-
-
 def rasterize(vertices: Tensor) -> object:
     """Rasterize the mesh with other vertices."""
     return build_fragments(vertices.numpy(), MESH.faces, [CAMERA], SETTINGS, RASTERIZER)
@@ -101,7 +96,6 @@ BOUNDED = [
     ("light", GOOD["light"], lambda x: shade("light", x)),
     ("albedo", GOOD["albedo"], lambda x: shade("albedo", x)),
     ("albedo", GOOD["albedo"], lambda x: shade("albedo", x, smooth=True)),
-    ("albedo_scale", torch.ones(1), operators),
     ("lights", torch.ones(2, 49, 3), OPERATOR.radiance),
     ("radiance_gradient", torch.ones(2, 3, 4), OPERATOR.light_gradient),
     ("radiance", torch.ones(3, 4), lambda x: tonemap(x, torch.ones(1, 4), torch.ones(3, 1))),
