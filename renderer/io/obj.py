@@ -117,14 +117,9 @@ def read_obj(file: MeshFile) -> list[Part]:
     is_clamped = np.array([material.is_clamped for material in materials])[material_of_face]
     if (np.abs(corner_uvs[is_clamped] - 0.5) > 0.5).any():
         raise ValueError("textures with the option -clamp are not supported beyond their edges")
-    mesh = colored_mesh(
-        vertices,
-        faces,
-        colors,
-        corner_uvs,
-        np.array(ids)[material_of_face],
-        [file.texture(*texture) for texture in textures],
-    )
+    texture_ids = np.array(ids)[material_of_face]
+    texels = [file.texture(*texture) for texture in textures]
+    mesh = colored_mesh(vertices, faces, colors, corner_uvs, texture_ids, texels)
     normals = np.append(normals, [[0.0] * 3], axis=0)
     return [Part(mesh, normals[normal_ids] if len(normals) > 1 else None)]
 
@@ -227,9 +222,9 @@ def _materials(lines: dict[str, _Lines], file: MeshFile) -> tuple[list[_Material
     names = [None, *lines["usemtl"].names()]
     choice_of_face = np.searchsorted(lines["usemtl"].numbers, lines["f"].numbers)
     used = list(dict.fromkeys([None, *(names[choice] for choice in np.unique(choice_of_face))]))
-    index_of_name = {name: index for index, name in enumerate(used)}
     materials = [_Material() if name is None else _material(name, library, file) for name in used]
-    return materials, np.array([index_of_name.get(name, 0) for name in names])[choice_of_face]
+    ids = [used.index(name) if name in used else 0 for name in names]
+    return materials, np.array(ids)[choice_of_face]
 
 
 def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
@@ -246,25 +241,20 @@ def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
             contents = {part: file.read(part) for part in parts}
         for path, content in contents.items():
             folder = "".join(path.replace("\\", "/").rpartition("/")[:2])
+            own: dict[str, _Definition] = {}
+            properties: list[tuple[str, str]] = []
+            for word, rest in _LINE.findall(_cleaned(content)):
+                keyword, text = word.decode(), rest.decode().strip()
+                if keyword.lower() != "newmtl":
+                    properties.append((keyword, text))
+                    continue
+                if text in own:
+                    raise ValueError(f"an .mtl file defines the material {text} twice")
+                properties = []
+                own[text] = (folder, properties)
             # The first file that defines a material counts.
-            library = _definitions(content, folder) | library
+            library = own | library
     return library if names else None
-
-
-def _definitions(content: bytes, folder: str) -> dict[str, _Definition]:
-    """Read the properties of the materials of the .mtl file in a folder by name."""
-    definitions: dict[str, _Definition] = {}
-    properties: list[tuple[str, str]] = []
-    for word, rest in _LINE.findall(_cleaned(content)):
-        keyword, text = word.decode(), rest.decode().strip()
-        if keyword.lower() != "newmtl":
-            properties.append((keyword, text))
-            continue
-        properties = []
-        if text in definitions:
-            raise ValueError(f"an .mtl file defines the material {text} twice")
-        definitions[text] = (folder, properties)
-    return definitions
 
 
 def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile) -> _Material:

@@ -73,14 +73,14 @@ class ViewFrame(NamedTuple):
 
     Attributes:
         normals: Unit normals in sample axes, shape (3, S).
-        tilt: Angles b and a, one for each sample or for all. None if sample axes and
-            view axes are the same.
+        tilt: sin b, cos b, sin a and cos a, shape (4, S), or (4, 1) for all samples. None
+            if sample axes and view axes are the same.
         polar: Angle of the z-axis of the view from that of the world, shape ().
         azimuth: Angle of this axis about the z-axis of the world, shape ().
     """
 
     normals: Tensor
-    tilt: tuple[Angle, Angle] | None
+    tilt: Tensor | None
     polar: Angle
     azimuth: Angle
 
@@ -112,11 +112,11 @@ class ViewFrame(NamedTuple):
         # The tilt takes (0, 0, 1) to (sin b, -sin a cos b, cos a cos b), with cos b ≥ 0.
         x, y, z = to_view(toward)
         cosine = (1 - x**2).sqrt()
-        about_y = Angle(sine=x, cosine=cosine)
-        about_x = Angle(sine=-y / cosine, cosine=z / cosine)
+        tilt = torch.stack([x, cosine, -y / cosine, z / cosine])
+        about_y, about_x = Angle(tilt[0], tilt[1]), Angle(tilt[2], tilt[3])
         without_x = rotate_about_x(normals_in_view, about_x.reversed())
         in_sample = rotate_about_y(without_x, about_y.reversed())
-        return ViewFrame(torch.stack(in_sample), (about_y, about_x), polar, azimuth)
+        return ViewFrame(torch.stack(in_sample), tilt, polar, azimuth)
 
     @property
     def cosine(self) -> Tensor:
@@ -142,7 +142,8 @@ class ViewFrame(NamedTuple):
         # C² R_x(a) = R_z(a) C², so R_z(a) C R_z(b) C = C² R_x(a) R_y(b). The loop computes
         # the left side, which is the tilt and then two permutations.
         permutation = _axis_permutation(degree)
-        for angle in self.tilt:
+        sine_b, cosine_b, sine_a, cosine_a = self.tilt
+        for angle in (Angle(sine_b, cosine_b), Angle(sine_a, cosine_a)):
             coefficients = _rotate_harmonics(_multiply_bands(permutation, coefficients), angle)
         return coefficients
 

@@ -10,20 +10,10 @@ from oracles import corners_of
 
 from renderer.errors import InputError
 from renderer.io.meshes import load_mesh
+from tests.renderer.io.test_polygons import shoelace, star_shaped
 
-CODES = {
-    "char": "b",
-    "uchar": "B",
-    "short": "h",
-    "ushort": "H",
-    "int": "i",
-    "uint": "I",
-    "float": "f",
-    "double": "d",
-    "uint8": "B",
-    "int32": "i",
-    "float64": "d",
-}
+NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
+CODES = dict(zip((*NAMES, "uint8", "int32", "float64"), "bBhHiIfdBid", strict=True))
 # A concave pentagon, a triangle and a quadrilateral, with a color for each vertex.
 VERTICES = np.array(
     [[0, 0, 0], [4, 0, 0], [4, 4, 0], [2, 1, 0], [0, 4, 0], [0, 0, 1], [4, 0, 1], [0, 0, 5]]
@@ -162,15 +152,8 @@ def test_triangle_strips_are_unrolled_with_alternating_orientation(tmp_path, for
 @pytest.mark.parametrize("suffix", ["obj", "ply", "off"])
 def test_random_polygons_have_the_area_of_the_shoelace_formula(tmp_path, suffix):
     rng = np.random.default_rng(0)
-    polygons = []
-    for count in rng.integers(3, 12, 60):
-        angles = 2 * np.pi * (np.arange(count) + rng.uniform(0, 0.9, count)) / count
-        radii = rng.uniform(0.2, 1, count)
-        polygons.append(np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1))
-    areas = [
-        abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2
-        for x, y in (polygon.T for polygon in polygons)
-    ]
+    polygons = [star_shaped(rng) for _ in range(60)]
+    areas = [shoelace(polygon) for polygon in polygons]
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2]
     vertices = np.concatenate(
         [polygon @ turn + [9 * index, 0, 0] for index, polygon in enumerate(polygons)]
