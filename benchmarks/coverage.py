@@ -275,9 +275,10 @@ def measure(setup: Setup, draws: int, seed: int = 0) -> dict[str, np.ndarray]:
 def describe(path: Path, label: str) -> Table:
     """Measure the effects of objects and the noise of images on the log-odds of a label."""
     objects: dict[tuple[bool, str | None], list[float]] = {}
-    for prediction in read_predictions(path, label):
-        key = (prediction.positive, prediction.photograph.mesh)
-        objects.setdefault(key, []).append(prediction.log_odds)
+    predictions = read_predictions(path, label)
+    columns = (predictions.positive, predictions.photograph, predictions.log_odds)
+    for is_positive, photograph, log_odds in zip(*columns, strict=True):
+        objects.setdefault((is_positive, photograph.mesh), []).append(log_odds)
     rows = []
     for is_positive, kind in ((True, label), (False, "other")):
         scores = [values for (group, _), values in objects.items() if group == is_positive]

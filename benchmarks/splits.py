@@ -49,7 +49,7 @@ from train.device import MixedPrecision, choose_precision
 from train.laboratory.laboratory import write_laboratory
 from train.results.compare import ALL, Evaluation, difference, mean_metric
 from train.results.metrics import METRICS, Pooled, metric_title
-from train.results.predictions import PREDICTIONS, Prediction, write_predictions
+from train.results.predictions import PREDICTIONS, Predictions, write_predictions
 from train.results.scoring import Predictor
 from train.results.store import RunSummary, summarize
 from train.results.tables import Estimate, Table, format_interval
@@ -399,7 +399,7 @@ class Scores:
     """
 
     evaluations: Sequence[Evaluation]
-    predictions: Sequence[Sequence[Prediction]]
+    predictions: Sequence[Predictions]
 
 
 def score(options: argparse.Namespace) -> None:
@@ -535,7 +535,7 @@ def evaluate_method(method: Method, folder: Path, split: str) -> Scores:
     return Scores(evaluations, predictions)
 
 
-def predict(model: MixedPrecision, folder: Path) -> list[Prediction]:
+def predict(model: MixedPrecision, folder: Path) -> Predictions:
     """Return the predictions of a network for all images of a folder.
 
     Args:
@@ -547,7 +547,7 @@ def predict(model: MixedPrecision, folder: Path) -> list[Prediction]:
     return predictor.predict(folder, LABEL).predictions
 
 
-def pool(run: str, network: Classifier, predictions: list[Prediction]) -> Evaluation:
+def pool(run: str, network: Classifier, predictions: Predictions) -> Evaluation:
     """Pool predictions by source and by object.
 
     A source is a pattern, an environment map, or where photographs come from.
@@ -580,7 +580,7 @@ def score_rows(method: Method, images: str, scores: Scores) -> Iterator[list[str
         images: Name of the folder.
         scores: Scores of the method on the folder.
     """
-    for part in scores.evaluations[0].pools("source", "mesh"):
+    for part in scores.evaluations[0].rows("source", "mesh"):
         estimates = [mean_metric(scores.evaluations, part, metric) for metric in METRICS]
         cells = [format_interval(estimate) for estimate in estimates]
         yield [method.name, images, Path(part.title()).stem, *cells]
@@ -636,17 +636,11 @@ def difference_rows(
     same_class = []
     same_class_of_negatives = []
     for predictions in scores.predictions:
-        pairs = list(zip(predictions, first_predictions, strict=True))
-        negatives = [pair for pair in pairs if not pair[1].positive]
-        same_class.append(agreement(pairs))
-        same_class_of_negatives.append(agreement(negatives))
+        is_same = predictions.predicted == first_predictions.predicted
+        same_class.append(is_same.mean())
+        same_class_of_negatives.append(is_same[~first_predictions.positive].mean())
     yield one_number_row(title, images, "same class", same_class)
     yield one_number_row(title, images, "same class, negatives", same_class_of_negatives)
-
-
-def agreement(pairs: Sequence[tuple[Prediction, Prediction]]) -> float:
-    """Return the fraction of pairs of predictions with the same predicted class."""
-    return fmean(first.predicted == second.predicted for first, second in pairs)
 
 
 def one_number_row(network: str, images: str, group: str, values: Sequence[float]) -> list[str]:

@@ -27,7 +27,7 @@ from renderer.errors import describe
 from renderer.light.lamps import Lamps, Projector
 from tests.helpers import bright_or_dark
 from train import load_run
-from train.results.scoring import Predictor, evaluate_photographs, score
+from train.commands.evaluate import evaluate
 
 NAN = math.nan
 SIZE = 8
@@ -54,7 +54,7 @@ def probabilities(images: Tensor) -> Tensor:
 
 CLASSIFIER = augment.Classifier(bright_or_dark, SIZE, CLASSES)
 HALF = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 2)).half()
-LINEAR = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 2))
+LINEAR = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 2)).eval()
 
 
 @cache
@@ -665,27 +665,21 @@ SERVICES = [
 ]
 
 
-def evaluated(model: Any = LINEAR, classes: Any = CLASSES, size: Any = SIZE, **changed: Any) -> Any:
-    given: dict[str, Any] = {"folder": "photos", "label": "orange", "out": "out"}
-    return evaluate_photographs(Predictor(model, classes, size), **given | changed)
+def evaluated(network: Any = LINEAR, photos: Any = "photos", **changed: Any) -> Any:
+    given: dict[str, Any] = {"label": "orange", "classes": CLASSES, "size": SIZE}
+    return evaluate(network, photos, **given | changed)
 
 
 SCORES = [
-    *calls_of("folder", lambda x: evaluated(folder=x), None, 3),
-    *calls_of("file.txt", lambda x: evaluated(folder=x), "file.txt"),
-    *calls_of("out", lambda x: evaluated(out=x), None, 3),
+    *calls_of("photos", lambda x: evaluated(photos=x), None, 3),
+    *calls_of("file.txt", lambda x: evaluated(photos=x), "file.txt"),
     *calls_of("file.txt", lambda x: evaluated(out=x), "file.txt"),
-    *calls_of("label", lambda x: evaluated(label=x), "pear", None, 3, []),
+    *calls_of("label", lambda x: evaluated(label=x), "pear", 3, []),
     *calls_of("classes", lambda x: evaluated(classes=x), "orange", 3, ["orange"]),
-    *calls_of("size", lambda x: evaluated(size=x), 16.5, True, 0),
-    *calls_of("model", lambda x: evaluated(model=x), None, 3, nn.Linear(5, 2)),
-    *calls_of("logits", lambda x: evaluated(model=x), probabilities),
-    *calls_of(
-        "by",
-        lambda x: score(Predictor(LINEAR, CLASSES, SIZE).predict("photos", "orange"), by=x),
-        "mesh",
-        "color",
-    ),
+    *calls_of("size", lambda x: evaluated(size=x), True, 0),
+    *calls_of("network", lambda x: evaluated(x), None, 3, nn.Linear(5, 2)),
+    *calls_of("logits", lambda x: evaluated(x), probabilities),
+    *calls_of("by", lambda x: evaluated(by=x), "mesh", "color"),
 ]
 
 CALLS = [

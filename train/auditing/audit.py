@@ -40,14 +40,24 @@ from train.auditing.lights import (
     success_by_light,
     transfer_success,
 )
-from train.auditing.network import LABORATORY, PHOTOGRAPHS, PLAIN, RECOGNIZED, TRANSFER
+from train.auditing.network import (
+    CLASSIFIER,
+    HARDENED,
+    LABORATORY,
+    NORMALIZED,
+    PHOTOGRAPHS,
+    PLAIN,
+    RECOGNIZED,
+    TRANSFER,
+    name_remedies,
+    normalizing,
+)
 from train.auditing.relit import (
     RELIT_FOLDER,
     measure_photographs,
     photographs_screen,
     write_photographs_page,
 )
-from train.auditing.remedies import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
 from train.checkpoints import load_chosen, load_network
 from train.class_names import class_name, class_of_meshes, require_others, with_class_name
 from train.command_settings import AuditSettings, LabSettings

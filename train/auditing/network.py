@@ -1,6 +1,6 @@
 """Results of an audit for one network: read once, judged, and as `nb.audit` returns them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -8,15 +8,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from augment.classifier import Classifier
 from renderer.errors import as_path
 from renderer.io.files import atomic_write
 from renderer.short_repr import ShortRepr
-from train.auditing.lights import KINDS, RANDOM
+from train.auditing.lights import KINDS, RANDOM, PlainViews
+from train.results.compare import ALL, Difference, Evaluations, difference, mean_metric
+from train.results.first_screen import EQUAL_RATE, gain_sentence
 from train.results.intervals import Units, leave_out, weighted_means
-from train.results.metrics import METRICS
-from train.results.predictions import Prediction
+from train.results.metrics import METRICS, metric_title
+from train.results.predictions import Predictions
 from train.results.store import RunSummary, ScoredRun, read_summaries
-from train.results.tables import Estimate, join_words
+from train.results.tables import (
+    Estimate,
+    Proportion,
+    Table,
+    describe_intervals,
+    format_interval,
+    fraction,
+    join_words,
+)
 from train.run_folder import read_json
 
 # Names of the two folders of test images, and of the subfolders with their scores.
@@ -35,6 +46,38 @@ MIN_VIEWS = 6
 # A network is called safe only if it classifies at least this fraction of the images
 # correctly, both of the tested class and of other objects.
 PASS_THRESHOLD = 0.9
+
+
+# Keys of the two networks of an audit. They are also the names of the subfolders for
+# their results.
+CLASSIFIER = "classifier"
+HARDENED = "hardened"
+# End of the key of a network whose images are normalized before they are classified.
+NORMALIZED = "_normalized_light"
+# Name of the audited network in the comparison with the remedies.
+ORIGINAL = "the original network"
+# Names of the remedies, from the cheapest to the most expensive.
+LIGHT_ALONE = "normalized light"
+HARDENING = "hardening"
+BOTH = "hardening and normalized light"
+# What a user does for each remedy.
+CHECK = "Choose its threshold and check it on your own photographs first."
+ADVICE = {
+    ORIGINAL: "Keep the original network: no remedy that was tested is proven to help.",
+    LIGHT_ALONE: "Recommended: the network as it is, with normalize_light=true.",
+    HARDENING: f"Recommended: the hardened network. {CHECK}",
+    BOTH: f"Recommended: the hardened network, with normalize_light=true. {CHECK}",
+}
+# What a user does next if no remedy helps: without and with a hardened network.
+NEXT_HARDENING = (
+    "Next: harden it (pnb-train experiment=classifier), and audit both with hardened=run:FOLDER."
+)
+NEXT_DATA = (
+    "Next: harden with more meshes of the class and photographs of the place of use, and audit "
+    "again."
+)
+# Remedies are compared by top-1 accuracy if there are several positive classes.
+TOP1 = "class_top1"
 
 
 @dataclass(frozen=True)
@@ -147,19 +190,11 @@ class _Finding(NamedTuple):
     least: float
 
 
-def _recognized(subject: str, recall: Estimate) -> Iterator[_Finding]:
+def _findings(subject: str, recall: Estimate) -> list[_Finding]:
     """Describe what fraction of the images of an object a network recognizes, if it is known."""
-    if recall.value is not None and recall.low is not None:
-        yield _Finding(f"it recognizes {recall.value:.0%} of {subject}", recall.value, recall.low)
-
-
-def _not_mistaken(subject: str, error: Estimate) -> Iterator[_Finding]:
-    """Describe what fraction of the images of other objects a network mistakes for a class.
-
-    `error` is the fraction that is mistaken, the finding has the fraction that is not.
-    """
-    if error.value is not None and error.high is not None:
-        yield _Finding(f"it takes {error.value:.0%} of {subject}", 1 - error.value, 1 - error.high)
+    if recall.value is None or recall.low is None:
+        return []
+    return [_Finding(f"it recognizes {recall.value:.0%} of {subject}", recall.value, recall.low)]
 
 
 @dataclass(frozen=True)
@@ -198,7 +233,12 @@ class AuditedNetwork:
         path = self.folder / TRANSFER
         return read_json(path) if path.exists() else {}
 
-    def predictions(self, images: str) -> Sequence[Prediction]:
+    @property
+    def plain(self) -> PlainViews:
+        """The plain light in which all networks of the audit are tested."""
+        return PlainViews(**read_json(self.folder.parent / CLASSIFIER / PLAIN))
+
+    def predictions(self, images: str) -> Predictions:
         """Predictions for a folder of test images, in the order of the images."""
         return ScoredRun(self.run, images).pooled().predictions
 
@@ -229,12 +269,8 @@ class AuditedNetwork:
         """Whether the network is safe, in words such as "No", and a sentence that says why."""
         if not any(any(views) for views in self.recognized.values()):
             return "Unknown", f"Unknown: it does not recognize {self.label} in plain light, either."
-        of_renders = [
-            finding
-            for subject, rate in self.rates.items()
-            for finding in _recognized(subject, rate)
-        ]
-        of_images = [*self._judge_images()]
+        of_renders = [item for rate in self.rates.items() for item in _findings(*rate)]
+        of_images = self._judge_images()
         findings = [*of_renders, *of_images]
         faults = [finding.text for finding in findings if finding.right < PASS_THRESHOLD]
         faults += self._attack_faults()
@@ -256,28 +292,33 @@ class AuditedNetwork:
         """Whether the network is safe in unusual lighting, and why it is not."""
         return f"Is {self.name} safe under unusual lighting? {self.verdict[1]}"
 
-    def _judge_images(self) -> Iterator[_Finding]:
-        """Yield what fractions of the test images the network classifies correctly."""
+    def _judge_images(self) -> list[_Finding]:
+        """Judge what fractions of the test images the network classifies correctly."""
+        findings = []
         for images, scores in self.run.photographs.items():
             place = f"{self.label} in the {IN_WORDS[images]}"
-            yield from _recognized(place, scores.overall.recall)
-            yield from _not_mistaken(
-                f"other objects for {place}", scores.overall.false_positive_rate
-            )
+            findings += _findings(place, scores.overall.recall)
+            error = scores.overall.false_positive_rate
+            if error.value is not None and error.high is not None:
+                text = f"it takes {error.value:.0%} of other objects for {place}"
+                findings.append(_Finding(text, 1 - error.value, 1 - error.high))
+        return findings
 
-    def _attack_faults(self) -> Iterator[str]:
-        """Yield the attacks after which the network misclassifies half of the views.
+    def _attack_faults(self) -> list[str]:
+        """Name the attacks after which the network misclassifies half of the views.
 
         Each clause has the smallest radius at which that is so, among the views that were correct
         before.
         """
+        faults = []
         for kind, counts in self.counts.items():
             light = KINDS[kind]
             for radius, fooled_count in zip(light.radii, counts["adversarial"], strict=True):
                 if 0 < counts["correct"] <= 2 * fooled_count:
                     attack = f"an attack with {light.title} of radius {radius:g}"
-                    yield f"{attack} loses {fooled_count} of {counts['correct']} views"
+                    faults.append(f"{attack} loses {fooled_count} of {counts['correct']} views")
                     break
+        return faults
 
     @property
     def withstood(self) -> str:
@@ -307,14 +348,13 @@ class AuditedNetwork:
         }
         return max(lost, key=lambda kind: lost[kind]) if lost else None
 
-    def remaining(self, kind: str, method: str) -> Iterator[tuple[int, int]]:
-        """Yield the numbers of views that stay correct, and of views correct before, by radius.
+    def remaining(self, kind: str, method: str) -> list[Proportion]:
+        """Return the fraction of the views that stay correct, of those correct before, by radius.
 
         The first is for the radius 0. `method` is "adversarial" or "random".
         """
         correct = self.counts[kind]["correct"]
-        for count in (0, *self.counts[kind][method]):
-            yield correct - count, correct
+        return [fraction(correct - count, correct) for count in (0, *self.counts[kind][method])]
 
     def report(self) -> NetworkReport:
         """Collect the results as `nb.audit` returns them."""
@@ -340,3 +380,100 @@ class AuditedNetwork:
             scores=scores,
             transfers=self.transfers,
         )
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """Remedy for unusual lighting that an audit recommends.
+
+    Attributes:
+        remedy: Name of the recommended remedy. None if none is recommended.
+        advice: What the user should do, in words.
+        sentence: The advice and the reason for it.
+        table: Metric of the network with each remedy, and its gain over the
+            original network.
+    """
+
+    remedy: str | None
+    advice: str
+    sentence: str
+    table: Table
+
+
+def normalizing(networks: Mapping[str, Classifier]) -> dict[str, Classifier]:
+    """Add the remedy "normalized light" to the networks of an audit.
+
+    This remedy normalizes the colors of an image before the network classifies it. Keys become such
+    as "hardened_normalized_light". Networks that normalize light already are left out.
+    """
+    return {
+        key + NORMALIZED: network.normalizing_light()
+        for key, network in networks.items()
+        if network.normalized_light is None
+    }
+
+
+def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
+    """Name the remedies that an audit compares, and find their results.
+
+    The values are subfolders. The original network comes first, then the remedies from the cheapest
+    to the most expensive.
+    """
+    subfolders = {ORIGINAL: CLASSIFIER}
+    for key, network in {**normalizing(networks), **networks}.items():
+        if key == CLASSIFIER:
+            continue
+        is_normalized = network.normalized_light is not None
+        if not key.startswith(HARDENED):
+            subfolders[LIGHT_ALONE] = key
+        else:
+            subfolders[BOTH if is_normalized else HARDENING] = key
+    order = (ORIGINAL, LIGHT_ALONE, HARDENING, BOTH)
+    return {name: subfolders[name] for name in order if name in subfolders}
+
+
+def recommend(evaluations: Evaluations) -> Recommendation | None:
+    """Recommend the cheapest remedy that helps, unless a more expensive one helps more.
+
+    A remedy helps if the 95% interval of its gain over the original network is above 0. It helps
+    more than a cheaper one if the interval of its gain over the cheaper one is above 0, too. The
+    metric is the recall at 10% false positives. With several positive classes, it is top-1
+    accuracy. The first evaluation is of the original network, and remedies follow by price. None if
+    a metric is unknown.
+    """
+    original, *remedies = evaluations
+    positives = evaluations[original][0].pooled.all.positives
+    metric = TOP1 if len(positives.labels) > 1 else EQUAL_RATE
+
+    def gain_over(name: str, reference: str) -> Difference | None:
+        return difference(evaluations[name], evaluations[reference], ALL, metric)
+
+    gains = {name: gain_over(name, original) for name in remedies}
+    if any(gain is None for gain in gains.values()):
+        return None
+    chosen = original
+    for name in remedies:
+        # Of a network over itself, there is no gain.
+        gains_of_name = (gains[name], gain_over(name, chosen))
+        if all(gain and gain.low is not None and gain.low > 0 for gain in gains_of_name):
+            chosen = name
+    title = metric_title(metric)
+    gain = gains.get(chosen)
+    if gain is None:
+        reason = f"No gain in {title} is proven for: {', '.join(remedies)}. "
+        reason += NEXT_DATA if {HARDENING, BOTH} & {*remedies} else NEXT_HARDENING
+    else:
+        reason = gain_sentence(f"With {chosen}, {title}", gain)
+    rows = []
+    for name, evaluations_of_network in evaluations.items():
+        value = format_interval(mean_metric(evaluations_of_network, ALL, metric))
+        rows.append([name, value, format_interval(gains.get(name), "+")])
+    intervals = describe_intervals(gains.values())
+    table = Table(intervals, ["network", title, "gain over the original network"], rows)
+    advice = ADVICE[chosen]
+    return Recommendation(
+        remedy=None if gain is None else chosen,
+        advice=advice,
+        sentence=f"{advice} {reason}",
+        table=table,
+    )

@@ -5,31 +5,31 @@ test images is either "laboratory", with path-traced renders, or "photographs".
 Plain light is ordinary light, before an attack changes it.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from PIL import Image
 
 from renderer.io.images import read_square
-from train.auditing.lights import ADDITIONAL_STEPS, KINDS, SIDE, STEPS, PlainViews
-from train.auditing.network import IN_WORDS, PHOTOGRAPHS, PLAIN, AuditedNetwork, AuditReport
-from train.auditing.relit import relit_sections
-from train.auditing.remedies import (
+from train.auditing.lights import ADDITIONAL_STEPS, KINDS, SIDE, STEPS
+from train.auditing.network import (
     CLASSIFIER,
     HARDENED,
     HARDENING,
+    IN_WORDS,
     NEXT_HARDENING,
     NORMALIZED,
+    PHOTOGRAPHS,
+    AuditedNetwork,
+    AuditReport,
     Recommendation,
     recommend,
 )
+from train.auditing.relit import relit_sections
 from train.results import compare
 from train.results.first_screen import (
-    NETWORKS,
-    Compared,
     ComparedImage,
     FirstScreen,
     ShownMetric,
@@ -39,10 +39,10 @@ from train.results.first_screen import (
     describe_place,
     describe_prediction,
 )
-from train.results.metrics import Pool
+from train.results.metrics import Metrics
 from train.results.page import scores_section, write_page
 from train.results.pictures import Picture, encode_picture, plot_by_radius, read_pictures
-from train.results.predictions import SUMMARY, Prediction
+from train.results.predictions import SUMMARY
 from train.results.store import RunSummary, ScoredRun
 from train.results.tables import Estimate, Proportion, fraction
 from train.run_config import CONFIG, read_config
@@ -108,24 +108,29 @@ def write_audit_page(
     by_key = {key: AuditedNetwork(label, name, out / key) for key, name in names.items()}
     networks = [*by_key.values()]
     counts = {network.name: network.counts for network in networks}
-    compared = networks if len(networks) > 1 else []
-    transfers = {network.name: network.transfers for network in compared}
-    plain = plain_sentence(networks[0], _plain_views(out))
+    transfers = {network.name: network.transfers for network in networks}
+    plain = plain_sentence(networks[0])
     images = next(iter(folders), None)
     screen = _first_screen(networks, images, folders, plain)
     recommendation = None
     if images is not None and len(remedies) > 1:
-        runs = {name: _scored_run(name, out / key) for name, key in remedies.items()}
+        runs = {name: AuditedNetwork("", name, out / key).run for name, key in remedies.items()}
         recommendation = recommend(_evaluate(runs, images))
+    advice = []
     if recommendation is not None:
-        sentence = recommendation.sentence
-        if recommendation.remedy == HARDENING:
-            # The top of the report shows the gain by hardening already.
-            sentence = recommendation.advice
-        screen = replace(screen, sentences=[*screen.sentences, sentence])
+        # The top of the report shows the gain by hardening already.
+        is_shown = recommendation.remedy == HARDENING
+        advice = [recommendation.advice if is_shown else recommendation.sentence]
     elif screen.answer in (VERDICTS["No"], VERDICTS["Perhaps not"]):
-        screen = replace(screen, sentences=[*screen.sentences, NEXT_HARDENING])
+        advice = [NEXT_HARDENING]
+    screen = replace(screen, sentences=[*screen.sentences, *advice])
     slider = _slider(counts)
+    unreadable = []
+    for name in folders:
+        files = read_json(networks[-1].folder / name / SUMMARY)["unreadable"]
+        if files:
+            text = f"{len(files)} of the {IN_WORDS[name]} cannot be read, such as {files[0]}."
+            unreadable.append(text)
     path = write_page(
         out,
         "audit.html.jinja",
@@ -142,29 +147,19 @@ def write_audit_page(
         charts=charts(networks),
         slider=slider,
         script=SLIDER_SCRIPT if slider else "",
-        transfers=transfers,
+        transfers=transfers if len(networks) > 1 else {},
         answers=[network.answer for network in networks],
         photographs=_score_sections(by_key, remedies, out),
         recommendation=recommendation,
         rates={network.name: network.rates for network in networks},
         worst=_worst(networks, folders),
         screen=screen,
-        caveats=[*caveats, *_unreadable_caveats(folders, networks[-1].folder)],
-        agreement=_agreement(networks) if PHOTOGRAPHS in folders else fraction(0, 0),
+        caveats=[*caveats, *unreadable],
+        agreement=_agreement(networks) if PHOTOGRAPHS in folders else Proportion(),
         relit=relit_sections({network.name: network.folder for network in networks}),
         config=read_config(out / CONFIG),
     )
     return Audited(path, screen, label, by_key, recommendation)
-
-
-def _plain_views(out: Path) -> PlainViews:
-    """Read in which plain light all networks of an audit are tested."""
-    return PlainViews(**read_json(out / CLASSIFIER / PLAIN))
-
-
-def _scored_run(name: str, folder: Path) -> RunSummary:
-    """Read the scores of a network, which may be a remedy without other results."""
-    return AuditedNetwork("", name, folder).run
 
 
 def _evaluate(runs: Mapping[str, RunSummary], images: str) -> compare.Evaluations:
@@ -199,32 +194,24 @@ def _first_screen(
     Otherwise it describes the first network.
     """
     if images is None:
-        return screen_of_one(networks[0], plain, None)
-    evaluations = _evaluate({network.name: network.run for network in networks[:2]}, images)
+        return screen_of_one(networks[0], plain, Metrics())
+    evaluations = _evaluate({network.name: network.run for network in networks}, images)
     if len(networks) > 1:
-        screen = _compare(networks, evaluations, folders[images])
+        original, hardened = evaluations.values()
+        label = networks[0].label
+        before, after = (item.pooled.predictions for (item,) in (original, hardened))
+        screen = compare_networks(
+            in_words(label),
+            original,
+            hardened,
+            (f"before: {networks[0].name}", f"after: {networks[1].name}"),
+            describe_place(folders[images], folders[images].name),
+            choose_disagreements(before, after, folders[images], [label]),
+        )
         if screen is not None:
             return screen
     (evaluation,) = evaluations[networks[0].name]
-    return screen_of_one(networks[0], plain, evaluation.pooled.all)
-
-
-def _compare(
-    networks: Sequence[AuditedNetwork], evaluations: compare.Evaluations, images: Path
-) -> FirstScreen | None:
-    """Make the top of a report that compares a network with its hardened version."""
-    original, hardened = evaluations.values()
-    label = networks[0].label
-    compared = Compared(
-        label=in_words(label),
-        before=original,
-        after=hardened,
-        names=(f"before: {networks[0].name}", f"after: {networks[1].name}"),
-        subjects=NETWORKS,
-        place=describe_place(images, images.name),
-    )
-    before, after = (item.pooled.predictions for (item,) in evaluations.values())
-    return compare_networks(compared, choose_disagreements(before, after, images, [label]))
+    return screen_of_one(networks[0], plain, evaluation.pooled.all.metrics)
 
 
 def _score_sections(
@@ -239,90 +226,63 @@ def _score_sections(
     for key in remedies.values():
         if key.endswith(NORMALIZED):
             name = f"{networks[key.removesuffix(NORMALIZED)].name}, normalized light"
-            runs[name] = [_scored_run(name, out / key)]
+            runs[name] = [AuditedNetwork("", name, out / key).run]
     return [scores_section(title, group) for title, group in compare.group_by_images(runs).items()]
 
 
-def plain_sentence(network: AuditedNetwork, plain: PlainViews) -> str:
+def plain_sentence(network: AuditedNetwork) -> str:
     """Write how many views a classifier recognizes in plain light, before any attack."""
-    label, name = in_words(network.label), network.name
-    counted = f"{plain.recognized} of {plain.n} views of {label}"
+    label, name, plain = in_words(network.label), network.name, network.plain
     if plain.recognized == 0:
         return (
             f"{name} recognizes none of {plain.n} views of {label} in plain light, at "
             "any exposure and size that was tried. So this audit cannot tell what unusual light "
             "does."
         )
+    sentence = f"In plain light, {name} recognizes {plain.recognized} of {plain.n} views of {label}"
     if plain.recognized == plain.recognized_as_given:
-        return f"In plain light, {name} recognizes {counted}."
-    place = f"in the light “{plain.light}” at exposure {plain.exposure:g}, size {plain.size:g}"
+        return f"{sentence}."
     return (
-        f"In plain light, {name} recognizes {counted} {place}; before this search, "
-        f"{plain.recognized_as_given}. All lights are tested there."
+        f"{sentence} in the light “{plain.light}” at exposure {plain.exposure:g}, size "
+        f"{plain.size:g}; before this search, {plain.recognized_as_given}. All lights are tested "
+        "there."
     )
 
 
-def screen_of_one(network: AuditedNetwork, plain: str, pool: Pool | None) -> FirstScreen:
+def screen_of_one(network: AuditedNetwork, plain: str, metrics: Metrics) -> FirstScreen:
     """Make the top of the report of an audit of one network, with its scores on test images."""
-    views = _plain_views(network.folder.parent)
-    numbers = [
-        ShownMetric(
-            title="Views recognized in plain light",
-            note="higher is better",
-            before=None,
-            after=fraction(views.recognized, views.n),
-        )
-    ]
+    views = fraction(network.plain.recognized, network.plain.n)
+    higher = "higher is better"
+    numbers = [ShownMetric("Views recognized in plain light", higher, None, views)]
     sentences = [plain]
     kind = network.strongest_kind
     if kind is not None:
         light = KINDS[kind]
-        *_, (remaining, correct) = network.remaining(kind, "adversarial")
-        title = f"Of these, under attack by {light.title}"
-        kept = fraction(remaining, correct)
-        numbers.append(ShownMetric(title, "higher is better", before=None, after=kept))
+        kept = network.remaining(kind, "adversarial")[-1]
+        numbers.append(ShownMetric(f"Of these, under attack by {light.title}", higher, None, kept))
         sentences.append(
             f"If an attacker controls {light.title} (radius {light.radii[-1]:g}), it "
-            f"still recognizes {remaining} of the {correct} views that it recognizes "
+            f"still recognizes {kept.hits} of the {kept.n} views that it recognizes "
             "before the attack."
         )
-    recall = pool.metrics.recall if pool else Proportion()
-    mistaken = pool.metrics.false_positive_rate if pool else Proportion()
+    recall, mistaken = metrics.recall, metrics.false_positive_rate
     name = in_words(network.label)
     if mistaken.value is not None:
         title = f"Other objects called {name}"
-        numbers.append(ShownMetric(title, "lower is better", before=None, after=mistaken))
+        numbers.append(ShownMetric(title, "lower is better", None, mistaken))
     if recall.value is not None and mistaken.value is not None:
         sentences.append(
             f"In the scored images, it recognizes {recall.value:.0%} of {name} and calls "
             f"{mistaken.value:.0%} of other objects “{name}”."
         )
     short, _ = network.verdict
-    return FirstScreen(
-        answer=VERDICTS.get(short, short),
-        sentences=sentences,
-        numbers=numbers,
-        rows={},
-        names=[network.name],
-        images="",
-    )
-
-
-def _unreadable_caveats(images: Collection[str], folder: Path) -> Iterator[str]:
-    """Yield a sentence about each folder of test images with files that cannot be read."""
-    for name in images:
-        files = read_json(folder / name / SUMMARY)["unreadable"]
-        if files:
-            images_in_words = IN_WORDS[name]
-            yield f"{len(files)} of the {images_in_words} cannot be read, such as {files[0]}."
+    return FirstScreen(VERDICTS.get(short, short), sentences, numbers, [network.name])
 
 
 def _agreement(networks: Sequence[AuditedNetwork]) -> Proportion:
     """Compute the fraction of photographs for which all networks predict the same class."""
-    by_network = [network.predictions(PHOTOGRAPHS) for network in networks]
-    is_same = []
-    for predictions in zip(*by_network, strict=True):
-        is_same.append(len({item.predicted for item in predictions}) == 1)
+    first, *others = (network.predictions(PHOTOGRAPHS).predicted for network in networks)
+    is_same = [all(names) for names in zip(*(first == other for other in others), strict=True)]
     return fraction(sum(is_same), len(is_same))
 
 
@@ -333,27 +293,17 @@ def attack_pictures(network: AuditedNetwork) -> list[ComparedImage]:
     """
     compared = []
     for kind, counts in network.counts.items():
-        light = KINDS[kind]
-        answers = _answers(counts)
-        if not answers:
+        if "predicted" not in counts:
             continue
-        path = network.folder / f"{kind}.png"
-        alt_text = f"{light.title}: {answers[0].text}, after the attack {answers[1].text}"
-        for picture in read_pictures(path, alt_text, PAIR_WIDTH):
-            lost = f"{counts['adversarial'][-1]} of {counts['correct']} views lost"
-            caption = f"{light.title}: {lost} at radius {light.radii[-1]:g}"
-            compared.append(ComparedImage(picture, caption, *answers))
+        light = KINDS[kind]
+        shown = zip(counts["predicted"], counts["confidence"], ("right", "wrong"), strict=True)
+        before, after = (ShownPrediction(f"{in_words(a)} {p:.0%}", b) for a, p, b in shown)
+        alt_text = f"{light.title}: {before.text}, after the attack {after.text}"
+        lost = f"{counts['adversarial'][-1]} of {counts['correct']} views lost"
+        caption = f"{light.title}: {lost} at radius {light.radii[-1]:g}"
+        for picture in read_pictures(network.folder / f"{kind}.png", alt_text, PAIR_WIDTH):
+            compared.append(ComparedImage(picture, caption, before, after))
     return compared
-
-
-def _answers(attack_counts: Mapping[str, Any]) -> list[ShownPrediction]:
-    """Describe the right prediction before an attack and the wrong one after it, if it succeeds."""
-    if "predicted" not in attack_counts:
-        return []
-    shown = zip(
-        attack_counts["predicted"], attack_counts["confidence"], ("right", "wrong"), strict=True
-    )
-    return [ShownPrediction(f"{in_words(name)} {p:.0%}", verdict) for name, p, verdict in shown]
 
 
 def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:
@@ -364,63 +314,50 @@ def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:
     """
     pictures = []
     for kind, light in KINDS.items():
-        lines: dict[str, list[Estimate]] = {}
+        lines: dict[str, Sequence[Estimate]] = {}
         for network in networks:
             if network.counts[kind]["correct"]:
                 for end, method in (("", "adversarial"), (", random", "random")):
-                    counts = network.remaining(kind, method)
-                    lines[network.name + end] = [fraction(*pair) for pair in counts]
+                    lines[network.name + end] = network.remaining(kind, method)
         if lines:
             unit = f"radius ({light.unit})"
             pictures.append(plot_by_radius(lines, (0, *light.radii), light.title, unit))
     return pictures
 
 
-class _ScoredImage(NamedTuple):
-    """Test image with the prediction of one network.
-
-    Attributes:
-        images: Name of the folder of test images, "laboratory" or
-            "photographs".
-        image_index: Index of the image in the folder.
-        prediction: Prediction of the network for the image.
-    """
-
-    images: str
-    image_index: int
-    prediction: Prediction
-
-
 def _worst(
     networks: Sequence[AuditedNetwork], folders: Mapping[str, Path]
 ) -> dict[str, list[Picture]]:
-    """Make two galleries of each network: its WORST misses and its WORST false alarms."""
+    """Make two galleries of each network: its WORST misses and its WORST false alarms.
+
+    The caption of an image has the predictions of all networks.
+    """
+
+    def draw(images: str, row: int) -> Picture:
+        texts = []
+        for network in networks:
+            prediction = describe_prediction(network.predictions(images), row)
+            texts.append(f"{network.name}: {prediction.text}")
+        photograph = networks[0].predictions(images).photograph[row]
+        caption = f"{in_words(photograph.label)}, {photograph.source}: {'; '.join(texts)}"
+        image = Image.fromarray(read_square(folders[images] / photograph.path, SIDE))
+        return encode_picture(image, caption, caption)
+
     galleries: dict[str, list[Picture]] = {}
-    draw = partial(_draw_image, folders, networks)
     for network in networks:
-        items = [
-            _ScoredImage(images, index, prediction)
-            for images in folders
-            for index, prediction in enumerate(network.predictions(images))
-        ]
-        items.sort(key=lambda item: item.prediction.log_odds)
-        positives = [item for item in items if item.prediction.positive]
-        negatives = [item for item in reversed(items) if not item.prediction.positive]
+        # Log-odds, whether the image is a positive, and its folder and row.
+        items = []
+        for images in folders:
+            predictions = network.predictions(images)
+            columns = zip(predictions.log_odds, predictions.positive, strict=True)
+            items += [(*pair, images, row) for row, pair in enumerate(columns)]
+        items.sort(key=lambda item: item[0])
+        positives = [item[2:] for item in items if item[1]]
+        negatives = [item[2:] for item in reversed(items) if not item[1]]
         label = in_words(network.label)
-        galleries[f"{label} that {network.name} doubts most"] = [*map(draw, positives[:WORST])]
-        galleries[f"what {network.name} most takes for {label}"] = [*map(draw, negatives[:WORST])]
+        for title, chosen in (
+            (f"{label} that {network.name} doubts most", positives),
+            (f"what {network.name} most takes for {label}", negatives),
+        ):
+            galleries[title] = [draw(*item) for item in chosen[:WORST]]
     return galleries
-
-
-def _draw_image(
-    folders: Mapping[str, Path], networks: Sequence[AuditedNetwork], item: _ScoredImage
-) -> Picture:
-    """Draw a test image with the predictions of all networks in its caption."""
-    photograph = item.prediction.photograph
-    texts = []
-    for network in networks:
-        prediction = network.predictions(item.images)[item.image_index]
-        texts.append(f"{network.name}: {describe_prediction(prediction).text}")
-    caption = f"{in_words(photograph.label)}, {photograph.source}: {'; '.join(texts)}"
-    image = Image.fromarray(read_square(folders[item.images] / photograph.path, SIDE))
-    return encode_picture(image, caption, caption)

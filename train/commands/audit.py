@@ -17,8 +17,7 @@ from augment.plain_networks import (
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, as_list
 from train.auditing.audit import run_audit
-from train.auditing.network import AuditReport
-from train.auditing.remedies import CLASSIFIER, HARDENED
+from train.auditing.network import CLASSIFIER, HARDENED, AuditReport
 from train.class_names import MeshItem, as_mappings, find_positive_classes
 from train.command_settings import ENVIRONMENTS, AuditSettings
 from train.results.overwrite import require_replaceable

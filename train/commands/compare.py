@@ -44,7 +44,7 @@ def run(settings: CompareSettings) -> None:
     printed, too.
     """
     # --help does not wait for these imports.
-    from train.results.run_tables import format_comparison, format_short_comparison
+    from train.results.compare import format_comparison, format_short_comparison
     from train.results.store import finished_runs
 
     runs = finished_runs([Path(run) for run in settings.runs])

@@ -22,9 +22,9 @@ from augment.augmentation_settings import MODES
 from train import checkpoints, console
 from train.cli import compose, read_settings
 from train.processes import Interrupted, broadcast, process_group
+from train.results.compare import format_short_comparison, format_table
 from train.results.overwrite import remove_run, require_new_run
 from train.results.page import report_of
-from train.results.run_tables import format_short_comparison, format_table
 from train.results.store import is_finished, summarize
 from train.run_config import CONFIG, format_command, require_same_run, resume_config
 from train.run_folder import sole_writer

@@ -25,9 +25,9 @@ from train import checkpoints, console
 from train.__main__ import run_name
 from train.cli import compose, quoted, read_settings
 from train.commands.experiment import LOG, logged_to
+from train.results.compare import format_short_comparison, format_table
 from train.results.overwrite import require_new_run, require_replaceable
 from train.results.page import PAGE, report_of
-from train.results.run_tables import format_short_comparison, format_table
 from train.results.store import is_finished, summarize
 from train.run_config import format_command, require_same_run
 from train.run_folder import FAILURE, locked, state

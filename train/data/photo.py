@@ -5,6 +5,8 @@ from pathlib import PurePosixPath
 
 # Separator of the names of sources in the column hard_negatives of photos.csv.
 SEPARATOR = ";"
+# pnb-lab writes a file of this name to its folder of renders.
+DESCRIPTION = "lab.json"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Comparison of finished training runs by their metrics on photographs.
+"""Comparison of finished training runs: tables of their accuracy, scores, gains and seconds.
 
 A method is a way to train a network. Runs that differ only in their seed are
 runs of the same method. An `Evaluation` holds the predictions of one run for one
@@ -6,40 +6,39 @@ folder of photographs. `difference` compares a metric of two methods, with a 95%
 interval.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from statistics import fmean
+from statistics import fmean, stdev
+from typing import NamedTuple
 
+from augment.augmentation_settings import MODES
 from renderer.errors import InputError
 from train.results.intervals import Jackknife, change
 from train.results.metrics import COUNTED_EACH, METRICS, TOP_RANKS, Pool, Pooled, metric_title
-from train.results.predictions import Prediction
+from train.results.predictions import CONTACT_SHEET
 from train.results.store import (
     INITIAL,
     Methods,
     RunSummary,
     Scored,
     ScoredRun,
+    group_by_method,
+    varied_settings,
 )
 from train.results.tables import Estimate, Table, describe_intervals, format_interval
-from train.settings import in_words
+from train.run_folder import PHASES
+from train.settings import PHOTOGRAPHS, UNLABELED, in_words
 
 # `class_table` has no rows if there are more classes than this.
 MAX_CLASSES = 30
 # Titles of the columns of tables that have a column for each metric in `METRICS`.
 TITLES = [metric_title(name) for name in METRICS]
+# Metrics in the table that commands print without --verbose.
+SHORT_METRICS = ("recall", "false_positive_rate", "auc", "class_top1")
 
 
-def label_title(label: str) -> str:
-    """Return the title of the row of a positive class in tables, such as "label=orange"."""
-    return f"label={label}"
-
-
-@dataclass(frozen=True)
-class Subset:
+class Subset(NamedTuple):
     """Subset of the images of an evaluation, such as the images of one source.
-
-    Tables have a row for each subset.
 
     Attributes:
         by: Property that the images of the subset have in common: "label",
@@ -53,45 +52,26 @@ class Subset:
 
     def title(self, overall: str = "all") -> str:
         """Return the title of the row of this subset in a table."""
-        if self == ALL:
-            return overall
-        if self.by == "label":
-            return label_title(self.name)
-        return self.name
-
-    @property
-    def is_overall(self) -> bool:
-        """Whether the subset has images of all sources, for all labels or for one label."""
-        return self.by in ("all", "label")
+        return {"all": overall, "label": f"label={self.name}"}.get(self.by, self.name)
 
 
 # All images, except those of sources that the user excludes.
 ALL = Subset()
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """Predictions of the network of a run for one folder of photographs.
-
-    Attributes:
-        run: Run that trained the network.
-        pooled: The predictions, which are scored together and in groups.
-    """
+class Evaluation(NamedTuple):
+    """Predictions of the network of a run for one folder of photographs, in groups."""
 
     run: RunSummary
     pooled: Pooled
 
-    def pools(self, *properties: str) -> dict[Subset, Pool]:
-        """Predictions for all images, and for the subsets by some properties."""
-        pools = {ALL: self.pooled.all}
-        for by in properties:
-            pools |= {Subset(by, name): pool for name, pool in self.pooled.groups(by).items()}
-        return pools
-
-    def rows(self, by: str) -> dict[Subset, Pool]:
-        """Predictions for each row of a table: all, several positive classes, and subsets."""
-        has_several_labels = len(self.pooled.by_label) > 1
-        return self.pools("label", by) if has_several_labels else self.pools(by)
+    def rows(self, *properties: str) -> list[Subset]:
+        """List the rows of a table: all images, several positive classes, and subsets."""
+        labels = ["label"] if len(self.pooled.by_label) > 1 else []
+        subsets = [
+            Subset(by, name) for by in (*labels, *properties) for name in self.pooled.groups(by)
+        ]
+        return [ALL, *subsets]
 
     def find(self, subset: Subset) -> Pool | None:
         """Predictions for a subset. None if there are none."""
@@ -103,7 +83,7 @@ Evaluations = Mapping[str, Sequence[Evaluation]]
 
 
 def group_by_images(methods: Methods) -> dict[str, Scored]:
-    """Group runs by the images on which they were scored."""
+    """Group runs by the images on which they were scored, and write a title for each group."""
     groups: dict[str, dict[str, list[ScoredRun]]] = {}
     for method, runs in methods.items():
         for run in runs:
@@ -112,31 +92,22 @@ def group_by_images(methods: Methods) -> dict[str, Scored]:
                 group.setdefault(method, []).append(ScoredRun(run, name))
     titled: dict[str, Scored] = {}
     for group in groups.values():
-        title = _title_of(group)
+        members = [scored for scored_runs in group.values() for scored in scored_runs]
+        # The name of the sub-folder comes from a training run if there is one, because the user
+        # has chosen this name. Only a training run has epochs.
+        first = next((scored for scored in members if scored.run.epochs), members[0])
+        title = first.name
+        auc = first.scores.overall.auc
+        labels = first.scores.labels
+        if auc.positives + auc.negatives:
+            title += f": {auc.positives:,} images of {' or '.join(labels)}, "
+            title += f"{auc.negatives:,} images of other objects"
+            title += COUNTED_EACH if len(labels) > 1 else ""
+            title += f"; {describe_intervals([auc])}" if auc.low is not None else ""
         if title in titled:
             title = f"{title} ({len(titled) + 1})"
         titled[title] = group
     return titled
-
-
-def _title_of(group: Scored) -> str:
-    """Write a title for the images on which a group of networks was scored."""
-    members = [scored for scored_runs in group.values() for scored in scored_runs]
-    # The name of the sub-folder comes from a training run if there is one, because the user
-    # has chosen this name. Only a training run has epochs.
-    of_training = [scored for scored in members if scored.run.epochs]
-    first = of_training[0] if of_training else members[0]
-    auc = first.scores.overall.auc
-    if not auc.positives + auc.negatives:
-        return first.name
-    labels = first.scores.labels
-    title = (
-        f"{first.name}: {auc.positives:,} images of {' or '.join(labels)}, "
-        f"{auc.negatives:,} images of other objects"
-    )
-    if len(labels) > 1:
-        title += COUNTED_EACH
-    return f"{title}; {describe_intervals([auc])}" if auc.low is not None else title
 
 
 def read_evaluations(group: Scored, exclude: Sequence[str] = ()) -> Evaluations:
@@ -148,25 +119,21 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = ()) -> Evaluations:
     methods: dict[str, list[Evaluation]] = {}
     for method, scored_runs in group.items():
         for scored in sorted(scored_runs, key=lambda item: item.run.seed or 0):
-            if scored.has_predictions:
-                pooled = scored.pooled(exclude)
-                _require_sources(exclude, pooled.predictions)
-                methods.setdefault(method, []).append(Evaluation(scored.run, pooled))
+            if not scored.has_predictions:
+                continue
+            pooled = scored.pooled(exclude)
+            sources = {*pooled.predictions.source}
+            unknown = {*exclude} - sources
+            if unknown:
+                known = ", ".join(sorted(filter(None, sources)))
+                raise InputError(
+                    f"exclude: no photograph is of source {min(unknown)!r}: choose among {known}",
+                )
+            methods.setdefault(method, []).append(Evaluation(scored.run, pooled))
     return methods
 
 
-def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) -> None:
-    """Check that each source that a user excludes is the source of some photograph."""
-    sources = {item.photograph.source for item in predictions}
-    unknown = set(names) - sources
-    if unknown:
-        known = ", ".join(sorted(filter(None, sources)))
-        raise InputError(
-            f"exclude: no photograph is of source {min(unknown)!r}: choose among {known}",
-        )
-
-
-def require_meshes(methods: Evaluations, by: str) -> None:
+def _require_meshes(methods: Evaluations, by: str) -> None:
     """Check that the photographs have meshes if scores by mesh are asked for."""
     for method, evaluations in methods.items():
         if by == "mesh" and not all(evaluation.pooled.by_mesh for evaluation in evaluations):
@@ -182,29 +149,25 @@ def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
     The interval is that of the only seed, or goes from the lowest to the highest of several. None
     if no seed has the metric.
     """
-    known: list[Estimate] = []
-    values: list[float] = []
-    for evaluation in evaluations:
-        pool = evaluation.find(subset)
-        metric = pool.metrics.find(name) if pool is not None else None
-        if metric is not None and metric.value is not None:
-            known.append(metric)
-            values.append(metric.value)
-    if not known:
-        return None
-    if len(known) == 1:
-        return known[0]
+    pools = [evaluation.find(subset) for evaluation in evaluations]
+    return _mean([pool.metrics.find(name) for pool in pools if pool is not None])
+
+
+def _mean(estimates: Iterable[Estimate | None]) -> Estimate | None:
+    """Average the known values, with the lowest and the highest of several as their interval."""
+    known = [item for item in estimates if item is not None and item.value is not None]
+    if len(known) < 2:
+        return known[0] if known else None
+    values = [item.value for item in known if item.value is not None]
     over = f"lowest and highest of {len(values)} seeds"
-    return Estimate(value=fmean(values), low=min(values), high=max(values), over=over)
+    return Estimate(fmean(values), min(values), max(values), over)
 
 
 def group_table(methods: Evaluations, overall: str = "all", by: str = "source") -> Table:
     """Make a table of the metrics, means over seeds, of each method on each subset of images."""
+    every_evaluation = [item for evaluations in methods.values() for item in evaluations]
     # A dictionary has each subset once, in order.
-    subsets: dict[Subset, None] = {}
-    for evaluations in methods.values():
-        for evaluation in evaluations:
-            subsets.update(dict.fromkeys(evaluation.rows(by)))
+    subsets = dict.fromkeys(subset for item in every_evaluation for subset in item.rows(by))
     rows: list[list[str]] = []
     shown: list[Estimate | None] = []
     for subset in subsets:
@@ -222,15 +185,13 @@ def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
     It is also compared with the first method. A pair is a method and its reference.
     """
     first_runs = {method: evaluations[0].run for method, evaluations in methods.items()}
-    pairs = []
-    for method, run in first_runs.items():
-        initial_network = run.before
-        if initial_network is None:
-            continue
-        for reference, reference_run in first_runs.items():
-            # The initial network is the method whose settings name the same network.
-            if reference_run.settings == initial_network.settings:
-                pairs.append((method, reference))
+    # The initial network is the method whose settings name the same network.
+    pairs = [
+        (method, reference)
+        for method, run in first_runs.items()
+        for reference, reference_run in first_runs.items()
+        if run.before is not None and reference_run.settings == run.before.settings
+    ]
     trained = [method for method, run in first_runs.items() if run.method != INITIAL]
     return pairs + [(method, trained[0]) for method in trained[1:]]
 
@@ -241,13 +202,13 @@ def class_table(methods: Evaluations) -> Table:
     The accuracies are among all classes of the network. The table has no rows if the networks have
     one such class, or more than MAX_CLASSES.
     """
-    header = ["class", "images", "network", "top-1", "top-5"]
+    image_counts = {
+        name: len(pool.classified)
+        for evaluations in methods.values()
+        for name, pool in evaluations[0].pooled.by_class.items()
+        if len(pool.classified)
+    }
     rows: list[list[str]] = []
-    image_counts: dict[str, int] = {}
-    for evaluations in methods.values():
-        for name, pool in evaluations[0].pooled.by_class.items():
-            if pool.classified:
-                image_counts[name] = len(pool.classified)
     if 1 < len(image_counts) <= MAX_CLASSES:
         for name, image_count in image_counts.items():
             for method, evaluations in methods.items():
@@ -255,6 +216,7 @@ def class_table(methods: Evaluations) -> Table:
                 metrics = (mean_metric(evaluations, subset, metric) for metric in TOP_RANKS)
                 cells = map(format_interval, metrics)
                 rows.append([in_words(name), str(image_count), method, *cells])
+    header = ["class", "images", "network", "top-1", "top-5"]
     return Table("by class, among all classes of the network", header, rows)
 
 
@@ -302,27 +264,23 @@ def _jackknives(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
 
 def _have_equal_seeds(evaluations: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
     """Return whether the runs of two methods have the same seeds, in the same order."""
-    seeds = [evaluation.run.seed or 0 for evaluation in evaluations]
-    reference_seeds = [evaluation.run.seed or 0 for evaluation in reference]
-    return seeds == reference_seeds
+    seeds, others = ([item.run.seed or 0 for item in runs] for runs in (evaluations, reference))
+    return seeds == others
 
 
 def difference_tables(
-    methods: Evaluations,
-    overall: str = "all",
-    by: str = "source",
-    overall_only: bool = False,
+    methods: Evaluations, overall: str = "all", by: str = "source", overall_only: bool = False
 ) -> list[Table]:
-    """Make a table of the differences of the metrics for each pair of methods."""
+    """Make a table of the differences of the metrics for each pair of methods.
+
+    With `overall_only`, the rows are all images, and all images for each positive class.
+    """
     tables = []
     for method, base in choose_pairs(methods):
-        evaluations = methods[method]
-        reference = methods[base]
+        evaluations, reference = methods[method], methods[base]
         rows = []
         shown: list[Difference | None] = []
-        for subset in reference[0].rows(by):
-            if overall_only and not subset.is_overall:
-                continue
+        for subset in reference[0].rows(*([] if overall_only else [by])):
             differences = [difference(evaluations, reference, subset, name) for name in METRICS]
             shown += differences
             cells = [format_interval(item, sign="+") for item in differences]
@@ -342,3 +300,219 @@ def overall_differences(methods: Evaluations) -> Table:
             title = f"{table.title}, {name}" if name else table.title
             rows.append([title, *cells])
     return Table("differences on the same images", ["networks", *TITLES], rows)
+
+
+def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:
+    """Make tables of the accuracy, the scores and the settings of runs."""
+    tables = [_accuracy_table(methods)]
+    tables += [score_table(title, group) for title, group in groups.items()]
+    # The first run of each method. Networks without a run have no settings of a training.
+    heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
+    varied = varied_settings([*heads.values()])
+    if varied:
+        rows = [
+            [method, *(str(head.settings.get(key)) for key in varied)]
+            for method, head in heads.items()
+        ]
+        header = ["network", *varied.values()]
+        tables.append(Table("settings in which the methods differ", header, rows))
+    return tables
+
+
+def _accuracy_table(methods: Methods) -> Table:
+    """Make a table of the accuracy of each run on the test images."""
+    every_run = [run for runs in methods.values() for run in runs]
+    lines: dict[str, list[Line]] = {}
+    for method, runs in methods.items():
+        for run in runs if runs[0].accuracy is not None else ():
+            last = run.scores.get("test/accuracy_last")
+            line = (run.seed, [Estimate(run.accuracy), Estimate(last)])
+            lines.setdefault(method, []).append(line)
+    # A dictionary has each name once, in the order of the runs.
+    names = dict.fromkeys(run.config.get("test_images", "") for run in every_run)
+    title = " or ".join(f"accuracy on {name}" for name in names if name)
+    return _run_table(title, [_accuracy_title(every_run), "of the last epoch"], lines)
+
+
+def _accuracy_title(runs: Sequence[RunSummary]) -> str:
+    """Return the title of the column with the accuracy of runs on their test images.
+
+    Images without labels are labeled with the predictions of the network before the training.
+    """
+    names = {run.config.get("data", {}).get("name") for run in runs if run.config}
+    return "agreement with the original" if names == {UNLABELED} else "test accuracy"
+
+
+def score_table(title: str, group: Scored) -> Table:
+    """Make a table of the metrics of runs on the same images."""
+    lines: dict[str, list[Line]] = {}
+    points = set()
+    for method, scored_runs in group.items():
+        for run, scores in ((scored.run, scored.scores) for scored in scored_runs):
+            points.add(scores.operating_point)
+            rows = {f"{method}, label={label}": item for label, item in scores.by_label.items()}
+            for name, metrics in {method: scores.overall, **rows}.items():
+                line = (run.seed, [*map(metrics.find, METRICS)])
+                lines.setdefault(name, []).append(line)
+    chosen = " or ".join(sorted(points - {""}))
+    if chosen:
+        title += f"; threshold for {chosen}"
+    return _run_table(title, TITLES, lines)
+
+
+def seconds_table(methods: Methods) -> Table:
+    """Make a table of the seconds that an epoch of the first run of each method takes, by phase."""
+    titles = {phase: phase.replace("_", " and ") for phase in PHASES}
+    titles["attack_classifier"] = "attack: in the classifier"
+    titles["operators"] = "operators, once"
+    rows = []
+    for method, (run, *_) in methods.items():
+        means = {}
+        for phase in titles:
+            name = f"seconds/{phase}"
+            seconds = [line[name] for line in run.epochs if name in line]
+            means[phase] = fmean(seconds) if seconds else 0.0
+        total = sum(means[phase] for phase in PHASES)
+        if any(means.values()):
+            rows.append([method, *(f"{mean:.2f}" for mean in (total, *means.values()))])
+    return Table("seconds per epoch", ["network", "all", *titles.values()], rows)
+
+
+# A row of a table: the seed of a run, and the metric of each column.
+Line = tuple[int | None, Sequence[Estimate | None]]
+
+
+def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[Line]]) -> Table:
+    """Make a table with a row for each run.
+
+    A line is a seed and the metrics in the order of `header`. Several seeds get a row of their mean
+    ± standard deviation, or "-" if a value is unknown.
+    """
+    rows = []
+    for method, runs in lines.items():
+        for seed, metrics in runs:
+            cells = map(format_interval, metrics)
+            rows.append([method, "" if seed is None else str(seed), *cells])
+        if len({seed for seed, _ in runs}) > 1:
+            spreads = []
+            # A column has the values of one metric in all runs of the method.
+            for column in zip(*(metrics for _, metrics in runs), strict=True):
+                values = [item.value for item in column if item and item.value is not None]
+                is_known = len(values) == len(runs)
+                spreads.append(f"{fmean(values):.3f} ± {stdev(values):.3f}" if is_known else "-")
+            rows.append([method, f"{len(runs)} seeds", *spreads])
+    return Table(title, ["network", "seed", *header], rows)
+
+
+def format_table(runs: Sequence[RunSummary]) -> str:
+    """Compare runs in the tables that pnb-train --verbose prints after training."""
+    methods = group_by_method(runs)
+    groups = group_by_images(methods)
+    tables = run_tables(methods, groups)
+    tables += [overall_differences(read_evaluations(group)) for group in groups.values()]
+    used_modes = {run.method for run in runs}
+    captions = [f"{mode}: {caption}" for mode, caption in MODES.items() if mode in used_modes]
+    sheets = [
+        f"image: {run.folder / name / CONTACT_SHEET}" for run in runs for name in run.photographs
+    ]
+    parts = [_format_tables(tables), "; ".join(captions), "\n".join(sheets)]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _format_tables(tables: Sequence[Table]) -> str:
+    """Write tables as Markdown, with an empty line between them.
+
+    A table without rows, and a column without known values, are left out.
+    """
+    return "\n\n".join(str(table.without_unknown_columns) for table in tables if table.rows)
+
+
+def format_comparison(
+    runs: Sequence[RunSummary],
+    exclude: Sequence[str],
+    photographs: str = PHOTOGRAPHS,
+    by: str = "source",
+) -> str:
+    """Compare runs in the tables that pnb-compare --verbose prints."""
+    methods = group_by_method(runs)
+    groups = group_by_images(methods)
+    tables = run_tables(methods, groups)
+    title = _find_group(groups, photographs)
+    if title:
+        evaluations = read_evaluations(groups[title], exclude)
+        _require_meshes(evaluations, by)
+        overall = _title_of_all(exclude)
+        tables.append(group_table(evaluations, overall, by))
+        tables += difference_tables(evaluations, overall, by)
+    return _format_tables([*tables, seconds_table(methods)])
+
+
+def format_short_comparison(
+    runs: Sequence[RunSummary],
+    exclude: Sequence[str] = (),
+    photographs: str = PHOTOGRAPHS,
+    by: str = "source",
+) -> str:
+    """Compare runs in one table, which pnb-train and pnb-compare print without --verbose.
+
+    Without the usual sub-folder "photographs", the first photographs of the runs are compared. The
+    gain in AUC is over the first method.
+    """
+    methods = group_by_method(runs)
+    groups = group_by_images(methods)
+    title = _find_group(groups, photographs) or next(iter(groups), "")
+    group = groups.get(title, {})
+    evaluations = read_evaluations(group, exclude)
+    _require_meshes(evaluations, by)
+    if by != "source" and evaluations:
+        return str(group_table(evaluations, _title_of_all(exclude), by).without_unknown_columns)
+    first = next(iter(evaluations), None)
+    rows = []
+    for method, runs_of_method in methods.items():
+        evaluated = evaluations.get(method, ())
+        shown = [_mean(Estimate(run.accuracy) for run in runs_of_method)]
+        for name in SHORT_METRICS:
+            if evaluated or exclude:
+                shown.append(mean_metric(evaluated, ALL, name))
+            else:
+                # A published network has stored metrics, but no predictions.
+                stored = (scored.scores.overall.find(name) for scored in group.get(method, ()))
+                shown.append(_mean(stored))
+        gain = None
+        if first is not None and evaluated and method != first:
+            gain = difference(evaluated, evaluations[first], ALL, "auc")
+        values = [format_interval(item and Estimate(item.value)) for item in shown]
+        rows.append([method, len(runs_of_method), *values, format_interval(gain, sign="+")])
+    header = ["network", "runs", _accuracy_title(runs), *map(metric_title, SHORT_METRICS)]
+    return str(Table(title, [*header, "gain in AUC [95%]"], rows).without_unknown_columns)
+
+
+def _title_of_all(exclude: Sequence[str]) -> str:
+    """Return the title of the row of all images: "all", or "all but A, B" without these sources."""
+    return f"all but {', '.join(exclude)}" if exclude else "all"
+
+
+def _find_group(groups: Mapping[str, Scored], photographs: str) -> str | None:
+    """Find the title of the runs whose scores lie in a sub-folder of a given name.
+
+    A network that is not a run, such as a published network, has no seed and no such sub-folder.
+    Its scores may be compared with those in any sub-folder. None if no run has the usual sub-folder
+    "photographs"; any other name that no run has is an error.
+    """
+    found = {}
+    for title, group in groups.items():
+        members = [scored for scored_runs in group.values() for scored in scored_runs]
+        if any(item.name == photographs or item.run.seed is None for item in members):
+            found[title] = members[0].folder
+    if len(found) > 1:
+        first, second, *_ = found.values()
+        raise InputError(
+            f"{second} has other photographs or sources than {first}: "
+            "score both networks on the same folder with pnb-evaluate",
+        )
+    if not found and photographs != PHOTOGRAPHS:
+        raise InputError(
+            f"photos={photographs}: no run has a sub-folder of this name with scores: "
+            "give a name in the setting photos of the runs",
+        )
+    return next(iter(found), None)

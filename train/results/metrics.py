@@ -1,19 +1,14 @@
 """Metrics of an evaluation: recall, false-positive rate, AUC and top-1.
 
-A `Pool` is a set of predictions that are scored together. It computes their
-`Metrics`. `Pooled` has all pools of one evaluation: the pool of all images, and
-the pools of each label, source, mesh and class.
-
-A label is the name of a positive class. A prediction scores how well an image
-fits a label. The image is a positive if it shows this class. Otherwise it is a
-negative.
+A `Pool` has predictions that are scored together, and computes their `Metrics`. `Pooled` has all
+pools of one evaluation: of all images, and of each label, source, mesh and class. A label is the
+name of a positive class. An image is a positive if it shows this class, and otherwise a negative.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
-from pathlib import PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +22,7 @@ from train.results.intervals import (
     leave_out_of_roc,
     weighted_means,
 )
-from train.results.predictions import Prediction
+from train.results.predictions import Predictions, as_column
 from train.results.tables import IMAGES, OBJECTS, THESE_OBJECTS, Estimate, Proportion, fraction
 
 # Names of the metrics that depend on the ranking of the images, in the order in which
@@ -140,8 +135,7 @@ class Metrics:
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the metrics to entries of summary.json. Metrics that are None are left out."""
-        entries = asdict(self)
-        return {name: entry for name, entry in entries.items() if entry is not None}
+        return {name: entry for name, entry in asdict(self).items() if entry is not None}
 
     @classmethod
     def read(cls, entries: Mapping[str, Any]) -> "Metrics":
@@ -150,60 +144,38 @@ class Metrics:
         A metric that an earlier version did not write is unknown. The number of images is not read,
         because summary.json has another entry of this name.
         """
-        kinds: dict[str, type[Estimate]] = {
-            **dict.fromkeys(FRACTION_METRICS, Proportion),
-            "auc": AreaUnderCurve,
-        }
-        found: dict[str, Any] = {}
-        for name in (*kinds, *TOP_RANKS):
-            if entries.get(name):
-                found[name] = _read_estimate(entries[name], kinds.get(name, Estimate))
+        kinds = {**dict.fromkeys(FRACTION_METRICS, Proportion), "auc": AreaUnderCurve}
         # summary.json has all rates under one name. A published network has a name for each.
         nested = entries.get("recall_at") or {}
-        of_rates = {rate: entries.get(f"recall_at/{rate}") or nested.get(rate) for rate in RATES}
-        found["recall_at"] = {
-            rate: _read_estimate(entry, Estimate) for rate, entry in of_rates.items() if entry
+        rates = {rate: entries.get(f"recall_at/{rate}") or nested.get(rate) for rate in RATES}
+        found: dict[str, Any] = {
+            name: _read_estimate(entries[name], kinds.get(name, Estimate))
+            for name in (*kinds, *TOP_RANKS)
+            if entries.get(name)
         }
-        return cls(**found)
+        recalls = {rate: _read_estimate(item, Estimate) for rate, item in rates.items() if item}
+        return cls(**found, recall_at=recalls)
 
 
 def _read_estimate(entry: Mapping[str, Any], kind: type[Estimate]) -> Estimate:
     """Read an estimate of a kind. Its value is needed; what an earlier version lacks is unknown."""
     numbers = {item.name: entry[item.name] for item in fields(kind) if item.name in entry}
-    for name in ("value", "low", "high"):
-        if entry["value"] is not None:
-            numbers[name] = float(entry[name])
+    if entry["value"] is not None:
+        numbers |= {name: float(entry[name]) for name in ("value", "low", "high")}
     return kind(**numbers)
-
-
-class RocPredictions(NamedTuple):
-    """Predictions whose log-odds give a ROC curve.
-
-    Attributes:
-        positives: Predictions for images of the positive class.
-        negatives: Predictions for other images.
-    """
-
-    positives: Sequence[Prediction]
-    negatives: Sequence[Prediction]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Predictions, and which of them are hits. A metric is the fraction of hits.
+    """Predictions, and which of them are hits. A metric is the fraction of hits."""
 
-    Attributes:
-        predictions: Predictions over which the fraction is taken.
-        hits: Whether each prediction is a hit.
-    """
-
-    predictions: Sequence[Prediction]
-    hits: Sequence[bool]
+    predictions: Predictions
+    hits: np.ndarray
 
     @cached_property
     def proportion(self) -> Proportion:
         """Fraction of hits with its 95% interval, which is Wilson's if no unit is repeated."""
-        proportion = fraction(sum(self.hits), len(self.hits))
+        proportion = fraction(int(self.hits.sum()), len(self.hits))
         if proportion.value is None:
             return proportion
         if self.jackknife.unit_count == proportion.n:
@@ -212,180 +184,155 @@ class Outcome:
         return replace(proportion, low=ends.low, high=ends.high, over=ends.over)
 
     @cached_property
-    def jackknife(self) -> "Jackknife":
+    def jackknife(self) -> Jackknife:
         """Fraction of hits without each unit."""
-        statistic = partial(weighted_means, np.array([self.hits], float))
+        statistic = partial(weighted_means, self.hits[None].astype(float))
         (jackknife,) = leave_out(statistic, choose_units(self.predictions))
         return jackknife
 
 
-def within_rank(predictions: Sequence[Prediction], max_rank: int) -> Outcome:
-    """Find the predictions whose true class is among the most probable classes."""
-    # `true_rank` is None if the network lacks the class. No prediction is then a hit, because
-    # infinity is above every rank.
-    hits = [(prediction.true_rank or np.inf) <= max_rank for prediction in predictions]
-    return Outcome(predictions, hits)
-
-
 @dataclass(frozen=True, repr=False)
 class Pool(ShortRepr):
-    """Set of predictions that are scored together.
+    """Predictions that are scored together.
 
     With several labels, a photograph has one prediction for each label. All of
     these predictions count.
 
     Attributes:
-        positives: Predictions for photographs whose class is the label.
-        negatives: Predictions for all other photographs.
-        for_roc: Predictions for the ROC curve. They may include photographs of
-            other sources or meshes than `positives` and `negatives` do.
+        predictions: The predictions.
         thresholds: Threshold on the log-odds of each label. If it is empty, the
             metrics in `AT_THRESHOLD` are None.
+        for_roc: Positives and negatives of the ROC curve, if it has photographs of other
+            sources or meshes, too. None for those of `predictions`.
     """
 
-    positives: Sequence[Prediction]
-    negatives: Sequence[Prediction]
-    for_roc: RocPredictions
+    predictions: Predictions
     thresholds: Thresholds = field(default_factory=dict)
+    for_roc: tuple[Predictions, Predictions] | None = None
+
+    @cached_property
+    def positives(self) -> Predictions:
+        """Predictions for photographs whose class is the label."""
+        return self.predictions[self.predictions.positive]
+
+    @cached_property
+    def negatives(self) -> Predictions:
+        """Predictions for all other photographs."""
+        return self.predictions[~self.predictions.positive]
 
     @property
-    def label(self) -> str:
-        """Labels of the predictions as text, such as "orange" or "orange or lemon"."""
-        predictions = [*self.positives, *self.negatives]
-        # The keys of a dictionary are unique, and keep the order of first appearance.
-        return " or ".join(dict.fromkeys(prediction.label for prediction in predictions))
+    def ranked(self) -> tuple[Predictions, Predictions]:
+        """Positives and negatives of the ROC curve."""
+        return self.for_roc or (self.positives, self.negatives)
 
     @property
     def scores(self) -> tuple[np.ndarray, np.ndarray]:
         """Log-odds for the ROC curve: of the positives, shape (n,), and of the negatives, (m,)."""
-        positives = np.array([prediction.log_odds for prediction in self.for_roc.positives])
-        negatives = np.array([prediction.log_odds for prediction in self.for_roc.negatives])
-        return positives, negatives
+        positives, negatives = self.ranked
+        return positives.log_odds, negatives.log_odds
 
     @cached_property
     def outcomes(self) -> dict[str, Outcome]:
         """Hits and misses for each metric that is a fraction of images, such as recall."""
-        false_positives = [item.predicted == item.label for item in self.negatives]
+        positives, negatives = self.positives, self.negatives
         outcomes = {
-            "recall": within_rank(self.positives, 1),
-            "top5": within_rank(self.positives, 5),
-            "false_positive_rate": Outcome(self.negatives, false_positives),
+            "recall": Outcome(positives, positives.true_rank <= 1),
+            "top5": Outcome(positives, positives.true_rank <= 5),
+            "false_positive_rate": Outcome(negatives, negatives.predicted == negatives.label),
         }
         if self.thresholds:
-            recall, false_positive_rate = AT_THRESHOLD
-            outcomes[recall] = self._above_threshold(self.positives)
-            outcomes[false_positive_rate] = self._above_threshold(self.negatives)
+            for name, group in zip(AT_THRESHOLD, (positives, negatives), strict=True):
+                limits = as_column([self.thresholds[label] for label in group.label])
+                outcomes[name] = Outcome(group, group.log_odds > limits)
         return outcomes
-
-    def _above_threshold(self, predictions: Sequence[Prediction]) -> Outcome:
-        """Find the predictions whose log-odds exceed the threshold of their label."""
-        hits = [item.log_odds > self.thresholds[item.label] for item in predictions]
-        return Outcome(predictions, hits)
 
     @cached_property
     def metrics(self) -> Metrics:
         """Metrics of the predictions with their 95% intervals."""
         proportions = {name: outcome.proportion for name, outcome in self.outcomes.items()}
-        known = {name: jackknife.estimate for name, jackknife in self._ranked.items()}
+        known = {name: jackknife.estimate for name, jackknife in self._rankings.items()}
         auc, *recalls = (known.get(name, Estimate()) for name in ROC_METRICS)
+        positives, negatives = self.ranked
         auc_with_counts = AreaUnderCurve(
             **asdict(auc),
-            positives=len(self.for_roc.positives),
-            positive_objects=_count_objects(self.for_roc.positives),
-            negatives=len(self.for_roc.negatives),
-            negative_objects=_count_objects(self.for_roc.negatives),
+            positives=len(positives),
+            positive_objects=len({*_objects(positives)}),
+            negatives=len(negatives),
+            negative_objects=len({*_objects(negatives)}),
         )
         return Metrics(
-            n=len(self.positives) + len(self.negatives),
+            n=len(self.predictions),
             auc=auc_with_counts,
             recall_at=dict(zip(RATES, recalls, strict=True)),
             **proportions,
-            class_top1=known.get("class_top1"),
-            class_top5=known.get("class_top5"),
+            **{name: known.get(name) for name in TOP_RANKS},
         )
 
     @cached_property
-    def classified(self) -> list[Prediction]:
+    def classified(self) -> Predictions:
         """One prediction for each photograph whose class is a class of the network.
 
         With several labels, a photograph has several predictions. All of them
         have the same predicted class, so the first one is taken.
         """
-        prediction_of_path: dict[PurePosixPath, Prediction] = {}
-        for prediction in (*self.positives, *self.negatives):
-            if prediction.true_rank is not None:
-                prediction_of_path.setdefault(prediction.photograph.path, prediction)
-        return list(prediction_of_path.values())
+        known = self.predictions[np.isfinite(self.predictions.true_rank)]
+        row_of_path: dict[object, int] = {}
+        for row in (*np.flatnonzero(known.positive), *np.flatnonzero(~known.positive)):
+            row_of_path.setdefault(known.photograph[row].path, row)
+        return known[[*row_of_path.values()]]
 
     @cached_property
-    def _ranked(self) -> dict[str, "Jackknife"]:
+    def _rankings(self) -> dict[str, Jackknife]:
         """Values without each unit of the known metrics that depend on a ranking."""
         jackknives: dict[str, Jackknife] = {}
-        if self.for_roc.positives and self.for_roc.negatives:
-            of_roc = leave_out_of_roc(*self.scores, choose_units(*self.for_roc))
+        if all(map(len, self.ranked)):
+            of_roc = leave_out_of_roc(*self.scores, choose_units(*self.ranked))
             jackknives.update(zip(ROC_METRICS, of_roc, strict=True))
-        if self.classified:
-            names = [prediction.photograph.label for prediction in self.classified]
-            ranks = np.array([prediction.true_rank for prediction in self.classified])
+        images = self.classified
+        if len(images):
             # One row for top-1 and one for top-5, shape (2, n).
-            hits = np.stack([ranks <= max_rank for max_rank in TOP_RANKS.values()])
-            of_classes = leave_out(partial(class_means, hits, names), choose_units(self.classified))
+            hits = np.stack([images.true_rank <= max_rank for max_rank in TOP_RANKS.values()])
+            statistic = partial(class_means, hits, images.shown.tolist())
+            of_classes = leave_out(statistic, choose_units(images))
             jackknives.update(zip(TOP_RANKS, of_classes, strict=True))
         return jackknives
 
     @cached_property
-    def jackknives(self) -> dict[str, "Jackknife"]:
+    def jackknives(self) -> dict[str, Jackknife]:
         """For each metric that is known, its values without each unit."""
-        outcomes = {name: item.jackknife for name, item in self.outcomes.items() if item.hits}
-        return {**outcomes, **self._ranked}
+        outcomes = {name: item.jackknife for name, item in self.outcomes.items() if len(item.hits)}
+        return {**outcomes, **self._rankings}
 
 
-def choose_units(*groups: Sequence[Prediction]) -> Units:
+def choose_units(*groups: Predictions) -> Units:
     """Choose objects as units if each group shows enough of them, and otherwise images.
 
     Images show the same object if they have the same mesh. An image with an
     unknown mesh counts as a different object.
     """
-    objects = [[item.photograph.mesh or item.photograph.path for item in group] for group in groups]
+    objects = [_objects(group) for group in groups]
+    images = [[item.path for item in group.photograph] for group in groups]
     if all(len({*names}) >= MIN_OBJECTS for names in objects):
-        has_mesh = any(item.photograph.mesh for group in groups for item in group)
-        return Units([_number(names) for names in objects], OBJECTS if has_mesh else IMAGES)
-    images = [[item.photograph.path for item in group] for group in groups]
+        over = IMAGES if objects == images else OBJECTS
+        return Units([_number(names) for names in objects], over)
     over = IMAGES if images == objects else THESE_OBJECTS
     return Units([_number(names) for names in images], over)
 
 
-def _number(names: Sequence[object]) -> np.ndarray:
+def _objects(predictions: Predictions) -> list[object]:
+    """Name the object that each photograph shows."""
+    return [item.mesh or item.path for item in predictions.photograph]
+
+
+def _number(names: Iterable[object]) -> np.ndarray:
     """Number names from 0 in order of first appearance, shape (n,)."""
     number_of_name: dict[object, int] = {}
     return np.array([number_of_name.setdefault(name, len(number_of_name)) for name in names])
 
 
-def _count_objects(predictions: Sequence[Prediction]) -> int:
-    """Count the different objects in the photographs of predictions."""
-    return len({item.photograph.mesh or item.photograph.path for item in predictions})
-
-
-def pool(predictions: Sequence[Prediction], thresholds: Thresholds | None = None) -> Pool:
-    """Collect predictions that are scored together, with one ROC curve of all of them.
-
-    `thresholds` are limits of the log-odds by label. None omits the metrics that need them.
-    """
-    positives = [prediction for prediction in predictions if prediction.positive]
-    negatives = [prediction for prediction in predictions if not prediction.positive]
-    return Pool(
-        positives=positives,
-        negatives=negatives,
-        for_roc=RocPredictions(positives, negatives),
-        thresholds=thresholds or {},
-    )
-
-
 @dataclass(frozen=True, repr=False)
 class Pooled(ShortRepr):
     """Predictions of one evaluation, grouped by label, source, mesh and class.
-
-    Each group is a `Pool`, whose predictions are scored together.
 
     Attributes:
         predictions: Predictions for one or several labels.
@@ -395,14 +342,15 @@ class Pooled(ShortRepr):
             metrics in `AT_THRESHOLD` are None.
     """
 
-    predictions: Sequence[Prediction]
+    predictions: Predictions
     exclude: Sequence[str] = ()
     thresholds: Thresholds = field(default_factory=dict)
 
     @cached_property
     def all(self) -> Pool:
         """Predictions that are scored together: all, except those of excluded sources."""
-        return pool(self._included, self.thresholds)
+        is_excluded = [source in self.exclude for source in self.predictions.source]
+        return Pool(self.predictions[~np.array(is_excluded, bool)], self.thresholds)
 
     def groups(self, by: str) -> dict[str, Pool]:
         """Groups by a property: "label", "source", "mesh" or "class". "all" is one group, ""."""
@@ -411,8 +359,8 @@ class Pooled(ShortRepr):
     @cached_property
     def by_label(self) -> dict[str, Pool]:
         """For each label, its predictions, which are scored together."""
-        groups = group_predictions(self._included, lambda prediction: prediction.label)
-        return {label: pool(group, self.thresholds) for label, group in groups.items()}
+        groups = group_rows(self.all.predictions, self.all.predictions.label)
+        return {label: Pool(group, self.thresholds) for label, group in groups.items()}
 
     @cached_property
     def by_source(self) -> dict[str, Pool]:
@@ -424,92 +372,62 @@ class Pooled(ShortRepr):
         positive can name other sources in its `hard_negatives`. The negatives
         of these sources are added.
         """
-        groups = group_predictions(
-            self.predictions, lambda prediction: prediction.photograph.source
-        )
+        everything = self.predictions
         pools = {}
-        for source, group in groups.items():
-            source_pool = pool(group, self.thresholds)
-            hard_negatives = self._hard_negatives(source_pool.positives, source)
-            for_roc = RocPredictions(
-                positives=source_pool.positives,
-                negatives=[*source_pool.negatives, *hard_negatives],
-            )
-            pools[source] = replace(source_pool, for_roc=for_roc)
+        for source, group in group_rows(everything, everything.source).items():
+            positives = group[group.positive]
+            wanted = {
+                (label, other)
+                for label, photograph in zip(positives.label, positives.photograph, strict=True)
+                for other in photograph.hard_negatives
+                if other != source
+            }
+            keys = zip(everything.label, everything.source, strict=True)
+            is_hard = np.array([key in wanted for key in keys]) & ~everything.positive
+            is_own = (everything.source == source) & ~everything.positive
+            rows = np.concatenate([np.flatnonzero(is_own), np.flatnonzero(is_hard)])
+            pools[source] = Pool(group, self.thresholds, (positives, everything[rows]))
         return pools
-
-    def _hard_negatives(self, positives: Sequence[Prediction], source: str) -> list[Prediction]:
-        """Find the negatives in the sources that positives name as hard negatives.
-
-        The negatives of `source` itself are left out.
-        """
-        wanted = set()
-        for prediction in positives:
-            for other_source in prediction.photograph.hard_negatives:
-                if other_source != source:
-                    wanted.add((prediction.label, other_source))
-        hard_negatives = []
-        for prediction in self.predictions:
-            label_and_source = (prediction.label, prediction.photograph.source)
-            if not prediction.positive and label_and_source in wanted:
-                hard_negatives.append(prediction)
-        return hard_negatives
 
     @cached_property
     def by_mesh(self) -> dict[str, Pool]:
         """For each known mesh, the predictions for its images, which are scored together."""
-        return self._by_content(lambda prediction: prediction.photograph.mesh)
+        return self._by_content([item.mesh for item in self.all.predictions.photograph])
 
     @cached_property
     def by_class(self) -> dict[str, Pool]:
         """For each class, the predictions for its images, which are scored together."""
-        return self._by_content(lambda prediction: prediction.photograph.label)
+        return self._by_content(self.all.predictions.shown)
 
-    def _by_content(self, name_of: Callable[[Prediction], str | None]) -> dict[str, Pool]:
+    def _by_content(self, names: Sequence[str | None]) -> dict[str, Pool]:
         """Collect the predictions for the images of each mesh, or of each class.
 
         The ROC curve of a mesh of a positive class compares the images of this
         mesh with all negatives. The ROC curve of another mesh compares all
         positives with the images of this mesh. The same holds for classes.
         """
-        labels = {prediction.label for prediction in self.predictions}
         pools = {}
-        for name, group in group_predictions(self._included, name_of).items():
-            own_pool = pool(group, self.thresholds)
+        for name, group in group_rows(self.all.predictions, names).items():
+            positives = group[group.positive]
             # Images of positive classes are left out. With the labels orange and lemon,
             # an image of an orange is also a negative for lemon, so oranges would be
             # compared with themselves.
-            negatives = [
-                prediction
-                for prediction in own_pool.negatives
-                if prediction.photograph.label not in labels
-            ]
-            for_roc = RocPredictions(
-                positives=own_pool.positives or self.all.positives,
-                negatives=negatives or self.all.negatives,
+            negatives = group[~np.isin(group.shown, self.predictions.labels)]
+            for_roc = (
+                positives if len(positives) else self.all.positives,
+                negatives if len(negatives) else self.all.negatives,
             )
-            pools[name] = replace(own_pool, for_roc=for_roc)
+            pools[name] = Pool(group, self.thresholds, for_roc)
         return pools
 
-    @cached_property
-    def _included(self) -> list[Prediction]:
-        """Predictions for images of sources that are not excluded."""
-        return [item for item in self.predictions if item.photograph.source not in self.exclude]
 
-
-def group_predictions(
-    predictions: Sequence[Prediction], name_of: Callable[[Prediction], str | None]
-) -> dict[str, list[Prediction]]:
+def group_rows(predictions: Predictions, names: Sequence[str | None]) -> dict[str, Predictions]:
     """Group predictions by a name, such as the name of their source.
 
     Predictions whose name is None are left out. The names are sorted.
     """
-    groups: dict[str, list[Prediction]] = {}
-    for prediction in predictions:
-        name = name_of(prediction)
-        if name is not None:
-            groups.setdefault(name, []).append(prediction)
-    return {name: groups[name] for name in sorted(groups)}
+    column = as_column(names)
+    return {name: predictions[column == name] for name in sorted({*names} - {None})}
 
 
 def metric_title(name: str) -> str:
@@ -519,12 +437,6 @@ def metric_title(name: str) -> str:
     # All other names have the form "recall_at/RATE".
     _, _, rate = name.partition("/")
     return f"recall at {float(rate):.0%} FPR"
-
-
-def operating_points(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Read the operating points in the content of summary.json."""
-    entry = summary.get("operating_point", [])
-    return entry if isinstance(entry, list) else [entry]
 
 
 def describe_point(point: Mapping[str, Any]) -> str:

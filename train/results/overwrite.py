@@ -10,6 +10,7 @@ from augment.attacks import adversary
 from renderer.errors import InputError
 from train import checkpoints, run_folder
 from train.data import photographs
+from train.data.photo import DESCRIPTION
 from train.results.attack_tables import FIGURE, TABLE, TRANSFERS
 from train.results.page import PAGE
 from train.results.predictions import CONTACT_SHEET, PREDICTIONS, ROC_FIGURE, ROC_TABLE, SUMMARY
@@ -29,7 +30,7 @@ RESULTS = (
     *(RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, TABLE, FIGURE),
     *OF_AUDIT,
     *(SUMMARY, PREDICTIONS, CONTACT_SHEET, ROC_TABLE, ROC_FIGURE),
-    *(photographs.DESCRIPTION, photographs.TABLE),
+    *(DESCRIPTION, photographs.TABLE),
     PUBLISHED,
     *("light.json", "background.png", "comparison.png"),
     *(CONFIG, PAGE),

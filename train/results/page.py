@@ -15,41 +15,23 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from augment.augmentation_settings import MODES
-from augment.progress import progress_message
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
-from train.laboratory.laboratory import can_be_generated
-from train.results import compare, store
+from train.data.photo import DESCRIPTION
+from train.results import compare, store, tables
 from train.results.first_screen import (
     NETWORKS,
-    Compared,
     FirstScreen,
     choose_disagreements,
     compare_networks,
     describe_place,
     is_laboratory,
 )
-from train.results.pictures import (
-    Picture,
-    Points,
-    evenly_spaced,
-    plot_curves,
-    plot_roc,
-    read_pictures,
-)
+from train.results.pictures import Picture, evenly_spaced, plot_curves, plot_roc, read_pictures
 from train.results.predictions import CONTACT_SHEET
-from train.results.run_tables import run_tables, score_table, seconds_table
 from train.results.store import Methods, RunSummary, Scored, ScoredRun
-from train.results.tables import (
-    Table,
-    as_text,
-    format_fraction,
-    format_interval,
-    fraction,
-    join_words,
-)
 from train.run_config import CONFIG, read_config
-from train.run_folder import RENDERS, attack_success
+from train.run_folder import RENDERS, attack_success, read_json
 from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, in_words, published
 from train.user_errors import user_message
 
@@ -78,7 +60,6 @@ SHEET_WIDTH = 1100
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
 
-@progress_message("report")
 def write_report(folders: Sequence[Path], out: Path) -> tuple[Path, FirstScreen | None]:
     """Write the page of the runs and attacks in folders and below them.
 
@@ -89,13 +70,7 @@ def write_report(folders: Sequence[Path], out: Path) -> tuple[Path, FirstScreen 
     methods = store.group_by_method(found.runs)
     # Methods and runs that plots and comparisons show.
     shown = {name: runs[:MAX_SEEDS] for name, runs in islice(methods.items(), MAX_METHODS)}
-    renders = {}
-    examples = {}
-    for method, runs in shown.items():
-        first = runs[0]
-        if first.epochs:
-            renders[method] = _read_renders(first, "epoch", "Renders")
-            examples[method] = _read_renders(first, "attacks", "Renders before and after")
+    first = {method: runs[0] for method, runs in shown.items() if runs[0].epochs}
     groups = compare.group_by_images(shown)
     screen = _first_screen(groups)
     path = write_page(
@@ -105,15 +80,18 @@ def write_report(folders: Sequence[Path], out: Path) -> tuple[Path, FirstScreen 
         methods=methods,
         title=_title(found, methods),
         screen=screen,
-        lead=[*_accuracy_sentences(methods), *_relit_sentences(methods)],
-        tables=[table for table in run_tables(methods, {}) if table.rows],
+        lead=[sentence for item in methods.items() for sentence in _accuracy_sentences(*item)],
+        tables=[table for table in compare.run_tables(methods, {}) if table.rows],
         captions=MODES,
         unfinished=[[str(run.folder), run.state, len(run.epochs)] for run in found.unfinished],
-        curves=_plot_metrics(_collect_epochs(shown, found.unfinished)),
-        seconds=seconds_table(shown),
+        curves=_plot_metrics(shown, found.unfinished),
+        seconds=compare.seconds_table(shown),
         photographs=[scores_section(title, group) for title, group in groups.items()],
-        renders=renders,
-        examples=examples,
+        renders={method: _read_renders(run, "epoch", "Renders") for method, run in first.items()},
+        examples={
+            method: _read_renders(run, "attacks", "Renders before and after")
+            for method, run in first.items()
+        },
         attacks=found.attacks,
         shown=[_attack_section(attack) for attack in found.attacks[:MAX_ATTACKS]],
     )
@@ -133,14 +111,11 @@ def _about(found: store.Findings, folders: Sequence[Path]) -> str:
     if found.attacks:
         counts.append(f"{len(found.attacks)} attacks")
     about = f"{', '.join(counts)}; in {', '.join(map(str, folders))}"
-
-    shown_folders = [run.folder for run in found.runs]
-    shown_folders += [attack.folder for attack in found.attacks]
-    times = []
-    for folder in shown_folders:
-        times += [file.stat().st_mtime for file in folder.iterdir() if file.name != PAGE]
-    if times:
-        about += f", {datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}"
+    shown_folders = [item.folder for item in (*found.runs, *found.attacks)]
+    files = [file for folder in shown_folders for file in folder.iterdir() if file.name != PAGE]
+    if files:
+        newest = max(file.stat().st_mtime for file in files)
+        about += f", {datetime.fromtimestamp(newest):%Y-%m-%d %H:%M}"
     return about
 
 
@@ -149,30 +124,13 @@ def _title(found: store.Findings, methods: Methods) -> str:
     if not methods:
         return "Attacks" if found.attacks else "Unfinished runs"
     # Positive classes of all runs.
-    labels: set[str] = set()
-    for runs in methods.values():
-        for scores in runs[0].photographs.values():
-            labels.update(scores.labels)
+    stored = [scores for runs in methods.values() for scores in runs[0].photographs.values()]
+    labels = {label for scores in stored for label in scores.labels}
     trained = [method for method, runs in methods.items() if runs[0].method != store.INITIAL]
     if labels and len(trained) < len(methods):
         return f"Hardened against unusual lighting: {', '.join(map(in_words, sorted(labels)))}"
     subject = " and ".join(sorted(labels)) or "Networks"
     return f"{subject}, trained with renders: {', '.join(trained)}"
-
-
-# Epochs of the runs of each method. A run is a list of its epochs. An epoch is a mapping
-# with the value of each metric by name, which is a line of metrics.jsonl.
-Epochs = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
-
-
-def _collect_epochs(methods: Methods, unfinished: Sequence[store.Unfinished]) -> Epochs:
-    """Collect the metrics of each epoch that are plotted."""
-    epochs = {method: [run.epochs for run in runs] for method, runs in methods.items()}
-    started = [run for run in unfinished if run.epochs]
-    for run in started[:MAX_UNFINISHED]:
-        name = run.folder.name[-FOLDER_NAME_LENGTH:]
-        epochs[f"unfinished: {name}"] = [run.epochs]
-    return epochs
 
 
 def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
@@ -191,11 +149,11 @@ def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["as_text"] = as_text
+    environment.filters["as_text"] = tables.as_text
     environment.filters["command"] = _shell_command
-    environment.filters["fraction"] = fraction
-    environment.filters["hits"] = format_fraction
-    environment.filters["interval"] = format_interval
+    environment.filters["fraction"] = tables.fraction
+    environment.filters["hits"] = tables.format_fraction
+    environment.filters["interval"] = tables.format_interval
     environment.filters["sha256"] = _sha256
     environment.filters["yaml"] = OmegaConf.to_yaml
     page = environment.get_template("page.html.jinja").render(body=body, script=script, **content)
@@ -237,20 +195,23 @@ def _shell_command(config: Mapping[str, Any]) -> str:
     return command
 
 
-def _plot_metrics(methods: Epochs) -> list[Picture]:
+def _plot_metrics(methods: Methods, unfinished: Sequence[store.Unfinished]) -> list[Picture]:
     """Plot accuracies by epoch, and the success of attacks on renders in training."""
+    epochs = {method: [run.epochs for run in runs] for method, runs in methods.items()}
+    for run in [run for run in unfinished if run.epochs][:MAX_UNFINISHED]:
+        epochs[f"unfinished: {run.folder.name[-FOLDER_NAME_LENGTH:]}"] = [run.epochs]
     pictures = []
     for name, title in CURVES.items():
         # Each run of a method has a line, which is a list of pairs (epoch, metric).
-        lines: dict[str, list[Points]] = {}
-        for method, runs in methods.items():
-            lines[method] = []
-            for run in runs:
-                lines[method].append([(epoch["epoch"], epoch.get(name)) for epoch in run])
+        lines = {
+            method: [[(epoch["epoch"], epoch.get(name)) for epoch in run] for run in runs]
+            for method, runs in epochs.items()
+        }
         pictures.append(plot_curves(lines, title))
-    rates = {}
-    for method, runs in methods.items():
-        rates[method] = [list(enumerate(_attack_success_by_round(run), 1)) for run in runs]
+    rates = {
+        method: [list(enumerate(_attack_success_by_round(run), 1)) for run in runs]
+        for method, runs in epochs.items()
+    }
     title = "attack success on clean-correct renders"
     pictures.append(plot_curves(rates, title, "round of renders"))
     return [picture for picture in pictures if picture is not None]
@@ -266,11 +227,9 @@ def _attack_success_by_round(epochs: Sequence[Mapping[str, float]]) -> list[floa
     """
     rates = []
     for epoch in epochs:
-        prefixes = {name.partition("/")[0] for name in epoch if name.startswith("round_")}
-        # The order of the numbers: "round_10" follows "round_9".
-        ordered = sorted(prefixes, key=lambda prefix: int(prefix.removeprefix("round_")))
-        for prefix in ordered or ["augment"]:
-            rates.append(attack_success(epoch, f"{prefix}/"))
+        numbers = {int(name[6:].partition("/")[0]) for name in epoch if name.startswith("round_")}
+        prefixes = [f"round_{number}/" for number in sorted(numbers)] or ["augment/"]
+        rates += [attack_success(epoch, prefix) for prefix in prefixes]
     return rates
 
 
@@ -288,71 +247,49 @@ def _read_renders(run: RunSummary, kind: str, title: str) -> list[Picture]:
     return pictures
 
 
-def _accuracy_sentences(methods: Methods) -> list[str]:
-    """Compare each method with the network that it began with, on the test images."""
+def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
+    """Compare a method with the network that it began with, on the test images."""
+
+    def mean(name: str) -> float | None:
+        values = [run.scores[name] for run in runs if name in run.scores]
+        return fmean(values) if values else None
+
     sentences = []
-    for method, runs in methods.items():
-        sentence = _agreement_sentence(method, runs) or _accuracy_sentence(method, runs)
-        if sentence is not None:
-            sentences.append(sentence)
-    return sentences
-
-
-def _agreement_sentence(method: str, runs: Sequence[RunSummary]) -> str | None:
-    """Say how often the predictions of a network are those of the network that it began with."""
-    agreements = [run.scores["test/agreement"] for run in runs if "test/agreement" in run.scores]
-    if not agreements:
-        return None
-    return (
-        f"{method}: on photographs that training did not use, the network predicts the "
-        f"same class as the original in {fmean(agreements):.1%} of the cases."
-    )
-
-
-def _accuracy_sentence(method: str, runs: Sequence[RunSummary]) -> str | None:
-    """Say how training changed the accuracy on the test images."""
-    initial_accuracies = [run.before.accuracy for run in runs if run.before]
-    known = [accuracy for accuracy in initial_accuracies if accuracy is not None]
-    if not known:
-        return None
-    before = fmean(known)
-    after = fmean(run.scores["test/accuracy"] for run in runs)
-    images = runs[0].config.get("test_images", "the test images")
-    title = method[0].upper() + method[1:]
-    sentence = f"{title}: accuracy went from {before:.1%} to {after:.1%} on {images}."
-    has_photographs = any(map(_is_scored_on_photographs, runs))
-    if OmegaConf.select(runs[0].config, "data.name") == "shapes" and not has_photographs:
-        sentence += (
-            " These are renders. No photographs were scored (setting photos), so the "
-            "price on photographs is unknown."
+    agreement = mean("test/agreement")
+    known = [run.before.accuracy for run in runs if run.before]
+    accuracies = [accuracy for accuracy in known if accuracy is not None]
+    if agreement is not None:
+        sentences.append(
+            f"{method}: on photographs that training did not use, the network predicts the "
+            f"same class as the original in {agreement:.1%} of the cases."
         )
-    return sentence
+    elif accuracies:
+        images = runs[0].config.get("test_images", "the test images")
+        sentence = (
+            f"{method[0].upper()}{method[1:]}: accuracy went from {fmean(accuracies):.1%} to "
+            f"{mean('test/accuracy'):.1%} on {images}."
+        )
+        is_rendered = OmegaConf.select(runs[0].config, "data.name") == "shapes"
+        if is_rendered and not any(map(_is_scored_on_photographs, runs)):
+            sentence += (
+                " These are renders. No photographs were scored (setting photos), so the "
+                "price on photographs is unknown."
+            )
+        sentences.append(sentence)
+    after = mean("test/relit_agreement_after")
+    if after is not None:
+        sentences.append(
+            f"{method}: trained on photographs in the light of a projector. In this light, "
+            f"{after:.1%} of the predictions are those for the unchanged photographs, "
+            f"and {mean('test/relit_agreement_before'):.1%} before."
+        )
+    return sentences
 
 
 def _is_scored_on_photographs(run: RunSummary) -> bool:
     """Return whether a run has scores on other images than renders of pnb-lab."""
-    for name in run.photographs:
-        folder = images_folder(run, name)
-        if folder is None or not is_laboratory(folder):
-            return True
-    return False
-
-
-def _relit_sentences(methods: Methods) -> list[str]:
-    """Say how training on photographs in the light of a projector changed predictions."""
-    sentences = []
-    for method, runs in methods.items():
-        scores = [run.scores for run in runs if "test/relit_agreement_after" in run.scores]
-        if not scores:
-            continue
-        before = fmean(item["test/relit_agreement_before"] for item in scores)
-        after = fmean(item["test/relit_agreement_after"] for item in scores)
-        sentences.append(
-            f"{method}: trained on photographs in the light of a projector. In this light, "
-            f"{after:.1%} of the predictions are those for the unchanged photographs, "
-            f"and {before:.1%} before."
-        )
-    return sentences
+    folders = [images_folder(run, name) for name in run.photographs]
+    return any(folder is None or not is_laboratory(folder) for folder in folders)
 
 
 def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
@@ -365,62 +302,54 @@ def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
     return None
 
 
-def _choose_pair(group: Scored, pairs: Sequence[tuple[str, str]]) -> tuple[str, str]:
-    """Choose which two networks the first screen compares.
-
-    It is the last pair of a method and the trained network that it began with, or else the last
-    pair.
-    """
-    hardened = []
-    for method, reference in pairs:
-        first_run = group[reference][0].run
-        if first_run.method == store.INITIAL:
-            hardened.append((method, reference))
-    return hardened[-1] if hardened else pairs[-1]
-
-
 def _compare_on(group: Scored) -> FirstScreen | None:
-    """Make the first screen, which compares two networks on the images that both were scored on."""
+    """Make the first screen, which compares two networks on the images that both were scored on.
+
+    They are the last pair of a method and the network that it began with, or else the last pair.
+    """
     evaluations = compare.read_evaluations(group)
     pairs = compare.choose_pairs(evaluations)
     if not pairs:
         return None
-    method, base = _choose_pair(group, pairs)
-    is_hardening = group[base][0].run.method == store.INITIAL
-    # All runs of a method have the same labels and images, so the first one stands for all.
-    scored = group[method][0]
-    if is_hardening:
-        names = ("before hardening", "after hardening")
-        subjects = NETWORKS
-    else:
+    hardened = [pair for pair in pairs if group[pair[1]][0].run.method == store.INITIAL]
+    method, base = (hardened or pairs)[-1]
+    names = ("before hardening", "after hardening")
+    subjects = NETWORKS
+    change = "hardening"
+    if not hardened:
         names = (base, method)
         subjects = (f"the network “{base}”", f"the network “{method}”")
+        change = f"“{method}”"
+    # All runs of a method have the same labels and images, so the first one stands for all.
+    scored = group[method][0]
     images = images_folder(scored.run, scored.name)
     labels = scored.scores.labels
     rows = {}
     if images is not None:
         before, after = (group[name][0].pooled().predictions for name in (base, method))
         rows = choose_disagreements(before, after, images, labels, subjects)
-    compared = Compared(
-        label=join_words([in_words(name) for name in labels], "or"),
-        before=evaluations[base],
-        after=evaluations[method],
-        names=names,
-        subjects=subjects,
-        change="hardening" if is_hardening else f"“{method}”",
-        place=describe_place(images, scored.name),
-        trained_objects=_classes_with_trained_objects(scored, images),
+    return compare_networks(
+        tables.join_words([in_words(name) for name in labels], "or"),
+        evaluations[base],
+        evaluations[method],
+        names,
+        describe_place(images, scored.name),
+        rows,
+        subjects,
+        change,
+        _classes_with_trained_objects(scored, images),
     )
-    return compare_networks(compared, rows)
 
 
 def _classes_with_trained_objects(scored: ScoredRun, images: Path | None) -> list[str]:
     """List the positive classes whose rendered test images show objects of the training."""
-    is_rendered_by_run = images == scored.run.folder / KEPT_ASIDE
-    if not is_rendered_by_run:
+    if images is None or images != scored.run.folder / KEPT_ASIDE:
         return []
-    labels = scored.scores.labels
-    return [in_words(label) for label in labels if not can_be_generated(label)]
+    meshes = scored.run.config.meshes
+    trained = {item.mesh if isinstance(item, Mapping) else item for item in meshes}
+    shown = read_json(images / DESCRIPTION)["meshes"]
+    labels = {item["label"] for item in shown if item["mesh"] in trained}
+    return [in_words(label) for label in scored.scores.labels if label in labels]
 
 
 def images_folder(run: RunSummary, name: str) -> Path | None:
@@ -429,8 +358,9 @@ def images_folder(run: RunSummary, name: str) -> Path | None:
     None if the configuration does not name it, or if it has been moved.
     """
     photos = OmegaConf.select(run.config, "photos")
-    folders = photos if isinstance(photos, Mapping) else {PHOTOGRAPHS: photos}
-    folder = folders.get(name)
+    folder = photos.get(name) if isinstance(photos, Mapping) else photos
+    if not isinstance(photos, Mapping) and name != PHOTOGRAPHS:
+        folder = None
     if not folder:
         # The run may have rendered the images itself.
         rendered = run.folder / KEPT_ASIDE
@@ -447,58 +377,45 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
 
     The keys are those that the macro `scores` of page.html.jinja reads.
     """
-    sheets = {}
-    for method, scored_runs in group.items():
-        path = scored_runs[0].folder / CONTACT_SHEET
-        alt = f"predictions of {method} on {title}"
-        sheets[method] = read_pictures(path, alt, SHEET_WIDTH)
-    tables = [score_table("", group)]
+    sheets = {
+        method: read_pictures(
+            scored[0].folder / CONTACT_SHEET, f"predictions of {method} on {title}", SHEET_WIDTH
+        )
+        for method, scored in group.items()
+    }
+    shown = [compare.score_table("", group)]
     rocs: list[Picture | None] = []
     problem = ""
     try:
         evaluations = compare.read_evaluations(group)
         if evaluations:
-            rocs = _plot_rocs(evaluations, title)
-            tables += _evaluation_tables(evaluations)
-            tables.append(compare.class_table(evaluations))
+            first_evaluation = next(iter(evaluations.values()))[0]
+            for subset in first_evaluation.rows():
+                rocs.append(_plot_roc(evaluations, subset, title.partition(":")[0]))
+            shown.append(compare.overall_differences(evaluations))
+            if len(first_evaluation.rows("source")) > 1:
+                shown.append(compare.group_table(evaluations))
+            shown.append(compare.class_table(evaluations))
     except InputError as error:
         problem = str(error)
     return {
         "name": title,
         "sheets": sheets,
         "rocs": rocs,
-        "tables": [table.without_unknown_columns for table in tables],
+        "tables": [table.without_unknown_columns for table in shown],
         "problem": problem,
     }
 
 
-def _plot_rocs(methods: compare.Evaluations, images: str) -> list[Picture | None]:
-    """Plot the ROC curves of all methods.
-
-    With several positive classes, a plot for each of them follows the plot of all images.
-    """
-    first_evaluation = next(iter(methods.values()))[0]
-    name = images.partition(":")[0]
-    pictures = []
-    for subset, pool in first_evaluation.rows("source").items():
-        if not subset.is_overall:
-            continue
-        scores = {}
-        for method, evaluations in methods.items():
-            scores[method] = [
-                pool_of.scores for item in evaluations if (pool_of := item.find(subset))
-            ]
-        pictures.append(plot_roc(scores, f"{pool.label}, {name}"))
-    return pictures
-
-
-def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
-    """Make tables of the metrics of methods on the same images."""
-    tables = [compare.overall_differences(methods)]
-    first_evaluation = next(iter(methods.values()))[0]
-    if len(first_evaluation.rows("source")) > 1:
-        tables.append(compare.group_table(methods))
-    return tables
+def _plot_roc(methods: compare.Evaluations, subset: compare.Subset, images: str) -> Picture | None:
+    """Plot the ROC curves of all methods on all images, or for one positive class."""
+    pools = {
+        method: [pool for item in evaluations if (pool := item.find(subset))]
+        for method, evaluations in methods.items()
+    }
+    scores = {method: [pool.scores for pool in found] for method, found in pools.items()}
+    labels = next(iter(pools.values()))[0].predictions.labels
+    return plot_roc(scores, f"{' or '.join(labels)}, {images}")
 
 
 def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:
@@ -514,10 +431,11 @@ def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:
     config: Mapping[str, Any] = {}
     with suppress(InputError):
         config = read_config(attack.folder.parent / CONFIG)
-    checks = []
-    for name, value in attack.checks.items():
-        if not isinstance(value, dict):
-            checks.append((name.replace("_", " "), value))
+    checks = [
+        (name.replace("_", " "), value)
+        for name, value in attack.checks.items()
+        if not isinstance(value, dict)
+    ]
     return {
         "folder": attack.folder,
         "rows": attack.rows,

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import UInt8
 from PIL import Image, ImageOps
-from torch import Tensor
 
 from renderer.io.files import atomic_write
 from renderer.io.images import PAPER, Tile, draw_grid, open_image
 from train.results.intervals import RATES, auc_and_recalls, roc_curve
-from train.results.predictions import ROC_FIGURE, ROC_TABLE, Prediction, by_label
+from train.results.predictions import ROC_FIGURE, ROC_TABLE, Predictions
 from train.results.tables import Estimate
 
 if TYPE_CHECKING:
@@ -117,51 +116,37 @@ def style(index: int) -> dict[str, Any]:
 
 
 def plot_curves(
-    methods: Mapping[str, Sequence[Points]],
-    title: str,
-    x_title: str = "epoch",
+    methods: Mapping[str, Sequence[Points]], title: str, x_title: str = "epoch"
 ) -> Picture | None:
     """Plot a metric over epochs or rounds, with a line for each seed of each method.
 
     None if the metric is constant in each line.
     """
-    lines_of_method: dict[str, list[list[tuple[float, float]]]] = {}
-    for method, seeds in methods.items():
-        lines_of_method[method] = []
-        for points in seeds:
-            lines_of_method[method].append([(x, y) for x, y in points if y is not None])
-    all_lines = [line for lines in lines_of_method.values() for line in lines]
-    is_constant = [len({y for _, y in line}) < 2 for line in all_lines]
-    if all(is_constant):
+    lines_of_method = {
+        method: [[(x, y) for x, y in points if y is not None] for points in seeds]
+        for method, seeds in methods.items()
+    }
+    every_line = [line for lines in lines_of_method.values() for line in lines]
+    if all(len({y for _, y in line}) < 2 for line in every_line):
         return None
-
     means = []
     for method, lines in lines_of_method.items():
         ends = [line[-1][1] for line in lines if line]
         if ends:
             means.append(f"{method} {np.mean(ends):.2f}")
-    alt = f"{title} by {x_title}, at the end: {', '.join(means)}"
-    return _plot(lambda axes: _draw_curves(axes, lines_of_method, x_title), title, alt)
 
+    def draw(axes: "Axes") -> None:
+        for index, (method, lines) in enumerate(lines_of_method.items()):
+            for line in lines:
+                if len(line) < 2:
+                    continue
+                marker = MARKERS[index % len(MARKERS)] if len(line) < MARKED else None
+                x, y = zip(*line, strict=True)
+                axes.plot(x, y, marker=marker, ms=4, label=method, **style(index))
+        axes.set(xlabel=x_title)
+        axes.locator_params(axis="x", integer=True, min_n_ticks=1)
 
-def _draw_curves(
-    axes: "Axes",
-    lines_of_method: Mapping[str, list[list[tuple[float, float]]]],
-    x_title: str,
-) -> None:
-    """Draw the lines of each method in the color of the method."""
-    for index, (method, lines) in enumerate(lines_of_method.items()):
-        name: str | None = method
-        for line in lines:
-            if len(line) < 2:
-                continue
-            marker = MARKERS[index % len(MARKERS)] if len(line) < MARKED else None
-            x, y = zip(*line, strict=True)
-            axes.plot(x, y, marker=marker, ms=4, label=name, **style(index))
-            # The other lines of the method get no label, and so no entry in the legend.
-            name = None
-    axes.set(xlabel=x_title)
-    axes.locator_params(axis="x", integer=True, min_n_ticks=1)
+    return _plot(draw, title, f"{title} by {x_title}, at the end: {', '.join(means)}")
 
 
 def plot_roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
@@ -171,25 +156,26 @@ def plot_roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | Non
     both.
     """
     # Seeds of each method that have both positive and negative images.
-    known = {}
-    for method, pairs in methods.items():
-        known[method] = [
-            (positives, negatives)
-            for positives, negatives in pairs
-            if len(positives) and len(negatives)
-        ]
+    known = {
+        method: [pair for pair in pairs if _has_both(pair)] for method, pairs in methods.items()
+    }
     if not any(known.values()):
         return None
     # A single network gets the second color, which is the color of a hardened network.
     first_color = 1 if len(methods) == 1 else 0
     styles = {method: style(index) for index, method in enumerate(methods, first_color)}
-    means = []
-    for method, pairs in known.items():
-        areas = [auc_and_recalls(*pair)[0] for pair in pairs]
-        if areas:
-            means.append(f"{method} {np.mean(areas):.3f}")
+    means = [
+        f"{method} {np.mean([auc_and_recalls(*pair)[0] for pair in pairs]):.3f}"
+        for method, pairs in known.items()
+        if pairs
+    ]
     alt = f"ROC of {label}; AUC: {', '.join(means)}"
     return _plot(lambda axes: draw_roc(axes, known, styles), f"ROC: {label}", alt)
+
+
+def _has_both(pair: Pair) -> bool:
+    """Return whether there are both positives and negatives."""
+    return all(map(len, pair))
 
 
 def plot_by_radius(
@@ -200,10 +186,11 @@ def plot_by_radius(
 ) -> Picture:
     """Plot which fraction of views is still recognized under attacks of a given radius.
 
-    Each network has two lines in turn: attacks, and random changes. The radii, ascending, stand at
-    equal distances.
+    Each network has two lines in turn: attacks with error bars, the 95% interval, and random
+    changes, dotted. The radii, ascending, stand at equal distances.
     """
-    ends = [f"{name} {_percent(values[-1])}" for name, values in lines.items()]
+    last = {name: values[-1].value for name, values in lines.items()}
+    ends = [f"{name} {'-' if end is None else f'{end:.0%}'}" for name, end in last.items()]
     alt = f"{title}: still recognized at the largest radius: {', '.join(ends)}"
 
     def draw(axes: "Axes") -> None:
@@ -211,42 +198,21 @@ def plot_by_radius(
         # A single network gets the second color, which is the color of a hardened network.
         first_color = 1 if len(lines) <= 2 else 0
         for index, (name, values) in enumerate(lines.items()):
-            is_random = index % 2 == 1
             color = COLORS[first_color + index // 2]
-            _draw_fractions(axes, positions, values, name, color, is_random)
+            numbers = [[item.value, item.low, item.high] for item in values]
+            heights, lows, highs = np.array(numbers, float).T
+            if index % 2 == 1:
+                axes.plot(positions, heights, color=color, linestyle=":", label=name)
+                continue
+            # Error bars must not be negative. Rounding errors can put an end of the interval on
+            # the wrong side of the fraction.
+            errors = np.stack([heights - lows, highs - heights]).clip(min=0)
+            bars = {"marker": "o", "ms": 4, "capsize": 3}
+            axes.errorbar(positions, heights, errors, color=color, label=name, **bars)
         axes.set(ylim=(-0.02, 1.02), xlabel=x_title, ylabel="still recognized")
         axes.set_xticks(positions, [f"{radius:g}" for radius in radii])
 
     return _plot(draw, title, alt)
-
-
-def _percent(estimate: Estimate) -> str:
-    """Write a fraction in percent without its interval, such as "81%", or "-" if it is unknown."""
-    return "-" if estimate.value is None else f"{estimate.value:.0%}"
-
-
-def _draw_fractions(
-    axes: "Axes",
-    positions: Int[np.ndarray, " radii"],
-    values: Sequence[Estimate],
-    name: str,
-    color: str,
-    is_random: bool,
-) -> None:
-    """Draw a line with the fraction of views that is still recognized at each radius.
-
-    Random changes are a dotted line. Attacks are a line with error bars, the 95% interval.
-    """
-    heights = np.array([estimate.value for estimate in values], float)
-    if is_random:
-        axes.plot(positions, heights, color=color, linestyle=":", label=name)
-        return
-    lows = np.array([estimate.low for estimate in values], float)
-    highs = np.array([estimate.high for estimate in values], float)
-    # Error bars must not be negative. Rounding errors can put an end of the interval on
-    # the wrong side of the fraction.
-    errors = np.stack([heights - lows, highs - heights]).clip(min=0)
-    axes.errorbar(positions, heights, errors, color=color, marker="o", ms=4, capsize=3, label=name)
 
 
 def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
@@ -297,7 +263,7 @@ def read_pictures(path: Path, alt: str, widest: int, caption: str = "") -> list[
     return [encode_picture(pixels, alt, caption)]
 
 
-def contact_sheet(predictions: Sequence[Prediction], images: Tensor) -> Image.Image:
+def contact_sheet(predictions: Predictions, images: UInt8[np.ndarray, "N 3 H W"]) -> Image.Image:
     """Draw a contact sheet of right and wrong predictions for each positive class.
 
     Each positive class has three sections: true positives, false negatives and
@@ -306,21 +272,22 @@ def contact_sheet(predictions: Sequence[Prediction], images: Tensor) -> Image.Im
     smoothing, so that pixels stay visible.
     """
     grids = [draw_grid([], heading=LEGEND)]
-    for label, of_label in by_label(predictions).items():
-        shown = sorted(zip(of_label, images, strict=True), key=lambda pair: -pair[0].probability)
-        positives = [pair for pair in shown if pair[0].positive]
-        negatives = [pair for pair in shown if not pair[0].positive]
-        found = [pair for pair in positives if pair[0].predicted == label]
-        missed = [pair for pair in positives if pair[0].predicted != label]
-        mistaken = [pair for pair in negatives if pair[0].predicted == label]
-        sections = {
-            "true positives": (GREEN, found, positives),
-            "false negatives": (RED, missed, positives),
-            "false positives": (YELLOW, mistaken, negatives),
-        }
-        for name, (color, pairs, all_of_kind) in sections.items():
-            heading = f"{label}: {len(pairs)} {name} of {len(all_of_kind)}"
-            grids.append(_draw_section(heading, color, pairs))
+    for label, rows in predictions.by_label.items():
+        order = np.argsort(-rows.probability, kind="stable")
+        is_positive = rows.positive[order]
+        is_found = rows.predicted[order] == label
+        for name, color, is_shown, is_of_kind in (
+            ("true positives", GREEN, is_positive & is_found, is_positive),
+            ("false negatives", RED, is_positive & ~is_found, is_positive),
+            ("false positives", YELLOW, ~is_positive & is_found, ~is_positive),
+        ):
+            heading = f"{label}: {is_shown.sum()} {name} of {is_of_kind.sum()}"
+            if is_shown.sum() > MAX_IMAGES:
+                heading += f" ({MAX_IMAGES} shown, evenly by probability)"
+            chosen = evenly_spaced(order[is_shown].tolist(), MAX_IMAGES)
+            tiles = [_tile(rows[row], images[row], color) for row in chosen]
+            lines = [tiles[first : first + COLUMNS] for first in range(0, len(tiles), COLUMNS)]
+            grids.append(draw_grid(lines, heading=heading))
     width = max(grid.width for grid in grids)
     sheet = Image.new("RGB", (width, sum(grid.height for grid in grids)), PAPER)
     top = 0
@@ -328,17 +295,6 @@ def contact_sheet(predictions: Sequence[Prediction], images: Tensor) -> Image.Im
         sheet.paste(grid, (0, top))
         top += grid.height
     return sheet
-
-
-def _draw_section(
-    heading: str, color: str, shown: Sequence[tuple[Prediction, Tensor]]
-) -> Image.Image:
-    """Draw images with frames of a color in a grid below a heading."""
-    if len(shown) > MAX_IMAGES:
-        heading += f" ({MAX_IMAGES} shown, evenly by probability)"
-    tiles = [_tile(*pair, color) for pair in evenly_spaced(shown, MAX_IMAGES)]
-    rows = [tiles[first : first + COLUMNS] for first in range(0, len(tiles), COLUMNS)]
-    return draw_grid(rows, heading=heading)
 
 
 def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
@@ -350,24 +306,20 @@ def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
     return [items[index] for index in indices.round().astype(int)]
 
 
-def _tile(prediction: Prediction, image: Tensor, color: str) -> Tile:
+def _tile(row: Predictions, image: UInt8[np.ndarray, "3 H W"], color: str) -> Tile:
     """Enlarge an image, and add a frame, its prediction and, if that is wrong, its true class."""
-    pixels = Image.fromarray(image.permute(1, 2, 0).numpy())
+    pixels = Image.fromarray(image.transpose(1, 2, 0))
     enlarged = pixels.resize((IMAGE_SIZE, IMAGE_SIZE), Image.Resampling.NEAREST)
-    lines = [f"{prediction.probability:.0%} {prediction.predicted}"]
-    if prediction.true_rank != 1:
-        label = prediction.photograph.label
-        probability = prediction.true_probability
-        lines.append(label if probability is None else f"{probability:.0%} {label}")
-    captions = tuple(_shortened(line) for line in lines)
+    lines = [f"{row.probability:.0%} {row.predicted}"]
+    if row.true_rank != 1:
+        label = row.photograph.label
+        is_known = np.isfinite(row.true_rank)
+        lines.append(f"{row.true_probability:.0%} {label}" if is_known else label)
+    captions = tuple(
+        line if len(line) <= MAX_CAPTION_LENGTH else f"{line[: MAX_CAPTION_LENGTH - 1]}…"
+        for line in lines
+    )
     return Tile(np.asarray(ImageOps.expand(enlarged, FRAME_WIDTH, color)), captions)
-
-
-def _shortened(caption: str) -> str:
-    """Cut off the end of a caption that is too long, and add "…"."""
-    if len(caption) <= MAX_CAPTION_LENGTH:
-        return caption
-    return f"{caption[: MAX_CAPTION_LENGTH - 1]}…"
 
 
 def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: str) -> None:
@@ -380,23 +332,21 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
     # This import is here because it takes half a second.
     from matplotlib.figure import Figure
 
-    # `all(map(len, pair))` is True if there are both positives and negatives.
-    known = {name: pair for name, pair in by_name.items() if all(map(len, pair))}
-    has_overall = all(map(len, overall))
+    known = {name: pair for name, pair in by_name.items() if _has_both(pair)}
+    # A source or a label can have the name "all", too.
+    title = "all images" if "all" in known else "all"
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(["source", "false_positive_rate", "recall", "threshold"])
-    if has_overall:
-        writer.writerows(_curve_rows("", overall))
-    for name, pair in known.items():
-        writer.writerows(_curve_rows(name, pair))
+    for name, pair in [("", overall), *known.items()]:
+        if _has_both(pair):
+            columns = [column.tolist() for column in roc_curve(*pair)]
+            writer.writerows([name, *point] for point in zip(*columns, strict=True))
     atomic_write(folder / ROC_TABLE, table.getvalue())
 
     figure = Figure(figsize=(7, 7), layout="constrained")
     axes = figure.subplots()
-    # A source or a label can have the name "all", too.
-    title = "all images" if "all" in known else "all"
-    curves = {title: [overall]} if has_overall else {}
+    curves = {title: [overall]} if _has_both(overall) else {}
     curves |= {name: [pair] for name, pair in known.items()}
     bold = {title: {"color": "black", "linewidth": 2.5, "zorder": 3}}
     draw_roc(axes, curves, bold)
@@ -407,15 +357,6 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
     image = io.BytesIO()
     figure.savefig(image)
     atomic_write(folder / ROC_FIGURE, image.getbuffer())
-
-
-def _curve_rows(name: str, pair: Pair) -> list[tuple[object, ...]]:
-    """Make a row of roc.csv for each point of a ROC curve.
-
-    A row has the name (empty for all images), false-positive rate, recall and threshold.
-    """
-    points = zip(*roc_curve(*pair), strict=True)
-    return [(name, *map(float, point)) for point in points]
 
 
 def draw_roc(

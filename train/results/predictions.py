@@ -1,17 +1,22 @@
-"""Predictions of a model for photographs, and the table predictions.csv.
+"""Predictions of a network for photographs as columns, and the table predictions.csv.
 
-A label is the name of a positive class. A model has one prediction for each pair
+A label is the name of a positive class. A network has one prediction for each pair
 of a photograph and a label.
 """
 
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
 
 from renderer.errors import InputError, single_line
 from renderer.io.files import atomic_write
+from renderer.short_repr import ShortRepr
 from train.data.photo import SEPARATOR, Photograph, split_sources
 from train.settings import label_names
 
@@ -27,126 +32,156 @@ TRUE_PROBABILITY = "probability_of_true"
 TRUE_RANK = "rank_of_true"
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """Prediction of a model for a photograph, and its score for one positive class.
+@dataclass(frozen=True, eq=False, repr=False)
+class Predictions(ShortRepr):
+    """Columns with a row for each pair of a photograph and a positive class.
 
-    Probabilities are in [0, 1]. The class with the highest logit has rank 1.
+    All photographs come for the first positive class, then for the next one. Probabilities are in
+    [0, 1]. The class with the highest logit has rank 1.
 
     Attributes:
-        photograph: The photograph.
-        label: Name of the positive class, which is a class of the model.
-        predicted: Name of the predicted class.
-        probability: Probability of the predicted class.
+        photograph: The photographs.
+        label: Names of the positive classes, which are classes of the network.
+        predicted: Names of the predicted classes.
+        probability: Probabilities of the predicted classes.
         true_probability: Probability of the class that the photograph shows.
-            None if the model does not have this class.
-        true_rank: Rank of the class that the photograph shows. None if the
-            model does not have this class.
-        label_probability: Probability of the positive class.
-        label_rank: Rank of the positive class.
+            NaN if the network does not have this class.
+        true_rank: Rank of the class that the photograph shows. Infinite if the
+            network does not have this class.
+        label_probability: Probabilities of the positive classes.
+        label_rank: Ranks of the positive classes.
         log_odds: Log-odds of the positive class against all other classes,
             which are the scores for ROC curves.
     """
 
-    photograph: Photograph
-    label: str
-    predicted: str
-    probability: float
-    true_probability: float | None
-    true_rank: int | None
-    label_probability: float
-    label_rank: int
-    log_odds: float
+    photograph: np.ndarray
+    label: np.ndarray
+    predicted: np.ndarray
+    probability: np.ndarray
+    true_probability: np.ndarray
+    true_rank: np.ndarray
+    label_probability: np.ndarray
+    label_rank: np.ndarray
+    log_odds: np.ndarray
+
+    @classmethod
+    def of_labels(
+        cls, columns: Sequence[Sequence[Any]], by_label: Mapping[str, Sequence[Sequence[Any]]]
+    ) -> "Predictions":
+        """Repeat the columns that do not depend on the positive class for each of them.
+
+        `columns` are `photograph`, and `predicted` to `true_rank`. `by_label` has the last three
+        columns of each positive class.
+        """
+        photograph, *others = (np.tile(as_column(column), len(by_label)) for column in columns)
+        label = as_column([*by_label]).repeat(len(columns[0]))
+        last = [np.concatenate(parts) for parts in zip(*by_label.values(), strict=True)]
+        return cls(photograph, label, *others, *last)
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    def __getitem__(self, rows: Any) -> "Predictions":
+        """Choose rows, as an index of NumPy chooses items."""
+        return Predictions(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+    @cached_property
+    def shown(self) -> np.ndarray:
+        """Names of the classes that the photographs show."""
+        return as_column([item.label for item in self.photograph])
+
+    @cached_property
+    def source(self) -> np.ndarray:
+        """Sources of the photographs. None for an unknown one."""
+        return as_column([item.source for item in self.photograph])
+
+    @cached_property
+    def positive(self) -> np.ndarray:
+        """Whether each photograph shows the positive class."""
+        return self.shown == self.label
 
     @property
-    def positive(self) -> bool:
-        """Whether the photograph shows the positive class."""
-        return self.photograph.label == self.label
+    def labels(self) -> list[str]:
+        """Names of the positive classes, each once."""
+        return [*dict.fromkeys(self.label)]
+
+    @property
+    def by_label(self) -> dict[str, "Predictions"]:
+        """The rows of each positive class."""
+        return {label: self[self.label == label] for label in self.labels}
 
 
-def by_label(predictions: Sequence[Prediction]) -> dict[str, list[Prediction]]:
-    """Group predictions by their positive class."""
-    groups: dict[str, list[Prediction]] = {}
-    for prediction in predictions:
-        groups.setdefault(prediction.label, []).append(prediction)
-    return groups
+def as_column(values: Sequence[object]) -> np.ndarray:
+    """Make an array of numbers, or else of objects."""
+    is_number = all(isinstance(value, int | float | np.number) for value in values)
+    return np.array(values, None if is_number else object)
 
 
-def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
+def write_predictions(path: Path, predictions: Predictions) -> None:
     """Write predictions to the table predictions.csv, which has a row for each photograph.
 
-    The columns path, label, source, hard_negatives, mesh, predicted,
-    probability, probability_of_true and rank_of_true do not depend on the
-    positive class. For each positive class, such as orange, there are the
-    columns orange_probability, orange_rank and orange_log_odds. The cell of a
-    value that is None is empty. `predictions` are in the order of `rank_classes`.
+    For each positive class, such as orange, there are the columns orange_probability, orange_rank
+    and orange_log_odds. The cell of a value that is unknown is empty.
     """
-    predictions_by_class = by_label(predictions).values()
-    rows = [_to_row(predictions) for predictions in zip(*predictions_by_class, strict=True)]
+    by_label = predictions.by_label
+    first = next(iter(by_label.values()))
+    photographs = first.photograph
+    ranks = first.true_rank.tolist()
+    columns: dict[str, Sequence[object]] = {
+        "path": [item.path for item in photographs],
+        "label": first.shown,
+        "source": first.source,
+        "hard_negatives": [SEPARATOR.join(item.hard_negatives) for item in photographs],
+        "mesh": [item.mesh for item in photographs],
+        "predicted": first.predicted,
+        "probability": first.probability.tolist(),
+        TRUE_PROBABILITY: ["" if np.isnan(p) else p for p in first.true_probability.tolist()],
+        TRUE_RANK: ["" if np.isinf(rank) else int(rank) for rank in ranks],
+    }
+    for label, rows in by_label.items():
+        columns[f"{label}_probability"] = rows.label_probability.tolist()
+        columns[f"{label}_rank"] = rows.label_rank.tolist()
+        columns[f"{label}_log_odds"] = rows.log_odds.tolist()
     table = io.StringIO()
-    writer = csv.DictWriter(table, fieldnames=list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
     atomic_write(path, table.getvalue())
 
 
-def _to_row(predictions: Sequence[Prediction]) -> dict[str, object]:
-    """Convert the predictions for one photograph to a row of predictions.csv."""
-    photograph = predictions[0].photograph
-    row: dict[str, object] = {
-        "path": photograph.path,
-        "label": photograph.label,
-        "source": photograph.source,
-        "hard_negatives": SEPARATOR.join(photograph.hard_negatives),
-        "mesh": photograph.mesh,
-        "predicted": predictions[0].predicted,
-        "probability": predictions[0].probability,
-        TRUE_PROBABILITY: predictions[0].true_probability,
-        TRUE_RANK: predictions[0].true_rank,
-    }
-    for prediction in predictions:
-        label = prediction.label
-        row[f"{label}_probability"] = prediction.label_probability
-        row[f"{label}_rank"] = prediction.label_rank
-        row[f"{label}_log_odds"] = prediction.log_odds
-    return row
-
-
-def read_predictions(path: Path, label: str | Sequence[str]) -> list[Prediction]:
-    """Read the table predictions.csv, which `write_predictions` wrote.
-
-    The predictions come in the order of `rank_classes`.
-    """
+def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
+    """Read the table predictions.csv, which `write_predictions` wrote."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
-        return [_from_row(row, name) for name in label_names(label) for row in rows]
+        photographs = [
+            Photograph(
+                path=PurePosixPath(row["path"]),
+                label=row["label"],
+                source=row["source"] or None,
+                hard_negatives=split_sources(row["hard_negatives"]),
+                mesh=row["mesh"] or None,
+            )
+            for row in rows
+        ]
+        columns = (
+            photographs,
+            [row["predicted"] for row in rows],
+            [float(row["probability"]) for row in rows],
+            [float(row[TRUE_PROBABILITY] or "nan") for row in rows],
+            [float(row[TRUE_RANK] or "inf") for row in rows],
+        )
+        by_label = {
+            name: (
+                [float(row[f"{name}_probability"]) for row in rows],
+                [int(row[f"{name}_rank"]) for row in rows],
+                [float(row[f"{name}_log_odds"]) for row in rows],
+            )
+            for name in label_names(label)
+        }
+        return Predictions.of_labels(columns, by_label)
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
         raise InputError(
             f"{path} is not a table of predictions for label={label} ({single_line(error)}): "
             f"score the photographs again with pnb-evaluate label={label}",
         ) from error
-
-
-def _from_row(row: Mapping[str, str], label: str) -> Prediction:
-    """Convert a row of predictions.csv to the prediction for one positive class."""
-    photograph = Photograph(
-        path=PurePosixPath(row["path"]),
-        label=row["label"],
-        source=row["source"] or None,
-        hard_negatives=split_sources(row["hard_negatives"]),
-        mesh=row["mesh"] or None,
-    )
-    true_probability = row[TRUE_PROBABILITY]
-    true_rank = row[TRUE_RANK]
-    return Prediction(
-        photograph=photograph,
-        label=label,
-        predicted=row["predicted"],
-        probability=float(row["probability"]),
-        true_probability=float(true_probability) if true_probability else None,
-        true_rank=int(true_rank) if true_rank else None,
-        label_probability=float(row[f"{label}_probability"]),
-        label_rank=int(row[f"{label}_rank"]),
-        log_odds=float(row[f"{label}_log_odds"]),
-    )

@@ -14,18 +14,18 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from augment.classifier import Label, LogitNetwork, OperatingPoint, as_class_names, log_odds
+from augment.classifier import Label, LogitNetwork, OperatingPoint, log_odds
 from augment.network import compute_outputs
-from renderer.errors import InputError, as_folder, require_choice, require_kind, require_whole
+from renderer.errors import InputError, require_choice
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
-from renderer.settings import MAX_SIZE
 from renderer.short_repr import ShortRepr
 from train.data.photo import Photograph
 from train.data.photographs import (
@@ -46,16 +46,15 @@ from train.results.metrics import (
     Pool,
     Pooled,
     describe_point,
-    group_predictions,
+    group_rows,
     metric_title,
-    within_rank,
 )
 from train.results.pictures import contact_sheet, write_roc
 from train.results.predictions import (
     CONTACT_SHEET,
     PREDICTIONS,
     SUMMARY,
-    Prediction,
+    Predictions,
     write_predictions,
 )
 from train.results.tables import (
@@ -87,9 +86,8 @@ class FolderPredictions(ShortRepr):
 
     Attributes:
         folder: Folder of the photographs.
-        predictions: Predictions of all photographs for the first positive
-            class, then for the next one, and so on. Those for one class are in
-            the order of `images`.
+        predictions: Predictions of all photographs. Those for one positive class are in the
+            order of `images`.
         images: Pixels of the photographs, uint8 sRGB, shape
             (N, 3, size, size).
         labels: Names of the positive classes.
@@ -100,22 +98,12 @@ class FolderPredictions(ShortRepr):
     """
 
     folder: Path
-    predictions: list[Prediction]
+    predictions: Predictions
     images: torch.Tensor
     labels: list[str]
     unreadable: list[str]
     left_out: list[str]
     images_hash: str
-
-    @property
-    def size(self) -> int:
-        """Pixels per side of the images that the model classified."""
-        return self.images.shape[-1]
-
-    @property
-    def photographs(self) -> list[Prediction]:
-        """One prediction for each photograph: the one for the first positive class."""
-        return self.predictions[: len(self.images)]
 
 
 @dataclass
@@ -137,27 +125,14 @@ class Predictor:
     size: int = 32
     device: str | torch.device = "cpu"
 
-    def __post_init__(self) -> None:
-        kinds = "a torch.nn.Module, or a function from images to logits"
-        require_kind("model", self.model, Callable, kinds)
-        self.classes = as_class_names("classes", self.classes)
-        require_whole("size", self.size, 1, MAX_SIZE)
-
     def predict(
-        self,
-        folder: Path,
-        label: Label,
-        skip_unreadable: bool = False,
+        self, folder: Path, label: Label, skip_unreadable: bool = False
     ) -> FolderPredictions:
         """Predict the classes of all photographs of a folder."""
-        folder = as_folder("folder", folder)
         labels = label_names(label)
         found = find_photographs(folder, self.classes, label)
         photographs, images, unreadable = load_photographs(
-            folder,
-            found,
-            self.size,
-            skip_unreadable,
+            folder, found, self.size, skip_unreadable
         )
         logits = compute_logits(self.model, images, len(self.classes), self.device)
         return FolderPredictions(
@@ -218,44 +193,32 @@ def rank_classes(
     logits: torch.Tensor,
     classes: Sequence[str],
     labels: Sequence[str],
-) -> list[Prediction]:
-    """Convert logits to predicted classes with their probabilities, ranks and log-odds.
-
-    All photographs come for the first positive class, then for the next one.
-    """
+) -> Predictions:
+    """Convert logits to predicted classes with their probabilities, ranks and log-odds."""
     logits = logits.double()
-    probabilities = logits.softmax(dim=1).tolist()
+    probabilities = logits.softmax(dim=1).numpy()
     # Classes are sorted by logits, because small probabilities may all round to 0.
     # Column k of `class_at_rank` has the index of the class with rank k + 1.
     class_at_rank = logits.argsort(dim=1, descending=True, stable=True)
     # The inverse permutation has the rank of each class, from 1, shape (N, C).
-    ranks = (class_at_rank.argsort(dim=1) + 1).tolist()
-    predicted = class_at_rank[:, 0].tolist()
-
-    predictions = []
+    ranks = class_at_rank.argsort(dim=1).numpy() + 1
+    predicted = class_at_rank[:, 0].numpy()
+    rows = np.arange(len(photographs))
+    index_of_class = {name: index for index, name in enumerate(classes)}
+    shown = np.array([index_of_class.get(item.label, -1) for item in photographs])
+    columns = (
+        photographs,
+        [classes[index] for index in predicted],
+        probabilities[rows, predicted],
+        np.where(shown < 0, np.nan, probabilities[rows, shown]),
+        np.where(shown < 0, np.inf, ranks[rows, shown]),
+    )
+    by_label = {}
     for label in labels:
-        label_index = classes.index(label)
-        label_odds = log_odds(logits, label_index).tolist()
-        for row, photograph in enumerate(photographs):
-            true_probability = None
-            true_rank = None
-            if photograph.label in classes:
-                true_index = classes.index(photograph.label)
-                true_probability = probabilities[row][true_index]
-                true_rank = ranks[row][true_index]
-            prediction = Prediction(
-                photograph=photograph,
-                label=label,
-                predicted=classes[predicted[row]],
-                probability=probabilities[row][predicted[row]],
-                true_probability=true_probability,
-                true_rank=true_rank,
-                label_probability=probabilities[row][label_index],
-                label_rank=ranks[row][label_index],
-                log_odds=label_odds[row],
-            )
-            predictions.append(prediction)
-    return predictions
+        index = index_of_class[label]
+        odds = log_odds(logits, index).numpy()
+        by_label[label] = (probabilities[:, index], ranks[:, index], odds)
+    return Predictions.of_labels(columns, by_label)
 
 
 @dataclass(frozen=True)
@@ -289,27 +252,13 @@ class Scores(ShortRepr):
         predicted: Predictions for the photographs.
         pooled: The same predictions, grouped by label, source, mesh and class.
         points: Operating point of each label. May be empty.
-        overall: Metrics of all photographs. With several labels, a photograph
-            counts once for each label.
-        by_label: Metrics of each label. Empty with a single label.
-        by_source: Metrics of the photographs of each source.
-        by_mesh: Metrics of the photographs of each mesh. None if `score` was
-            not called with by="mesh".
-        by_class: Recall and wrong predictions for the photographs of each
-            class.
-        class_metrics: Metrics of the photographs of each class. None if `score`
-            was not called with by="class".
+        by: Groups of photographs that are scored in addition: "source", "mesh" or "class".
     """
 
     predicted: FolderPredictions
     pooled: Pooled
     points: Sequence[OperatingPoint]
-    overall: Metrics
-    by_label: Mapping[str, Metrics]
-    by_source: Mapping[str, Metrics]
-    by_mesh: Mapping[str, Metrics] | None
-    by_class: Mapping[str, ClassScores]
-    class_metrics: Mapping[str, Metrics] | None = None
+    by: str
 
     def __str__(self) -> str:
         """Return the lines that pnb-evaluate prints."""
@@ -319,6 +268,38 @@ class Scores(ShortRepr):
     def label(self) -> str:
         """Positive classes in words, such as "orange" or "orange or lemon"."""
         return " or ".join(self.predicted.labels)
+
+    @property
+    def overall(self) -> Metrics:
+        """Metrics of all photographs. With several labels, one counts once for each label."""
+        return self.pooled.all.metrics
+
+    @cached_property
+    def by_label(self) -> dict[str, Metrics]:
+        """Metrics of each label. Empty with a single label."""
+        return _metrics_of(self.pooled.by_label) if len(self.predicted.labels) > 1 else {}
+
+    @cached_property
+    def by_source(self) -> dict[str, Metrics]:
+        """Metrics of the photographs of each source."""
+        return _metrics_of(self.pooled.by_source)
+
+    @cached_property
+    def by_mesh(self) -> dict[str, Metrics] | None:
+        """Metrics of the photographs of each mesh. None without by="mesh"."""
+        return _metrics_of(self.pooled.by_mesh) if self.by == "mesh" else None
+
+    @cached_property
+    def class_metrics(self) -> dict[str, Metrics] | None:
+        """Metrics of the photographs of each class. None without by="class"."""
+        return _metrics_of(self.pooled.by_class) if self.by == "class" else None
+
+    @cached_property
+    def by_class(self) -> dict[str, ClassScores]:
+        """Recall and wrong predictions for the photographs of each class."""
+        photographs = self.predicted.predictions[: len(self.predicted.images)]
+        classes = group_rows(photographs, photographs.shown)
+        return {name: _score_class(rows, self.predicted.labels) for name, rows in classes.items()}
 
     @property
     def point_entries(self) -> list[dict[str, Any]]:
@@ -333,51 +314,54 @@ class Scores(ShortRepr):
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""
         predicted = self.predicted
-        has_several_labels = len(predicted.labels) > 1
+        labels = predicted.labels
+        points = self.point_entries
+        groups = {
+            "by_label": self.by_label or None,
+            "by_source": self.by_source,
+            "by_mesh": self.by_mesh,
+        }
         summary: dict[str, Any] = {
-            "label": predicted.labels if has_several_labels else predicted.labels[0],
-            "size": predicted.size,
+            "label": labels if self.by_label else labels[0],
+            "size": predicted.images.shape[-1],
             "images": predicted.images_hash,
+            **self.overall.to_summary(),
+            "n": {
+                "photographs": len(predicted.images),
+                "positives": len(self.pooled.all.positives),
+                "negatives": len(self.pooled.all.negatives),
+                "unreadable": len(predicted.unreadable),
+                "left_out": len(predicted.left_out),
+            },
         }
-        summary |= self.overall.to_summary()
-        summary["n"] = {
-            "photographs": len(predicted.photographs),
-            "positives": len(self.pooled.all.positives),
-            "negatives": len(self.pooled.all.negatives),
-            "unreadable": len(predicted.unreadable),
-            "left_out": len(predicted.left_out),
-        }
-        if self.points:
-            entries = self.point_entries
-            summary["operating_point"] = entries if has_several_labels else entries[0]
-        if has_several_labels:
-            summary["by_label"] = {name: item.to_summary() for name, item in self.by_label.items()}
-        summary["by_source"] = {name: item.to_summary() for name, item in self.by_source.items()}
-        if self.by_mesh is not None:
-            summary["by_mesh"] = {name: item.to_summary() for name, item in self.by_mesh.items()}
+        if points:
+            summary["operating_point"] = points if self.by_label else points[0]
+        summary |= _to_entries(groups)
         summary["by_class"] = {name: asdict(scores) for name, scores in self.by_class.items()}
-        if self.class_metrics is not None:
-            summary["class_metrics"] = {
-                name: item.to_summary() for name, item in self.class_metrics.items()
-            }
-        summary["unreadable"] = predicted.unreadable
-        summary["left_out"] = predicted.left_out
-        return summary
+        summary |= _to_entries({"class_metrics": self.class_metrics})
+        return summary | {"unreadable": predicted.unreadable, "left_out": predicted.left_out}
+
+
+def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
+    """Compute the metrics of several groups of predictions."""
+    return {name: pool.metrics for name, pool in pools.items()}
+
+
+def _to_entries(groups: Mapping[str, Mapping[str, Metrics] | None]) -> dict[str, Any]:
+    """Convert groups of metrics to entries of summary.json. Those that are None are left out."""
+    return {
+        by: {name: metrics.to_summary() for name, metrics in group.items()}
+        for by, group in groups.items()
+        if group is not None
+    }
 
 
 def evaluate_photographs(
-    predictor: Predictor,
-    folder: Path,
-    label: Label,
-    out: Path,
-    skip_unreadable: bool = False,
+    predictor: Predictor, folder: Path, label: Label, out: Path, skip_unreadable: bool = False
 ) -> Scores:
     """Score a model on all photographs of a folder, and write the scores to files."""
-    folder = as_folder("folder", folder)
-    out = as_folder("out", out)
     require_outside(out, folder)
-    predicted = predictor.predict(folder, label, skip_unreadable)
-    scores = score(predicted)
+    scores = score(predictor.predict(folder, label, skip_unreadable))
     write(scores, out)
     return scores
 
@@ -395,44 +379,27 @@ def score(
     from a jackknife. `by` is "mesh", "class" or "source"; "source" adds no groups.
     """
     require_choice("by", by, GROUPS)
-    if by == "mesh" and not any(item.photograph.mesh for item in predicted.predictions):
+    if by == "mesh" and not any(item.mesh for item in predicted.predictions.photograph):
         raise InputError(
             f"by=mesh needs the meshes of the photographs, but {predicted.folder} has no "
             f"{TABLE} with a column mesh: add this table, or remove by=mesh",
         )
     thresholds_by_label = {point.label: point.threshold for point in points}
     pooled = Pooled(predicted.predictions, thresholds=thresholds_by_label)
-    has_several_labels = len(predicted.labels) > 1
-    classes = group_predictions(predicted.photographs, lambda item: item.photograph.label)
-    return Scores(
-        predicted=predicted,
-        pooled=pooled,
-        points=points,
-        overall=pooled.all.metrics,
-        by_label=_metrics_of(pooled.by_label) if has_several_labels else {},
-        by_source=_metrics_of(pooled.by_source),
-        by_mesh=_metrics_of(pooled.by_mesh) if by == "mesh" else None,
-        by_class={name: _score_class(item, predicted.labels) for name, item in classes.items()},
-        class_metrics=_metrics_of(pooled.by_class) if by == "class" else None,
-    )
+    return Scores(predicted, pooled, points, by)
 
 
-def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
-    """Compute the metrics of several groups of predictions."""
-    return {name: pool.metrics for name, pool in pools.items()}
-
-
-def _score_class(predictions: Sequence[Prediction], labels: Sequence[str]) -> ClassScores:
+def _score_class(photographs: Predictions, labels: Sequence[str]) -> ClassScores:
     """Score the photographs of one class."""
-    # `true_rank` is None for all photographs if the model lacks the class.
-    known = [item for item in predictions if item.true_rank is not None]
-    wrong_classes = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
-    is_predicted_label = [item.predicted in labels for item in predictions]
+    # The rank is infinite for all photographs if the model lacks the class.
+    known = photographs[np.isfinite(photographs.true_rank)]
+    wrong_classes = Counter(sorted(photographs.predicted[photographs.true_rank != 1]))
+    is_predicted_label = np.isin(photographs.predicted, labels)
     return ClassScores(
-        n=len(predictions),
-        recall=within_rank(known, 1).proportion,
-        top5=within_rank(known, 5).proportion,
-        predicted_label=Outcome(predictions, is_predicted_label).proportion,
+        n=len(photographs),
+        recall=Outcome(known, known.true_rank <= 1).proportion,
+        top5=Outcome(known, known.true_rank <= 5).proportion,
+        predicted_label=Outcome(photographs, is_predicted_label).proportion,
         most_common_wrong=dict(wrong_classes.most_common(WRONG_CLASSES)),
     )
 
@@ -452,7 +419,7 @@ def write(scores: Scores, out: Path) -> None:
     # Without a summary, no folder counts as scored.
     (out / SUMMARY).unlink(missing_ok=True)
     write_predictions(out / PREDICTIONS, predicted.predictions)
-    write_image(out / CONTACT_SHEET, contact_sheet(predicted.predictions, predicted.images))
+    write_image(out / CONTACT_SHEET, contact_sheet(predicted.predictions, predicted.images.numpy()))
     pooled = scores.pooled
     groups = pooled.by_label if len(predicted.labels) > 1 else pooled.by_source
     curves = {name: pool.scores for name, pool in groups.items()}
@@ -462,11 +429,7 @@ def write(scores: Scores, out: Path) -> None:
 
 
 def choose_operating_points(
-    predictor: Predictor,
-    folder: Path,
-    label: Label,
-    rate: float,
-    skip_unreadable: bool = False,
+    predictor: Predictor, folder: Path, label: Label, rate: float, skip_unreadable: bool = False
 ) -> list[OperatingPoint]:
     """Choose a threshold on the log-odds of each label for a given false-positive rate.
 
@@ -478,9 +441,8 @@ def choose_operating_points(
     predicted = predictor.predict(folder, label, skip_unreadable)
     exact_rate = Fraction(str(rate))
     points = []
-    for name in predicted.labels:
-        predictions = [item for item in predicted.predictions if item.label == name]
-        log_odds = np.array([item.log_odds for item in predictions if not item.positive])
+    for name, predictions in predicted.predictions.by_label.items():
+        log_odds = predictions.log_odds[~predictions.positive]
         count = len(log_odds)
         if count * exact_rate < 1:
             min_count = math.ceil(1 / exact_rate)
@@ -550,19 +512,12 @@ def _format_metric(metric: Estimate | None) -> str:
     return format_interval(metric)
 
 
-def _metrics_of_rows(scores: Scores) -> Iterator[tuple[str, Metrics]]:
-    """Yield title and metrics of all images, each label, and each mesh, class or source."""
-    yield "all", scores.overall
-    yield from scores.by_label.items()
-    groups = scores.by_mesh or scores.class_metrics or scores.by_source
-    yield from groups.items()
-
-
 def _metric_table(scores: Scores, names: Sequence[str]) -> Table:
-    """Make a table of some metrics for each row."""
+    """Make a table of some metrics of all images, each label, and each mesh, class or source."""
+    groups = scores.by_mesh or scores.class_metrics or scores.by_source
     rows = []
     shown: list[Estimate | None] = []
-    for title, metrics in _metrics_of_rows(scores):
+    for title, metrics in [("all", scores.overall), *scores.by_label.items(), *groups.items()]:
         estimates = [metrics.find(name) for name in names]
         shown += estimates
         rows.append([title, *map(_format_metric, estimates)])

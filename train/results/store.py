@@ -15,14 +15,8 @@ from augment.attack_settings import LINES
 from augment.augmentation_settings import MODES
 from renderer.errors import InputError, single_line
 from train import console, run_config, run_folder
-from train.results.metrics import (
-    Metrics,
-    Pooled,
-    Thresholds,
-    describe_point,
-    operating_points,
-)
-from train.results.predictions import PREDICTIONS, SUMMARY, Prediction, read_predictions
+from train.results.metrics import Metrics, Pooled, Thresholds, describe_point
+from train.results.predictions import PREDICTIONS, SUMMARY, read_predictions
 from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, PUBLISHED, read_json, read_metrics
 from train.settings import label_names, published
@@ -72,7 +66,8 @@ class StoredScores:
         A damaged mapping raises an error of any type.
         """
         labels = label_names(summary.get("label", ""))
-        points = operating_points(summary)
+        points = summary.get("operating_point", [])
+        points = points if isinstance(points, list) else [points]
         by_label = {}
         if len(labels) > 1:
             by_label = {label: Metrics.read(summary["by_label"][label]) for label in labels}
@@ -87,10 +82,9 @@ class StoredScores:
 
     def to_published(self) -> dict[str, Any]:
         """Convert the scores to a mapping for the file of a published network."""
-        label = [*self.labels] if self.by_label else self.labels[0]
         entries: dict[str, Any] = {
             "images": self.images,
-            "label": label,
+            "label": [*self.labels] if self.by_label else self.labels[0],
             **self.overall.to_summary(),
         }
         if self.thresholds:
@@ -169,9 +163,8 @@ class ScoredRun(NamedTuple):
     def pooled(self, exclude: Sequence[str] = ()) -> Pooled:
         """Read the predictions, which are scored together without those of some sources."""
         path = self.folder / PREDICTIONS
-        thresholds = tuple(self.scores.thresholds.items())
-        key = (path, path.stat().st_mtime_ns, tuple(self.scores.labels))
-        return _pool(*key, tuple(exclude), thresholds)
+        labels, thresholds = tuple(self.scores.labels), tuple(self.scores.thresholds.items())
+        return _pool(path, path.stat().st_mtime_ns, labels, tuple(exclude), thresholds)
 
 
 @lru_cache(maxsize=64)
@@ -182,14 +175,8 @@ def _pool(
     exclude: tuple[str, ...],
     thresholds: tuple[tuple[str, float], ...],
 ) -> Pooled:
-    """Read and pool predictions. Tables and pages of one command share the pools."""
-    return Pooled(_read_once(path, modified, labels), exclude, dict(thresholds))
-
-
-@lru_cache(maxsize=64)
-def _read_once(path: Path, modified: int, labels: tuple[str, ...]) -> Sequence[Prediction]:
-    """Read predictions.csv unless this process has read it at this time of modification."""
-    return read_predictions(path, labels)
+    """Read predictions.csv once at a time of modification, for all tables and pages."""
+    return Pooled(read_predictions(path, labels), exclude, dict(thresholds))
 
 
 # The runs of each method with their scores on the same images.
@@ -255,11 +242,12 @@ def _read(folder: Path) -> RunSummary | None:
         from train.checkpoints import load_selected
 
         stored = load_selected(folder)[1].get("scores", {})
-        scores = {}
-        for key, value in stored.items():
-            # Scores on photographs are mappings. The test accuracy is a number.
-            if isinstance(value, dict):
-                scores[key] = StoredScores.read(value)
+        # Scores on photographs are mappings. The test accuracy is a number.
+        scores = {
+            key: StoredScores.read(value)
+            for key, value in stored.items()
+            if isinstance(value, dict)
+        }
         return RunSummary(folder, name, settings, scores, stored.get("test/accuracy"))
     return None
 
@@ -275,10 +263,12 @@ def _read_run(folder: Path) -> RunSummary:
     before = None
     if "test/accuracy_before" in scores:
         path = folder / BEFORE
+        # The settings that determine the initial network.
+        keys = ("network", "weights", "classes", "normalization", "normalize_light", "size")
         before = RunSummary(
             folder=path,
             method=INITIAL,
-            settings=_initial_settings(config),
+            settings={key: OmegaConf.select(config, key) for key in keys},
             photographs=read_summaries(path),
             accuracy=scores["test/accuracy_before"],
         )
@@ -296,19 +286,10 @@ def _read_run(folder: Path) -> RunSummary:
     )
 
 
-def _initial_settings(config: DictConfig) -> dict[str, Any]:
-    """Return the settings of a run that determine its initial network."""
-    keys = ("weights", "classes", "normalization", "normalize_light", "size")
-    others = {key: OmegaConf.select(config, key) for key in keys}
-    return {"network": config.network, **others}
-
-
 def read_summaries(folder: Path) -> dict[str, StoredScores]:
     """Read the scores on photographs in all sub-folders of a folder."""
-    summaries = {}
-    for path in sorted(folder.glob(f"*/{SUMMARY}")):
-        summaries[path.parent.name] = StoredScores.read(read_json(path))
-    return summaries
+    paths = sorted(folder.glob(f"*/{SUMMARY}"))
+    return {path.parent.name: StoredScores.read(read_json(path)) for path in paths}
 
 
 def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
@@ -333,47 +314,31 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     The networks with whose weights runs began come first, each once. Many varied settings in a name
     become a number.
     """
+    # Two initial networks are the same if they have the same settings and the same test images.
+    initial = {}
+    for before in filter(None, (run.before for run in runs)):
+        images = [scores.images for scores in before.photographs.values()]
+        initial[repr((before.settings, images))] = before
     # The key of a group is the text of the settings without the seed.
     groups: dict[str, list[RunSummary]] = {}
-    for run in (*_initial_networks(runs), *runs):
+    for run in (*initial.values(), *runs):
         groups.setdefault(repr({**run.settings, "seed": None}), []).append(run)
     # Runs of a group differ only in their seed. The first one stands for all.
     heads = [group[0] for group in groups.values()]
     if len(heads) == 2 and heads[0].method == INITIAL and heads[1].method != "none":
         # One network, before and after it was trained with renders.
         return dict(zip((BEFORE_HARDENING, AFTER_HARDENING), groups.values(), strict=True))
-    # Settings in which the groups with the same kind of renders differ.
-    varied = {}
-    for method in {head.method for head in heads}:
-        varied[method] = varied_settings([head for head in heads if head.method == method])
     named: dict[str, list[RunSummary]] = {}
     for number, group in enumerate(groups.values(), 1):
-        name = _name_by_settings(group[0], varied[group[0].method])
-        is_short = len(heads) <= MAX_NAMED and len(name) <= LONGEST_NAME
-        if not is_short or name in named:
-            name = f"{number}: {group[0].method}"
+        head = group[0]
+        # Settings in which the groups with the same kind of renders differ.
+        varied = varied_settings([other for other in heads if other.method == head.method])
+        values = [f"{words}={head.settings.get(key)}" for key, words in varied.items()]
+        name = ", ".join([head.method, *values])
+        if len(heads) > MAX_NAMED or len(name) > LONGEST_NAME or name in named:
+            name = f"{number}: {head.method}"
         named[name] = group
     return named
-
-
-def _name_by_settings(run: RunSummary, varied: Mapping[str, str]) -> str:
-    """Name a method by the kind of renders and by some of its settings."""
-    values = [f"{words}={run.settings.get(key)}" for key, words in varied.items()]
-    return ", ".join([run.method, *values])
-
-
-def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
-    """List the networks with whose weights runs began, each network once.
-
-    Two networks are the same if they have the same settings and were scored on the same images.
-    """
-    networks = {}
-    for run in runs:
-        if run.before:
-            images = [scores.images for scores in run.before.photographs.values()]
-            identity = repr((run.before.settings, images))
-            networks[identity] = run.before
-    return [*networks.values()]
 
 
 class ExampleRow(NamedTuple):
@@ -448,32 +413,21 @@ def read_attack(folder: Path) -> AttackSummary:
 
 def _example_row(line: Mapping[str, Any]) -> ExampleRow:
     """Make the row of a table about an example."""
-    return ExampleRow(
-        number=int(line["example"]),
-        # The dictionary removes the class of a view if an earlier view has the same class.
-        label=", ".join(dict.fromkeys(map(str, line["label"]))),
-        before=_format_predictions(line["predicted_before"], line["confidence_before"]),
-        after=_format_predictions(line["predicted"], line["confidence"]),
-        outcome=_describe_outcome(line),
-    )
-
-
-def _format_predictions(names: Sequence[str], probabilities: Sequence[float]) -> str:
-    """Write the predicted class of each view with its probability."""
-    pairs = zip(names, probabilities, strict=True)
-    return ", ".join(f"{probability:.1%} {name}" for name, probability in pairs)
-
-
-def _describe_outcome(line: Mapping[str, Any]) -> str:
-    """Say whether the attack on an example succeeded, and in how many steps."""
-    if line["success_before"]:
-        return "wrong before any step"
-    success = "no success"
+    views = []
+    for end in ("_before", ""):
+        pairs = zip(line[f"predicted{end}"], line[f"confidence{end}"], strict=True)
+        views.append(", ".join(f"{probability:.1%} {name}" for name, probability in pairs))
+    outcome = "no success"
     if line["success"]:
-        success = "success"
+        outcome = "success"
     elif line["success_without_noise"]:
-        success = "success only without noise"
-    return f"{success} in {int(line['steps'])} steps"
+        outcome = "success only without noise"
+    outcome = f"{outcome} in {int(line['steps'])} steps"
+    if line["success_before"]:
+        outcome = "wrong before any step"
+    # The dictionary removes the class of a view if an earlier view has the same class.
+    label = ", ".join(dict.fromkeys(map(str, line["label"])))
+    return ExampleRow(int(line["example"]), label, *views, outcome)
 
 
 class Unfinished(NamedTuple):
@@ -523,7 +477,13 @@ def find(folders: Sequence[Path]) -> Findings:
     found = Findings()
     for path in paths.values():
         try:
-            _add(found, path)
+            if (path / LINES).is_file():
+                found.attacks.append(read_attack(path))
+            elif (path / SUMMARY).is_file() or (path / PUBLISHED).is_file() or is_finished(path):
+                found.runs.append(summarize(path))
+            else:
+                epochs = [line for line in read_metrics(path) if "epoch" in line]
+                found.unfinished.append(Unfinished(path, run_folder.state(path), epochs))
         except (InputError, OSError) as error:
             # OSError is raised if the folder belongs to another user.
             found.unfinished.append(Unfinished(path, f"cannot be read: {error}", []))
@@ -550,17 +510,6 @@ def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
         for summary in found.runs:
             runs.setdefault((summary.folder.resolve(), summary.method), summary)
     return [*runs.values()]
-
-
-def _add(found: Findings, path: Path) -> None:
-    """Read a folder, and add its run or attack to the findings."""
-    if (path / LINES).is_file():
-        found.attacks.append(read_attack(path))
-    elif (path / SUMMARY).is_file() or (path / PUBLISHED).is_file() or is_finished(path):
-        found.runs.append(summarize(path))
-    else:
-        epochs = [line for line in read_metrics(path) if "epoch" in line]
-        found.unfinished.append(Unfinished(path, run_folder.state(path), epochs))
 
 
 def _walk(folder: Path) -> Iterator[Path]:

@@ -5,9 +5,10 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pytest
+import torch
 
 import augment
-from train.auditing.remedies import (
+from train.auditing.network import (
     BOTH,
     HARDENING,
     LIGHT_ALONE,
@@ -19,7 +20,7 @@ from train.auditing.remedies import (
 from train.data.photo import Photograph
 from train.results.compare import Evaluation
 from train.results.metrics import Pooled
-from train.results.predictions import Prediction
+from train.results.scoring import rank_classes
 from train.results.store import RunSummary
 
 COUNT = 60
@@ -30,29 +31,20 @@ def evaluation(found: Sequence[int], labels: Sequence[str] = ("orange",)) -> Eva
 
     An image that is found scores above all negatives, and has the rank 1. Others score below.
     """
-    predictions = []
-    for label in labels:
-        for number in range(COUNT):
-            score = 2.0 if number in found else -2.0
-            predictions.append(prediction(label, label, number, score))
-        predictions += [prediction("other_ball", label, number, 0.0) for number in range(COUNT)]
+    numbers = {name: range(COUNT) for name in (*labels, "other_ball")}
+    photographs = [
+        Photograph(PurePosixPath(f"{name}/{number}.png"), name, None)
+        for name, group in numbers.items()
+        for number in group
+    ]
+    classes = ["other", *labels]
+    logits = torch.zeros(len(photographs), len(classes))
+    for row, photograph in enumerate(photographs):
+        if photograph.label in labels:
+            is_found = row % COUNT in found
+            logits[row, classes.index(photograph.label)] = 2 if is_found else -2
+    predictions = rank_classes(photographs, logits, classes, labels)
     return Evaluation(RunSummary(Path("run"), "network", {}, {}, None), Pooled(predictions))
-
-
-def prediction(shown: str, label: str, number: int, score: float) -> Prediction:
-    """Make the prediction about a label for an image."""
-    is_found = score > 0
-    return Prediction(
-        photograph=Photograph(PurePosixPath(f"{shown}/{number}.png"), shown, None),
-        label=label,
-        predicted=label if is_found else "other",
-        probability=0.5,
-        true_probability=None if shown != label else 0.5,
-        true_rank=None if shown != label else 2 - is_found,
-        label_probability=0.5,
-        label_rank=2 - is_found,
-        log_odds=score,
-    )
 
 
 FEW = range(10)

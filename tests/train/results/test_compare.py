@@ -1,21 +1,28 @@
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from shutil import copytree
 from statistics import NormalDist
 
 import numpy as np
 import pytest
+import torch
 
 from renderer.errors import InputError
 from tests.train.helpers import read_markdown
 from train.data.photo import Photograph
-from train.results.compare import class_table, read_evaluations
-from train.results.metrics import pool
+from train.results.compare import (
+    class_table,
+    format_comparison,
+    format_short_comparison,
+    format_table,
+    read_evaluations,
+)
+from train.results.metrics import Pool
 from train.results.page import write_report
-from train.results.predictions import Prediction, write_predictions
-from train.results.run_tables import format_comparison, format_short_comparison, format_table
+from train.results.predictions import Predictions, write_predictions
+from train.results.scoring import rank_classes
 from train.results.store import ScoredRun, summarize
 
 # Scores of oranges and scores of other things, by source.
@@ -28,33 +35,26 @@ STUDIO_AND_WEB: Scores = {
 }
 
 
-def prediction(index: int, label: str, source: str | None, score: float) -> Prediction:
-    """Make the prediction of a network that predicts orange if the score is positive."""
-    is_predicted_orange = score > 0
-    is_correct = is_predicted_orange == (label == "orange")
-    true_rank = None
-    if label == "orange":
-        true_rank = 1 if is_correct else 2
-    return Prediction(
-        photograph=Photograph(PurePosixPath(f"{label}/{index:03}.png"), label, source),
-        label="orange",
-        predicted="orange" if is_predicted_orange else "pear",
-        probability=0.5,
-        true_probability=None,
-        true_rank=true_rank,
-        label_probability=0.5,
-        label_rank=1 if is_predicted_orange else 2,
-        log_odds=score,
-    )
+# Rows of predictions: the class that is shown, the source, and the score of orange.
+Rows = list[tuple[str, str | None, float]]
 
 
-def predictions_of(scores: Scores) -> list[Prediction]:
-    predictions = []
-    for source, (oranges, others) in scores.items():
-        for label, group in (("orange", oranges), ("other_lime", others)):
-            for score in group:
-                predictions.append(prediction(len(predictions), label, source, score))
-    return predictions
+def rows_of(scores: Scores) -> Rows:
+    rows = []
+    for source, groups in scores.items():
+        for label, group in zip(("orange", "other_lime"), groups, strict=True):
+            rows += [(label, source, score) for score in group]
+    return rows
+
+
+def predictions_of(rows: Rows) -> Predictions:
+    """Make the predictions of a network that knows two fruits, by the sign of the score."""
+    photographs = [
+        Photograph(PurePosixPath(f"{label}/{index:03}.png"), label, source)
+        for index, (label, source, _) in enumerate(rows)
+    ]
+    logits = torch.tensor([[score, 0.0] for *_, score in rows], dtype=torch.float64)
+    return rank_classes(photographs, logits, ["orange", "pear"], ["orange"])
 
 
 @pytest.fixture
@@ -64,9 +64,9 @@ def scored_run(tmp_path, made_up_run, monkeypatch) -> Callable[..., Path]:
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)
 
     def make(method: str, scores: Scores, *overrides: str, name: str = "photographs") -> Path:
-        predictions = predictions_of(scores)
-        summary = pool(predictions).metrics.to_summary()
-        summary["images"] = str([item.photograph for item in predictions])
+        predictions = predictions_of(rows_of(scores))
+        summary = Pool(predictions).metrics.to_summary()
+        summary["images"] = str([*predictions.photograph])
         summary["label"] = "orange"
         run_count = len(list(tmp_path.iterdir()))
         folder = made_up_run(tmp_path / str(run_count), method, {name: summary}, *overrides)
@@ -96,13 +96,9 @@ def compared_sources(scored_run, made_up_run, tmp_path) -> dict[str, list[list[s
 
 
 def test_a_report_has_top_1_by_class_of_each_network(scored_run):
-    def with_pears(correct: int) -> list[Prediction]:
-        pears = []
-        for number in range(10):
-            score = -1 if number < correct else 1
-            made = prediction(100 + number, "pear", "web", score)
-            pears.append(replace(made, true_rank=1 if number < correct else 2))
-        return predictions_of(STUDIO_AND_WEB) + pears
+    def with_pears(correct: int) -> Predictions:
+        pears = [("pear", "web", -1 if number < correct else 1) for number in range(10)]
+        return predictions_of(rows_of(STUDIO_AND_WEB) + pears)
 
     group = {}
     for method, correct in (("none", 3), ("random", 7)):

@@ -11,14 +11,13 @@ from PIL import Image
 from train.data.photo import Photograph
 from train.results.compare import Difference, Evaluation
 from train.results.first_screen import (
-    NETWORKS,
-    Compared,
+    FirstScreen,
     choose_disagreements,
     compare_networks,
     gain_sentence,
 )
 from train.results.metrics import Pooled
-from train.results.predictions import Prediction
+from train.results.predictions import Predictions
 from train.results.scoring import rank_classes
 from train.results.store import RunSummary
 
@@ -29,14 +28,15 @@ AFTER = ("banana", "banana", "spoon", "spoon", "banana", "banana")
 LABELS = ("banana", "mug")
 
 
-def predictions_of(predicted: tuple[str, ...]) -> list[Prediction]:
-    """Make the predictions of a network for the images."""
-    predictions = []
-    for label in LABELS:
-        for number, (shown, name) in enumerate(zip(SHOWN, predicted, strict=True)):
-            photograph = Photograph(PurePosixPath(f"{number}.png"), shown, f"source {number}")
-            predictions.append(Prediction(photograph, label, name, 0.5, None, None, 0.1, 2, -1.0))
-    return predictions
+def predictions_of(predicted: tuple[str, ...], labels: tuple[str, ...] = LABELS) -> Predictions:
+    """Make the predictions of a network that predicts a class for each of the images."""
+    classes = ("banana", "mug", "spoon")
+    photographs = [
+        Photograph(PurePosixPath(f"{number}.png"), shown, f"source {number}")
+        for number, shown in enumerate(SHOWN)
+    ]
+    logits = torch.tensor([[float(name == other) for other in classes] for name in predicted])
+    return rank_classes(photographs, logits, classes, labels)
 
 
 def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predicted(tmp_path):
@@ -61,34 +61,19 @@ def test_an_end_of_an_interval_is_shown_as_0_only_if_it_is_0(low, high, expected
     assert re.findall(r"[−+]?\d[\d.]*", interval) == expected
 
 
-def evaluation(predicted: tuple[str, ...], labels: tuple[str, ...]) -> Evaluation:
-    """Make the evaluation of a network that predicts a class for each of the images."""
-    classes = ("banana", "mug", "spoon")
-    photographs = [
-        Photograph(PurePosixPath(f"{number}.png"), shown, None)
-        for number, shown in enumerate(SHOWN)
-    ]
-    logits = torch.tensor([[float(name == other) for other in classes] for name in predicted])
-    pooled = Pooled(rank_classes(photographs, logits, classes, labels))
-    return Evaluation(RunSummary(Path("run"), "", {}, {}, None), pooled)
-
-
-def compare_on(labels: tuple[str, ...]) -> Compared:
+def screen_of(labels: tuple[str, ...]) -> FirstScreen:
     """Compare both networks on the images, for some positive classes."""
-    return Compared(
-        label="banana or mug",
-        before=[evaluation(BEFORE, labels)],
-        after=[evaluation(AFTER, labels)],
-        names=("before", "after"),
-        subjects=NETWORKS,
-        place="Here",
+    run = RunSummary(Path("run"), "", {}, {}, None)
+    before, after = (
+        [Evaluation(run, Pooled(predictions_of(predicted, labels)))]
+        for predicted in (BEFORE, AFTER)
     )
+    return compare_networks("banana or mug", before, after, ("before", "after"), "Here", {})
 
 
 @pytest.mark.parametrize("labels", [LABELS, LABELS[:1]])
 def test_top_1_is_shown_if_several_classes_are_under_study(labels):
-    compared = compare_on(labels)
-    screen = compare_networks(compared, {})
+    screen = screen_of(labels)
     shown = [number for number in screen.numbers if number.title.startswith("Top-1")]
     # Both networks lack the class of the cups.
     expected = [((1 / 2 + 1 / 2) / 2, (2 / 2 + 0 / 2) / 2)] if len(labels) > 1 else []
@@ -96,8 +81,7 @@ def test_top_1_is_shown_if_several_classes_are_under_study(labels):
 
 
 def test_an_image_of_no_class_under_study_is_counted_once_for_all_classes():
-    compared = compare_on(LABELS)
-    counts = re.findall(r"\d+", compare_networks(compared, {}).images)
+    counts = re.findall(r"\d+", screen_of(LABELS).images)
     others = [shown for shown in SHOWN if shown not in LABELS]
     assert int(counts[0]) == len(SHOWN) - len(others)
     assert int(counts[2]) == len(others)

@@ -24,7 +24,7 @@ from train.results.intervals import (
     thresholds,
     weighted_means,
 )
-from train.results.metrics import pool
+from train.results.metrics import Pool
 from train.results.scoring import rank_classes
 from train.results.tables import OBJECTS, THESE_OBJECTS
 
@@ -196,7 +196,7 @@ def test_few_objects_have_an_interval_over_images(object_count, over):
         for number in range(40 if name == "orange" else 50)
     ]
     logits = torch.randn(90, 2, generator=torch.Generator().manual_seed(1))
-    scored = pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
+    scored = Pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
     metrics = scored.metrics
     assert (metrics.auc.over, metrics.recall.over) == (over, over)
     assert metrics.false_positive_rate.over == OBJECTS
@@ -253,7 +253,7 @@ def test_top_k_is_that_of_torch_for_images_of_known_classes(labels):
     ]
     logits = torch.randn(len(photographs), len(classes), generator=generator)
     logits[:, :3] += 1.5
-    metrics = pool(rank_classes(photographs, logits, classes, labels)).metrics
+    metrics = Pool(rank_classes(photographs, logits, classes, labels)).metrics
 
     for rank, metric in ((1, metrics.class_top1), (5, metrics.class_top5)):
         best = logits.topk(rank).indices
@@ -289,7 +289,7 @@ def test_the_interval_of_a_recall_is_wilsons_if_each_image_shows_another_object(
         for number in range(8)
     ]
     logits = torch.tensor([[1.0, 0.0]] * 3 + [[0.0, 1.0]] * 5)
-    scored = pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
+    scored = Pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
     metric = scored.metrics.recall
     wilson = binomtest(3, 8).proportion_ci(method="wilson")
     assert (metric.low, metric.high) == pytest.approx((wilson.low, wilson.high))

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from train.results.compare import format_comparison, format_short_comparison, format_table
 from train.results.page import report_of, write_report
-from train.results.run_tables import format_comparison, format_short_comparison, format_table
 from train.results.store import summarize
 from train.run_config import write_config
 from train.run_folder import locked

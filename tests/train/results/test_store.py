@@ -7,7 +7,7 @@ import pytest
 
 from renderer.errors import InputError
 from tests.train.helpers import read_markdown
-from train.results.run_tables import format_table
+from train.results.compare import format_table
 from train.results.store import finished_runs, summarize
 from train.results.tables import format_interval, fraction
 
@@ -103,7 +103,7 @@ def test_a_table_shows_the_settings_in_which_runs_differ(tables):
 def test_scores_of_a_run_are_read_and_compared_without_torch(tables, tmp_path):
     program = (
         "import sys; from pathlib import Path\n"
-        "from train.results.run_tables import format_comparison, format_short_comparison\n"
+        "from train.results.compare import format_comparison, format_short_comparison\n"
         "from train.results.store import finished_runs\n"
         "runs = finished_runs([Path(sys.argv[1])])\n"
         "assert len(format_short_comparison(runs)) < len(format_comparison(runs, []))\n"
