@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -101,33 +102,17 @@ class Angle(NamedTuple):
         )
 
 
-def rotate_about_x(vectors: Components, angle: Angle) -> Components:
-    """Rotate vectors about the x-axis, from y toward z."""
-    x, y, z = vectors
-    rotated_y, rotated_z = _rotate_in_plane(y, z, angle)
-    return x, rotated_y, rotated_z
+def _rotate(axis: int, vectors: Components, angle: Angle) -> Components:
+    """Rotate vectors about an axis, from the next axis toward the one after it."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    rotated = list(vectors)
+    rotated[first] = vectors[first] * angle.cosine - vectors[second] * angle.sine
+    rotated[second] = vectors[first] * angle.sine + vectors[second] * angle.cosine
+    return rotated[0], rotated[1], rotated[2]
 
 
-def rotate_about_y(vectors: Components, angle: Angle) -> Components:
-    """Rotate vectors about the y-axis, from z toward x."""
-    x, y, z = vectors
-    rotated_z, rotated_x = _rotate_in_plane(z, x, angle)
-    return rotated_x, y, rotated_z
-
-
-def rotate_about_z(vectors: Components, angle: Angle) -> Components:
-    """Rotate vectors about the z-axis, from x toward y."""
-    x, y, z = vectors
-    rotated_x, rotated_y = _rotate_in_plane(x, y, angle)
-    return rotated_x, rotated_y, z
-
-
-def _rotate_in_plane(first: Tensor, second: Tensor, angle: Angle) -> tuple[Tensor, Tensor]:
-    """Rotate vectors in the plane of two axes, from the first axis toward the second."""
-    rotated_first = first * angle.cosine - second * angle.sine
-    rotated_second = first * angle.sine + second * angle.cosine
-    return rotated_first, rotated_second
-
+# Functions of vectors and an angle. For example, the first one rotates from y toward z.
+rotate_about_x, rotate_about_y, rotate_about_z = (partial(_rotate, axis) for axis in range(3))
 
 # Largest number of Newton steps in `_nearest_in_box_and_sphere`. Four are usual. With
 # too few steps, the result would lie inside of the ball instead of on its surface.

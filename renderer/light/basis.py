@@ -7,7 +7,7 @@ basis.
 
 Environment light has the basis `Harmonics`. Local light comes from sources within
 the scene, such as lamps. Each kind of local light is a subclass of `LocalBasis` in
-a module of its own, such as light/lamps.py. CONTRIBUTING.md describes how to add a
+light/lamps.py or in a module of its own. CONTRIBUTING.md describes how to add a
 kind.
 
 In shapes, `size` is the number of functions of a basis.
@@ -24,14 +24,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from renderer.errors import InputError, require_finite, require_whole
-from renderer.light.harmonics import (
-    basis,
-    degree_of,
-    evaluate_harmonics,
-    lambertian_factors,
-    nonzero_coefficients,
-)
+from renderer.errors import InputError, require_whole
+from renderer.light import harmonics
 from renderer.settings import MAX_DEGREE
 from renderer.vectors import Ball, nearest_in_box, unit
 
@@ -52,10 +46,7 @@ class EnvironmentPart(NamedTuple):
 class LocalPart(NamedTuple):
     """Local light, such as lamps or a projector, as one of the lights of a basis.
 
-    Attributes:
-        rows: Slice that selects the coefficients of the local light from the
-            coefficients of all lights, shape (size, 3).
-        basis: Basis of the local light.
+    Its attributes are like those of `EnvironmentPart`.
     """
 
     rows: slice
@@ -165,16 +156,15 @@ class Harmonics(Basis):
 
         All other harmonics have no effect on a diffuse surface without shadows.
         """
-        return nonzero_coefficients(self.degree)
+        return harmonics.nonzero_coefficients(self.degree)
 
     def irradiance(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N K"]:
         """Compute the irradiance of N surfaces from each harmonic that changes it.
 
         Column k is for a coefficient of 1 of the harmonic `nonzero[k]`.
         """
-        require_finite(normals=normals)
-        factors = lambertian_factors(self.degree)[self.nonzero].to(normals)
-        values = evaluate_harmonics(unit(normals.double().T), self.nonzero.tolist())
+        factors = harmonics.lambertian_factors(self.degree)[self.nonzero].to(normals)
+        values = harmonics.evaluate_harmonics(unit(normals.double().T), self.nonzero.tolist())
         # One row for each of K harmonics. Transposing at the end is faster than filling
         # columns.
         irradiance = torch.stack(values).to(normals.dtype) * factors[:, None]
@@ -182,7 +172,7 @@ class Harmonics(Basis):
 
     def radiance(self, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N size"]:
         """Compute the radiance of each harmonic from N directions."""
-        return basis(directions, self.degree)
+        return harmonics.basis(directions, self.degree)
 
     def project_nonnegative(
         self, coefficients: Float[Tensor, "... size 3"]
@@ -442,7 +432,9 @@ class SplitLight(NamedTuple):
     @property
     def basis(self) -> SumBasis:
         """Basis of all lights, with the environment light first."""
-        environment = [] if self.environment is None else [Harmonics(degree_of(self.environment))]
+        environment = (
+            [] if self.environment is None else [Harmonics(harmonics.degree_of(self.environment))]
+        )
         return SumBasis((*environment, *(basis for basis, _ in self.local_lights)))
 
 
@@ -462,9 +454,9 @@ def with_local_lights(
 
     The environment light comes first.
     """
-    harmonics = Harmonics(degree_of(sky))
+    environment = Harmonics(harmonics.degree_of(sky))
     if not lights:
-        return harmonics, sky
+        return environment, sky
     bases = [basis for basis, _ in lights]
     coefficients = [values.to(sky) for _, values in lights]
-    return SumBasis((harmonics, *bases)), torch.cat([sky, *coefficients])
+    return SumBasis((environment, *bases)), torch.cat([sky, *coefficients])

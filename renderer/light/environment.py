@@ -302,19 +302,13 @@ def _color_channels(names: Sequence[str]) -> list[int]:
 
     Names are "CHANNEL" or "LAYER.CHANNEL". A gray image has three equal indices.
     """
-    layers = []
-    channels = []
-    for name in names:
-        layer, _, channel = name.casefold().rpartition(".")
-        layers.append(layer)
-        channels.append(channel)
-    layers_and_channels = list(zip(layers, channels, strict=True))
+    keys = [name.casefold().rpartition(".")[::2] for name in names]
     # OpenImageIO lists the layer without a name first. The loop therefore prefers it.
-    for layer in layers:
+    for layer, _ in keys:
         for color_names in _COLOR_NAMES:
-            red_green_blue = [(layer, color_name) for color_name in color_names]
-            if set(red_green_blue) <= set(layers_and_channels):
-                return [layers_and_channels.index(channel) for channel in red_green_blue]
+            channels = [(layer, color_name) for color_name in color_names]
+            if set(channels) <= set(keys):
+                return [keys.index(channel) for channel in channels]
     gray_channels = [
         index
         for index, name in enumerate(names)

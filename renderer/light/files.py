@@ -19,43 +19,17 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from renderer.errors import (
-    MAX_SCALE,
-    InputError,
-    as_path,
-    as_tensor,
-    require_bounded,
-    require_file,
-    require_kind,
-    require_whole,
-)
+from renderer import errors
+from renderer.errors import InputError
 from renderer.image import LUMINANCE, to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
+from renderer.light import harmonics
 from renderer.light.basis import COEFFICIENTS, DEGREE, HARMONICS, Harmonics, LocalBasis
 from renderer.light.environment import SUFFIXES, read_panorama, to_map, write_map
-from renderer.light.harmonics import (
-    basis,
-    degree_of,
-    irradiance_error,
-    nonzero_coefficients,
-    project,
-    require_degree,
-    rotate,
-)
 from renderer.light.ringing import window_without_ringing
 from renderer.mesh import Y_UP_TO_Z_UP
 
-# Exceptions that are raised if a .json file is damaged, or does not describe a light.
-_DAMAGED_FILE_ERRORS = (
-    KeyError,
-    ValueError,
-    TypeError,
-    RuntimeError,
-    OverflowError,
-    RecursionError,
-    OSError,
-)
 # Largest number of rows of a written map, which needs 3 GB of memory.
 MAX_MAP_HEIGHT = 8192
 # Type of the basis that `read_light` returns.
@@ -102,7 +76,7 @@ def save_light(
         >>> nb.save_light("light.hdr", light) < 0.01
         True
     """
-    path = as_path("path", path)
+    path = errors.as_path("path", path)
     is_map = path.suffix.lower() in SUFFIXES and isinstance(basis, Harmonics)
     if path.suffix != ".json" and not is_map:
         raise InputError(
@@ -110,9 +84,9 @@ def save_light(
             f"use one of the suffixes .json, {', '.join(SUFFIXES)}"
         )
     expected = "Harmonics(degree), or lamps or a projector"
-    require_kind("basis", basis, Harmonics | LocalBasis, expected)
-    coefficients = as_tensor("coefficients", coefficients)
-    require_bounded(coefficients=coefficients)
+    errors.require_kind("basis", basis, Harmonics | LocalBasis, expected)
+    coefficients = errors.as_tensor("coefficients", coefficients)
+    errors.require_bounded(coefficients=coefficients)
     if coefficients.shape != (basis.size, 3):
         shape = tuple(coefficients.shape)
         raise InputError(
@@ -120,10 +94,10 @@ def save_light(
             "give coefficients of this shape"
         )
     if isinstance(basis, Harmonics) and is_map:
-        require_whole("height", height, 1, MAX_MAP_HEIGHT)
+        errors.require_whole("height", height, 1, MAX_MAP_HEIGHT)
         physical = basis.project_nonnegative(coefficients)
         write_map(path, to_map(physical, height).clamp(min=0))
-        return float(irradiance_error(physical, coefficients))
+        return float(harmonics.irradiance_error(physical, coefficients))
     description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
     picture = basis.picture(coefficients)
     try:
@@ -143,7 +117,7 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
     as `Lamps`.
     """
     path = Path(path)
-    require_file(path, "give the path of a .json file of coefficients")
+    errors.require_file(path, "give the path of a .json file of coefficients")
     kind_of_name = {kind.name: kind for kind in kinds}
     try:
         description = json.loads(path.read_text(encoding="utf-8-sig"))
@@ -157,17 +131,17 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
         basis = kind_of_name[name](**description)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except _DAMAGED_FILE_ERRORS as error:
+    except Exception as error:  # A damaged file raises many kinds of errors.
         raise InputError(
             f"{path} does not describe a light ({error}): write the file again"
         ) from error
     # The comparison is False for NaN, so NaN counts as too large.
-    is_bounded = bool((coefficients.abs() <= MAX_SCALE).all())
+    is_bounded = bool((coefficients.abs() <= errors.MAX_SCALE).all())
     if coefficients.shape != (basis.size, 3) or not is_bounded:
         shape = tuple(coefficients.shape)
         raise InputError(
-            f"{path} has coefficients of shape {shape}, or values that are not finite: "
-            f"give {basis.size} rows [r, g, b] of numbers with magnitudes up to {MAX_SCALE:g}"
+            f"{path} has coefficients of shape {shape}, or values that are not finite: give "
+            f"{basis.size} rows [r, g, b] of numbers with magnitudes up to {errors.MAX_SCALE:g}"
         )
     return basis, coefficients
 
@@ -176,41 +150,7 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
 # L11, L2-2, L2-1, L20, L21, L22, in the axes of the probes, whose y is up.
 # Source: Ramamoorthi and Hanrahan 2001, "An Efficient Representation for
 # Irradiance Environment Maps", figure 2.
-_PUBLISHED_PROBES = {
-    "grace": [
-        (0.79, 0.44, 0.54),
-        (0.39, 0.35, 0.60),
-        (-0.34, -0.18, -0.27),
-        (-0.29, -0.06, 0.01),
-        (-0.11, -0.05, -0.12),
-        (-0.26, -0.22, -0.47),
-        (-0.16, -0.09, -0.15),
-        (0.56, 0.21, 0.14),
-        (0.21, -0.05, -0.30),
-    ],
-    "eucalyptus": [
-        (0.38, 0.43, 0.45),
-        (0.29, 0.36, 0.41),
-        (0.04, 0.03, 0.01),
-        (-0.10, -0.10, -0.09),
-        (-0.06, -0.06, -0.04),
-        (0.01, -0.01, -0.05),
-        (-0.09, -0.13, -0.15),
-        (-0.06, -0.05, -0.04),
-        (0.02, 0.00, -0.05),
-    ],
-    "st_peters": [
-        (0.36, 0.26, 0.23),
-        (0.18, 0.14, 0.13),
-        (-0.02, -0.01, 0.00),
-        (0.03, 0.02, 0.01),
-        (0.02, 0.01, 0.00),
-        (-0.05, -0.03, -0.01),
-        (-0.09, -0.08, -0.07),
-        (0.01, 0.00, 0.00),
-        (-0.08, -0.03, 0.00),
-    ],
-}
+_PUBLISHED_PROBES = json.loads(Path(__file__).with_name("probes.json").read_text())
 # Names of the light probes.
 PROBES = tuple(_PUBLISHED_PROBES)
 # Name with which `load_light` creates light with the same radiance from all directions.
@@ -256,10 +196,10 @@ def load_light(
         >>> bool((uniform[1:] == 0).all())
         True
     """
-    as_path("light", light)
+    errors.as_path("light", light)
     light = str(light)
     if degree is not None:
-        require_degree(degree)
+        harmonics.require_degree(degree)
     suffix = Path(light).suffix.lower()
     if light in _PUBLISHED_PROBES:
         coefficients = probe(light)
@@ -292,7 +232,7 @@ def probe(name: str) -> Float[Tensor, "49 3"]:
     """
     published = torch.tensor(_PUBLISHED_PROBES[name], dtype=torch.float64)
     coefficients = torch.zeros(COEFFICIENTS, 3)
-    z_up = rotate(published, torch.from_numpy(Y_UP_TO_Z_UP[:3, :3])).float()
+    z_up = harmonics.rotate(published, torch.from_numpy(Y_UP_TO_Z_UP[:3, :3])).float()
     coefficients[: len(published)] = z_up
     return coefficients
 
@@ -302,7 +242,6 @@ def ambient(color: Float[Tensor, " 3"]) -> Float[Tensor, "49 3"]:
 
     The irradiance of a surface in this light is π times the radiance.
     """
-    require_bounded(color=color)
     coefficients = torch.zeros(COEFFICIENTS, 3, dtype=color.dtype)
     coefficients[0] = math.sqrt(4 * math.pi) * color
     return coefficients
@@ -317,8 +256,7 @@ def directional(
     of a surface that faces the light. Directions lead toward the light, and `color` is the
     linear irradiance of a surface that faces it.
     """
-    require_bounded(color=color)
-    return basis(direction, degree)[..., None] * color
+    return harmonics.basis(direction, degree)[..., None] * color
 
 
 def perturb(
@@ -335,10 +273,9 @@ def perturb(
     norm to which a change is scaled, only coefficients that change the irradiance of a
     diffuse surface are changed. None changes all and does not scale.
     """
-    require_bounded(light=light)
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
     if radius is not None:
-        diffuse_indices = nonzero_coefficients(degree_of(light))
+        diffuse_indices = harmonics.nonzero_coefficients(harmonics.degree_of(light))
         # 1 for coefficients that change the irradiance of a surface, 0 for the others.
         mask = torch.zeros(len(light), 1).index_fill_(0, diffuse_indices, 1.0)
         offsets = offsets * mask
@@ -361,7 +298,7 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
 
     `roughness` is that of the smoothest surface, whose highlights must not get dark rings, or None.
     """
-    coefficients = project(read_panorama(path), degree)
+    coefficients = harmonics.project(read_panorama(path), degree)
     if roughness is not None:
         coefficients = coefficients * window_without_ringing(coefficients, roughness)[:, None]
     luminance = mean_luminance(coefficients)

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from functools import cache, wraps
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -57,16 +57,6 @@ def cache_tensors(function: Callable[..., Constant]) -> Callable[..., Constant]:
     created in inference mode could not be used in training later.
     """
     return cache(torch.inference_mode(False)(function))
-
-
-def _copy_result(function: Callable[[int], Tensor]) -> Callable[[int], Tensor]:
-    """Decorate a function with a cache, so that changes of a result do not reach the cache."""
-
-    @wraps(function)
-    def copied(degree: int) -> Tensor:
-        return function(degree).clone()
-
-    return copied
 
 
 def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
@@ -335,8 +325,6 @@ def monomials(vectors: Float[Tensor, "3 N"], degree: int) -> Float[Tensor, "mono
     return values
 
 
-@_copy_result
-@cache_tensors
 def bands(degree: int) -> Int[Tensor, " coefficients"]:
     """Return the band l of each SH coefficient up to a degree: 0, 1, 1, 1, 2, ...
 
@@ -350,8 +338,6 @@ def bands(degree: int) -> Int[Tensor, " coefficients"]:
     return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
 
 
-@_copy_result
-@cache_tensors
 def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
     """Compute the factor A_l of each SH coefficient of a light in the irradiance.
 
@@ -375,8 +361,6 @@ def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
     return torch.tensor(factors, dtype=torch.float64)[bands(degree)]
 
 
-@_copy_result
-@cache_tensors
 def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
     """Return the indices of the SH coefficients that change the irradiance of a diffuse surface.
 
@@ -412,23 +396,15 @@ def irradiance_error(
     """
     size = max(lights.shape[-2], given.shape[-2])
     factors = lambertian_factors(math.isqrt(size) - 1)[:, None].to(given.device)
-    approximate = _pad_bands(lights.double(), size) * factors
-    exact = _pad_bands(given.double(), size) * factors
+    approximate, exact = (
+        F.pad(light.double(), (0, 0, 0, size - light.shape[-2])) * factors
+        for light in (lights, given)
+    )
     # Harmonics are orthonormal, so the norm of the coefficients is proportional to the
     # root mean square of the irradiance over all normals.
-    error = _norm_over_coefficients(approximate - exact)
-    norm = _norm_over_coefficients(exact)
+    error = (approximate - exact).square().sum((-2, -1)).sqrt()
+    norm = exact.square().sum((-2, -1)).sqrt()
     return torch.where(error > 0, error / norm, error)
-
-
-def _pad_bands(coefficients: Float[Tensor, "... K C"], size: int) -> Float[Tensor, "... size C"]:
-    """Append zeros to the SH coefficients of lights, up to `size` coefficients."""
-    return F.pad(coefficients, (0, 0, 0, size - coefficients.shape[-2]))
-
-
-def _norm_over_coefficients(coefficients: Float[Tensor, "... K C"]) -> Float[Tensor, " ..."]:
-    """Compute the L2 norm of each light over its K SH coefficients and C color channels."""
-    return coefficients.square().sum((-2, -1)).sqrt()
 
 
 def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N"]]:
@@ -521,27 +497,21 @@ def project(
     """
     require_degree(degree)
     if not callable(radiance):
-        return _project_map(as_tensor("radiance", radiance), degree)
+        radiance = as_tensor("radiance", radiance)
+        if radiance.ndim != 3:
+            shape = tuple(radiance.shape)
+            raise InputError(f"radiance has shape {shape}: give a map (height, width, channels)")
+        require_finite(radiance=radiance)
+        # A map may have 10⁸ texels, so the midpoint rule sums row by row to save memory.
+        rows = zip(*equirectangular(*radiance.shape[:2]), radiance, strict=True)
+        return sum(
+            basis(directions, degree).T @ (weights[:, None] * texels.to(directions))
+            for directions, weights, texels in rows
+        )
     directions, weights = quadrature(quadrature_degree)
     values = as_tensor("radiance", radiance(directions)).to(torch.float64)
     require_finite(radiance=values)
     return basis(directions, degree).T @ (weights[:, None] * values)
-
-
-def _project_map(radiance: Float[Tensor, " ..."], degree: int) -> Tensor:
-    """Compute the SH coefficients of an environment map with the midpoint rule, in float64."""
-    if radiance.ndim != 3:
-        shape = tuple(radiance.shape)
-        raise InputError(f"radiance has shape {shape}: give a map (height, width, channels)")
-    require_finite(radiance=radiance)
-    directions, solid_angles = equirectangular(*radiance.shape[:2])
-    # A map may have 10⁸ texels, so the harmonics are evaluated row by row to save
-    # memory.
-    rows = zip(directions, solid_angles, radiance, strict=True)
-    return sum(
-        basis(row_directions, degree).T @ (weights[:, None] * texels.to(row_directions))
-        for row_directions, weights, texels in rows
-    )
 
 
 def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
@@ -573,7 +543,10 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
             f"coefficients has shape {shape}: give SH coefficients of shape "
             "((degree + 1)², channels)"
         )
-    if not _is_orthonormal(rotation):
+    identity = torch.eye(3).to(rotation)
+    if rotation.shape != (3, 3) or not torch.allclose(
+        rotation @ rotation.mT, identity, rtol=0, atol=ORTHONORMALITY_TOLERANCE
+    ):
         raise InputError("rotation is not orthonormal: give an orthonormal matrix of shape (3, 3)")
 
     def rotated_radiance(directions: Tensor) -> Tensor:
@@ -583,11 +556,3 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
         return basis(turned_back, degree) @ coefficients.to(directions)
 
     return project(rotated_radiance, degree, quadrature_degree=2 * degree).to(coefficients)
-
-
-def _is_orthonormal(matrix: Tensor) -> bool:
-    """Tell whether a matrix R has the shape (3, 3) and R Rᵀ is the identity, up to rounding."""
-    if matrix.shape != (3, 3):
-        return False
-    identity = torch.eye(3).to(matrix)
-    return torch.allclose(matrix @ matrix.mT, identity, rtol=0, atol=ORTHONORMALITY_TOLERANCE)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, Self
@@ -89,17 +89,7 @@ class Projector(LocalBasis):
             InputError: If a setting is out of range, or if the image cannot be
                 read.
         """
-        require_range("polar", settings.polar, 0, 180)
-        require_range("azimuth", settings.azimuth, -360, 360)
-        require_range("fov", settings.fov, 0.1, 170)
-        light = cls(
-            pixels=settings.pixels,
-            polar=settings.polar,
-            azimuth=settings.azimuth,
-            distance=settings.distance,
-            fov=settings.fov,
-            power=settings.power,
-        )
+        light = cls(**{field.name: getattr(settings, field.name) for field in fields(cls)})
         pattern = gray_or_image("pattern", settings.pattern, light.pixels).expand(3, -1, -1)
         return light, light.power * pattern.flatten(1).T
 
@@ -258,17 +248,14 @@ class Lamps(LocalBasis):
         if isinstance(settings.start, str | Path):
             lamps, powers = read_light(settings.start, cls)
             return lamps, lamps.project_nonnegative(powers)
+        lamps = cls(settings.positions, settings.power, settings.radius)
         try:
-            positions = tuple((float(x), float(y), float(z)) for x, y, z in settings.positions)
-            start = as_tensor("start", settings.start).float().expand(len(positions), 3)
-        except InputError:
-            raise
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            start = as_tensor("start", settings.start).float().expand(lamps.size, 3)
+        except RuntimeError as error:
             raise InputError(
-                f"positions or start of lamps cannot be read ({error}): give positions [x, y, z], "
-                "and as start a number or a list with [r, g, b] for each lamp"
+                f"start={settings.start} does not fit {lamps}: give a number or a list with "
+                "[r, g, b] for each lamp"
             ) from error
-        lamps = cls(positions, settings.power, settings.radius)
         # NaN is out of range, too, because both comparisons with NaN are False.
         if not ((start >= 0) & (start <= settings.power)).all():
             raise InputError(
@@ -346,11 +333,23 @@ class Lamps(LocalBasis):
         # A surface reflects albedo / π times the irradiance in Mitsuba, and albedo times
         # the irradiance in this project.
         intensities = math.pi * albedo_scale * coefficients
-        describe = self._mitsuba_disc if self.radius else self._mitsuba_point
-        return [
-            describe(position, intensity.tolist())
-            for position, intensity in zip(self.positions, intensities, strict=True)
-        ]
+        emitters: list[dict[str, Any]] = []
+        for (x, y, z), intensity in zip(self.positions, intensities.tolist(), strict=True):
+            if not self.radius:
+                color = {"type": "rgb", "value": intensity}
+                emitters.append({"type": "point", "position": [x, y, z], "intensity": color})
+                continue
+            # A Mitsuba disk emits along its +z axis, as a camera looks along it. The disc
+            # therefore has the pose of a camera at its center that looks at the origin.
+            polar = math.degrees(math.atan2(math.hypot(x, y), z))
+            azimuth = math.degrees(math.atan2(y, x))
+            camera = PerspectiveCamera(polar, azimuth, 1.0, distance=math.hypot(x, y, z))
+            area = math.pi * self.radius**2
+            radiance = {"type": "rgb", "value": [channel / area for channel in intensity]}
+            area_light = {"type": "area", "radiance": radiance}
+            pose = pose_of(camera, self.radius)
+            emitters.append({"type": "disk", "to_world": pose, "emitter": area_light})
+        return emitters
 
     def _disc_points(
         self, positions: Float[Tensor, "L 3"]
@@ -400,28 +399,6 @@ class Lamps(LocalBasis):
         disc_axis = F.normalize(positions, dim=-1)
         cosine_at_disc = (to_lamp * disc_axis).sum(-1) / squared_distance.sqrt()
         return irradiance * cosine_at_disc.clamp(min=0)
-
-    def _mitsuba_point(
-        self, position: tuple[float, float, float], intensity: list[float]
-    ) -> dict[str, Any]:
-        """Create the Mitsuba entry of a point lamp."""
-        color = {"type": "rgb", "value": intensity}
-        return {"type": "point", "position": list(position), "intensity": color}
-
-    def _mitsuba_disc(
-        self, position: tuple[float, float, float], intensity: list[float]
-    ) -> dict[str, Any]:
-        """Create the Mitsuba entry of a disc lamp with a radiant intensity along its axis."""
-        x, y, z = position
-        polar = math.degrees(math.atan2(math.hypot(x, y), z))
-        azimuth = math.degrees(math.atan2(y, x))
-        # A Mitsuba disk emits along its +z axis, as a camera looks along it. The disc
-        # therefore has the pose of a camera at its center that looks at the origin.
-        camera = PerspectiveCamera(polar, azimuth, 1.0, distance=math.hypot(x, y, z))
-        area = math.pi * self.radius**2
-        radiance = {"type": "rgb", "value": [channel / area for channel in intensity]}
-        emitter = {"type": "area", "radiance": radiance}
-        return {"type": "disk", "to_world": pose_of(camera, self.radius), "emitter": emitter}
 
 
 # All kinds of local light by name. In this order, their coefficients follow those of the

@@ -232,14 +232,10 @@ def _create_programs(
     if within is None:
         return [_QuadraticProgram(channel) for channel in original]
     if within.norm == "linf":
-        low, high = map(_split_channels, within.ends)
-        channels_and_bounds = zip(original, low, high, strict=True)
-        return [
-            _QuadraticProgram(channel, channel_low, channel_high)
-            for channel, channel_low, channel_high in channels_and_bounds
-        ]
+        bounds = map(_split_channels, within.ends)
+        return [_QuadraticProgram(*arrays) for arrays in zip(original, *bounds, strict=True)]
     # One row for each channel of each light becomes one block (C, K) for each light.
-    shape = (len(coefficients), coefficients.shape[2], coefficients.shape[1])
+    shape = coefficients.mT.shape
     centers = _split_channels(within.center).reshape(shape)
     pairs = zip(original.reshape(shape), centers, strict=True)
     return [
@@ -325,13 +321,16 @@ class _QuadraticProgram:
             if is_inside or is_on_sphere:
                 break
             channels = zip(self._offset, nearest - target, self._active_constraints, strict=True)
-            derivatives = [_differentiate(*channel) for channel in channels]
-            velocity = np.stack([derivative.solution for derivative in derivatives])
+            derivatives, multipliers, rates = zip(
+                *(_differentiate(*channel) for channel in channels), strict=True
+            )
+            velocity = np.stack(derivatives)
             # r² - |x - c|² = (r - |x - c|) (r + |x - c|).
             missing_squared = missing * (self._radius + distance)
             step = self._step_to_sphere(velocity, displacement, missing_squared)
             self._t += step
-            if all(derivative.keeps_active(step) for derivative in derivatives):
+            # A constraint stays active if its multiplier does not become negative.
+            if (np.concatenate(multipliers) + step * np.concatenate(rates) >= 0).all():
                 # The same constraints stay active, so the solution is affine in t, and
                 # the step is exact.
                 displacement = displacement + step * velocity
@@ -342,14 +341,9 @@ class _QuadraticProgram:
 
     def _project(self, target: Array, constraints: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Find the nearest light in all constraints but the ball, and the active constraints."""
-        nearest = []
-        active_constraints = []
         channels = zip(target, constraints, self._low, self._high, strict=True)
-        for channel, rows, low, high in channels:
-            solution, active_rows = _least_distance(channel, rows, low, high)
-            nearest.append(solution)
-            active_constraints.append(active_rows)
-        return np.stack(nearest), active_constraints
+        nearest, active = zip(*(_least_distance(*channel) for channel in channels), strict=True)
+        return np.stack(nearest), list(active)
 
     def _step_to_sphere(
         self, velocity: Array, displacement: Array, missing_squared: float
@@ -366,45 +360,17 @@ class _QuadraticProgram:
         return min(max(step, self._min_t - self._t), 1 - self._t)
 
 
-@dataclass(frozen=True)
-class _SolutionDerivative:
-    """Derivatives with respect to t of one channel of the solution of a `_QuadraticProgram`.
-
-    They hold as long as the same M constraints on the radiance are active.
-
-    Attributes:
-        solution: Derivative of the SH coefficients of the solution, shape (K,).
-        multipliers: Multiplier μ of each active constraint, shape (M,).
-        multiplier_derivatives: Derivatives of the multipliers, shape (M,).
-    """
-
-    solution: Array
-    multipliers: Array
-    multiplier_derivatives: Array
-
-    def keeps_active(self, step: float) -> bool:
-        """Tell whether all active constraints stay active if t changes by `step`.
-
-        A constraint stays active if its multiplier does not become negative.
-        """
-        return bool(np.all(self.multipliers + step * self.multiplier_derivatives >= 0))
-
-
-def _differentiate(offset: Array, correction: Array, active_rows: Array) -> _SolutionDerivative:
+def _differentiate(offset: Array, correction: Array, active_rows: Array) -> tuple[Array, ...]:
     """Differentiate one channel of the solution of a `_QuadraticProgram` with respect to t.
 
     With the matrix R of the M active constraints, the solution is x = c + t (v − c) + Rᵀ μ, and R x
     = 0. The derivative of the multipliers μ is therefore the solution μ' of the least squares
     problem Rᵀ μ' ≈ −(v − c). `offset` is v − c, and `correction` is Rᵀ μ, from which μ is computed.
+    The results are the derivative of x, μ and μ'.
     """
     right_sides = np.stack([-offset, correction], axis=1)
-    solution = np.linalg.lstsq(active_rows.T, right_sides)[0]
-    multiplier_derivatives, multipliers = solution.T
-    return _SolutionDerivative(
-        solution=offset + active_rows.T @ multiplier_derivatives,
-        multipliers=multipliers,
-        multiplier_derivatives=multiplier_derivatives,
-    )
+    rates, multipliers = np.linalg.lstsq(active_rows.T, right_sides)[0].T
+    return offset + active_rows.T @ rates, multipliers, rates
 
 
 def _least_distance(

@@ -113,12 +113,19 @@ def best_window(
     degree = len(weight) - 1
     if degree == 0:
         return torch.ones(1, dtype=torch.float64)
+    odd_numbers = 2 * np.arange(degree + 1) + 1
     # Cosines of the angles at which the windowed lobe must not be negative.
     cosines = np.cos(np.linspace(0, math.pi, 2 * degree + 1))
     for _ in range(_MAX_ROUNDS):
-        factors = _best_factors(cosines, weight, spectrum)
+        # Values of (2l + 1) s_l P_l, with one row for each angle and one column for each l.
+        terms = legendre.legvander(cosines, degree) * odd_numbers * spectrum
+        # The sum over a row is the value of the lobe at this angle if all factors are 1. The change
+        # of the factors must add at least the negative of this value. The error is the squared
+        # length of the vector with the entries weight_l (w_l - 1), so the shortest one is searched.
+        weighted_change = shortest(terms[:, 1:] / weight[1:], -terms.sum(1))
+        factors = np.concatenate([[1.0], 1 + weighted_change / weight[1:]])
         # Legendre coefficients of the windowed lobe.
-        series = (2 * np.arange(degree + 1) + 1) * spectrum * factors
+        series = odd_numbers * spectrum * factors
         # The minima of the lobe are at roots of its derivative, or at an end.
         stationary = legendre.legroots(legendre.legder(series))
         candidates = np.concatenate([stationary.real.clip(-1, 1), [-1.0, 1.0]])
@@ -131,27 +138,6 @@ def best_window(
     # the lobe toward a constant, which lifts its minimum to 0.
     factors[1:] /= max(1 - lobe_values.min(), 1)
     return torch.from_numpy(factors)[bands(degree)]
-
-
-def _best_factors(
-    cosines: Float[np.ndarray, " N"],
-    weight: Float[np.ndarray, " degrees"],
-    spectrum: Float[np.ndarray, " degrees"],
-) -> Float[np.ndarray, " degrees"]:
-    """Compute the factors that make a lobe non-negative at N angles and change it least.
-
-    The lobe is Σ_l (2l + 1) s_l w_l P_l(cos θ) with the factors w_l. Its error is
-    Σ_l weight_l² (w_l - 1)². It is the squared length of the vector with the
-    entries weight_l (w_l - 1), so the shortest vector is searched. The first factor is 1.
-    """
-    degree = len(weight) - 1
-
-    # Values of (2l + 1) s_l P_l, with one row for each angle and one column for each l.
-    terms = legendre.legvander(cosines, degree) * (2 * np.arange(degree + 1) + 1) * spectrum
-    # The sum over a row is the value of the lobe at this angle if all factors are 1. The
-    # change of the factors must add at least the negative of this value.
-    weighted_change = shortest(terms[:, 1:] / weight[1:], -terms.sum(1))
-    return np.concatenate([[1.0], 1 + weighted_change / weight[1:]])
 
 
 def shortest(

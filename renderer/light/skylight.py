@@ -19,7 +19,7 @@ Parameters", after Habel et al. 2008.
 import math
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -161,31 +161,27 @@ def _as_parameters(
     Angles are converted to radians before they are rounded to this dtype. Angles are given
     in degrees. The results are in the order of the arguments.
     """
-    value_by_name = {"zenith": zenith, "azimuth": azimuth, "turbidity": turbidity}
+    value_by_name = {"turbidity": turbidity, "zenith": zenith, "azimuth": azimuth}
+    floating = []
     for name, value in value_by_name.items():
         if not is_number(value):
             # `as_tensor` raises InputError if the value is no tensor.
             as_tensor(name, value)
-    tensors = [value for value in (turbidity, zenith, azimuth) if _is_floating(value)]
+        if isinstance(value, Tensor) and value.is_floating_point():
+            floating.append(value)
     # Tensor that gives the dtype and the device of the results.
-    like = tensors[0] if tensors else torch.zeros((), dtype=torch.float64)
+    like = floating[0] if floating else torch.zeros((), dtype=torch.float64)
     turbidity_tensor = torch.as_tensor(turbidity, dtype=like.dtype, device=like.device)
     degrees = []
     for angle in (zenith, azimuth):
-        dtype = angle.dtype if _is_floating(angle) else torch.float64
+        is_given = any(angle is tensor for tensor in floating)
+        dtype = None if is_given else torch.float64
         degrees.append(torch.as_tensor(angle, dtype=dtype, device=like.device))
-    zenith_degrees, azimuth_degrees = degrees
-    require_finite(azimuth=azimuth_degrees)
+    require_finite(azimuth=degrees[1])
     expected = "0 to 90 degrees, with the sun above the horizon"
-    _require_in_range("zenith", zenith_degrees.to(like.dtype), ZENITH, expected)
+    _require_in_range("zenith", degrees[0].to(like.dtype), ZENITH, expected)
     _require_in_range("turbidity", turbidity_tensor, TURBIDITY, "2 to 10")
-    radians = [torch.deg2rad(angle).to(like.dtype) for angle in degrees]
-    return [*radians, turbidity_tensor]
-
-
-def _is_floating(value: object) -> TypeGuard[Tensor]:
-    """Tell whether a value is a tensor of floating-point numbers."""
-    return isinstance(value, Tensor) and value.is_floating_point()
+    return [*(torch.deg2rad(angle).to(like.dtype) for angle in degrees), turbidity_tensor]
 
 
 def _require_in_range(name: str, value: Tensor, limits: tuple[float, float], expected: str) -> None:

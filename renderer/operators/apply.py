@@ -222,7 +222,7 @@ class TransferOperator:
         """
         lights = as_tensor("lights", lights)
         self.require_lights(lights)
-        return _Radiance.apply(lights, self)
+        return self._radiance(lights)
 
     def light_gradient(
         self, radiance_gradient: Float[Tensor, "*lights 3 P"]
@@ -256,20 +256,21 @@ class TransferOperator:
         return self._light_gradient(radiance_gradient)
 
     def _images(
-        self, lights: Float[Tensor, "... coefficients 3"], background: _PreparedBackground
+        self, lights: Float[Tensor, "... coefficients 3"], background: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Render images without autograd, and return what the gradient needs.
 
         It returns the images, 1 for values of the covered pixels that clamping left alone
         and 0 for others, and the clamped linear values of the covered pixels.
         """
-        unclamped = self._radiance(lights).add_(background.term)
+        background_images, background_values = background
+        unclamped = self._radiance(lights).add_(background_values)
         clamped_values = unclamped.clamp(0, 1)
         # 1 for values in [0, 1], including the limits. Only these have a gradient.
         is_unclamped = unclamped.eq_(clamped_values)
         encoded = encode(clamped_values, self.settings.encoding)
         batch_shape = lights.shape[:-2]
-        canvas = background.images.expand(*batch_shape, -1, -1)
+        canvas = background_images.expand(*batch_shape, -1, -1)
         images = canvas.clone(memory_format=torch.contiguous_format)
         # `scatter_` takes half the time of `index_copy_` on a CPU.
         images.scatter_(-1, self._pixels_by_color.expand(*batch_shape, -1, -1), encoded)
@@ -321,7 +322,7 @@ class TransferOperator:
             require_bounded(lights=lights)
 
     def _radiance(self, lights: Float[Tensor, "... coefficients 3"]) -> Float[Tensor, "... 3 P"]:
-        """Compute `radiance` without autograd or checks."""
+        """Compute `radiance` without checks."""
         # Coefficients that change a pixel. All other coefficients have no row in the matrix.
         used_lights = lights.index_select(-2, self.nonzero).to(self.transfer.dtype)
         shared, *white = self._channels
@@ -364,7 +365,7 @@ class TransferOperator:
 
     def _prepare_background(
         self, background: float | Tensor, lights: Float[Tensor, "... coefficients 3"]
-    ) -> _PreparedBackground:
+    ) -> tuple[Tensor, Tensor]:
         """Convert a background to images, and compute what it adds to the covered pixels.
 
         In a pixel that the mesh covers partly, the background is visible, too. The
@@ -386,7 +387,7 @@ class TransferOperator:
             at_pixels = at_pixels.expand(*lights.shape[:-2], *at_pixels.shape[-2:]).contiguous()
         coverage = self.coverage.to(images)[None]
         term = background_term(coverage, at_pixels, self.settings.encoding)
-        prepared = _PreparedBackground(images=images, term=term)
+        prepared = (images, term)
         if is_kept:
             self._last_background["pair"] = key, prepared
         return prepared
@@ -432,7 +433,7 @@ class TransferOperator:
         return list(self.transfer)
 
     @cached_property
-    def _last_background(self) -> dict[str, tuple[Any, _PreparedBackground]]:
+    def _last_background(self) -> dict[str, tuple[Any, tuple[Tensor, Tensor]]]:
         """Key of the last gray background, and what was prepared for it ("pair")."""
         return {}
 
@@ -451,37 +452,6 @@ class TransferOperator:
         return torch.eye(self.basis.size).to(self.transfer)[:, self.nonzero]
 
 
-class _PreparedBackground(NamedTuple):
-    """Background of the images of an operator, in the form in which it is added.
-
-    Attributes:
-        images: Background images, shape (..., 3, size²).
-        term: Linear values of the background that are added to the radiance of
-            the P covered pixels, shape (..., 3, P).
-    """
-
-    images: Float[Tensor, "... 3 N"]
-    term: Float[Tensor, "... 3 P"]
-
-
-class _Radiance(torch.autograd.Function):
-    """Radiance of the covered pixels of a view, differentiable with respect to the light."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, lights: Float[Tensor, "... coefficients 3"], operator: TransferOperator
-    ) -> Float[Tensor, "... 3 P"]:
-        """Compute the radiance of the P covered pixels, times the fraction that the mesh covers."""
-        ctx.operator = operator
-        return operator._radiance(lights)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Float[Tensor, "... 3 P"]) -> tuple[Tensor, None]:
-        """Compute the gradient with respect to the lights."""
-        return ctx.operator.light_gradient(upstream), None
-
-
 class _Image(torch.autograd.Function):
     """Images under a light, differentiable with respect to the light.
 
@@ -494,7 +464,7 @@ class _Image(torch.autograd.Function):
         ctx: Any,
         lights: Float[Tensor, "... coefficients 3"],
         operator: TransferOperator,
-        background: _PreparedBackground,
+        background: tuple[Tensor, Tensor],
     ) -> Float[Tensor, "... 3 size size"]:
         """Render one image under each light."""
         images, is_unclamped, clamped_values = operator._images(lights, background)

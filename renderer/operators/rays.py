@@ -348,7 +348,7 @@ def local_transfer(
     paths = unoccluded(rays, basis, surface.points, surface.normals, surface.planes)
     # One row for each path, one column for each channel: radiance of the sample at the end
     # of the path, per unit of the coefficient of its light.
-    weights = _reflectance(surface, albedo, paths) * paths.irradiance[:, None]
+    weights = path_reflectance(surface, albedo, paths) * paths.irradiance[:, None]
     weights = weights / fragments.samples**2
     # The paths of a pixel that come from the same basis function are added up to one entry.
     # Pixel and function are combined to one number, because sorting numbers is faster.
@@ -363,30 +363,7 @@ def local_transfer(
     )
 
 
-def local_radiance(
-    surface: Surface,
-    albedo: Float[Tensor, "S 3"],
-    paths: LightPaths,
-    light: Float[Tensor, "K 3"],
-    fragments: Fragments | None = None,
-) -> Float[Tensor, "3 P"]:
-    """Compute the radiance of a view under local light.
-
-    The result is differentiable with respect to the light, the albedo, the
-    irradiance of the paths and the gloss. The radiance is multiplied by the fraction of
-    each pixel that the mesh covers. `fragments` may assign the same samples to other
-    pixels.
-    """
-    fragments = fragments or surface.fragments
-    # Irradiance at the end of each path: one row for each path, one column for each color.
-    irradiance = paths.irradiance[:, None] * light[paths.function]
-    radiance = _reflectance(surface, albedo, paths) / fragments.samples**2 * irradiance
-    pixel_of_path = fragments.sample_to_pixel[paths.point]
-    zeros = radiance.new_zeros(len(fragments.pixels), 3)
-    return zeros.index_add(0, pixel_of_path, radiance).T
-
-
-def _reflectance(
+def path_reflectance(
     surface: Surface, albedo: Float[Tensor, "S C"], paths: LightPaths
 ) -> Float[Tensor, "E C"]:
     """Compute the reflected radiance, per irradiance, at the ends of E paths of light.
@@ -483,8 +460,9 @@ class LocalLightView:
     ) -> Float[Tensor, "3 P"]:
         """Compute the radiance of the view under local light.
 
-        The result is differentiable with respect to all tensors and to the
-        vertices of the view. The arguments are those of `local_radiance` and `unoccluded`.
+        The result is differentiable with respect to all tensors and to the vertices of the view.
+        It is multiplied by the fraction of each pixel that the mesh covers. Lamps may have moved
+        to `positions`, and `fragments` may assign the samples to other pixels.
         """
         surface = self._surface
         moved = positions.cpu().double() if basis.is_movable and positions is not None else None
@@ -494,6 +472,11 @@ class LocalLightView:
             paths = unoccluded(self._rays, basis, *samples, moved)
         if moved is None:
             self._fixed_paths[basis] = paths
-        fragments = None if fragments is None else fragments.to("cpu")
-        arguments = albedo.cpu().double(), paths, light.cpu().double(), fragments
-        return local_radiance(surface, *arguments).to(light)
+        shown = (fragments or surface.fragments).to("cpu")
+        # Irradiance at the end of each path: one row for each path, one column for each color.
+        irradiance = paths.irradiance[:, None] * light.cpu().double()[paths.function]
+        radiance = path_reflectance(surface, albedo.cpu().double(), paths) / shown.samples**2
+        radiance = radiance * irradiance
+        zeros = radiance.new_zeros(len(shown.pixels), 3)
+        pixel_of_path = shown.sample_to_pixel[paths.point]
+        return zeros.index_add(0, pixel_of_path, radiance).T.to(light)

@@ -74,13 +74,9 @@ class Rasterizer:
         x and y of the points are in [-1, 1] in the image, and the third coordinate is the
         depth. `closed` leaves out faces that are seen from behind.
         """
-        lowest = points.min(initial=0)
-        highest = points.max(initial=0)
-        if not (np.isfinite(lowest) and np.isfinite(highest)):
-            raise ValueError("points has NaN or infinite values: give finite values")
         # Larger coordinates would not fit into the integers of the rasterizers.
         limit = SPAN / resolution
-        if max(-lowest, highest) > limit:
+        if np.abs(points).max(initial=0) > limit:
             points = np.clip(points, -limit, limit)
         needed = (4 * len(points) + SHADED_BYTES) * int(resolution) ** 2
         name = f"{len(points)} views of {resolution} samples per side"

@@ -44,11 +44,6 @@ def rasterize(
     """
     # Unsigned indices are faster: compiled code checks signed indices for negative values.
     corners = np.ascontiguousarray(faces, dtype=np.int64).view(np.uint64)
-    if corners.max(initial=0) >= points.shape[1]:
-        raise IndexError(
-            f"faces has vertex indices outside of 0 to {points.shape[1] - 1}: "
-            "give indices of vertices"
-        )
     ids = np.full((len(points), resolution, resolution), -1, dtype=np.int32)
     # Depths are whole numbers with 24 bits, which float32 can store exactly.
     nearest_depths = np.empty(ids.shape[1:], dtype=np.float32)

@@ -23,8 +23,8 @@ longest axis is the last axis of every array. An array of triangles has shape
 y down.
 """
 
+import math
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -59,77 +59,71 @@ def rasterize(
     """
     ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
     for view, view_ids in zip(points, ids, strict=True):
+        positions, depths = to_fixed_point(view, resolution)
+        keys = np.full(resolution * resolution, EMPTY_KEY)
+        for begin in range(0, len(faces), FACES_PER_BLOCK):
+            block = np.ascontiguousarray(faces[begin : begin + FACES_PER_BLOCK].T)
+            _draw(keys, positions, depths, block, begin, closed)
         # The conversion to int32 keeps the low 32 bits of each key, the face index.
-        view_ids[:] = _keys(view, faces, resolution, closed).reshape(view_ids.shape)
+        view_ids[:] = keys.reshape(view_ids.shape)
     return ids
-
-
-class _TriangleRows(NamedTuple):
-    """Rows of the image in which T triangles may cover samples.
-
-    Attributes:
-        triangle_index: Index of each triangle among all triangles of a block,
-            shape (T,).
-        first_row: First row in which each triangle can cover samples,
-            shape (T,).
-        row_count: Number of rows in which each triangle can cover samples,
-            shape (T,).
-    """
-
-    triangle_index: Int[np.ndarray, " T"]
-    first_row: Int[np.ndarray, " T"]
-    row_count: Int[np.ndarray, " T"]
-
-
-def _keys(
-    points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], resolution: int, closed: bool
-) -> Int[np.ndarray, " _"]:
-    """Compute the smallest key of each sample of one view.
-
-    Each face has one key at a sample that it covers: its depth, and in the low FACE_BITS bits its
-    index. The smallest key therefore belongs to the nearest face.
-    """
-    positions, depths = to_fixed_point(points, resolution)
-    keys = np.full(resolution * resolution, EMPTY_KEY)
-    for begin in range(0, len(faces), FACES_PER_BLOCK):
-        block = np.ascontiguousarray(faces[begin : begin + FACES_PER_BLOCK].T)
-        rows = _cull(positions.take(block, axis=1), resolution, closed)
-        # Sort the corners of each face, so that two faces with the same corners in another
-        # order get exactly the same depth.
-        corners = _sort(block.take(rows.triangle_index, axis=1))
-        face_ids = rows.triangle_index + begin
-        _draw(
-            keys, positions.take(corners, axis=1), depths.take(corners), rows, face_ids, resolution
-        )
-    return keys
 
 
 def _draw(
     keys: Int[np.ndarray, " _"],
-    triangles: Int[np.ndarray, "2 3 T"],
-    depths: Float[np.ndarray, "3 T"],
-    rows: _TriangleRows,
-    face_ids: Int[np.ndarray, " T"],
-    resolution: int,
+    positions: Int[np.ndarray, "2 V"],
+    depths: Float[np.ndarray, " V"],
+    block: Int[np.ndarray, "3 F"],
+    begin: int,
+    closed: bool,
 ) -> None:
-    """Draw T triangles: lower the keys of the samples at which a triangle is nearest so far.
+    """Draw a block of faces: lower the keys of the samples at which a face is nearest so far.
 
-    A key is an integer. Its high bits are the depth of the nearest face at a
-    sample, and its low FACE_BITS bits are the index of this face.
+    Each face has one key at a sample that it covers: its depth, and in the low FACE_BITS bits its
+    index. The smallest key therefore belongs to the nearest face. The first face has the index
+    `begin`.
     """
-    edges = _edges(triangles)
-    planes = _planes(triangles, depths)
+    resolution = math.isqrt(len(keys))
+    # By the top-left rule, a sample on an edge belongs to the triangle to the right of the edge or,
+    # if the edge is horizontal, to the triangle below it. A triangle therefore covers only samples
+    # whose x and y are at least its smallest x and y, and less than its largest x and y.
+    triangles = positions.take(block, axis=1)
+    areas = _doubled_areas(triangles)
+    # First column and first row of samples in the bounding box of each triangle, as the
+    # two rows of this array.
+    first = _next_sample(triangles.min(axis=1)).clip(0, None)
+    counts = _next_sample(triangles.max(axis=1)).clip(None, resolution) - first
+    # y points down, so triangles that are counter-clockwise in the image have negative
+    # areas.
+    is_facing = areas < 0 if closed else areas != 0
+    drawn = np.flatnonzero(is_facing & (counts > 0).all(axis=0))
+    first_row = first[1].take(drawn)
+    # Sort the corners of each face, so that two faces with the same corners in another
+    # order get exactly the same depth.
+    corners = _sort(block.take(drawn, axis=1))
+    triangles = positions.take(corners, axis=1)
+    edges, middle_row = _edges(triangles)
+    planes = _planes(triangles, depths.take(corners))
     # One entry for each pair of a triangle and a row of samples that it may cover.
-    for triangle, row in _expand(rows.row_count):
-        row += rows.first_row.take(triangle)
-        left, right = _crossings(edges, triangle, row, resolution)
+    for triangle, row in _expand(counts[1].take(drawn)):
+        row += first_row.take(triangle)
+        # A row crosses the edge from the top to the bottom corner (edge 0), and edge 1 above or
+        # edge 2 below the middle corner. Edge e of triangle t has the number e · T + t.
+        is_below_middle = row >= middle_row.take(triangle)
+        crossed_edges = np.stack([triangle, triangle + (1 + is_below_middle) * len(drawn)])
+        slope, constant, height = edges.take(crossed_edges, axis=1)
+        # Each row crosses an edge at the column -(slope · row + constant) / height. The first
+        # column after it is this number, rounded up. The operator // rounds down, but the minus
+        # sign before it makes the result round up.
+        columns = (-((slope * row + constant) // height)).clip(0, resolution)
+        left, right = columns.min(axis=0), columns.max(axis=0)
         # Position and depth of the first corner, and slopes of the depth.
         x, y, depth, slope_x, slope_y = planes.take(triangle, axis=1)
         depth_at_row = depth + (row - y) * slope_y
         # Columns from the first corner to the first covered sample.
         first_offset = left - x
         first_sample = row * resolution + left
-        face = face_ids.take(triangle)
+        face = drawn.take(triangle) + begin
         # One entry for each covered sample: the index of its pair of triangle and row, and
         # the number of steps from the first covered sample of the row.
         for pair, step in _expand(right - left):
@@ -170,29 +164,6 @@ def to_fixed_point(
     return positions, depths
 
 
-def _cull(triangles: Int[np.ndarray, "2 3 F"], resolution: int, closed: bool) -> _TriangleRows:
-    """Find the triangles that can cover samples, and their rows.
-
-    By the top-left rule, a sample on an edge belongs to the triangle to the right of the edge or,
-    if the edge is horizontal, to the triangle below it. A triangle therefore covers only samples
-    whose x and y are at least its smallest x and y, and less than its largest x and y.
-    """
-    areas = _doubled_areas(triangles)
-    # First column and first row of samples in the bounding box of each triangle, as the
-    # two rows of this array.
-    first = _next_sample(triangles.min(axis=1)).clip(0, None)
-    counts = _next_sample(triangles.max(axis=1)).clip(None, resolution) - first
-    # y points down, so triangles that are counter-clockwise in the image have negative
-    # areas.
-    is_facing = areas < 0 if closed else areas != 0
-    index = np.flatnonzero(is_facing & (counts > 0).all(axis=0))
-    return _TriangleRows(
-        triangle_index=index,
-        first_row=first[1].take(index),
-        row_count=counts[1].take(index),
-    )
-
-
 def _doubled_areas(triangles: Int[np.ndarray, "2 3 F"]) -> Int[np.ndarray, " F"]:
     """Compute twice the signed areas of F triangles, negative if counter-clockwise in the image."""
     (ax, bx, cx), (ay, by, cy) = triangles
@@ -211,28 +182,19 @@ def _sort(corners: Int[np.ndarray, "3 T"]) -> Int[np.ndarray, "3 T"]:
     return np.stack([least, corners.sum(axis=0) - least - greatest, greatest])
 
 
-class _EdgeLines(NamedTuple):
-    """Lines through the three edges of T triangles.
+def _edges(
+    triangles: Int[np.ndarray, "2 3 T"],
+) -> tuple[Int[np.ndarray, "3 _"], Int[np.ndarray, " T"]]:
+    """Compute the lines through the edges of T triangles.
 
     The corners are called top, middle and bottom by their position in the image.
     The first edge leads from the top to the bottom corner, the second one from the
     top to the middle corner, and the third one from the middle to the bottom
     corner. A row of samples crosses an edge at the column
-    -(slope · row + constant) / height.
-
-    Attributes:
-        coefficients: Slope, constant and height of the edges, with the axes:
-            coefficient, edge, triangle. The shape is (3, 3, T).
-        middle_row: First row of samples at or below the middle corner,
-            shape (T,).
+    -(slope · row + constant) / height. The results are slope, constant and height of the first
+    edges, then of the second and the third ones; and the first row of samples at or below the
+    middle corners.
     """
-
-    coefficients: np.ndarray
-    middle_row: Int[np.ndarray, " T"]
-
-
-def _edges(triangles: Int[np.ndarray, "2 3 T"]) -> _EdgeLines:
-    """Compute the lines through the edges of T triangles."""
     x, y = triangles
     # Sort the corners by y. For this, one integer per corner holds y in its high 32 bits
     # and x in its low 32 bits. The sum in `_sort` may overflow, but the differences are
@@ -249,31 +211,7 @@ def _edges(triangles: Int[np.ndarray, "2 3 T"]) -> _EdgeLines:
     slope = -SUBSAMPLES * dx
     constant = y[start] * dx - x[start] * dy
     height = SUBSAMPLES * dy
-    return _EdgeLines(np.stack([slope, constant, height]), middle_row=_next_sample(y[1]))
-
-
-def _crossings(
-    edges: _EdgeLines,
-    triangle: Int[np.ndarray, " N"],
-    row: Int[np.ndarray, " N"],
-    resolution: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find the columns that a triangle covers in a row, for N pairs of a triangle and a row.
-
-    The results are the first covered column, and the first column after the covered ones.
-    """
-    is_below_middle = row >= edges.middle_row.take(triangle)
-    triangle_count = len(edges.middle_row)
-    # A row crosses the edge from the top to the bottom corner (edge 0), and edge 1 above or
-    # edge 2 below the middle corner. Edge e of triangle t has the number e · T + t.
-    short_edge = triangle + (1 + is_below_middle) * triangle_count
-    crossed_edges = np.stack([triangle, short_edge])
-    slope, constant, height = edges.coefficients.reshape(3, -1).take(crossed_edges, axis=1)
-    # Each row crosses an edge at the column -(slope · row + constant) / height. The first
-    # column after it is this number, rounded up. The operator // rounds down, but the minus
-    # sign before it makes the result round up.
-    columns = (-((slope * row + constant) // height)).clip(0, resolution)
-    return np.minimum(*columns), np.maximum(*columns)
+    return np.stack([slope, constant, height]).reshape(3, -1), _next_sample(y[1])
 
 
 def _planes(

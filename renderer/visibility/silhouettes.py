@@ -116,11 +116,9 @@ def moving_outlines(
         fragments.to("cpu"), *map(_to_numpy, (positions, nearness, faces, sample_grid))
     )
     crossings = Crossings(*(array.to(sample_grid.device) for array in silhouettes.crossings()))
-    # True for pixels that show no mesh, but have a sample beside a visible silhouette.
-    is_uncovered = torch.zeros(fragments.size**2, dtype=torch.bool, device=sample_grid.device)
-    is_uncovered.index_fill_(0, _pixels_of_cells(crossings.cells, fragments).flatten(), True)
-    is_uncovered.index_fill_(0, fragments.pixels, False)
-    uncovered_pixels = is_uncovered.nonzero().squeeze(1)
+    # Pixels that show no mesh, but have a sample beside a visible silhouette.
+    crossed_pixels = _pixels_of_cells(crossings.cells, fragments).unique()
+    uncovered_pixels = crossed_pixels[~torch.isin(crossed_pixels, fragments.pixels)]
     constants = radiance.detach(), background.detach()
     view = _MovingView(fragments, crossings, sample_grid, uncovered_pixels, *constants)
     return uncovered_pixels, _ZerosWithGradient.apply(positions, view)
@@ -278,8 +276,24 @@ class _MovingView:
         # Component of the edge normal in the direction from the first to the second sample,
         # which is to the right in a row, and down in a column.
         along = torch.where(crossings.horizontal, crossings.normal[0], -crossings.normal[1])
+        # Index of the column of `upstream` for each pixel of the image, or -1 without a column.
+        column_of_pixel = torch.full((self.fragments.size**2,), -1, device=upstream.device)
+        upstream_pixels = torch.cat([self.fragments.pixels, self.uncovered_pixels])
+        column_of_pixel[upstream_pixels] = torch.arange(upstream.shape[1], device=upstream.device)
+        # Gradient with respect to movements toward the second sample. The pixel of the first
+        # sample and the pixel of the second sample each gain half of the difference of the two
+        # radiances. The factor 1/2 is already in `upstream`.
+        toward_second = self.radiance.new_zeros(len(along))
+        for pixels in _pixels_of_cells(crossings.cells, self.fragments):
+            # Radiance at both samples, or the background if a sample shows no mesh.
+            first_radiance, second_radiance = (
+                torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixels])
+                for samples in crossings.samples
+            )
+            pixel_gradient = upstream[:, column_of_pixel[pixels]]
+            toward_second += (pixel_gradient * (first_radiance - second_radiance)).sum(0)
         # Gradient with respect to the position (x, y) of each crossing in the image.
-        crossing_gradients = (self._crossing_gradients(upstream) * along * crossings.normal).T
+        crossing_gradients = (toward_second * along * crossings.normal).T
         # Distances by which a crossing moves if the first, or the second, end of its edge
         # moves by 1.
         end_weights = (1 - crossings.fraction, crossings.fraction)
@@ -290,40 +304,6 @@ class _MovingView:
             end_gradients = crossing_gradients * end_weight[:, None]
             gradients.append(_to_homogeneous(end_gradients, end_position, depth[:, None]))
         return crossings.ends.flatten(), torch.cat(gradients)
-
-    def _crossing_gradients(self, upstream: Float[Tensor, "3 _"]) -> Float[Tensor, " K"]:
-        """Compute the gradient with respect to movements of silhouettes between two samples.
-
-        Each of the K crossings lies between a first and a second sample. The
-        movement is toward the second sample.
-        """
-        # Two rows: pixels of the first samples, and pixels of the second samples.
-        pixels_at_crossings = _pixels_of_cells(self.crossings.cells, self.fragments)
-        device = pixels_at_crossings.device
-        # Index of the column of `upstream` for each pixel of the image, or -1 without a column.
-        column_of_pixel = torch.full((self.fragments.size**2,), -1, device=device)
-        upstream_pixels = torch.cat([self.fragments.pixels, self.uncovered_pixels])
-        column_of_pixel[upstream_pixels] = torch.arange(upstream.shape[1], device=device)
-        gradient = self.radiance.new_zeros(pixels_at_crossings.shape[1])
-        first_samples, second_samples = self.crossings.samples
-        # If the silhouette moves, the pixel of the first sample and the pixel of the second
-        # sample each gain half of the difference of the two radiances. The factor 1/2 is
-        # already in `upstream`.
-        for pixels in pixels_at_crossings:
-            first_radiance = self._seen_radiance(first_samples, pixels)
-            second_radiance = self._seen_radiance(second_samples, pixels)
-            pixel_gradient = upstream[:, column_of_pixel[pixels]]
-            gradient += (pixel_gradient * (first_radiance - second_radiance)).sum(0)
-        return gradient
-
-    def _seen_radiance(
-        self, samples: Int[Tensor, " K"], pixels: Int[Tensor, " K"]
-    ) -> Float[Tensor, "3 K"]:
-        """Look up the radiance at K samples, or the background if a sample shows no mesh.
-
-        `samples` are indices of covered samples or NOT_COVERED, and `pixels` are row-major.
-        """
-        return torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixels])
 
 
 def _to_homogeneous(

@@ -12,7 +12,6 @@ from scipy.special import eval_legendre, spherical_in
 
 from renderer.light.harmonics import (
     DIFFUSE_DEGREE,
-    bands,
     basis,
     lambertian_factors,
     nonzero_coefficients,
@@ -120,11 +119,3 @@ def test_rotated_light_in_a_rotated_direction_is_the_light_in_the_direction(degr
     found = basis(directions @ rotation.T, degree) @ rotate(light, rotation)
     expected = basis(directions, degree) @ light
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-13 * (degree + 1))
-
-
-@pytest.mark.parametrize("function", [bands, lambertian_factors, nonzero_coefficients])
-def test_changes_of_a_result_do_not_reach_later_results(function):
-    first = function(6)
-    expected = first.clone()
-    first += 1
-    assert torch.equal(function(6), expected)

@@ -58,82 +58,50 @@ def test_degree_1_is_projected_into_a_second_order_cone():
     torch.testing.assert_close(nearest_nonnegative(lights), expected, rtol=0, atol=TOLERANCE)
 
 
-class GridProgram:
-    """SciPy's search for the nearest light that is nowhere negative on a grid of directions.
+def best_on_grid(
+    target: np.ndarray, weights: np.ndarray, start: np.ndarray, grid: np.ndarray, **options
+) -> float:
+    """Return the weighted distance of SciPy's nearest light that is nowhere negative on a grid.
 
     The grid lacks the directions between its nodes. Its light is therefore
     slightly nearer than the light that is nowhere negative.
     """
+    [constraint] = options.pop("constraints", [None])
+    radiance = {"type": "ineq", "fun": lambda values: grid @ values, "jac": lambda values: grid}
+    found = optimize.minimize(
+        lambda values: (weights**2 * (values - target) ** 2).sum(),
+        start,
+        jac=lambda values: 2 * weights**2 * (values - target),
+        constraints=[radiance, constraint] if constraint else [radiance],
+        method="SLSQP",
+        options={"ftol": 1e-12, "maxiter": 200},
+        **options,
+    )
+    return math.sqrt(found.fun)
 
-    def __init__(self, target: Tensor) -> None:
-        self.target = target.numpy()
-        self.grid = icosphere_basis(3).numpy()
 
-    def squared_distance(self, values: np.ndarray) -> float:
-        return ((values - self.target) ** 2).sum()
-
-    def gradient(self, values: np.ndarray) -> np.ndarray:
-        return 2 * (values - self.target)
-
-    def radiance_constraint(self) -> dict:
-        return {
+@pytest.mark.parametrize("norm", [None, "linf", "l2"])
+def test_scipy_finds_no_nearer_light_also_in_a_ball(norm):
+    target = random_lights(1, 0.1)[0, :, 0]
+    center = nearest_nonnegative(GRACE)[:, 0]
+    radius = {None: None, "linf": 0.1, "l2": 0.3}[norm]
+    ball = Ball(center[None, :, None], radius, norm) if norm else None
+    options = {}
+    if norm == "linf":
+        options["bounds"] = [(value - radius, value + radius) for value in center.tolist()]
+    if norm == "l2":
+        middle = center.numpy()
+        sphere = {
             "type": "ineq",
-            "fun": lambda values: self.grid @ values,
-            "jac": lambda values: self.grid,
+            "fun": lambda values: radius**2 - ((values - middle) ** 2).sum(),
+            "jac": lambda values: 2 * (middle - values),
         }
-
-    def distance(self, start: Tensor, extra_constraints: list[dict], bounds=None) -> float:
-        """Return the distance of the nearest light that SciPy finds."""
-        found = optimize.minimize(
-            self.squared_distance,
-            start.numpy(),
-            jac=self.gradient,
-            bounds=bounds,
-            constraints=[self.radiance_constraint(), *extra_constraints],
-            method="SLSQP",
-            options={"ftol": 1e-12},
-        )
-        assert found.success
-        return math.sqrt(found.fun)
-
-
-def sphere_constraint(center: np.ndarray, radius: float) -> dict:
-    """Return SciPy's constraint of an L2 ball."""
-    return {
-        "type": "ineq",
-        "fun": lambda values: radius**2 - ((values - center) ** 2).sum(),
-        "jac": lambda values: 2 * (center - values),
-    }
-
-
-def assert_nearest(nearest: Tensor, target: Tensor, grid_distance: float) -> None:
-    """Check that a light is about as near to the target as the grid's light."""
+        options["constraints"] = [sphere]
+    nearest = nearest_nonnegative(target[None, :, None], ball)[0, :, 0]
+    grid = icosphere_basis(3).numpy()
+    expected = best_on_grid(target.numpy(), np.ones(49), nearest.numpy(), grid, **options)
     distance = float((nearest - target).norm())
-    assert grid_distance - 1e-5 <= distance <= 1.03 * grid_distance
-
-
-def test_scipy_finds_no_nearer_light():
-    target = random_lights(1, 0.1)[0, :, 0]
-    nearest = nearest_nonnegative(target[None, :, None])[0, :, 0]
-    assert_nearest(nearest, target, GridProgram(target).distance(nearest, []))
-
-
-def test_scipy_finds_no_nearer_light_in_a_ball_of_the_maximum_norm():
-    target = random_lights(1, 0.1)[0, :, 0]
-    center = nearest_nonnegative(GRACE)[:, 0]
-    ball = Ball(center[None, :, None], 0.1, "linf")
-    nearest = nearest_nonnegative(target[None, :, None], ball)[0, :, 0]
-    bounds = [(value - 0.1, value + 0.1) for value in center.tolist()]
-    assert_nearest(nearest, target, GridProgram(target).distance(nearest, [], bounds))
-
-
-def test_scipy_finds_no_nearer_light_in_a_ball_of_the_euclidean_norm():
-    target = random_lights(1, 0.1)[0, :, 0]
-    center = nearest_nonnegative(GRACE)[:, 0]
-    ball = Ball(center[None, :, None], 0.3, "l2")
-    nearest = nearest_nonnegative(target[None, :, None], ball)[0, :, 0]
-    constraint = sphere_constraint(center.numpy(), 0.3)
-    assert_nearest(nearest, target, GridProgram(target).distance(nearest, [constraint]))
+    assert expected - 1e-5 <= distance <= 1.03 * expected
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.6, 3.0])
@@ -298,25 +266,15 @@ def test_scipy_finds_no_light_of_the_same_mean_with_a_closer_irradiance(degree):
     given = random_lights(1, 0.1)[0, : (degree + 1) ** 2, 0]
     physical = project_nonnegative(given[:, None])[:, 0]
     factors = lambertian_factors(degree).numpy()
-    target = given.numpy()
+    same_mean = {
+        "type": "eq",
+        "fun": lambda values: values[:1] - given.numpy()[:1],
+        "jac": lambda values: np.eye(len(values))[:1],
+    }
     grid = DENSE[:642, : len(given)].numpy()
-    found = optimize.minimize(
-        lambda values: (factors**2 * (values - target) ** 2).sum(),
-        physical.numpy(),
-        jac=lambda values: 2 * factors**2 * (values - target),
-        constraints=[
-            {"type": "ineq", "fun": lambda values: grid @ values, "jac": lambda values: grid},
-            {
-                "type": "eq",
-                "fun": lambda values: values[:1] - target[0],
-                "jac": lambda values: np.eye(len(values))[:1],
-            },
-        ],
-        method="SLSQP",
-        options={"ftol": 1e-12, "maxiter": 200},
-    )
+    found = best_on_grid(given.numpy(), factors, physical.numpy(), grid, constraints=[same_mean])
     error = float((torch.from_numpy(factors) * (physical - given)).norm())
-    assert error <= 1.03 * math.sqrt(found.fun) + 1e-3 * float(given[0])
+    assert error <= 1.03 * found + 1e-3 * float(given[0])
 
 
 def test_channels_without_a_positive_mean_become_dark():

@@ -37,18 +37,34 @@ def coefficients(zenith: Any, azimuth: Any, turbidity: Any) -> torch.Tensor:
     return skylight.coefficients(degrees * zenith, degrees * azimuth, turbidity)
 
 
-def perez(theta: ArrayLike, gamma: ArrayLike, parameters: list[float]) -> np.ndarray:
+# Matrices of Preetham et al., appendix A.2: the five parameters of Perez's formula by turbidity T
+# and 1 (rows), for the luminance Y and the chromaticities x and y.
+PEREZ = [
+    [[0.1787, -0.3554, -0.0227, 0.1206, -0.0670], [-1.4630, 0.4275, 5.3251, -2.5771, 0.3703]],
+    [[-0.0193, -0.0665, -0.0004, -0.0641, -0.0033], [-0.2592, 0.0008, 0.2125, -0.8989, 0.0452]],
+    [[-0.0167, -0.0950, -0.0079, -0.0441, -0.0109], [-0.2608, 0.0092, 0.2102, -1.6537, 0.0529]],
+]
+# Matrices of the chromaticities x and y overhead, by T², T and 1, and powers of the sun's angle.
+OVERHEAD = [
+    [
+        [0.00166, -0.00375, 0.00209, 0],
+        [-0.02903, 0.06377, -0.03202, 0.00394],
+        [0.11693, -0.21196, 0.06052, 0.25886],
+    ],
+    [
+        [0.00275, -0.00610, 0.00317, 0],
+        [-0.04214, 0.08970, -0.04153, 0.00516],
+        [0.15346, -0.26756, 0.06670, 0.26688],
+    ],
+]
+
+
+def perez(theta: ArrayLike, gamma: ArrayLike, parameters: np.ndarray) -> np.ndarray:
     """Evaluate Perez's formula at an angle from the zenith and one from the sun."""
     a, b, c, d, e = parameters
     gradation = 1 + a * np.exp(b / np.cos(theta))
     indicatrix = 1 + c * np.exp(d * gamma) + e * np.cos(gamma) ** 2
     return gradation * indicatrix
-
-
-def chromaticity(rows: list[list[float]], sun_zenith: float, t: float) -> float:
-    """Evaluate a chromaticity overhead, from rows for T², T and 1 of the turbidity T."""
-    squared, linear, constant = (np.polyval(row, sun_zenith) for row in rows)
-    return squared * t**2 + linear * t + constant
 
 
 def published_sky(
@@ -60,55 +76,15 @@ def published_sky(
     horizontal = np.sin(theta) * np.sin(sun_zenith) * np.cos(azimuth - sun_azimuth)
     vertical = np.cos(theta) * np.cos(sun_zenith)
     gamma = np.arccos(np.clip(horizontal + vertical, -1, 1))
-
     chi = (4 / 9 - t / 120) * (np.pi - 2 * sun_zenith)
     luminance_overhead = (4.0453 * t - 4.9710) * np.tan(chi) - 0.2155 * t + 2.4192
-    luminance_parameters = [
-        0.1787 * t - 1.4630,
-        -0.3554 * t + 0.4275,
-        -0.0227 * t + 5.3251,
-        0.1206 * t - 2.5771,
-        -0.0670 * t + 0.3703,
-    ]
-    x_overhead = chromaticity(
-        [
-            [0.00166, -0.00375, 0.00209, 0],
-            [-0.02903, 0.06377, -0.03202, 0.00394],
-            [0.11693, -0.21196, 0.06052, 0.25886],
-        ],
-        sun_zenith,
-        t,
-    )
-    x_parameters = [
-        -0.0193 * t - 0.2592,
-        -0.0665 * t + 0.0008,
-        -0.0004 * t + 0.2125,
-        -0.0641 * t - 0.8989,
-        -0.0033 * t + 0.0452,
-    ]
-    y_overhead = chromaticity(
-        [
-            [0.00275, -0.00610, 0.00317, 0],
-            [-0.04214, 0.08970, -0.04153, 0.00516],
-            [0.15346, -0.26756, 0.06670, 0.26688],
-        ],
-        sun_zenith,
-        t,
-    )
-    y_parameters = [
-        -0.0167 * t - 0.2608,
-        -0.0950 * t + 0.0092,
-        -0.0079 * t + 0.2102,
-        -0.0441 * t - 1.6537,
-        -0.0109 * t + 0.0529,
-    ]
+    powers = sun_zenith ** np.arange(3, -1, -1)
+    chromaticities = np.array([t**2, t, 1]) @ OVERHEAD @ powers
     luminance, x, y = (
         overhead * perez(theta, gamma, parameters) / perez(0, sun_zenith, parameters)
-        for overhead, parameters in [
-            (luminance_overhead, luminance_parameters),
-            (x_overhead, x_parameters),
-            (y_overhead, y_parameters),
-        ]
+        for overhead, parameters in zip(
+            [luminance_overhead, *chromaticities], np.array([t, 1]) @ PEREZ, strict=True
+        )
     )
     return np.stack([x / y * luminance, luminance, (1 - x - y) / y * luminance], axis=1)
 

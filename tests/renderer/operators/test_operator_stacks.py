@@ -166,12 +166,6 @@ def test_operators_are_a_sequence():
     assert operators + others == [*operators, *others]
 
 
-def test_operators_are_moved_to_a_device():
-    operators = scene_operators("float32").to("cpu")
-    images = operators.image(renderer.load_light("grace"))
-    assert images.shape == (VIEW_COUNT, 3, SIZE, SIZE)
-
-
 def test_views_without_the_mesh_show_the_background_and_have_no_gradient():
     far_away = replace(PEAR, vertices=PEAR.vertices + np.array([20, 0, 0]))
     operators = operators_of(far_away)

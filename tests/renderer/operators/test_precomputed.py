@@ -20,7 +20,7 @@ from torch import Tensor
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.light.files import ambient, load_light
-from renderer.light.harmonics import nonzero_coefficients
+from renderer.light.harmonics import nonzero_coefficients, quadrature
 from renderer.mesh import Mesh
 from renderer.operators import rays
 from renderer.operators import shadows as precomputed
@@ -123,17 +123,6 @@ def points_on_octahedron(operator: TransferOperator, camera: OrthographicCamera)
     return in_plane + heights * back
 
 
-def sphere_quadrature() -> tuple[np.ndarray, np.ndarray]:
-    """Return directions (N, 3) and their solid angles (N,)."""
-    z, weights = np.polynomial.legendre.leggauss(128)
-    azimuth = np.arange(256) * math.pi / 128
-    radius = np.sqrt(1 - z**2)[:, None]
-    x = radius * np.cos(azimuth)
-    y = radius * np.sin(azimuth)
-    directions = np.stack(np.broadcast_arrays(x, y, z[:, None]), axis=-1)
-    return directions.reshape(-1, 3), weights.repeat(256) * math.pi / 128
-
-
 @pytest.mark.parametrize("bounces", [0, 2])
 def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive(
     bounces, monkeypatch
@@ -154,7 +143,7 @@ def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive
     assert fractions.min() < 0.9
     np.testing.assert_allclose(sky_fraction(operator)[0], fractions, atol=1e-3)
 
-    directions, solid_angles = sphere_quadrature()
+    directions, solid_angles = (values.numpy() for values in quadrature(255))
     is_above_face = face_normals @ directions.T > 0
     received = (normals @ directions.T).clip(0) * is_above_face * solid_angles
     expected = received @ scipy_basis(directions, 6)

@@ -32,7 +32,7 @@ from renderer.microfacets import reflectance
 from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
-from renderer.operators.rays import Rays, local_radiance
+from renderer.operators.rays import Rays, path_reflectance
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shaded_view import ShadedView
@@ -475,15 +475,11 @@ def reflected_fraction(beam: np.ndarray, gloss: SampleGloss) -> float:
     directions, solid_angles = half_hemisphere()
     views = torch.from_numpy(directions)
     count = len(views)
-    fragments = SimpleNamespace(
-        samples=1, sample_to_pixel=torch.arange(count), pixels=torch.arange(count)
-    )
     surface: Any = SimpleNamespace(
         gloss=gloss,
         normals=UP.expand_as(views),
         toward=views,
         points=0 * views,
-        fragments=fragments,
     )
     paths = LightPaths(
         point=torch.arange(count),
@@ -491,9 +487,9 @@ def reflected_fraction(beam: np.ndarray, gloss: SampleGloss) -> float:
         source=torch.from_numpy(beam).expand_as(views),
         irradiance=views.new_ones(count),
     )
-    values = local_radiance(surface, views.new_ones(count, 3), paths, views.new_ones(1, 3))
+    values = path_reflectance(surface, views.new_ones(count, 3), paths)
     measure = torch.from_numpy(directions[:, 2] * solid_angles) / math.pi
-    return float(values[0] @ measure)
+    return float(values[:, 0] @ measure)
 
 
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
