@@ -63,7 +63,7 @@ def test_each_sample_casts_rays_in_directions_all_over_the_sphere():
     assert means.norm(dim=-1).mean() < 0.4
 
 
-@pytest.mark.parametrize("normals", ["flat", "smooth"])
+@pytest.mark.parametrize("normals", ["flat", pytest.param("smooth", marks=pytest.mark.slow)])
 def test_shadows_converge_with_the_number_of_samples(normals):
     """An image of 16 times as many pixels, averaged, is the reference.
 

@@ -389,7 +389,7 @@ def table() -> list[renderer.Mesh]:
 
 
 PARTS = {
-    "ring": [mesh_of(trimesh.creation.annulus(0.5, 0.75, 1.4, sections=7))],
+    "ring": [mesh_of(trimesh.creation.annulus(0.4, 0.8, 1.4, sections=7))],
     "boxes": [box([-0.8, -0.7, -0.6], [0.2, 0.1, 0.3]), box([-0.3, 0.15, -0.5], [0.5, 0.9, 0.6])],
     "table": table(),
 }
