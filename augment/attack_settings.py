@@ -46,19 +46,14 @@ class StepSettings(Settings):
 
     norm: str = setting("linf", "Norm of the ball.", choices=NORMS)
     radius: float | None = setting(
-        None,
-        "Radius of the norm-ball. null permits all values.",
-        minimum=0,
-        maximum=MAX_SCALE,
+        None, "Radius of the norm-ball. null permits all values.", within=(0, MAX_SCALE)
     )
     step: str = setting(
         "unit",
         "Direction of a step: the gradient with L2 norm 1 (unit), the gradient (raw) or its sign.",
         choices=STEPS,
     )
-    step_size: float = setting(
-        0.05, "Factor of each step.", minimum=1 / MAX_MAGNITUDE, maximum=MAX_SCALE
-    )
+    step_size: float = setting(0.05, "Factor of each step.", within=(1 / MAX_MAGNITUDE, MAX_SCALE))
 
 
 @dataclass
@@ -71,27 +66,21 @@ class SkylightSettings(StepSettings):
     """
 
     zenith: float = setting(
-        45.0, "Zenith angle of the sun at the start.", "degrees", minimum=0, maximum=90
+        45.0, "Zenith angle of the sun at the start.", "degrees", within=(0, 90)
     )
     azimuth: float = setting(
-        0.0,
-        "Azimuth of the sun at the start.",
-        "degrees",
-        minimum=-MAX_SCALE,
-        maximum=MAX_SCALE,
+        0.0, "Azimuth of the sun at the start.", "degrees", within=(-MAX_SCALE, MAX_SCALE)
     )
     turbidity: float = setting(
         3.0,
         "Turbidity of the air at the start, from 2 (clear) to 10 (hazy).",
-        minimum=TURBIDITY[0],
-        maximum=TURBIDITY[1],
+        within=(TURBIDITY[0], TURBIDITY[1]),
     )
     sun: float = setting(
         math.degrees(1),
         "Change of the zenith angle and the azimuth of the sun for a value of 1.",
         "degrees",
-        minimum=0.1,
-        maximum=360,
+        within=(0.1, 360),
     )
 
 
@@ -109,33 +98,26 @@ class PoseSettings(StepSettings):
         10.0,
         "Rotation of the object about its center for a value of 1.",
         "degrees",
-        minimum=0,
-        maximum=180,
+        within=(0, 180),
     )
     shift: float = setting(
         0.1,
         "Shift of the object along x and y for a value of 1. The mesh spans [-1, 1].",
-        minimum=0,
-        maximum=10,
+        within=(0, 10),
     )
     scale: float = setting(
-        0.1,
-        "Growth of the object for a value of 1. 0.1 is a factor of 1.1.",
-        minimum=0,
-        maximum=1,
+        0.1, "Growth of the object for a value of 1. 0.1 is a factor of 1.1.", within=(0, 1)
     )
     view: float = setting(
         10.0,
         "Change of the polar angle and the azimuth of the camera for a value of 1.",
         "degrees",
-        minimum=0,
-        maximum=180,
+        within=(0, 180),
     )
     distance: float = setting(
         0.1,
         "Growth of the distance of the camera for a value of 1. 0.1 is a factor of 1.1.",
-        minimum=0,
-        maximum=1,
+        within=(0, 1),
     )
 
     def __post_init__(self) -> None:
@@ -162,28 +144,24 @@ class MaterialSettings(StepSettings):
         0.3,
         "Change of the roughness for a value of 1. The roughness stays between 0.2 and 1. "
         "A matte mesh starts with a dielectric specular layer of roughness 0.5 and strength 1.",
-        minimum=0,
-        maximum=1,
+        within=(0, 1),
     )
     metallic: float = setting(
         0.3,
         "Change of the metallic factor for a value of 1, of meshes that are metallic.",
-        minimum=0,
-        maximum=1,
+        within=(0, 1),
     )
     specular_factor: float = setting(
         1.0,
         "Change of the strength of the highlight for a value of 1. "
         "The strength is the specularFactor of KHR_materials_specular.",
-        minimum=0,
-        maximum=1,
+        within=(0, 1),
     )
     hue: float = setting(
         0.0,
         "Rotation of the albedo about the gray axis for a value of 1.",
         "degrees",
-        minimum=0,
-        maximum=180,
+        within=(0, 180),
     )
 
     def __post_init__(self) -> None:
@@ -245,20 +223,18 @@ class EOTSettings(Settings):
     draws: int = setting(
         0,
         "Number of transformations of each image at each step. 0 transforms nothing.",
-        minimum=0,
-        maximum=1000,
+        within=(0, 1000),
     )
     jitter: float = setting(
         0.03,
         "Largest motion of the camera: its shift as a fraction of the width of the image, and its "
         "approach as a fraction of the distance. It also rolls by up to 57 degrees times this "
         "number, which is 1.7 degrees for 0.03.",
-        minimum=0,
-        maximum=0.5,
+        within=(0, 0.5),
     )
-    exposure: float = setting(0.2, "Largest change of the exposure.", "stops", minimum=0, maximum=5)
-    noise: float = setting(0.02, "Standard deviation of the pixel noise.", minimum=0, maximum=1)
-    jpeg: int = setting(75, "Lowest JPEG quality.", minimum=1, maximum=100)
+    exposure: float = setting(0.2, "Largest change of the exposure.", "stops", within=(0, 5))
+    noise: float = setting(0.02, "Standard deviation of the pixel noise.", within=(0, 1))
+    jpeg: int = setting(75, "Lowest JPEG quality.", within=(1, 100))
 
 
 @dataclass
@@ -272,27 +248,22 @@ class RelightingSettings(Settings):
     gain: float = setting(
         3.0,
         "Largest factor of a channel of the slide. Its inverse is the smallest.",
-        minimum=1,
-        maximum=100,
+        within=(1, 100),
     )
     cells: int = setting(
         6,
         "Number of cells per side with a factor of their own. Between their centers, the "
         "logarithm of the factor is interpolated linearly.",
-        minimum=1,
-        maximum=64,
+        within=(1, 64),
     )
     passes: int = setting(
         21,
         "Passes through the classifier of each search: forward ones, and those backward for the "
         "gradient. Random search draws as many factors. The gradient attack takes half as many "
         "steps.",
-        minimum=1,
-        maximum=10**6,
+        within=(1, 10**6),
     )
-    slides: int = setting(
-        1, "Number of random slides for each photograph.", minimum=1, maximum=10**4
-    )
+    slides: int = setting(1, "Number of random slides for each photograph.", within=(1, 10**4))
 
     @property
     def radius(self) -> float:
@@ -327,16 +298,14 @@ class AttackSettings(ParameterSettings):
     max_steps: int = setting(
         30,
         "Largest number of steps along the gradient. The paper takes 30 (appendix C).",
-        minimum=0,
-        maximum=10**6,
+        within=(0, 10**6),
     )
     max_queries: int | None = setting(
         None,
         "Largest number of forward passes for each example: images that the search shows to the "
         "classifier. All starts have the same share of it. "
         f"null: {DEFAULT_QUERIES}, and no limit besides max_steps for optimizer=gradient.",
-        minimum=1,
-        maximum=10**9,
+        within=(1, 10**9),
     )
     backtracking: bool = setting(
         False, "Take back a step that did not lower the cost, and try half of it (backtracking)."
@@ -344,16 +313,14 @@ class AttackSettings(ParameterSettings):
     restarts: int = setting(
         0,
         "Number of additional starts, drawn from the norm-balls, for examples without success.",
-        minimum=0,
-        maximum=10**6,
+        within=(0, 10**6),
     )
     margin: float = setting(
         2.0,
         "Stop an example when, in every view, the logit gap is at least this large: the target "
         "logit minus the largest other logit or, without a target, the largest other logit minus "
         "the logit of the true class. Its unit is that of the classifier's logits.",
-        minimum=0,
-        maximum=MAX_SCALE,
+        within=(0, MAX_SCALE),
     )
     quantized: bool = setting(True, "Round the images to 8 bits before the classifier.")
     sensor_noise: float = setting(
@@ -361,8 +328,7 @@ class AttackSettings(ParameterSettings):
         "Standard deviation of the noise of a camera. A success counts only if it survives three "
         "draws of this noise. 0 counts without noise.",
         "steps of 8 bits",
-        minimum=0,
-        maximum=MAX_NOISE,
+        within=(0, MAX_NOISE),
     )
     noise_margin: float | None = setting(
         None,
@@ -370,8 +336,7 @@ class AttackSettings(ParameterSettings):
         "gap, with noise and without, must be this many times the range of the gaps. null is 2 if "
         "the pose or the material is attacked, or if log-odds exceed 50 and `margin` is not 0. "
         "Otherwise it is 0.",
-        minimum=0,
-        maximum=MAX_SCALE,
+        within=(0, MAX_SCALE),
     )
     eot: EOTSettings = setting(
         EOTSettings, "Attack the mean over random transformations of the image."
@@ -384,8 +349,7 @@ class AttackSettings(ParameterSettings):
     batch_size: int = setting(
         32,
         "Images per pass through the classifier. Fewer are passed if memory runs out.",
-        minimum=1,
-        maximum=10**6,
+        within=(1, 10**6),
     )
 
     def __post_init__(self) -> None:

@@ -46,8 +46,7 @@ class MeshSettings(Settings):
         None,
         "Color of a mesh without colors: red, green and blue in sRGB, from 0 to 1.",
         length=3,
-        minimum=0,
-        maximum=1,
+        within=(0, 1),
     )
     gloss: Any = setting(
         None,
@@ -90,18 +89,14 @@ class PropSettings(MeshSettings):
         REQUIRED,
         "x and y of its centroid in world units.",
         length=2,
-        minimum=-MAX_PROP_DISTANCE,
-        maximum=MAX_PROP_DISTANCE,
+        within=(-MAX_PROP_DISTANCE, MAX_PROP_DISTANCE),
     )
     scale: float = setting(
         1.0,
         "Its largest coordinate. The largest coordinate of the object is 1.",
-        minimum=1 / MAX_PROP_DISTANCE,
-        maximum=MAX_PROP_DISTANCE,
+        within=(1 / MAX_PROP_DISTANCE, MAX_PROP_DISTANCE),
     )
-    azimuth: float = setting(
-        0.0, "Rotation about the vertical.", "degrees", minimum=-360, maximum=360
-    )
+    azimuth: float = setting(0.0, "Rotation about the vertical.", "degrees", within=(-360, 360))
 
 
 @dataclass
@@ -117,9 +112,7 @@ class ObjectSettings(MeshSettings):
     """
 
     label: str = setting(REQUIRED, "Name of its class. It may be empty.", may_be_empty=True)
-    albedo_scale: float = setting(
-        1.0, "Factor of its albedo.", minimum=1 / MAX_SCALE, maximum=MAX_SCALE
-    )
+    albedo_scale: float = setting(1.0, "Factor of its albedo.", within=(1 / MAX_SCALE, MAX_SCALE))
     props: list[Any] = setting([], "Meshes beside the object, as mappings or PropSettings.")
 
     def __post_init__(self) -> None:
@@ -133,24 +126,18 @@ class ObjectSettings(MeshSettings):
 class ProjectorSettings(Settings):
     """A projector, and the pattern that it shows before an attack."""
 
-    pixels: int = setting(
-        16, "Pixels per side of its pattern.", minimum=1, maximum=MAX_PROJECTOR_PIXELS
-    )
+    pixels: int = setting(16, "Pixels per side of its pattern.", within=(1, MAX_PROJECTOR_PIXELS))
     polar: float = setting(
-        45.0, "Polar angle of the projector from +z.", "degrees", minimum=0, maximum=180
+        45.0, "Polar angle of the projector from +z.", "degrees", within=(0, 180)
     )
-    azimuth: float = setting(
-        45.0, "Azimuth of the projector.", "degrees", minimum=-360, maximum=360
-    )
+    azimuth: float = setting(45.0, "Azimuth of the projector.", "degrees", within=(-360, 360))
     distance: float = setting(
-        4.0, "Distance from the origin in world units.", minimum=2, maximum=MAX_SCALE
+        4.0, "Distance from the origin in world units.", within=(2, MAX_SCALE)
     )
     fov: float = setting(
-        30.0, "Angle between the sides of its image.", "degrees", minimum=0.1, maximum=170
+        30.0, "Angle between the sides of its image.", "degrees", within=(0.1, 170)
     )
-    power: float = setting(
-        1.0, "Largest value of a pixel.", minimum=1 / MAX_SCALE, maximum=MAX_SCALE
-    )
+    power: float = setting(1.0, "Largest value of a pixel.", within=(1 / MAX_SCALE, MAX_SCALE))
     pattern: Any = setting(
         0.0, "Pattern with which attacks start: a gray value in [0, 1] or an image file."
     )
@@ -164,12 +151,8 @@ class LampsSettings(Settings):
         [[2.0, 2.0, 2.0], [2.0, -2.0, 2.0], [-2.0, 2.0, 2.0], [-2.0, -2.0, 2.0]],
         "Positions [x, y, z] of the lamps in world units.",
     )
-    power: float = setting(
-        10.0, "Largest power of a lamp.", minimum=1 / MAX_SCALE, maximum=MAX_SCALE
-    )
-    radius: float = setting(
-        0.0, "Radius of the discs in world units.", minimum=0, maximum=MAX_SCALE
-    )
+    power: float = setting(10.0, "Largest power of a lamp.", within=(1 / MAX_SCALE, MAX_SCALE))
+    radius: float = setting(0.0, "Radius of the discs in world units.", within=(0, MAX_SCALE))
     start: Any = setting(
         0.0,
         "Powers with which attacks start: a number, [r, g, b] of each lamp, or the lamps.json of "
@@ -190,17 +173,11 @@ class SceneSettings(Settings):
 
     backgrounds: list[Any] = setting([0.5], "Gray values in [0, 1] or image files.")
     views: int | None = setting(
-        1, "Number of cameras per mesh, at equal azimuths.", minimum=1, maximum=MAX_VIEWS
+        1, "Number of cameras per mesh, at equal azimuths.", within=(1, MAX_VIEWS)
     )
-    polar: float = setting(
-        60.0, "Polar angle of the cameras from +z.", "degrees", minimum=0, maximum=180
-    )
+    polar: float = setting(60.0, "Polar angle of the cameras from +z.", "degrees", within=(0, 180))
     azimuth: float = setting(
-        0.0,
-        "Azimuth of the first camera from +x toward +y.",
-        "degrees",
-        minimum=-360,
-        maximum=360,
+        0.0, "Azimuth of the first camera from +x toward +y.", "degrees", within=(-360, 360)
     )
     width: float = setting(
         2.0, "Width of the image in world units, at the mesh. The mesh spans [-1, 1]."
@@ -209,8 +186,7 @@ class SceneSettings(Settings):
         None,
         "Angle between the sides of the image. null: orthographic.",
         "degrees",
-        minimum=0.1,
-        maximum=150,
+        within=(0.1, 150),
     )
     vertices: int = setting(
         0,
@@ -230,12 +206,9 @@ class SceneSettings(Settings):
         None,
         "Spherical-harmonic degree of the lighting. "
         "null: 6, or what the smoothest specular material needs that the run can reach.",
-        minimum=0,
-        maximum=MAX_DEGREE,
+        within=(0, MAX_DEGREE),
     )
-    exposure: float = setting(
-        1.0, "Factor of the lighting.", minimum=1 / MAX_SCALE, maximum=MAX_SCALE
-    )
+    exposure: float = setting(1.0, "Factor of the lighting.", within=(1 / MAX_SCALE, MAX_SCALE))
     # `projector` and `lamps` are dictionaries that `__post_init__` converts to settings, because
     # OmegaConf cannot set a single field of an optional dataclass.
     projector: Any = setting(
@@ -252,8 +225,7 @@ class SceneSettings(Settings):
         None,
         "Color of a table under each mesh: [r, g, b] in sRGB. null: no table.",
         length=3,
-        minimum=0,
-        maximum=1,
+        within=(0, 1),
     )
 
     def __post_init__(self) -> None:
@@ -276,8 +248,7 @@ class RendererSettings(Settings):
         None,
         "Samples per side of a pixel. With 2, each pixel has 4 samples. null: 2, or 8 with "
         "silhouettes.",
-        minimum=1,
-        maximum=MAX_SAMPLES,
+        within=(1, MAX_SAMPLES),
     )
     encoding: str = setting_like(ImageSettings, "encoding", "linear")
     normals: str = setting_like(ImageSettings, "normals", "smooth")
@@ -317,22 +288,17 @@ class NormalizedLightSettings(Settings):
         maximum=100,
     )
     level: float = setting(
-        1.0,
-        "Linear value of this percentile after the exposure.",
-        above=0,
-        maximum=1,
+        1.0, "Linear value of this percentile after the exposure.", above=0, maximum=1
     )
     white_balance: float = setting(
         0.0,
         "Degree of the white balance. 0: none. 1: all channels have the same mean (gray world).",
-        minimum=0,
-        maximum=1,
+        within=(0, 1),
     )
     gamma: float = setting(
         1.25,
         "Exponent of the encoded image. 1: sRGB. Less than 1 brightens the image.",
-        minimum=0.1,
-        maximum=10,
+        within=(0.1, 10),
     )
 
 

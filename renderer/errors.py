@@ -9,9 +9,11 @@ them themselves.
 from __future__ import annotations
 
 import os
+import re
 import reprlib
 import unicodedata
-from collections.abc import Collection, Iterable, Mapping, Set
+from collections.abc import Collection, Iterable, Iterator, Mapping, Set
+from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -94,10 +96,41 @@ class InputError(ValueError):
             return self
         # An argument such as "light.turbidity" or
         # "light[0]" belongs to the field "light".
-        field = self.argument.partition(".")[0].partition("[")[0]
+        field = re.split(r"[.[]", self.argument)[0]
         if field and field in names:
             return InputError(f"{key}.{self}", f"{key}.{self.argument}")
         return InputError(f"{key}: {self}", key)
+
+
+@contextmanager
+def keyed(group: str = "", /, **keys: str) -> Iterator[None]:
+    """Replace the names of Python arguments in error messages by keys of settings.
+
+    A message of the library begins with the name of a Python argument, such as
+    "name". The user of a command knows only the setting from which the command
+    took the argument, such as "network". The key of "lighting" also holds for
+    "lighting.radius" and "lighting[0]", and `group` is put before all other arguments.
+    """
+    try:
+        yield
+    except InputError as error:
+        argument = error.argument
+        if argument not in keys:
+            # "light.turbidity" and "light[0]" are parts of the argument "light".
+            argument = re.split(r"[.[]", argument)[0]
+        message = str(error)
+        if argument in keys:
+            key = keys[argument]
+            named = key + error.argument.removeprefix(argument)
+            raise InputError(key + message.removeprefix(argument), named) from error
+        if group and not message.startswith(group):
+            raise InputError(f"{group}: {message}", group) from error
+        raise
+
+
+def keys_of(key: str, settings: object) -> dict[str, str]:
+    """List the dotted key of each field of a group of settings, as `keyed` takes them."""
+    return {name: f"{key}.{name}" for name in vars(settings)}
 
 
 def single_line(error: Exception) -> str:
@@ -204,8 +237,7 @@ def require_bounded(**tensors: Tensor) -> None:
         # A comparison with NaN is False, so `not` also finds NaN.
         if not _largest_magnitude(tensor) <= MAX_MAGNITUDE:
             raise InputError(
-                f"{name} holds NaN, infinity or magnitudes beyond {MAX_MAGNITUDE:g}: "
-                "give finite values",
+                f"{name} holds NaN, infinity or magnitudes beyond {MAX_MAGNITUDE:g}",
                 name,
             )
 
@@ -221,17 +253,14 @@ def as_tensor(name: str, value: object) -> Tensor:
     import numpy as np
     import torch
 
+    is_sequence = isinstance(value, list | tuple) and bool(value)
     if isinstance(value, torch.Tensor):
         if value.is_floating_point():
             return value
         if not value.is_complex() and value.dtype != torch.bool:
             return value.to(torch.get_default_dtype())
-    elif (
-        isinstance(value, list | tuple)
-        and value
-        and all(isinstance(item, torch.Tensor) for item in value)
-    ):
-        rows = [as_tensor(name, item) for item in value]
+    elif is_sequence and all(isinstance(item, torch.Tensor) for item in cast(Any, value)):
+        rows = [as_tensor(name, item) for item in cast(Any, value)]
         first = rows[0]
         if all(row.shape == first.shape for row in rows):
             return torch.stack([row.to(first) for row in rows])
@@ -312,18 +341,12 @@ def as_path(name: str, value: object) -> Path:
 def as_folder(name: str, value: object) -> Path:
     """Convert an argument to the path of a folder that exists or can be created."""
     path = as_path(name, value)
-    for ancestor in (path, *path.absolute().parents):
-        if not os.path.lexists(ancestor):
-            continue
-        # `exists` is False for a symbolic link
-        # without a target, which is no file.
-        if ancestor.exists() and not ancestor.is_dir():
-            raise InputError(
-                f"{name}={path} cannot be a folder, because {ancestor} is a file: give the path of "
-                "a folder",
-                name,
-            )
-        break
+    ancestors = (path, *path.absolute().parents)
+    nearest = next(ancestor for ancestor in ancestors if os.path.lexists(ancestor))
+    # `exists` is False for a symbolic link
+    # without a target, which is no file.
+    if nearest.exists() and not nearest.is_dir():
+        raise InputError(f"{name}={path} cannot be a folder, because {nearest} is a file", name)
     return path
 
 
@@ -434,8 +457,7 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
     if not has_memory(needed, device):
         free = free_memory(device) or 0
         raise InputError(
-            f"{name} need {needed / GIB:.1f} GB of memory, but only {free / GIB:.1f} GB are free: "
-            "reduce their number or size",
+            f"{name} need {needed / GIB:.1f} GB of memory, of {free / GIB:.1f} free: reduce them"
         )
 
 

@@ -14,10 +14,10 @@ import math
 import operator
 import os
 import types
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, Field, dataclass, field, fields
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from renderer.errors import (
@@ -104,44 +104,41 @@ class Facts:
     may_be_empty: bool = False
     checks_type: bool = True
 
-    @cached_property
-    def limits(self) -> list[Limit]:
-        """Limits of the range of the field: its minimum, its maximum and so on."""
+    @property
+    def limits(self) -> list[tuple[str, str, Callable[[Any, Any], Any], float]]:
+        """Limits of the range: words in errors, sign in --help, comparison and number of each."""
         all_limits = (
-            Limit("at least", "≥", operator.ge, self.minimum),
-            Limit("above", ">", operator.gt, self.above),
-            Limit("at most", "≤", operator.le, self.maximum),
-            Limit("below", "<", operator.lt, self.below),
+            ("at least", "≥", operator.ge, self.minimum),
+            ("above", ">", operator.gt, self.above),
+            ("at most", "≤", operator.le, self.maximum),
+            ("below", "<", operator.lt, self.below),
         )
-        return [limit for limit in all_limits if limit.end is not None]
+        return [(*limit, end) for *limit, end in all_limits if end is not None]  # type: ignore[misc]
 
 
-@dataclass(frozen=True)
-class Limit:
-    """Limit of a range of numbers, such as "at least 0".
-
-    Attributes:
-        words: Words of the limit in errors, such as "at least".
-        sign: Sign of the limit in `--help`, such as "≥".
-        holds: Function that compares a value with `end`, such as operator.ge.
-        end: Number of the limit. None if the range has no such limit.
-    """
-
-    words: str
-    sign: str
-    holds: Callable[[Any, Any], Any]
-    end: float | None
-
-
-def setting(default: Any, about: str, unit: str = "", **facts: Any) -> Any:
+def setting(
+    default: Any,
+    about: str,
+    unit: str = "",
+    *,
+    within: tuple[float | None, float | None] = (None, None),
+    **facts: Any,
+) -> Any:
     """Create a field of a settings class. `facts` are further attributes of `Facts`.
 
-    If the value is a list, its items are checked against the range and the choices. None is
+    `within` is the smallest and the largest permitted value. If the value is a list, its items are
+    checked against the range and the choices. None is
     permitted if the annotation of the field permits None. A function as default is called
     for each instance, and REQUIRED means that there is none. `above` and `below` exclude
     the limit. `is_text` makes the command line read 1.10 as text.
     """
-    return _field(default, Facts(about, unit, **facts))
+    limits: dict[str, Any] = {"minimum": within[0], "maximum": within[1]}
+    return _field(default, Facts(about, unit, **limits | facts))
+
+
+def pair(default: Any, about: str, within: tuple[float, float], unit: str = "") -> Any:
+    """Create a field for the smallest and the largest value of what `about` says."""
+    return setting(default, f"Smallest and largest {about}", unit, within=within, is_pair=True)
 
 
 def setting_like(kind: type, name: str, default: Any) -> Any:
@@ -152,8 +149,6 @@ def setting_like(kind: type, name: str, default: Any) -> Any:
 def _field(default: Any, facts: Facts) -> Any:
     """Create a field of a dataclass, and store facts about the field in its metadata."""
     metadata = {"facts": facts}
-    if default is REQUIRED:
-        return field(metadata=metadata)
     if isinstance(default, list | dict):
         return field(default_factory=partial(deepcopy, default), metadata=metadata)
     if callable(default):
@@ -172,10 +167,14 @@ class Settings:
         """Check the type, the range and the choices of each field."""
         for name, hint, facts in _checked_fields(type(self)):  # type: ignore[arg-type]  # types are hashable
             value = getattr(self, name)
-            if facts.checks_type and not _fits(value, hint):
-                raise InputError(f"{name} is {describe(value)}: give {_expected(hint)}", name)
+            if facts.checks_type:
+                _check_type(name, value, hint)
             if value is not None:
                 _check_value(name, value, facts)
+
+    def wrong(self, name: str, text: str) -> InputError:
+        """Make an error about a field, such as wrong("size", "is odd") for "size=3 is odd"."""
+        return InputError(f"{name}={getattr(self, name)} {text}", name)
 
 
 def facts_of(kind: type, name: str) -> Facts:
@@ -207,16 +206,14 @@ def settings_from(kind: type[Kind], values: object, argument: str) -> Kind:
     if not isinstance(values, Mapping):
         expected = f"give a mapping or {kind.__name__}(...)"
         raise InputError(f"{argument} is {describe(values)}: {expected}", argument)
-    known_fields = fields(cast(Any, kind))
-    names = [known.name for known in known_fields]
+    names = [item.name for item in fields(cast(Any, kind))]
     for name in values:
         if name not in names:
             unknown = f"{argument}.{name}"
             raise InputError(f"{unknown} is not a setting: choose from {', '.join(names)}", unknown)
-    for known in known_fields:
-        has_default = known.default is not MISSING or known.default_factory is not MISSING
-        if not has_default and known.name not in values:
-            missing = f"{argument}.{known.name}"
+    for item in fields(cast(Any, kind)):
+        if item.name not in values and item.default is item.default_factory is MISSING:
+            missing = f"{argument}.{item.name}"
             raise InputError(f"{missing} is not set: give a value", missing)
     try:
         return kind(**values)
@@ -240,19 +237,16 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
     items = list(value) if _is_list(value) else [value]
     if facts.length not in (None, len(items)):
         raise InputError(f"{name}={items}: give {facts.length} numbers", name)
+    limits = facts.limits
     for item in items:
         if facts.choices:
             require_choice(name, item, facts.choices)
-        _check_range(name, item, facts.limits)
-
-
-def _check_range(name: str, value: Any, limits: Sequence[Limit]) -> None:
-    """Check that a value is a number within some limits. NaN is outside of all limits."""
-    if limits and not is_number(value):
-        raise InputError(f"{name}={describe(value)} must be a number", name)
-    if not all(limit.holds(value, limit.end) for limit in limits):
-        range_in_words = " and ".join(f"{limit.words} {limit.end:g}" for limit in limits)
-        raise InputError(f"{name}={value} must be {range_in_words}", name)
+        if limits and not is_number(item):
+            raise InputError(f"{name}={describe(item)} must be a number", name)
+        # NaN is outside of all limits.
+        if not all(holds(item, end) for _, _, holds, end in limits):
+            range_in_words = " and ".join(f"{words} {end:g}" for words, _, _, end in limits)
+            raise InputError(f"{name}={item} must be {range_in_words}", name)
 
 
 def _check_pair(name: str, value: Any, facts: Facts) -> None:
@@ -262,8 +256,7 @@ def _check_pair(name: str, value: Any, facts: Facts) -> None:
     if len(value) == 2 and lower_limit <= value[0] <= value[1] <= upper_limit:
         return
     raise InputError(
-        f"{name}={list(value)} is no range: "
-        f"give [minimum, maximum], both from {lower_limit:g} to {upper_limit:g}",
+        f"{name}={list(value)}: give [minimum, maximum] from {lower_limit:g} to {upper_limit:g}",
         name,
     )
 
@@ -275,9 +268,14 @@ def require_field_types(settings: Any, *unchecked: str) -> None:
     float, and a path for a string.
     """
     for name, hint, _ in _checked_fields(type(settings)):  # type: ignore[arg-type]  # types are hashable
-        value = getattr(settings, name)
-        if name not in unchecked and not _fits(value, hint):
-            raise InputError(f"{name} is {describe(value)}: give {_expected(hint)}", name)
+        if name not in unchecked:
+            _check_type(name, getattr(settings, name), hint)
+
+
+def _check_type(name: str, value: Any, hint: Any) -> None:
+    """Check that a value has the annotated type of its field."""
+    if not _fits(value, hint):
+        raise InputError(f"{name} is {describe(value)}: give {_expected(hint)}", name)
 
 
 # Functions that tell whether a value is accepted for a
@@ -302,10 +300,7 @@ def _fits(value: object, hint: Any) -> bool:
         return any(_fits(value, option) for option in get_args(hint))
     if origin is list:
         (item_hint,) = get_args(hint)
-        if not _is_list(value):
-            return False
-        items = cast(Iterable[Any], value)
-        return item_hint is Any or all(_fits(item, item_hint) for item in items)
+        return _is_list(value) and all(_fits(item, item_hint) for item in cast(Any, value))
     return isinstance(value, origin or hint)
 
 
@@ -347,12 +342,9 @@ class ImageSettings(Settings):
     True
     """
 
-    size: int = setting(32, "Pixels per side.", minimum=1, maximum=MAX_SAMPLES_PER_ROW)
+    size: int = setting(32, "Pixels per side.", within=(1, MAX_SAMPLES_PER_ROW))
     samples: int = setting(
-        2,
-        "Samples per side of a pixel. With 2, each pixel has 4 samples.",
-        minimum=1,
-        maximum=MAX_SAMPLES,
+        2, "Samples per side of a pixel. With 2, each pixel has 4 samples.", within=(1, MAX_SAMPLES)
     )
     encoding: str = setting(
         "linear",
@@ -370,8 +362,7 @@ class ImageSettings(Settings):
     bounces: int = setting(
         0,
         "Number of bounces of light between the surfaces. One or more includes shadows.",
-        minimum=0,
-        maximum=MAX_BOUNCES,
+        within=(0, MAX_BOUNCES),
     )
     silhouettes: bool = setting(
         False,

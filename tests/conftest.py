@@ -5,7 +5,6 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from importlib import import_module
 from ipaddress import ip_address
 
 import pytest
@@ -99,14 +98,16 @@ def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
 
     The command runs within this process, in the temporary folder of the test.
     """
+    import scripts
+    from train.__main__ import main
+
     handlers = logging.root.handlers[:]
 
     def command(name: str, *arguments: str) -> int:
-        module = "train.__main__" if name == "train" else f"scripts.{name}"
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
         try:
-            import_module(module).main()
+            (main if name == "train" else getattr(scripts, name))()
         except SystemExit as stop:
             return stop.code
         return 0

@@ -112,10 +112,10 @@ def test_only_commands_and_what_gets_all_their_settings_name_keys():
     command_layer = (
         "train.cli",
         "train.commands",
-        "train.fingerprints",
+        "train.run_config",
+        "train.system",
         "train.__main__",
         "train.results",
-        "train.user_errors",
     )
     checked = 0
     for name, path in modules().items():

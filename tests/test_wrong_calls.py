@@ -6,7 +6,7 @@ The kinds of values that the checks of arguments refuse are in tests/renderer/te
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -125,101 +125,67 @@ def calls_of(
     return [(name, f"{name}={_title(value)}", lambda value=value: call(value)) for value in values]
 
 
+def by_name(call: Callable[..., object], **wrong: list[Any]) -> list[Any]:
+    """List the calls with each wrong value of each argument."""
+    calls = []
+    for name, values in wrong.items():
+        calls += calls_of(name, lambda value, name=name: call(**{name: value}), *values)
+    return calls
+
+
 def _title(value: object) -> str:
     """Name a value without the address of an object, which differs between processes."""
     return describe(value)[:60]
 
 
 RENDERING = [
-    *calls_of("mesh", lambda x: render(mesh=x), "orange.glb"),
-    *calls_of("cameras", lambda x: render(cameras=x), None, [], 1.0, (1.0, 0.5)),
-    *calls_of("light", lambda x: render(light=x), "grace", COMPLEX),
-    *calls_of("light", lambda x: render(light=x), LIGHT[:, 0], LIGHT * NAN, MESH, 3.0),
-    *calls_of("light", lambda x: render(light=x), LIGHT.bool(), LIGHT[:, :2]),
-    *calls_of("size", lambda x: render(size=x), 16.5, True, 0),
-    *calls_of(
-        "background", lambda x: render(background=x), 255, "white", NAN, torch.rand(SIZE, SIZE, 3)
+    *by_name(render, mesh=["orange.glb"], cameras=[None, [], 1.0, (1.0, 0.5)]),
+    *by_name(render, light=["grace", MESH, 3.0, LIGHT * NAN]),
+    *by_name(render, size=[16.5, True, 0]),
+    *by_name(render, background=[255, "white", [0.1, 0.2]]),
+    *by_name(
+        render,
+        lights=[
+            LIGHT,
+            LAMP,
+            [(LAMP, LIGHT)],
+            [(LAMP, "white")],
+            [(LAMP,)],
+            [(LIGHT, LAMP)],
+            [(LAMP, [[NAN] * 3])],
+        ],
     ),
-    *calls_of(
-        "background",
-        lambda x: render(background=x),
-        -0.1,
-        [0.1, 0.2],
-        [0, 128, 255],
-        [[0.5], [0.5, 0.5]],
-    ),
-    *calls_of(
-        "lights", lambda x: render(lights=x), LIGHT, LAMP, [(LAMP, LIGHT)], [(LAMP, "white")]
-    ),
-    *calls_of(
-        "lights",
-        lambda x: render(lights=x),
-        [(LAMP, [[1, 2j, 3]])],
-        [(LAMP,)],
-        "lamp",
-        [(LIGHT, LAMP)],
-    ),
-    *calls_of("lights", lambda x: render(lights=x), [(LAMP, [[NAN] * 3])]),
-    *calls_of("vertices", lambda x: render(vertices=x), np.ones((3, 3)), "x", MESH.vertices * NAN),
-    *calls_of("vertices", lambda x: render(vertices=x), MESH.vertices.T[:, :3].tolist(), MESH, 1.0),
-    *calls_of("albedo", lambda x: render(albedo=x), torch.full((4, 3), -5.0), torch.ones(3, 3)),
-    *calls_of(
-        "albedo",
-        lambda x: render(albedo=x),
-        "red",
-        torch.ones(4, 3) * NAN,
-        torch.full((4, 3), 255.0),
-        0.5,
-    ),
-    *calls_of("albedo", lambda x: render(albedo=x), torch.ones(4, 3) * 1j, torch.ones(2, 2, 3)),
-    *calls_of("albedo_scale", lambda x: render(albedo_scale=x), "2", -1.0, NAN),
-    *calls_of("gloss", lambda x: render(gloss=x), 0.3, (0.3, 0, 1)),
-    *calls_of("samples", lambda x: render(samples=x), 0, 2.5, "2", 65),
-    *calls_of("encoding", lambda x: render(encoding=x), "sRGB", None, 3),
-    *calls_of("normals", lambda x: render(normals=x), "Smooth", None),
-    *calls_of("shadows", lambda x: render(shadows=x), "no", 2),
-    *calls_of("bounces", lambda x: render(bounces=x), 1.5, -1, "2", 101),
-    *calls_of("silhouettes", lambda x: render(silhouettes=x), "yes"),
-    *calls_of("rasterizer", lambda x: render(rasterizer=x), "gpu", 3),
-    *calls_of("mesh", lambda x: operators(mesh=x), "orange.glb"),
-    *calls_of("cameras", lambda x: operators(cameras=x), None, [], [1.0]),
-    *calls_of("size", lambda x: operators(size=x), 16.5, True, 0),
-    *calls_of("albedo_scale", lambda x: operators(albedo_scale=x), "2", -1.0),
-    *calls_of("gloss", lambda x: operators(gloss=x), 0.3, "shiny"),
-    *calls_of("rasterizer", lambda x: operators(rasterizer=x), "gpu"),
+    *by_name(render, vertices=[1.0, "x", MESH.vertices * NAN]),
+    *by_name(render, albedo=[torch.full((4, 3), -5.0), 0.5, "red", torch.ones(4, 3) * NAN]),
+    *by_name(render, albedo_scale=["2", -1.0, NAN], gloss=[0.3, (0.3, 0, 1)]),
+    *by_name(render, samples=[0, 2.5, "2", 65], encoding=["sRGB", None, 3]),
+    *by_name(render, normals=["Smooth", None], shadows=["no", 2], bounces=[1.5, -1, "2", 101]),
+    *by_name(render, silhouettes=["yes"], rasterizer=["gpu", 3]),
+    *by_name(operators, mesh=["orange.glb"], cameras=[None, [], [1.0]], size=[16.5, True, 0]),
+    *by_name(operators, albedo_scale=["2", -1.0], gloss=[0.3, "shiny"], rasterizer=["gpu"]),
     *calls_of("lights", lambda x: operator().image(x), "grace", LIGHT.T, LIGHT * NAN),
     *calls_of("lights", lambda x: operator().radiance(x), "grace", LIGHT[:9]),
     *calls_of(
         "background", lambda x: operator().image(LIGHT, x), 2.0, "white", torch.rand(3, 4, 4)
     ),
-    *calls_of(
-        "radiance_gradient", lambda x: operator().light_gradient(x), "x", torch.ones(3, 2), 1.0
-    ),
+    *calls_of("radiance_gradient", lambda x: operator().light_gradient(x), "x", 1.0),
     *calls_of("device", lambda x: operator().to(x), "gpu", 3.5),
 ]
 
 CAMERAS = [
     *calls_of("views", lambda x: renderer.orbit_cameras(x, 2.0), 0, 2.5, "3"),
     *calls_of("width", lambda x: renderer.orbit_cameras(1, x), 0, "2", NAN),
-    *calls_of("polar", lambda x: renderer.orbit_cameras(1, 2.0, polar=x), "60", NAN, 721.0),
-    *calls_of("azimuth", lambda x: renderer.orbit_cameras(1, 2.0, azimuth=x), "45", NAN, -721.0),
-    *calls_of("fov", lambda x: renderer.orbit_cameras(1, 2.0, fov=x), 173.0, "30", 0, NAN),
+    *by_name(partial(renderer.orbit_cameras, 1, 2.0), polar=["60", NAN, 721.0]),
+    *by_name(partial(renderer.orbit_cameras, 1, 2.0), azimuth=["45", NAN, -721.0]),
+    *by_name(partial(renderer.orbit_cameras, 1, 2.0), fov=[173.0, "30", 0, NAN]),
     *calls_of("polar", lambda x: renderer.OrthographicCamera(x, 0.0, 2.0), "up", NAN),
     *calls_of("azimuth", lambda x: renderer.OrthographicCamera(1.0, x, 2.0), "east", NAN),
     *calls_of("width", lambda x: renderer.OrthographicCamera(57.3, 0.0, x), 0.0, "wide", NAN),
-    *calls_of("right", lambda x: renderer.OrthographicCamera(57.3, 0.0, 2.0, right=x), "x", NAN),
-    *calls_of(
-        "clip_range",
-        lambda x: renderer.OrthographicCamera(57.3, 0.0, 2.0, clip_range=x),
-        0.0,
-        "far",
-    ),
-    *calls_of(
-        "distance", lambda x: renderer.PerspectiveCamera(57.3, 0.0, 2.0, distance=x), 0, "far", NAN
-    ),
-    *calls_of("size", lambda x: renderer.ImageSettings(size=x), 16.5, True, 0),
-    *calls_of("samples", lambda x: renderer.ImageSettings(samples=x), 0, 65, 2.5, "8"),
-    *calls_of("encoding", lambda x: renderer.ImageSettings(encoding=x), "gamma", None),
+    *by_name(partial(renderer.OrthographicCamera, 57.3, 0.0, 2.0), right=["x", NAN]),
+    *by_name(partial(renderer.OrthographicCamera, 57.3, 0.0, 2.0), clip_range=[0.0, "far"]),
+    *by_name(partial(renderer.PerspectiveCamera, 57.3, 0.0, 2.0), distance=[0, "far"]),
+    *by_name(renderer.ImageSettings, size=[16.5, True, 0], samples=[0, 65, 2.5, "8"]),
+    *by_name(renderer.ImageSettings, encoding=["gamma", None]),
 ]
 
 LIGHTS = [
@@ -235,25 +201,11 @@ LIGHTS = [
     ),
     *calls_of("basis", lambda x: renderer.save_light(Path("l.json"), LIGHT, x), "harmonics", 6),
     *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, 3, "light.png"),
-    *calls_of("height", lambda x: renderer.save_light("l.exr", LIGHT, height=x), 0, 2.5, None),
-    *calls_of(
-        "directions",
-        lambda x: harmonics.basis(x, 2),
-        "up",
-        torch.ones(4, 2),
-        1.0,
-        torch.ones(2, 3) * NAN,
-    ),
+    *by_name(partial(renderer.save_light, "l.exr", LIGHT), height=[0, 2.5, None]),
+    *calls_of("directions", lambda x: harmonics.basis(x, 2), "up", 1.0, torch.ones(2, 3) * NAN),
     *calls_of("degree", lambda x: harmonics.basis(torch.ones(2, 3), x), -1, 2.5, 41, "2"),
     *calls_of("light", harmonics.degree_of, "grace", torch.ones(49), 6),
-    *calls_of(
-        "radiance",
-        lambda x: harmonics.project(x, 2),
-        "sky",
-        torch.ones(4),
-        torch.ones(4, 8, 3) * NAN,
-        1.0,
-    ),
+    *calls_of("radiance", lambda x: harmonics.project(x, 2), "sky", torch.ones(4, 8, 3) * NAN, 1.0),
     *calls_of("degree", lambda x: harmonics.project(torch.ones(4, 8, 3), x), -1, 2.5, "2"),
     *calls_of("coefficients", lambda x: harmonics.rotate(x, torch.eye(3)), "x", torch.ones(8, 3)),
     *calls_of("rotation", lambda x: harmonics.rotate(LIGHT, x), "x", torch.eye(2)),
@@ -262,16 +214,14 @@ LIGHTS = [
     *calls_of("turbidity", lambda x: skylight.coefficients(0.5, 0.0, x), "clear", 1.0, NAN),
     *calls_of("positions", Lamps, 3, (), ((1.0, 2.0),), ((0.0, 0.0, 0.0),), (1.0, 2.0, 3.0)),
     *calls_of("power", lambda x: Lamps(((1.0, 1.0, 1.0),), x), 0, "bright", NAN),
-    *calls_of("pixels", lambda x: Projector(pixels=x), 0, 2.5, "16", 257),
-    *calls_of("fov", lambda x: Projector(fov=x), 173.0, "30", 0),
+    *by_name(Projector, pixels=[0, 2.5, "16", 257], fov=[173.0, "30", 0]),
 ]
 
 MESHES = [
     *calls_of("path", renderer.load_mesh, None, 3),
     *calls_of("missing.glb", renderer.load_mesh, "missing.glb"),
     *calls_of("folder.glb", renderer.load_mesh, "folder.glb"),
-    *calls_of("up", lambda x: renderer.load_mesh("a.glb", up=x), "x", 2),
-    *calls_of("gloss", lambda x: renderer.load_mesh("a.glb", gloss=x), "yes", 0.3),
+    *by_name(partial(renderer.load_mesh, "a.glb"), up=["x", 2], gloss=["yes", 0.3]),
     *calls_of("mesh", renderer.normalize, "a.glb"),
     *calls_of("mesh", lambda x: renderer.subdivide(x, 10), "a.glb"),
     *calls_of("vertices", lambda x: renderer.subdivide(MESH, x), 2.5, -1, "many", 10**8),
@@ -280,8 +230,8 @@ MESHES = [
     *calls_of("a.obj", lambda x: renderer.export_mesh(MESH, x), "a.obj"),
     *calls_of("folder.glb", lambda x: renderer.export_mesh(MESH, x), "folder.glb"),
     *calls_of("normals", lambda x: renderer.export_mesh(MESH, "a.glb", x), "hard"),
-    *calls_of("cameras", lambda x: renderer.export_mesh(MESH, "a.glb", cameras=x), 3, None, [None]),
-    *calls_of("first", lambda x: renderer.export_mesh(MESH, "a.glb", first=x), "x", 2.5, -1),
+    *by_name(partial(renderer.export_mesh, MESH, "a.glb"), cameras=[3, None, [None]]),
+    *by_name(partial(renderer.export_mesh, MESH, "a.glb"), first=["x", 2.5, -1]),
     *calls_of("name", renderer.solid, "car", 3),
     *calls_of("seed", lambda x: renderer.solid("orange", x), -1, 1.5, "3"),
     *calls_of("vertices", lambda x: renderer.Mesh.plain(x, MESH.faces), "x", 3.0, np.ones((4, 2))),
@@ -294,45 +244,26 @@ MESHES = [
         [[0, 1]],
     ),
     *calls_of(
-        "color",
-        lambda x: renderer.Mesh.plain(MESH.vertices, MESH.faces, x),
-        "red",
-        (255, 128, 0),
-        (1, 1),
-        -0.1,
+        "color", lambda x: renderer.Mesh.plain(MESH.vertices, MESH.faces, x), "red", (1, 1), -0.1
     ),
     *calls_of("faces", lambda x: renderer.Mesh.plain(MESH.faces, x), MESH.vertices / 2),
-    *calls_of("vertices", lambda x: mesh_of(vertices=x), "x", MESH.vertices[:, :2]),
-    *calls_of("faces", lambda x: mesh_of(faces=x), None, MESH.faces + 1),
-    *calls_of("corner_colors", lambda x: mesh_of(corner_colors=x), None, MESH.faces),
+    *by_name(mesh_of, vertices=["x", MESH.vertices[:, :2]], faces=[None, MESH.faces + 1]),
+    *by_name(mesh_of, corner_colors=[None, MESH.faces], corner_uvs=[None, np.ones((4, 3))]),
+    *by_name(mesh_of, normal_ids=[MESH.faces - 1, MESH.faces * 1.0, MESH.faces[1:]]),
+    *by_name(mesh_of, texture_ids=[None, np.zeros(4, int), [0, 0]]),
+    *by_name(mesh_of, textures=["a.png", [np.ones((4, 4, 3))], 3]),
     *calls_of(
         "corner_colors", lambda x: render(mesh=mesh_of(corner_colors=x)), MESH.corner_colors * 255
     ),
-    *calls_of("corner_uvs", lambda x: mesh_of(corner_uvs=x), None, np.ones((4, 3))),
-    *calls_of(
-        "normal_ids",
-        lambda x: mesh_of(normal_ids=x),
-        MESH.faces - 1,
-        MESH.faces + 2**32,
-        MESH.faces * 1.0,
-        MESH.faces[1:],
-    ),
-    *calls_of(
-        "crease", lambda x: renderer.Mesh.plain(MESH.vertices, MESH.faces, crease=x), -1, 181, "x"
-    ),
-    *calls_of("texture_ids", lambda x: mesh_of(texture_ids=x), None, np.zeros(4, int), [0, 0]),
-    *calls_of("textures", lambda x: mesh_of(textures=x), "a.png", [np.ones((4, 4, 3))], 3),
+    *by_name(partial(renderer.Mesh.plain, MESH.vertices, MESH.faces), crease=[-1, "x"]),
     *calls_of(
         "gloss",
         lambda x: render(mesh=mesh_of(gloss=x)),
         0.3,
         np.full((4, 3), 2.0),
-        np.ones(3),
         renderer.Gloss(0.3),
     ),
-    *calls_of(
-        "roughness", lambda x: renderer.Gloss(x).on(MESH), "smooth", 2.0, -0.1, NAN, [0.1, 0.2]
-    ),
+    *calls_of("roughness", lambda x: renderer.Gloss(x).on(MESH), "smooth", 2.0, NAN),
     *calls_of("metallic", lambda x: renderer.Gloss(0.3, x).on(MESH), "gold", 1.5, np.ones((4, 3))),
     *calls_of("specular_factor", lambda x: renderer.Gloss(0.3, 0.0, x).on(MESH), "full", 1.5),
     *calls_of("mesh", renderer.Gloss(0.3).on, "a.glb"),
@@ -341,91 +272,48 @@ MESHES = [
 SCENES = [
     *calls_of("meshes", scene, "solid:orange", [], [("solid:orange",)], ["solid:orange"], 3),
     *calls_of("meshes", scene, [(MESH, None)], [(TRIMESH, "orange")], {"orange": MESH}, [()]),
-    *calls_of("size", lambda x: scene(size=x), 16.5, True, 0),
-    *calls_of("views", lambda x: scene(views=x), 0, 2.5, "3", -1),
-    *calls_of("shared", lambda x: scene(shared=x), "yes", 3),
-    *calls_of("scene", lambda x: scene(scene=x), {"views": 3}, 3),
-    *calls_of("renderer", lambda x: scene(renderer=x), {"samples": 3}),
-    *calls_of("device", lambda x: scene(device=x), "gpu", 3.5),
-    *calls_of("widht", lambda x: scene(widht=x), 2.0),
-    *calls_of(
-        "backgrounds", lambda x: scene(backgrounds=x), 0.5, [], "gray", [255], ["missing.png"]
-    ),
-    *calls_of("light", lambda x: scene(light=x), None, 3, "sunset", LIGHT.T, LIGHT * NAN),
-    *calls_of("degree", lambda x: scene(degree=x), 2.5, -1, 41, "6"),
-    *calls_of("exposure", lambda x: scene(exposure=x), -1, "bright", NAN),
-    *calls_of("width", lambda x: scene(width=x), 0, "wide", NAN),
-    *calls_of("polar", lambda x: scene(polar=x), 200.0, "top", NAN),
-    *calls_of("azimuth", lambda x: scene(azimuth=x), "east", 1000.0),
-    *calls_of("fov", lambda x: scene(fov=x), 200.0, "30", 0),
-    *calls_of("vertices", lambda x: scene(vertices=x), 2.5, -1, "many", None),
-    *calls_of("ground", lambda x: scene(ground=x), [1, 2, 3], "wood", 0.5, [0.5, 0.5]),
-    *calls_of("projector", lambda x: scene(projector=x), Projector(), 16),
-    *calls_of("lamps", lambda x: scene(lamps=x), LAMP),
-    *calls_of("samples", lambda x: scene(samples=x), 0, 2.5, "2"),
-    *calls_of("rasterizer", lambda x: scene(rasterizer=x), "gpu", 3),
-    *calls_of(
-        "pixels", lambda x: scene(projector=augment.ProjectorSettings(pixels=x)), 2.5, 0, "16"
-    ),
+    *by_name(scene, size=[16.5, True, 0], views=[0, 2.5, "3", -1], shared=["yes", 3]),
+    *by_name(scene, scene=[{"views": 3}, 3], renderer=[{"samples": 3}], device=["gpu", 3.5]),
+    *by_name(scene, widht=[2.0], backgrounds=[0.5, [], [255], ["missing.png"]]),
+    *by_name(scene, light=[None, 3, "sunset", LIGHT.T, LIGHT * NAN], degree=[2.5, -1, 41, "6"]),
+    *by_name(scene, exposure=[-1, "bright", NAN], width=[0, "wide", NAN]),
+    *by_name(scene, polar=[200.0, "top", NAN], azimuth=["east", 1000.0], fov=[200.0, "30", 0]),
+    *by_name(scene, vertices=[2.5, -1, "many", None], ground=[[1, 2, 3], "wood", 0.5, [0.5, 0.5]]),
+    *by_name(scene, projector=[Projector(), 16], lamps=[LAMP], samples=[0, 2.5, "2"]),
+    *by_name(scene, rasterizer=["gpu", 3]),
+    *calls_of("pixels", lambda x: scene(projector=augment.ProjectorSettings(pixels=x)), 2.5, 0),
     *calls_of(
         "pattern",
         lambda x: scene(projector=augment.ProjectorSettings(pattern=x)),
         2.0,
         "missing.png",
-        None,
     ),
     *calls_of(
-        "positions",
-        lambda x: scene(lamps=augment.LampsSettings(positions=x)),
-        3,
-        [],
-        [[1, 2]],
-        "above",
+        "positions", lambda x: scene(lamps=augment.LampsSettings(positions=x)), 3, [], [[1, 2]]
     ),
-    *calls_of(
-        "start",
-        lambda x: scene(lamps=augment.LampsSettings(start=x)),
-        -1.0,
-        [1, 2],
-        None,
-        NAN,
-        11.0,
-    ),
+    *calls_of("start", lambda x: scene(lamps=augment.LampsSettings(start=x)), [1, 2], None, NAN),
     *calls_of("mesh", lambda x: augment.ObjectSettings(x, "orange"), None, 3, ""),
     *calls_of("label", lambda x: scene([augment.ObjectSettings("solid:orange", x)]), None, 3),
     *calls_of("albedo_scale", lambda x: augment.ObjectSettings("solid:cup", "cup", x), "2", 0, NAN),
-    *calls_of(
-        "color",
-        lambda x: augment.ObjectSettings("solid:cup", "cup", color=x),
-        "red",
-        0.5,
-        [255, 0, 0],
-        [0, 0],
-    ),
-    *calls_of("gloss", lambda x: augment.ObjectSettings("solid:cup", "cup", gloss=x), "shiny"),
+    *by_name(partial(augment.ObjectSettings, "solid:cup", "cup"), color=[0.5, [255, 0, 0], [0, 0]]),
+    *by_name(partial(augment.ObjectSettings, "solid:cup", "cup"), gloss=["shiny"]),
     *calls_of(
         "props",
         lambda x: scene([augment.ObjectSettings("solid:cup", "cup", props=x)]),
         ["solid:cup"],
         3,
-        None,
     ),
     *calls_of("at", lambda x: augment.PropSettings("solid:cup", x), 3, "left", [1], [NAN, 0]),
     *calls_of("scale", lambda x: augment.PropSettings("solid:cup", [0, 0], x), 0, "big", NAN),
-    *calls_of("shift", lambda x: augment.VariationSettings(shift=x), 2.0, "far", NAN),
-    *calls_of("scale", lambda x: augment.VariationSettings(scale=x), 2.0, [2, 1], None),
-    *calls_of("environments", lambda x: augment.VariationSettings(environments=x), "grace", 3),
-    *calls_of("instances", lambda x: augment.VariationSettings(instances=x), "yes"),
-    *calls_of("fov", lambda x: augment.VariationSettings(fov=x), 30.0, None, [50, 60]),
-    *calls_of("gloss", lambda x: augment.VariationSettings(gloss=x), 0.3, None),
-    *calls_of("camera", lambda x: augment.VariationSettings(camera=x), 0.3, None),
-    *calls_of("noise", lambda x: augment.CameraEffectSettings(noise=x), 2.0, "much", NAN),
-    *calls_of(
-        "pattern_fill", lambda x: augment.CameraEffectSettings(pattern_fill=x), 0.5, [0, 2], None
-    ),
-    *calls_of("backgrounds", lambda x: small_scene().changed(backgrounds=x), "gray", BYTES, 0.5),
-    *calls_of("lights", lambda x: small_scene().changed(lights=x), "grace", LIGHT[:9], LIGHT * NAN),
-    *calls_of("examples", lambda x: small_scene().changed(examples=x), [], None, [3]),
+    *by_name(augment.VariationSettings, shift=[2.0, "far", NAN], scale=[2.0, [2, 1], None]),
+    *by_name(augment.VariationSettings, environments=["grace", 3], instances=["yes"]),
+    *by_name(augment.VariationSettings, fov=[30.0, None, [50, 60]], gloss=[0.3, None]),
+    *by_name(augment.VariationSettings, camera=[0.3, None]),
+    *by_name(augment.CameraEffectSettings, noise=[2.0, "much", NAN], pattern_fill=[0.5, [0, 2]]),
+    *by_name(small_scene().changed, backgrounds=["gray", BYTES, 0.5]),
+    *by_name(small_scene().changed, lights=["grace", LIGHT[:9], LIGHT * NAN]),
+    *by_name(small_scene().changed, examples=[[], None, [3]], objects=[[MESH], None, []]),
+    *by_name(small_scene().changed, settings=[None, 8]),
     *calls_of("light", lambda x: renderer.light_sphere(x, 8), "grace", 96),
     *calls_of(
         "photograph", lambda x: renderer.fit_scene(x, torch.ones(8, 8), MESH), "photo.jpg", BYTES[0]
@@ -436,8 +324,6 @@ SCENES = [
     *calls_of("permute", CLASSIFIER, IMAGES.permute(0, 2, 3, 1)),
     *calls_of("inference_mode", torch.inference_mode()(lambda x: attack(force=x)), True),
     *calls_of("alone", attack, lambda x: {"logits": bright_or_dark(x)}),
-    *calls_of("objects", lambda x: small_scene().changed(objects=x), [MESH], None, []),
-    *calls_of("settings", lambda x: small_scene().changed(settings=x), None, 8),
     *calls_of("conditions", lambda x: small_scene().render(x, torch.arange(2)), None),
     *calls_of(
         "examples",
@@ -448,56 +334,37 @@ SCENES = [
     ),
 ]
 
+
+def transferred(**changed: Any) -> Any:
+    return augment.transfer(small_result(), **changed)
+
+
+def saved(**changed: Any) -> Any:
+    return augment.save(small_result(), "out", **changed)
+
+
 STEPS = augment.StepSettings()
 ATTACKS = [
     *calls_of("norm", augment.StepSettings, "l3", 0.1, None, 2),
     *calls_of("radius", lambda x: augment.StepSettings("l2", x), "big", -1, NAN),
-    *calls_of("step", lambda x: augment.StepSettings(step=x), "adam", None, 0.1),
-    *calls_of("step_size", lambda x: augment.StepSettings(step_size=x), 0, "small", NAN),
-    *calls_of("rotation", lambda x: augment.PoseSettings(rotation=x), 200, "much", NAN),
-    *calls_of("roughness", lambda x: augment.MaterialSettings(roughness=x), 2, "rough"),
-    *calls_of("zenith", lambda x: augment.SkylightSettings(zenith=x), "noon"),
-    *calls_of("lighting", lambda x: augment.AttackSettings(lighting=x), 0.1, True),
-    *calls_of("pose", lambda x: augment.AttackSettings(pose=x), augment.StepSettings(), 10.0),
-    *calls_of(
-        "material", lambda x: augment.AttackSettings(material=x), augment.StepSettings(), 0.3
-    ),
-    *calls_of("skylight", lambda x: augment.AttackSettings(skylight=x), augment.StepSettings()),
-    *calls_of(
-        "max_steps", lambda x: augment.AttackSettings(lighting=STEPS, max_steps=x), 2.5, "x", -1
-    ),
-    *calls_of(
-        "restarts", lambda x: augment.AttackSettings(lighting=STEPS, restarts=x), 1.5, "x", -1
-    ),
-    *calls_of("margin", lambda x: augment.AttackSettings(lighting=STEPS, margin=x), "x", -1, NAN),
-    *calls_of("quantized", lambda x: augment.AttackSettings(lighting=STEPS, quantized=x), "yes", 8),
-    *calls_of(
-        "allow_negative", lambda x: augment.AttackSettings(lighting=STEPS, allow_negative=x), "no"
-    ),
-    *calls_of(
-        "backtracking", lambda x: augment.AttackSettings(lighting=STEPS, backtracking=x), "no"
-    ),
-    *calls_of("eot", lambda x: augment.AttackSettings(lighting=STEPS, eot=x), 3, None),
-    *calls_of(
-        "batch_size", lambda x: augment.AttackSettings(lighting=STEPS, batch_size=x), 0, 2.5, "32"
-    ),
+    *by_name(augment.StepSettings, step=["adam", None, 0.1], step_size=[0, "small", NAN]),
+    *by_name(augment.PoseSettings, rotation=[200, "much", NAN]),
+    *by_name(augment.MaterialSettings, roughness=[2, "rough"]),
+    *by_name(augment.SkylightSettings, zenith=["noon"]),
+    *by_name(augment.AttackSettings, lighting=[0.1, True], pose=[augment.StepSettings(), 10.0]),
+    *by_name(augment.AttackSettings, material=[0.3], skylight=[augment.StepSettings()]),
+    *by_name(partial(augment.AttackSettings, lighting=STEPS), max_steps=[2.5, -1]),
+    *by_name(partial(augment.AttackSettings, lighting=STEPS), restarts=[1.5, -1]),
+    *by_name(partial(augment.AttackSettings, lighting=STEPS), margin=["x", -1, NAN]),
+    *by_name(partial(augment.AttackSettings, lighting=STEPS), quantized=["yes", 8]),
+    *by_name(partial(augment.AttackSettings, lighting=STEPS), allow_negative=["no"]),
+    *by_name(partial(augment.AttackSettings, lighting=STEPS), backtracking=["no"], eot=[3, None]),
+    *by_name(partial(augment.AttackSettings, lighting=STEPS), batch_size=[0, 2.5]),
     *calls_of("classifier", attack, None, LINEAR, small_scene),
-    *calls_of("scene", lambda x: attack(scene=x), None),
-    *calls_of(
-        "target",
-        lambda x: attack(target=x, force=True),
-        3,
-        True,
-        "pear",
-        ["other", "other"],
-        [3],
-        0.5,
-        LIGHT,
-    ),
-    *calls_of("settings", lambda x: attack(settings=x), {"lighting": STEPS}),
+    *by_name(attack, scene=[None], settings=[{"lighting": STEPS}], force=["yes"]),
+    *by_name(partial(attack, force=True), target=[3, "pear", ["other", "other"], 0.5, LIGHT]),
+    *by_name(partial(attack, force=True), seed=["x", 1.5, -1]),
     *calls_of("attack", lambda x: attack(settings=x), augment.AttackSettings()),
-    *calls_of("seed", lambda x: attack(seed=x, force=True), "x", 1.5, -1),
-    *calls_of("force", lambda x: attack(force=x), "yes"),
     *calls_of(
         "orange",
         lambda x: attack(x, force=True),
@@ -511,29 +378,15 @@ ATTACKS = [
     *calls_of("result", augment.check, None),
     *calls_of("result", lambda x: augment.success_by_radius(x, [1.0]), None),
     *calls_of(
-        "scales", lambda x: augment.success_by_radius(small_result(), x), 0.5, [], ["x"], [-1], None
+        "scales", lambda x: augment.success_by_radius(small_result(), x), 0.5, [], ["x"], [-1]
     ),
     *calls_of("result", lambda x: augment.transfer(x, [CLASSIFIER]), None),
-    *calls_of(
-        "classifiers", lambda x: augment.transfer(small_result(), x), CLASSIFIER, ["squeezenet"], 3
-    ),
-    *calls_of(
-        "azimuths", lambda x: augment.transfer(small_result(), azimuths=x), 30.0, ["x"], None, [NAN]
-    ),
-    *calls_of("objects", lambda x: augment.transfer(small_result(), objects=x), [MESH], MESH),
+    *calls_of("classifiers", lambda x: augment.transfer(small_result(), x), ["squeezenet"], 3),
+    *by_name(transferred, azimuths=[30.0, ["x"], [NAN]], objects=[[MESH], MESH]),
     *calls_of("result", lambda x: augment.save(x, "out"), None),
     *calls_of("folder", lambda x: augment.save(small_result(), x), None, 3),
     *calls_of("file.txt", lambda x: augment.save(small_result(), x), "file.txt"),
-    *calls_of(
-        "checks",
-        lambda x: augment.save(small_result(), "out", checks=x),
-        3,
-        "all",
-        {"success": 1.0},
-    ),
-    *calls_of(
-        "verify", lambda x: augment.save(small_result(), "out", verify=x), "blender", None, 3
-    ),
+    *by_name(saved, checks=[3, {"success": 1.0}], verify=["blender", 3]),
     *calls_of("folder", augment.reload, None, 3),
     *calls_of("file.txt", augment.reload, "file.txt"),
     *calls_of("missing", augment.reload, "missing"),
@@ -550,10 +403,9 @@ def returning(value: Any) -> augment.Classifier:
 
 
 DIRECT = [
-    *calls_of("rasterizer", lambda x: small_scene().changed(rasterizer=x), "numpy"),
-    *calls_of("basis", lambda x: small_scene().changed(basis=x), "harmonics", 6),
-    *calls_of("camera_effects", lambda x: small_scene().changed(camera_effects=x), 3, "blur"),
-    *calls_of("backgrounds", lambda x: scene(backgrounds=x), [True]),
+    *by_name(small_scene().changed, rasterizer=["numpy"], basis=["harmonics", 6]),
+    *by_name(small_scene().changed, camera_effects=[3, "blur"]),
+    *by_name(scene, backgrounds=[[True]]),
     *calls_of("textured", lambda x: renderer.Gloss(0.3, textured=x).on(MESH), "yes"),
     *calls_of(
         "classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), {"orange", "other"}
@@ -562,28 +414,16 @@ DIRECT = [
     *calls_of("height", lambda x: harmonics.equirectangular(x, 8), "x", 0, 4.5),
     *calls_of("examples", lambda x: small_scene().conditions(x), "all", [9], 0),
     *calls_of("light", lambda x: small_scene().render(x, [0]), Conditions(LIGHT)),
-    *calls_of("scene", lambda x: service_of(scene=x), 3, MESH),
-    *calls_of("labels", lambda x: service_of(labels=x), "orange", [0]),
-    *calls_of("positive_classes", lambda x: service_of(positive_classes=x), "orange"),
-    *calls_of("phases", lambda x: service_of(phases=x), None),
-    *calls_of("seed", lambda x: service_of(seed=x), None, 0.5),
-    *calls_of("images", lambda x: service_of(images=x), BYTES, [1]),
+    *by_name(service_of, scene=[3, MESH], labels=["orange", [0]], positive_classes=["orange"]),
+    *by_name(service_of, phases=[None], seed=[None, 0.5], images=[BYTES, [1]]),
 ]
 
 
 CLASSIFIERS = [
     *calls_of("function", lambda x: augment.Classifier(x, SIZE, CLASSES), None, 3),
+    *calls_of("size", lambda x: augment.Classifier(bright_or_dark, x, CLASSES), 16.5, 0),
     *calls_of(
-        "size", lambda x: augment.Classifier(bright_or_dark, x, CLASSES), 16.5, True, 0, 5000
-    ),
-    *calls_of(
-        "classes",
-        lambda x: augment.Classifier(bright_or_dark, SIZE, x),
-        "orange",
-        3,
-        [],
-        ["a", "a"],
-        [0, 1],
+        "classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), 3, [], ["a", "a"], [0, 1]
     ),
     *calls_of("name", lambda x: augment.Classifier(bright_or_dark, SIZE, CLASSES, x), None, 3),
     *calls_of("images", CLASSIFIER, BYTES, BYTES.to(torch.uint8), "x"),
@@ -605,43 +445,28 @@ CLASSIFIERS = [
     *calls_of("label", lambda x: CLASSIFIER.detect(IMAGES, x), 3, ["orange"]),
     *calls_of("name", augment.load_classifier, None, 3),
     *calls_of("resnet50", augment.load_classifier, "resnet50"),
-    *calls_of(
-        "weights", lambda x: augment.load_classifier("torchvision:resnet18", x), 3, ".", LINEAR
-    ),
+    *calls_of("weights", lambda x: augment.load_classifier("torchvision:resnet18", x), 3, "."),
     *calls_of("run", load_run, None, 3),
     *calls_of("missing", load_run, "missing"),
     *calls_of("file.txt", load_run, "file.txt"),
-    *calls_of("weights", lambda x: load_run("pretrained/none", weights=x), "a.pt"),
+    *by_name(partial(load_run, "pretrained/none"), weights=["a.pt"]),
     *calls_of("size", lambda x: augment.build_scene([("solid:orange", "orange")], x), CLASSIFIER),
 ]
 
 SERVICES = [
     *calls_of("mode", augment.AugmentationSettings, "all", None, 3),
     *calls_of("folder", lambda x: augment.AugmentationSettings("folder", x), None, 3),
-    *calls_of("examples", lambda x: augment.AugmentationSettings(examples=x), 2.5, "x", -1),
-    *calls_of("init", lambda x: augment.AugmentationSettings(init=x), "zero", None),
-    *calls_of("warm_start", lambda x: augment.AugmentationSettings(warm_start=x), "yes"),
-    *calls_of(
-        "regenerate_every", lambda x: augment.AugmentationSettings(regenerate_every=x), 0, 2.5, "x"
-    ),
-    *calls_of("vary", lambda x: augment.AugmentationSettings(vary=x), {"shift": 0.1}),
-    *calls_of("random_light", lambda x: augment.AugmentationSettings(random_light=x), 0.5, None),
-    *calls_of("attack", lambda x: augment.AugmentationSettings(attack=x), STEPS),
+    *by_name(augment.AugmentationSettings, examples=[2.5, "x", -1], init=["zero", None]),
+    *by_name(augment.AugmentationSettings, warm_start=["yes"], regenerate_every=[0, 2.5]),
+    *by_name(augment.AugmentationSettings, vary=[{"shift": 0.1}], random_light=[0.5, None]),
+    *by_name(augment.AugmentationSettings, attack=[STEPS]),
     *calls_of("amplitude", RandomLightSettings, 0, "x", NAN),
     *calls_of(
-        "meshes",
-        lambda x: augment.AugmentationService.from_meshes(x, SIZE),
-        "solid:orange",
-        [(MESH,)],
-        [MESH],
-        3,
+        "meshes", lambda x: augment.AugmentationService.from_meshes(x, SIZE), [(MESH,)], [MESH], 3
     ),
     *calls_of("label", small_service, "orange", 1.5, None),
-    *calls_of(
-        "size", lambda x: augment.AugmentationService.from_meshes([(MESH, 0)], x), 16.5, None, 0
-    ),
-    *calls_of("settings", lambda x: small_service(settings=x), {"mode": "random"}),
-    *calls_of("seed", lambda x: small_service(seed=x), "x", 1.5, -1),
+    *calls_of("size", lambda x: augment.AugmentationService.from_meshes([(MESH, 0)], x), 16.5, 0),
+    *by_name(small_service, settings=[{"mode": "random"}], seed=["x", 1.5, -1]),
     *calls_of("label", lambda x: small_service(x).regenerate(LINEAR, 0), 2),
     *calls_of("model", lambda x: small_service().regenerate(x, 0), None, 3),
     *calls_of("model", lambda x: small_service().regenerate(x, 0), nn.Flatten(0), nn.Linear(5, 2)),

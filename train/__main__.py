@@ -1,9 +1,7 @@
 """pnb-train: train a network with and without renders, and score it."""
 
 import hashlib
-import os
 import re
-import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
@@ -11,10 +9,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from renderer.errors import InputError
-from train.cli import SWEEP_FLAGS, Command, HelpText, read_settings
-from train.settings import CIRCUMSTANCES, ExperimentSettings
-from train.system import import_function, take_flag
+from train.cli import Command, read_settings
+from train.settings import CIRCUMSTANCES
+from train.system import import_function
 
 # Largest number of characters of one setting in the name of a folder.
 MAX_PART = 48
@@ -25,39 +22,21 @@ HYDRAS_OWN = re.compile(r"\+*hydra[./]")
 
 
 class TrainCommand(Command):
-    """The command pnb-train.
+    """The command pnb-train."""
 
-    It starts one training run in this process. With --multirun, it starts several
-    runs by one of Hydra's launchers.
-    """
-
-    def __call__(self) -> None:
-        """Start one run or, with --multirun, several runs."""
-        if SWEEP_FLAGS.isdisjoint(sys.argv):
-            super().__call__()
-            return
-        with self.handle_errors():
-            # torchrun sets this variable in the processes that it starts.
-            if "TORCHELASTIC_RUN_ID" in os.environ:
-                raise InputError(
-                    "torchrun cannot start a sweep (--multirun), since its processes train one "
-                    "run together: start a sweep with pnb-train --multirun",
-                )
-            overrides = self.to_overrides(take_flag(sys.argv[1:]))
-            import_function("train.commands.sweep:sweep")(super().__call__, overrides)
-
-    def work(self, config: DictConfig) -> None:
+    def run(self, config: DictConfig) -> None:
         """Train one run. With --multirun, Hydra calls this method for each run."""
-        job = HydraConfig.get()
-        if job.mode == RunMode.MULTIRUN:
-            config.out = job.runtime.output_dir
-            import_function("train.commands.sweep:run_in_sweep")(config)
-            return
-        if not config.train.resume:
-            # Report mistakes in the settings before the import of the module
-            # train.commands.experiment, which takes seconds.
-            read_settings(self.settings, config)
-        import_function("train.commands.experiment:train")(config, list(job.overrides.task))
+        with self.handle_errors():
+            job = HydraConfig.get()
+            if job.mode == RunMode.MULTIRUN:
+                config.out = job.runtime.output_dir
+                import_function("train.commands.sweep:run_in_sweep")(config)
+                return
+            if not config.train.resume:
+                # Report mistakes in the settings before the import of the module
+                # train.commands.experiment, which takes seconds.
+                read_settings(self.kind, config)
+            import_function(self.body)(config, list(job.overrides.task))
 
 
 def name_model(words: list[str]) -> list[str]:
@@ -65,11 +44,7 @@ def name_model(words: list[str]) -> list[str]:
 
     A mapping as in model={...} stays, because it sets several fields.
     """
-    renamed = []
-    for word in words:
-        has_name = word.startswith("model=") and not word.startswith("model={")
-        renamed.append(word.replace("model=", "model.name=", 1) if has_name else word)
-    return renamed
+    return [re.sub(r"^model=(?!\{)", "model.name=", word) for word in words]
 
 
 def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str = "") -> str:
@@ -81,12 +56,9 @@ def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str 
     to Hydra are replaced by "_". `fixed` settings count in the hash, but are not shown. A folder in
     `parent` with the same hash keeps its name.
     """
-    pairs = []
-    for override in overrides:
-        key, _, value = override.partition("=")
-        if not HYDRAS_OWN.match(override) and key not in CIRCUMSTANCES:
-            pairs.append((key, value))
-    pairs.sort()
+    words = [override for override in overrides if not HYDRAS_OWN.match(override)]
+    pairs = sorted((key, value) for key, _, value in (word.partition("=") for word in words))
+    pairs = [(key, value) for key, value in pairs if key not in CIRCUMSTANCES]
     digest = hashlib.sha256(repr(pairs).encode(errors="surrogatepass")).hexdigest()
     ending = f"@{digest[:8]}"
     if parent:
@@ -101,25 +73,23 @@ def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 main = TrainCommand(
     name="train",
-    settings=ExperimentSettings,
+    settings="train.settings:ExperimentSettings",
     body="train.commands.experiment:train",
-    help=HelpText(
-        about="Train a network with and without renders, and score it.",
-        examples=[
-            "pnb-train",
-            "pnb-train train.epochs=10 scene.views=5",
-            "pnb-train experiment=best network=runs/first",
-            "pnb-train --multirun seed=0,1,2",
-        ],
-        common=[
-            *("out", "seed", "label", "network", "train.epochs", "train.batch_size"),
-            *("train.learning_rate", "train.device", "augment.examples", "meshes"),
-            *("scene.views", "photos"),
-        ],
-        groups=["experiment", "data", "augment", "attack@augment.attack", "launcher"],
-    ),
+    about="Train a network with and without renders, and score it.",
+    examples=[
+        "pnb-train",
+        "pnb-train train.epochs=10 scene.views=5",
+        "pnb-train experiment=best network=runs/first",
+        "pnb-train --multirun seed=0,1,2",
+    ],
+    common=[
+        *("out", "seed", "label", "network", "train.epochs", "train.batch_size"),
+        *("train.learning_rate", "train.device", "augment.examples", "meshes"),
+        *("scene.views", "photos"),
+    ],
+    groups=["experiment", "data", "augment", "attack@augment.attack", "launcher"],
     rewrite=name_model,
-    sweeps=True,
+    sweep="train.commands.sweep:sweep",
 )
 
 if __name__ == "__main__":

@@ -25,13 +25,12 @@ from augment.network import unwrapped, with_normalized_light
 from augment.plain_networks import Normalization, as_facts, require_no_facts, say_inputs_of
 from augment.settings import NormalizeLight
 from augment.sources import SOURCES, load_classifier
-from renderer.errors import InputError, as_path, require_file, require_kind, single_line
+from renderer.errors import InputError, as_path, keyed, require_file, require_kind, single_line
 from renderer.io.files import atomic_write
 from train.data.sets import content_hash
 from train.networks import PYTHON, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
 from train.settings import NetworkSettings, published
-from train.user_errors import keyed
 
 # Key in a checkpoint. Its value is the hash of the other entries.
 HASH = "sha256"
@@ -54,8 +53,21 @@ def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> 
 
     An existing file is moved to `previous`.
     """
+    _write({**state, HASH: content_hash(state)}, path, previous)
+
+
+def export(path: Path, network: nn.Module) -> None:
+    """Write the trained weights of a classifier of the user, so that the user can load them.
+
+    The weights have the names of the user's own network, without wrappers of this library.
+    """
+    _write({name: value.cpu() for name, value in unwrapped(network).state_dict().items()}, path)
+
+
+def _write(state: dict[str, Any], path: Path, previous: Path | None = None) -> None:
+    """Write a dictionary atomically by `torch.save`."""
     content = io.BytesIO()
-    torch.save({**state, HASH: content_hash(state)}, content)
+    torch.save(state, content)
     atomic_write(path, content.getbuffer(), durable=True, previous=previous)
 
 
@@ -91,8 +103,7 @@ def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
         ) from error
     if version not in range(VERSION + 1):
         raise InputError(
-            f"checkpoint {path} has format version {version!r}, and this library knows versions "
-            f"up to {VERSION}: install the later version of the library that wrote it",
+            f"checkpoint {path} has version {version!r}, later than {VERSION}: update the library"
         )
     if not is_finite:
         raise InputError(
@@ -150,12 +161,10 @@ def load_network(
     its own weights, classes, size and normalization, so these must then be None.
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
-    folder = _find_run(Path(name))
-    if folder is not None:
-        raise InputError(
-            f"name={name} is a training run or a file of one: give name={RUN}{folder} instead",
-            "name",
-        )
+    path = Path(name)
+    folder = path.parent if path.name == WEIGHTS else path
+    if (folder / BEST).is_file():
+        raise InputError(f"name={name} is a training run: give name={RUN}{folder} instead", "name")
     if name.startswith(RUN):
         require_no_facts(name, as_facts(classes, size, normalization))
         # Error messages about the argument `run` begin with `name` instead, the argument of
@@ -166,23 +175,19 @@ def load_network(
     return load_classifier(name, weights, classes, size, normalization, normalize_light, trust_code)
 
 
-def _find_run(path: Path) -> Path | None:
-    """Return the folder of a training run if a path is this folder, or its file weights.pt."""
-    folder = path.parent if path.name == WEIGHTS else path
-    return folder if (folder / BEST).is_file() else None
-
-
 def load_chosen(settings: NetworkSettings) -> Classifier:
     """Load the classifier that the settings of a command choose."""
-    return load_network(
-        str(settings.network),
-        settings.weights,
-        settings.classes,
-        settings.size,
-        settings.normalization,
-        settings.normalize_light,
-        settings.trust,
-    )
+    # Error messages about the argument `name` begin with the setting `network` instead.
+    with keyed(name="network"):
+        return load_network(
+            str(settings.network),
+            settings.weights,
+            settings.classes,
+            settings.size,
+            settings.normalization,
+            settings.normalize_light,
+            settings.trust,
+        )
 
 
 def load_run(
@@ -216,8 +221,7 @@ def load_run(
     """
     if weights is not None:
         raise InputError(
-            f"weights={weights} cannot replace the weights of {RUN}{run}: leave weights out",
-            "weights",
+            f"weights={weights} cannot replace those of a run: leave it out", "weights"
         )
     require_kind("model", model, str | None, "python:package.module:function, or None")
     path, state = load_selected(as_path("run", run))
@@ -226,9 +230,8 @@ def load_run(
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
         raise InputError(
-            f"the network in {path} is built by {name}: "
-            f"give model={name} to run that code or, "
-            f"for an attack, name {PYTHON}MODULE:FUNCTION, a function that loads the weights",
+            f"the network in {path} is built by {name}: give model={name} to run that code, or "
+            f"load its weights in a {PYTHON}MODULE:FUNCTION of your own"
         )
     with checks_architecture(path):
         size = int(shape.pop("size"))
@@ -238,20 +241,14 @@ def load_run(
         network = with_normalized_light(built, light)
         network.load_state_dict(state["model"])
         classifier = Classifier(network, size, classes, f"{RUN}{run}")
-        classifier.operating_points = _operating_points(state)
+        stored = state.get("operating_point", [])
+        points = stored if isinstance(stored, list) else [stored]
+        classifier.operating_points = [OperatingPoint(**values) for values in points]
         for point in classifier.operating_points:
             # This call raises InputError if the network lacks the class.
             classifier.label(point.label)
         say_inputs_of(classifier)
         return classifier
-
-
-def _operating_points(state: Mapping[str, Any]) -> list[OperatingPoint]:
-    """Read the operating points (thresholds on the log-odds) that are stored with a network."""
-    stored = state.get("operating_point", [])
-    if not isinstance(stored, list):
-        stored = [stored]
-    return [OperatingPoint(**values) for values in stored]
 
 
 @contextmanager
@@ -279,10 +276,8 @@ def selected_file(run: Path) -> Path | None:
     None if there is none. `run` can also be the file itself, or a folder below pretrained/.
     """
     found = published(run)
-    for file in (found, found / BEST, found / PUBLISHED):
-        if file.is_file():
-            return file
-    return None
+    files = (found, found / BEST, found / PUBLISHED)
+    return next((file for file in files if file.is_file()), None)
 
 
 def is_state_dict(path: Path) -> bool:
@@ -290,15 +285,11 @@ def is_state_dict(path: Path) -> bool:
 
     `torch.save(network.state_dict(), path)` writes such a file.
     """
-    if not path.is_file() or path.suffix == ".safetensors":
-        return False
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
+        return all(isinstance(value, Tensor) for value in content.values())
     except Exception:  # `torch.load` raises errors of many types for other files.
         return False
-    if not isinstance(content, dict):
-        return False
-    return all(isinstance(value, Tensor) for value in content.values())
 
 
 def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
@@ -306,8 +297,7 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     path = selected_file(run)
     if path is None:
         raise InputError(
-            f"run={run} holds neither {BEST} nor {PUBLISHED}: give a folder that pnb-train wrote",
-            "run",
+            f"run={run} holds neither {BEST} nor {PUBLISHED}: give another folder", "run"
         )
     if path.suffix == ".safetensors":
         return path, _load_published(path)
@@ -327,13 +317,12 @@ def write_published(path: Path, state: Mapping[str, Any]) -> None:
 
     The format is safetensors, with the entries PUBLISHED_FACTS as JSON in its metadata.
     """
-    metadata = {}
-    for key in PUBLISHED_FACTS:
-        if key in state:
-            metadata[key] = json.dumps(state[key], ensure_ascii=False)
-    weights = {}
-    for name, value in state["model"].items():
-        weights[name] = value.half().contiguous() if value.is_floating_point() else value
+    facts = [key for key in PUBLISHED_FACTS if key in state]
+    metadata = {key: json.dumps(state[key], ensure_ascii=False) for key in facts}
+    weights = {
+        name: value.half().contiguous() if value.is_floating_point() else value
+        for name, value in state["model"].items()
+    }
     atomic_write(path, safetensors.torch.save(weights, metadata), durable=True)
 
 
@@ -352,14 +341,3 @@ def _load_published(path: Path) -> dict[str, Any]:
             f"checkpoint {path} is damaged or has no architecture: use another checkpoint",
         ) from error
     return checked({**facts, "model": weights}, path)
-
-
-def export(path: Path, network: nn.Module) -> None:
-    """Write the trained weights of a classifier of the user, so that the user can load them.
-
-    The weights have the names of the user's own network, without wrappers of this library.
-    """
-    state = unwrapped(network).state_dict()
-    content = io.BytesIO()
-    torch.save({name: value.cpu() for name, value in state.items()}, content)
-    atomic_write(path, content.getbuffer(), durable=True)

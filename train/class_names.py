@@ -77,45 +77,44 @@ def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) ->
     for index, item in enumerate(items):
         values = item if isinstance(item, dict) else {"mesh": item}
         label = values.get("label")
-        if label in (None, ""):
-            found.append(_class_of_unlabeled_mesh(str(values.get("mesh")), classes))
-        else:
+        if label not in (None, ""):
             found.append(class_name(classes, label, f"{key}[{index}].label"))
+            continue
+        mesh = str(values.get("mesh"))
+        name = class_of_name(name_of_mesh(mesh), classes)
+        if name is None:
+            raise _unknown_class_error(mesh, classes)
+        found.append(name)
     return found
-
-
-def _class_of_unlabeled_mesh(mesh: str, classes: Sequence[str]) -> str:
-    """Find the class of a mesh by its name, and raise InputError if no class has this name."""
-    name = class_of_name(name_of_mesh(mesh), classes)
-    if name is None:
-        raise _unknown_class_error(mesh, classes)
-    return name
 
 
 def _unknown_class_error(mesh: str, classes: Sequence[str]) -> InputError:
     """Create the error for a mesh whose class is unknown."""
     solid = solid_name(mesh)
+    solids = (*SOLIDS, *HARD_NEGATIVES)
     if not solid and not Path(mesh).exists():
         return InputError(f"{mesh} does not exist: give the path of a mesh, or solid:NAME")
-    if solid and solid not in (*SOLIDS, *HARD_NEGATIVES):
-        choices = nearest(solid, (*SOLIDS, *HARD_NEGATIVES))
-        return InputError(f"{mesh} is not a solid: choose one, such as {choices}")
-    if list(classes) == [str(index) for index in range(len(classes))]:
-        remedy = f"give label=INDEX, from 0 to {len(classes) - 1}, or name the classes in classes="
-        return InputError(f"label is not set, and the classes have no names: {remedy}", "label")
-    choices = nearest(name_of_mesh(mesh), classes)
+    if solid and solid not in solids:
+        return InputError(f"{mesh} is not a solid: choose one, such as {nearest(solid, solids)}")
     fault = f"label is not set, and {mesh} is not named like a class of the network"
-    remedy = f"give label=CLASS or {{mesh: '{mesh}', label: CLASS}}, such as {choices}"
-    return InputError(f"{fault}: {remedy}", "label")
+    remedy = f"give label=CLASS or {{mesh: '{mesh}', label: CLASS}}"
+    choices = nearest(name_of_mesh(mesh), classes)
+    return InputError(f"{fault}: {remedy}, such as {choices}", "label")
 
 
-def class_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> str:
-    """Find the class of meshes, and raise InputError if they are of several classes."""
+def class_of_meshes(
+    items: Sequence[Any], classes: Sequence[str], key: str, label: Any = None
+) -> str:
+    """Find the class of meshes, which is `label`, a name or an index, if it is given.
+
+    Meshes of several classes raise InputError.
+    """
+    if label is not None:
+        return class_name(classes, label, "label")
     found = set(classes_of_meshes(items, classes, key))
     if len(found) != 1:
         raise InputError(
-            f"label is not set, and {key} are of the classes {', '.join(sorted(found))}: "
-            "give the meshes of one class, or label=CLASS",
+            f"label is not set, and {key} are of the classes {', '.join(sorted(found))}: give one",
             "label",
         )
     return found.pop()
@@ -139,9 +138,7 @@ def require_others(
         is_permitted = is_labeled and len(labels) > 1
         if name in labels and not is_permitted:
             raise InputError(
-                f"{key} is {item.mesh}, which is of the positive class {name}: "
-                "move it to meshes, or remove it",
-                key,
+                f"{key} is {item.mesh}, which is of the positive class {name}: remove it", key
             )
 
 
@@ -190,22 +187,16 @@ def as_mappings(
         mapping: dict[str, Any]
         if isinstance(item, ObjectSettings):
             mapping = asdict(item)
-        elif isinstance(item, MeshSource):
-            mapping = {"mesh": _name(item)}
-        elif len(item) == 2 and isinstance(item[0], MeshSource):
-            source, label = item
-            mapping = {"mesh": _name(source), "label": label}
         else:
-            raise InputError(f"{name}[{index}] is {describe(item)}: give {EXPECTED}")
+            source, *label = [item] if isinstance(item, MeshSource) else item or [None]
+            if not isinstance(source, MeshSource) or len(label) > 1:
+                raise InputError(f"{name}[{index}] is {describe(item)}: give {EXPECTED}")
+            mesh = name_mesh(source) if isinstance(source, Mesh) else str(source)
+            mapping = {"mesh": mesh, **({"label": label[0]} if label else {})}
         if mapping.get("label", "") != "":
             mapping["label"] = classifier.classes[classifier.label(mapping["label"])]
         mappings.append(mapping)
     return mappings
-
-
-def _name(source: MeshSource) -> str:
-    """Return the text that names a mesh in settings: its file, its solid, or a name in memory."""
-    return name_mesh(source) if isinstance(source, Mesh) else str(source)
 
 
 def find_positive_classes(
@@ -225,8 +216,7 @@ def find_positive_classes(
         if isinstance(item, Mesh):
             name = classifier.classes[0]
             raise InputError(
-                f"meshes[{index}] is an nb.Mesh without a class: give it in a pair, such as "
-                f"(mesh, {name!r}), or give label={name!r}"
+                f"meshes[{index}] is an nb.Mesh without a class: give (mesh, {name!r})"
             )
     names = classes_of_meshes(mappings, classifier.classes, "meshes")
     # A dictionary has each name once, in the order of the meshes.

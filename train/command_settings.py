@@ -19,6 +19,7 @@ from renderer.settings import (
     MAX_VIEWS,
     REQUIRED,
     Settings,
+    pair,
     setting,
     setting_like,
 )
@@ -64,8 +65,7 @@ class AttackCommandSettings(AttackSettings):
         None, "Attack on the light of a projector on `unlabeled`, without a mesh."
     )
     shared: bool = setting(
-        False,
-        "The views share one lighting, shape or color, and their costs are summed.",
+        False, "The views share one lighting, shape or color, and their costs are summed."
     )
     force: bool = setting(False, "Also attack images that are misclassified before the attack.")
     checks: bool | None = setting(
@@ -77,12 +77,10 @@ class AttackCommandSettings(AttackSettings):
         [],
         "Measure success against radius at these factors of each radius, such as "
         "[0.25, 0.5, 1, 2]. A radius of null counts as 1.",
-        minimum=1 / MAX_SCALE,
-        maximum=MAX_SCALE,
+        within=(1 / MAX_SCALE, MAX_SCALE),
     )
     verify: str | None = setting(
-        "reload",
-        "Render the written files again: reload (here), mitsuba, reload+mitsuba or null.",
+        "reload", "Render the written files again: reload (here), mitsuba, reload+mitsuba or null."
     )
 
     def __post_init__(self) -> None:
@@ -106,8 +104,7 @@ class AttackSceneSettings(SceneSettings):
         10,
         "Number of cameras to try for a mesh that is misclassified, in several lightings and in "
         "front of light gray.",
-        minimum=0,
-        maximum=MAX_VIEWS,
+        within=(0, MAX_VIEWS),
     )
 
     def __post_init__(self) -> None:
@@ -126,12 +123,9 @@ class TransferSettings(Settings):
     counts only images that it classified correctly before the attack.
     """
 
-    networks: list[Any] = setting(
-        [],
-        "Other networks: as `network`, or {network, weights}.",
-    )
+    networks: list[Any] = setting([], "Other networks: as `network`, or {network, weights}.")
     azimuths: list[float] = setting(
-        [], "Rotations of the camera about the vertical.", "degrees", minimum=-360, maximum=360
+        [], "Rotations of the camera about the vertical.", "degrees", within=(-360, 360)
     )
     meshes: list[Any] = setting([], "Other meshes, as `meshes`, in the same lighting.")
 
@@ -158,7 +152,7 @@ class AttackExperimentSettings(NetworkSettings):
         "classes, one per view.",
         is_text=True,
     )
-    seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
+    seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
     meshes: list[Any] = setting(["solid:orange:0"], MESHES)
     unlabeled: str | None = setting(
@@ -175,13 +169,11 @@ class AttackExperimentSettings(NetworkSettings):
         AttackCommandSettings, "What is attacked, and how. attack=NAME+NAME names it."
     )
     transfer: TransferSettings = setting(
-        TransferSettings,
-        "Where else successful adversaries are shown.",
+        TransferSettings, "Where else successful adversaries are shown."
     )
     scene: AttackSceneSettings = setting(AttackSceneSettings, "The scene.")
     renderer: RendererSettings = setting(
-        lambda: RendererSettings(shadows=True),
-        "How images are rendered.",
+        lambda: RendererSettings(shadows=True), "How images are rendered."
     )
 
     def __post_init__(self) -> None:
@@ -189,48 +181,30 @@ class AttackExperimentSettings(NetworkSettings):
         super().__post_init__()
         names = self.target if isinstance(self.target, list) else [self.target]
         if any(isinstance(name, dict | list) for name in names):
-            raise InputError(
-                f"target={self.target} is not a class: "
-                "give a class, least_likely, or a list of classes, one per view",
-                "target",
+            raise self.wrong(
+                "target", "is no class: give one, least_likely, or a list, one per view"
             )
         # The name of a class can be a number, which YAML reads as one.
         if isinstance(self.target, int | float):
             self.target = str(self.target)
         if not self.meshes:
             raise InputError("meshes must not be empty: name one or more", "meshes")
-        self._check_photographs()
-        self._add_attacked_lights()
-
-    def _check_photographs(self) -> None:
-        """Check that the attack "relighting" has photographs, and that it is the only attack."""
-        if (self.attack.relighting is None) != (self.unlabeled is None):
-            given = "unlabeled" if self.attack.relighting is None else "attack=relighting"
-            other = "attack=relighting" if self.attack.relighting is None else "unlabeled"
-            raise InputError(f"{given} is set without {other}: set both, or neither")
-        if self.unlabeled is not None and (self.attack.parameters or self.reload):
-            raise InputError(
-                "attack=relighting attacks photographs alone: "
-                "attack meshes in a command of their own",
-                "attack",
-            )
-
-    def _add_attacked_lights(self) -> None:
-        """Add to the settings what the attacked parameters need.
-
-        An attacked light that the scene lacks, such as a projector, is added with
-        default settings. An attack on the pose needs gradients at silhouettes. An
-        attack on the positions of lamps needs lamps that shine.
-        """
         attacked = self.attack.parameters
+        if (self.attack.relighting is None) != (self.unlabeled is None):
+            raise InputError("attack=relighting and unlabeled=FOLDER: set both, or neither")
+        if self.unlabeled is not None and (attacked or self.reload):
+            raise InputError(
+                "attack=relighting attacks photographs alone: remove the others", "attack"
+            )
+        # An attacked light that the scene lacks, such as a projector, is added with default
+        # settings. An attack on the positions of lamps needs lamps that shine.
         for light, settings_class in LOCAL_LIGHT_SETTINGS.items():
-            is_missing = getattr(self.scene, light, None) is None
-            if light in attacked and is_missing:
+            if light in attacked and getattr(self.scene, light, None) is None:
                 setattr(self.scene, light, settings_class())
-        if "pose" in attacked:
-            self.renderer.silhouettes = True
         if "positions" in attacked and self.scene.lamps is None:
             self.scene.lamps = LampsSettings(start=LAMP_POWER)
+        if "pose" in attacked:
+            self.renderer.silhouettes = True
 
 
 @dataclass
@@ -253,8 +227,7 @@ class LabSettings(Settings):
     setups: int = setting(
         180,
         "Number of draws of lighting, camera and pose. With one label, each has two renders.",
-        minimum=1,
-        maximum=MAX_IMAGES,
+        within=(1, MAX_IMAGES),
     )
     patterns: list[str] = setting(
         list(TRAINED_PATTERNS),
@@ -265,102 +238,58 @@ class LabSettings(Settings):
     environments: list[str] = setting(
         [], "Environment maps (.npy, .hdr, .exr) instead of patterns, for as many setups each."
     )
-    brightness: list[float] = setting(
-        [0.2, 2.5],
-        "Smallest and largest radiance of white surfaces that face the light.",
-        minimum=1 / MAX_SCALE,
-        maximum=MAX_SCALE,
-        is_pair=True,
+    brightness: list[float] = pair(
+        [0.2, 2.5], "radiance of white surfaces that face the light.", (1 / MAX_SCALE, MAX_SCALE)
     )
-    azimuth: list[float] = setting(
-        [-70, 70],
-        "Smallest and largest azimuth of a projector, relative to the camera.",
-        "degrees",
-        minimum=-180,
-        maximum=180,
-        is_pair=True,
+    azimuth: list[float] = pair(
+        [-70, 70], "azimuth of a projector, relative to the camera.", (-180, 180), "degrees"
     )
-    elevation: list[float] = setting(
-        [25, 70],
-        "Smallest and largest elevation of a projector above the table.",
-        "degrees",
-        minimum=1,
-        maximum=89,
-        is_pair=True,
+    elevation: list[float] = pair(
+        [25, 70], "elevation of a projector above the table.", (1, 89), "degrees"
     )
-    ambient: list[float] = setting(
-        [0.01, 0.06],
-        "Smallest and largest radiance of the uniform environment besides the projectors.",
-        minimum=0,
-        maximum=1,
-        is_pair=True,
+    ambient: list[float] = pair(
+        [0.01, 0.06], "radiance of the uniform environment besides the projectors.", (0, 1)
     )
-    albedo: list[float] = setting(
-        [0.04, 0.16],
-        "Smallest and largest albedo of table and wall.",
-        minimum=0,
-        maximum=1,
-        is_pair=True,
-    )
+    albedo: list[float] = pair([0.04, 0.16], "albedo of table and wall.", (0, 1))
     walls: float = setting(
         0.0,
         "Fraction of the setups with a wall behind the object, if no projector stands behind it.",
-        minimum=0,
-        maximum=1,
+        within=(0, 1),
     )
-    roughness: list[float] = setting(
-        [0.5, 0.5],
-        "Smallest and largest roughness of the object. 0.1 is glossy, 1 is matte.",
-        minimum=0.05,
-        maximum=1,
-        is_pair=True,
+    roughness: list[float] = pair(
+        [0.5, 0.5], "roughness of the object. 0.1 is glossy, 1 is matte.", (0.05, 1)
     )
     exposure: float = setting(
         1.0,
         "Factor of the radiance. With 1, a radiance of 1 is white.",
-        minimum=1 / MAX_SCALE,
-        maximum=MAX_SCALE,
+        within=(1 / MAX_SCALE, MAX_SCALE),
     )
-    size: int = setting(64, "Pixels per side.", minimum=1, maximum=MAX_SIZE)
-    spp: int = setting(32, "Paths per pixel and light.", minimum=1, maximum=10**5)
-    bounces: int = setting(4, "Largest number of bounces of light.", minimum=1, maximum=1000)
-    seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
+    size: int = setting(64, "Pixels per side.", within=(1, MAX_SIZE))
+    spp: int = setting(32, "Paths per pixel and light.", within=(1, 10**5))
+    bounces: int = setting(4, "Largest number of bounces of light.", within=(1, 1000))
+    seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     overwrite: bool = setting(
-        False,
-        "Render into a folder that is not empty. The renders in it are replaced.",
+        False, "Render into a folder that is not empty. The renders in it are replaced."
     )
 
     def __post_init__(self) -> None:
         """Check all values, and that each pattern and each environment gets as many setups."""
         super().__post_init__()
         if self.label is None and self.meshes != LAB_MESHES:
-            raise InputError(
-                "label is not set: give the class of the meshes that are no hard negatives, "
-                "label=CLASS",
-                "label",
-            )
+            raise InputError("label is not set: give the class of the meshes, label=CLASS", "label")
         self.label = "orange" if self.label is None else self.label
         families = {family for pattern in self.patterns for family in pattern.split("+")}
         for family in sorted(families):
             require_choice("patterns", family, PATTERNS)
         if SLIDES in families and not self.slides:
-            raise InputError(
-                f"patterns has {SLIDES}, but slides is empty: set slides to image files",
-                "patterns",
-            )
+            raise self.wrong("patterns", "need image files: set slides to them")
         sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
         if not sources or self.setups % len(sources):
-            raise InputError(
-                f"setups={self.setups} must be a multiple of the {len(sources)} patterns and "
-                "environments: choose a multiple, so that each of them gets equally many setups",
-                "setups",
+            raise self.wrong(
+                "setups", f"must be a multiple of the {len(sources)} patterns and environments"
             )
-        repeated = [name for name in sources if sources.count(name) > 1]
-        if repeated:
-            raise InputError(
-                f"patterns and environments name {repeated[0]} twice: "
-                "give them different names, which group the renders",
-            )
+        if len(set(sources)) < len(sources):
+            raise InputError(f"patterns and environments {sources} must have different names")
 
 
 @dataclass
@@ -401,11 +330,10 @@ class AuditSettings(NetworkSettings):
         1.0,
         "Factor of the number of views, lightings and renders. "
         "With 1, EfficientNet-Lite0 takes 18 minutes on one core.",
-        minimum=0.01,
-        maximum=100,
+        within=(0.01, 100),
     )
     overwrite: bool = setting(False, "Start anew in a folder that holds an audit or other results.")
-    seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
+    seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
     out: str = setting(
         f"runs/audits/{TIME_FOLDER}",
@@ -416,20 +344,14 @@ class AuditSettings(NetworkSettings):
         """Check all values, and that there is something to audit: meshes or photographs."""
         super().__post_init__()
         if not self.meshes and self.unlabeled is None:
-            raise InputError(
-                "meshes is empty: name one mesh or more, as in meshes=[solid:orange], or a folder "
-                "of photographs, as in unlabeled=FOLDER",
-                "meshes",
+            raise self.wrong(
+                "meshes", "is empty: name a mesh, or set unlabeled to a folder of photographs"
             )
         for key in ("hard_negatives", "photos", "laboratory"):
             if getattr(self, key) and not self.meshes:
                 raise InputError(f"{key} is set, but meshes is empty: set meshes, too", key)
         if self.laboratory and self.hard_negatives:
-            raise InputError(
-                f"hard_negatives and laboratory={self.laboratory} are both set: "
-                "give either meshes to render or a folder of renders",
-                "hard_negatives",
-            )
+            raise self.wrong("laboratory", "is a folder of renders: give it or hard_negatives")
 
     def scale(self, count: int) -> int:
         """Multiply a number of views, lightings or renders by the budget; at least 1 is left."""
@@ -461,8 +383,7 @@ class EvaluateSettings(NetworkSettings):
     false_positive_rate: float | None = setting(
         None,
         "Rate for which a threshold on the log-odds of `label` is chosen on calibrate.",
-        minimum=1e-6,
-        maximum=1 - 1e-6,
+        within=(1e-6, 1 - 1e-6),
     )
     calibrate: str | None = setting(
         None, "A folder like photos. null: the threshold that a published network carries, if any."
@@ -473,8 +394,7 @@ class EvaluateSettings(NetworkSettings):
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
     precision: str = setting(
-        "auto",
-        "auto (bfloat16 if the hardware computes in it), bfloat16 or float32.",
+        "auto", "auto (bfloat16 if the hardware computes in it), bfloat16 or float32."
     )
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
 
@@ -487,8 +407,7 @@ class EvaluateSettings(NetworkSettings):
         builds_run = bool(self.network and self.network.startswith("python:"))
         if (self.run is None) == (self.network is None) and not (self.run and builds_run):
             raise InputError(
-                f"run={self.run} and network={self.network} do not name one network: "
-                "give one network by run=FOLDER, or by network=NAME"
+                f"run={self.run} and network={self.network} do not name one network: give one"
             )
 
 
@@ -501,8 +420,7 @@ def require_calibration(rate: float | None, calibrate: str | None) -> None:
     """
     if (rate is None) != (calibrate is None):
         raise InputError(
-            f"false_positive_rate={rate} and calibrate={calibrate} belong together: "
-            "give false_positive_rate=RATE and calibrate=FOLDER, or neither"
+            f"false_positive_rate={rate} and calibrate={calibrate}: give both, or neither"
         )
 
 
@@ -517,21 +435,18 @@ class FitSettings(Settings):
     mesh: str = setting(REQUIRED, "A mesh file or solid:NAME:SEED, upright as in the photograph.")
     mask: str | None = setting(None, "Image of the photograph's size, white where the object is.")
     box: list[int] = setting(
-        [],
-        "Instead of mask, [left, top, right, bottom] in pixels, for OpenCV's GrabCut.",
+        [], "Instead of mask, [left, top, right, bottom] in pixels, for OpenCV's GrabCut."
     )
     fov: float | None = setting(
         None,
         "Angle across a square that is 1.6 times as wide as the object. null: orthographic.",
         "degrees",
-        minimum=0.1,
-        maximum=120,
+        within=(0.1, 120),
     )
     albedo_scale: float = setting(
         1.0,
         "Factor of the albedo of the mesh. Twice as much halves the lighting.",
-        minimum=1e-3,
-        maximum=1e3,
+        within=(1e-3, 1e3),
     )
     encoding: str = setting(
         "srgb",
@@ -541,16 +456,14 @@ class FitSettings(Settings):
     bounces: int = setting(
         3,
         "Number of bounces of light between the surfaces of the mesh. 0: also without shadows.",
-        minimum=0,
-        maximum=MAX_BOUNCES,
+        within=(0, MAX_BOUNCES),
     )
     label: str | None = setting(
         None, "Class of the printed attack. null: the class that the name of the mesh tells."
     )
-    size: int = setting(64, "Pixels per side that are compared.", minimum=16, maximum=512)
+    size: int = setting(64, "Pixels per side that are compared.", within=(16, 512))
     out: str = setting(
-        "runs/fit",
-        "Folder of background.png, mask.png, light.json and comparison.png.",
+        "runs/fit", "Folder of background.png, mask.png, light.json and comparison.png."
     )
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
 
@@ -559,6 +472,5 @@ class FitSettings(Settings):
         super().__post_init__()
         if bool(self.mask) == bool(self.box):
             raise InputError(
-                f"mask={self.mask} and box={self.box}: give one of them, "
-                "either mask=FILE or box=[left,top,right,bottom]"
+                f"mask={self.mask} and box={self.box}: give mask=FILE, or a box instead"
             )

@@ -13,10 +13,9 @@ from augment import distributed
 from augment.network import Network
 from augment.progress import progress_message
 from augment.settings import RendererSettings
-from renderer.errors import InputError, as_device, require_choice
+from renderer.errors import InputError, as_device, keyed, require_choice
 from renderer.visibility import Rasterizer, choose
 from train import console
-from train.user_errors import keyed
 
 # File in which Linux stores how much time of the cores a container may use: a quota and a
 # period. The quota divided by the period is the number of cores.
@@ -101,37 +100,25 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
     long in bfloat16.
     """
     require_choice("precision", precision, ("auto", *PRECISIONS))
-    if device.type == "cuda":
-        if precision != "auto":
-            return precision
+    is_gpu = device.type == "cuda"
+    if is_gpu:
         is_native = torch.cuda.is_bf16_supported(including_emulation=False)
-        return "bfloat16" if is_native else "float16"
-    is_native = device.type == "cpu" and _computes_in_bfloat16()
-    if precision == "bfloat16" and not is_native:
+    elif platform.machine() in ("x86_64", "AMD64"):
+        is_native = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
+    else:
+        is_native = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    if precision == "bfloat16" and not is_native and not is_gpu:
         slow = "this CPU emulates bfloat16, some 10 times slower than float32"
         console.warning("%s: leave precision out", slow)
     if precision != "auto":
         return precision
-    if is_native and not _has_depthwise_layer(trained):
+    modules = [] if is_gpu or trained is None else trained.modules()
+    layers = [module for module in modules if isinstance(module, nn.Conv2d)]
+    # A depthwise convolution has as many groups as input channels, and more than one.
+    has_depthwise = any(layer.groups == layer.in_channels > 1 for layer in layers)
+    if is_native and not has_depthwise:
         return "bfloat16"
-    return "float32"
-
-
-def _has_depthwise_layer(network: nn.Module | None) -> bool:
-    """Return whether a network has a depthwise convolution.
-
-    A depthwise convolution has as many groups as input channels, and more than one.
-    """
-    modules = network.modules() if network is not None else []
-    convolutions = [module for module in modules if isinstance(module, nn.Conv2d)]
-    return any(layer.groups == layer.in_channels > 1 for layer in convolutions)
-
-
-def _computes_in_bfloat16() -> bool:
-    """Return whether this CPU has instructions for numbers of the type bfloat16."""
-    if platform.machine() in ("x86_64", "AMD64"):
-        return torch.cpu._is_avx512_bf16_supported()
-    return torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    return "float16" if is_gpu else "float32"
 
 
 class MixedPrecision(Network):
@@ -161,11 +148,7 @@ def compiles(choice: str, device: torch.device) -> bool:
     communicate within a pass.
     """
     if choice == "always" and device.type == "cpu":
-        raise InputError(
-            "choice=always needs a GPU, since it records CUDA graphs, but the device is a CPU: "
-            "use auto or never",
-            "choice",
-        )
+        raise InputError("choice=always needs a GPU for CUDA graphs: use auto or never", "choice")
     if choice != "auto" or device.type != "cuda" or distributed.world_size() > 1:
         return choice == "always"
     try:

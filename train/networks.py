@@ -38,12 +38,9 @@ STD = (0.25, 0.25, 0.25)
 # Key in the description of a network. It is True if `augment.build_classifier` built
 # the network.
 CLASSIFIER = "classifier"
-# Arguments for some architectures of torchvision. They switch off the auxiliary
-# classifiers, with which a network would return several outputs.
-_OPTIONS = {
-    "googlenet": {"aux_logits": False, "init_weights": True},
-    "inception_v3": {"aux_logits": False, "init_weights": True},
-}
+# Architectures of torchvision with auxiliary classifiers, with which a network would return
+# several outputs.
+WITH_AUXILIARY = ("googlenet", "inception_v3")
 
 
 class WideResNet(nn.Module):
@@ -72,21 +69,19 @@ class WideResNet(nn.Module):
         """
         super().__init__()
         _require_shape(depth, width, dropout)
-        channels = [16, 16 * width, 32 * width, 64 * width]
-        block_count = (depth - 4) // 6
         self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
-        self.stem = nn.Conv2d(3, channels[0], 3, padding=1, bias=False)
+        self.stem = nn.Conv2d(3, 16, 3, padding=1, bias=False)
         self.groups = nn.Sequential()
-        for index in range(3):
-            inputs = channels[index]
-            outputs = channels[index + 1]
-            stride = 2 if index else 1
+        inputs = 16
+        for outputs in (16 * width, 32 * width, 64 * width):
+            stride = 1 if outputs == 16 * width else 2
             blocks = [_Block(inputs, outputs, stride, dropout)]
-            blocks += [_Block(outputs, outputs, 1, dropout) for _ in range(block_count - 1)]
+            blocks += [_Block(outputs, outputs, 1, dropout) for _ in range((depth - 4) // 6 - 1)]
             self.groups.append(nn.Sequential(*blocks))
-        self.norm = nn.BatchNorm2d(channels[3])
-        self.head = nn.Linear(channels[3], classes)
+            inputs = outputs
+        self.norm = nn.BatchNorm2d(inputs)
+        self.head = nn.Linear(inputs, classes)
         self.apply(_initialize)
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N classes"]:
@@ -99,21 +94,15 @@ def _require_shape(depth: int, width: int, dropout: float) -> None:
     """Check the arguments of a WideResNet."""
     if depth < 10 or (depth - 4) % 6 or width < 1:
         raise InputError(
-            f"depth={depth}, width={width} is no shape of a WideResNet: "
-            "set depth to 10, 16, 22, ..., and width to 1 or more",
+            f"depth={depth}, width={width}: set depth to 10, 16, 22 ..., and width to 1 or more",
             "depth",
         )
-    # Each of three groups of layers has this number of blocks. A block has two
-    # 3 × 3 convolutions, whose weights are most of the parameters of the network.
-    block_count = (depth - 4) // 6
-    parameter_count = 0
-    for channels in (16 * width, 32 * width, 64 * width):
-        parameter_count += block_count * 2 * (3 * 3 * channels**2)
+    # Each group has (depth - 4) / 6 blocks. A block has two 3 × 3 convolutions, whose weights are
+    # most of the parameters of the network. The groups have 16, 32 and 64 times `width` channels.
+    parameter_count = (depth - 4) // 6 * 2 * 3 * 3 * (16**2 + 32**2 + 64**2) * width**2
     if depth > MAX_DEPTH or parameter_count > MAX_PARAMETER_COUNT:
         raise InputError(
-            f"depth={depth}, width={width} gives too many parameters ({parameter_count:.1g}): "
-            "set a smaller depth or width",
-            "depth",
+            f"depth={depth}, width={width} has {parameter_count:.1g} parameters: set less", "depth"
         )
     if not 0 <= dropout < 1:
         raise InputError(f"dropout={dropout} must be at least 0 and below 1", "dropout")
@@ -194,27 +183,28 @@ def build_network(
     mean, std = mean or MEAN, std or STD
     if name == WIDERESNET:
         return WideResNet(len(classes), **shape, mean=mean, std=std)
-    network: nn.Module | None = None
-    if name.startswith(PYTHON):
-        network = _call_function(name, classes, size)
-    elif name.startswith(TORCHVISION):
-        require_architecture(name.removeprefix(TORCHVISION))
-    else:
+    if not name.startswith((PYTHON, TORCHVISION)):
         raise InputError(
-            f"name={name} is not a network: "
-            f"choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION",
-            "name",
+            f"name={name} is not {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION", "name"
         )
+    own = _call_function(name, classes, size) if name.startswith(PYTHON) else None
+    architecture = name.removeprefix(TORCHVISION)
+    if own is None:
+        require_architecture(architecture)
     # Architectures raise errors of many types if images are too small for them.
     try:
+        network = own
         if network is None:
-            architecture = _build_architecture(name.removeprefix(TORCHVISION), len(classes), size)
-            network = Network(architecture, [ChannelNormalization(mean, std)])
-        _require_logits(network, len(classes), size)
+            built = _build_architecture(architecture, len(classes), size)
+            network = Network(built, [ChannelNormalization(mean, std)])
+        with eval_mode(network), torch.no_grad():
+            shape_of_two = tuple(network(torch.zeros(2, 3, size, size)).shape)
+        if shape_of_two != (2, len(classes)):
+            raise ValueError(f"it returned {shape_of_two} for 2 images")
     except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
         raise InputError(
             f"name={name} does not give {len(classes)} logits for images of {size} pixels per "
-            f"side ({single_line(error)}): choose another network or another size",
+            f"side: {single_line(error)}",
             "name",
         ) from error
     return network
@@ -225,22 +215,15 @@ def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
     network, own_size, own_classes = call_python(name.removeprefix(PYTHON))
     if not isinstance(network, nn.Module):
         raise InputError(
-            f"name={name} returns an object of type {type(network).__name__} as its network: "
-            "return a torch.nn.Module, whose weights can be trained",
-            "name",
+            f"name={name} returns a {type(network).__name__}: return a torch.nn.Module", "name"
         )
+    fault = ""
     if own_size != size:
-        raise InputError(
-            f"name={name} is for images of {own_size} pixels per side, "
-            f"but the images of the data have {size}: use the same size",
-            "name",
-        )
-    if list(own_classes) != list(classes):
-        raise InputError(
-            f"name={name} has other classes than the data, or in another order: "
-            f"return the {len(classes)} classes of the data, of which {classes[0]!r} is the first",
-            "name",
-        )
+        fault = f"is for images of {own_size} pixels per side, but those of the data have {size}"
+    elif list(own_classes) != list(classes):
+        fault = f"has other classes than the data, or another order: {classes[0]!r} is the first"
+    if fault:
+        raise InputError(f"name={name} {fault}: return the size and classes of the data", "name")
     return network
 
 
@@ -248,18 +231,12 @@ def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Mo
     """Build an architecture of torchvision with random weights."""
     from torchvision import models
 
-    options: dict[str, Any] = dict(_OPTIONS.get(architecture, {}))
+    options: dict[str, Any] = {}
+    if architecture in WITH_AUXILIARY:
+        options = {"aux_logits": False, "init_weights": True}
     if architecture.startswith("vit_"):
         options = {"image_size": size}
     return models.get_model(architecture, weights=None, num_classes=class_count, **options)
-
-
-def _require_logits(network: nn.Module, class_count: int, size: int) -> None:
-    """Raise ValueError if a network does not return logits, shape (2, classes), for two images."""
-    with eval_mode(network), torch.no_grad():
-        logits = network(torch.zeros(2, 3, size, size))
-    if logits.shape != (2, class_count):
-        raise ValueError(f"it returned {tuple(logits.shape)} for 2 images")
 
 
 def describe(
@@ -273,18 +250,14 @@ def describe(
 
     The description is stored with the weights of the network.
     """
-    description = {
-        "version": VERSION,
-        "classes": list(classes),
-        "size": size,
-        "encoding": encoding,
-        **shape,
-    }
+    facts = {"version": VERSION, "classes": list(classes), "size": size, "encoding": encoding}
     # A network normalizes images itself, or by its last transform.
     owner = (
         network.transforms[-1] if isinstance(network, Network) and network.transforms else network
     )
-    for name in ("mean", "std"):
-        if hasattr(owner, name):
-            description[name] = getattr(owner, name).flatten().tolist()
-    return description
+    normalization = {
+        name: getattr(owner, name).flatten().tolist()
+        for name in ("mean", "std")
+        if hasattr(owner, name)
+    }
+    return facts | shape | normalization

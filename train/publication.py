@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from augment.classifier import Classifier, OperatingPoint
-from renderer.errors import InputError, as_path, require_kind
+from renderer.errors import InputError, as_path, keyed, require_choice
 from train.checkpoints import load_run, load_selected, write_published
 from train.command_settings import require_calibration
 from train.networks import PYTHON
@@ -16,9 +16,8 @@ from train.results.scoring import Predictor, choose_operating_points
 from train.results.store import summarize, trained_labels
 from train.results.tables import Estimate
 from train.run_config import mapped
-from train.run_folder import PUBLISHED
+from train.run_folder import PUBLISHED, writable_folder
 from train.settings import published
-from train.user_errors import keyed, writable_folder
 
 # Folder of the published networks, in the installation or in a clone.
 PRETRAINED = Path("pretrained")
@@ -61,11 +60,8 @@ def load(name: str) -> PublishedNetwork:
         >>> round(network.results["photographs/auc"].value, 3)
         0.966
     """
-    require_kind("name", name, str, "the name of a published network, such as 'best'")
-    names = published_names()
-    if name not in names:
-        known = ", ".join(names)
-        raise InputError(f"name={name!r} is no published network: choose one of {known}")
+    files = published(PRETRAINED).glob(f"*/{PUBLISHED}")
+    require_choice("name", name, sorted(path.parent.name for path in files))
     folder = published(PRETRAINED / name)
     loaded = load_run(folder)
     _, state = load_selected(folder)
@@ -73,12 +69,6 @@ def load(name: str) -> PublishedNetwork:
     network.operating_points = loaded.operating_points
     network.results = _read_results(state["scores"])
     return network
-
-
-def published_names() -> list[str]:
-    """Return the names of the networks that are published with the library, sorted."""
-    files = published(PRETRAINED).glob(f"*/{PUBLISHED}")
-    return sorted(path.parent.name for path in files)
 
 
 def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:
@@ -164,33 +154,18 @@ def publish(
             labels = label if label is not None else trained_labels(folder)
             if not labels:
                 raise InputError(
-                    f"label is not set, and run={run} records no positive class: give label",
-                    "label",
+                    f"label is not set, and run={run} records none: give label", "label"
                 )
-            points = _calibrate(
-                loaded, as_path("calibrate", calibrate), labels, false_positive_rate
-            )
+            # Published weights have 16 bits.
+            loaded.half().float()
+            predictor = Predictor(loaded, loaded.classes, loaded.size)
+            negatives = published(as_path("calibrate", calibrate))
+            with keyed(folder="calibrate"):
+                points = choose_operating_points(predictor, negatives, labels, false_positive_rate)
             state["operating_point"] = [asdict(point) for point in points]
     target.mkdir(parents=True, exist_ok=True)
     write_published(target / PUBLISHED, state)
     return points
-
-
-def _calibrate(
-    network: Classifier, folder: Path, label: Any, false_positive_rate: float
-) -> list[OperatingPoint]:
-    """Choose a threshold for each positive class on photographs, with weights of 16 bits.
-
-    Published weights have 16 bits.
-    """
-    network.half().float()
-    with keyed(folder="calibrate"):
-        return choose_operating_points(
-            Predictor(network, network.classes, network.size),
-            published(folder),
-            label,
-            false_positive_rate,
-        )
 
 
 def _describe_run(folder: Path) -> dict[str, Any]:

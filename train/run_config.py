@@ -2,18 +2,24 @@
 
 A run that continues must have the same decisive settings and the same input
 files as before. Decisive settings are the settings that change the result. The
-number of threads, for example, is not decisive.
+number of threads, for example, is not decisive. Fingerprints (hashes) tell whether
+input files have changed.
 """
 
+import hashlib
 import os
 import platform
+import re
 import shlex
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields
+from functools import cache
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -21,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.run_folder import opened_text
-from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted
+from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted, published
 from train.system import program
 
 CONFIG = "config.yaml"
@@ -30,6 +36,23 @@ PACKAGES = ("torchvision", "numpy")
 # Arguments that are left out when the command line of a run is recorded. Whoever
 # resumes the run gives other values.
 NOT_RECORDED = ("out=", "train.resume=")
+# The files of a folder with more bytes are not read. Their sizes and times count instead.
+MAX_FOLDER_BYTES = 2**32
+# What a line of a .obj, .mtl or .ply file says before the path of another file, and such a path in
+# a .gltf file.
+REFERENCE = re.compile(
+    rb"^[ \t]*(?:mtllib|map_\w+|bump|norm|disp|refl|comment TextureFile)[ \t]+(.+?)[ \t\r]*$"
+    rb'|"uri"\s*:\s*"([^"]{1,1000})"',
+    re.MULTILINE | re.IGNORECASE,
+)
+REFERRING = (".obj", ".mtl", ".ply", ".gltf")
+# Settings that can name input files. Their hashes are recorded with a run.
+INPUTS = (
+    *("data.path", "weights", "classes", "scene.backgrounds", "scene.light", "augment.folder"),
+    *("augment.vary.environments", "augment.vary.backgrounds", "augment.vary.camera.slides"),
+    *("scene.projector.pattern", "scene.lamps.start", "unlabeled", "network", "hardened"),
+    *("meshes", "hard_negatives", "environments", "photos", "laboratory"),
+)
 
 
 def read_config(path: Path) -> DictConfig:
@@ -58,11 +81,14 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     if "command" in facts:
-        facts["working_folder"] = _working_folder(folder, str(facts["command"]))
-    # These imports are here because results of runs are read without torch.
+        facts["working_folder"] = os.getcwd()
+        with suppress(InputError):
+            recorded = read_config(folder / CONFIG)
+            # A command that begins with the recorded command continues the run.
+            if str(facts["command"]).startswith(str(recorded.get("command"))):
+                facts["working_folder"] = recorded.get("working_folder") or os.getcwd()
+    # This import is here because results of runs are read without torch.
     from torch import __version__ as torch_version
-
-    from train.fingerprints import fingerprints
 
     versions = {"python": platform.python_version(), "torch": str(torch_version)}
     versions |= {name: version(name) for name in PACKAGES}
@@ -73,18 +99,6 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
     atomic_write(folder / CONFIG, text.encode(), durable=True)
 
 
-def _working_folder(folder: Path, command: str) -> str:
-    """Return the folder in which the command of a run was started for the first time.
-
-    A command that begins with the recorded command continues the run.
-    """
-    with suppress(InputError):
-        recorded = read_config(folder / CONFIG)
-        if command.startswith(str(recorded.get("command"))):
-            return recorded.get("working_folder") or os.getcwd()
-    return os.getcwd()
-
-
 def decisive_settings(settings: Any) -> dict[str, object]:
     """Select the settings that decide the result of a run.
 
@@ -92,18 +106,13 @@ def decisive_settings(settings: Any) -> dict[str, object]:
     the folder of the run. A run whose folder was moved then has equal settings. The keys are
     dotted, such as "train.epochs".
     """
-    if isinstance(settings, DictConfig):
-        nested: Any = OmegaConf.to_container(settings)
-    else:
-        nested = asdict(settings)
+    is_config = isinstance(settings, DictConfig)
+    nested: Any = OmegaConf.to_container(settings) if is_config else asdict(settings)
     nested = _move_paths(nested, str(nested.get("out")), "<run>")
     # Each key gets a dot at its end, so that "out" does not match "outer".
     circumstances = tuple(f"{key}." for key in CIRCUMSTANCES)
-    decisive = {}
-    for key, value in dotted(nested):
-        if not f"{key}.".startswith(circumstances):
-            decisive[key] = value
-    return decisive
+    pairs = dotted(nested)
+    return {key: value for key, value in pairs if not f"{key}.".startswith(circumstances)}
 
 
 def _move_paths(value: Any, folder: str, to: str) -> Any:
@@ -117,16 +126,12 @@ def _move_paths(value: Any, folder: str, to: str) -> Any:
 
 
 def format_command(overrides: Sequence[str]) -> str:
-    """Format the command line of a training run, as config.yaml records it."""
-    return shlex.join([*program("train"), *_recorded(overrides)])
-
-
-def _recorded(overrides: Sequence[str]) -> list[str]:
-    """Return the arguments of a command that config.yaml records.
+    """Format the command line of a training run, as config.yaml records it.
 
     The folder of the run and the request to resume it are left out.
     """
-    return [override for override in overrides if not override.startswith(NOT_RECORDED)]
+    recorded = [override for override in overrides if not override.startswith(NOT_RECORDED)]
+    return shlex.join([*program("train"), *recorded])
 
 
 def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, str]:
@@ -138,13 +143,18 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
     folder = Path(config.out).absolute()
-    recorded = _read_recorded(folder)
+    recorded: Any = {}
+    if (folder / CONFIG).is_file():
+        recorded = OmegaConf.to_container(read_config(folder / CONFIG))
+    if not isinstance(recorded.get("train"), dict) or not isinstance(recorded.get("out"), str):
+        raise InputError(
+            f"out={folder} holds no run to resume: give another, or leave train.resume out"
+        )
     names = [item.name for item in fields(ExperimentSettings)]
     settings = {name: recorded[name] for name in names if name in recorded}
     # If the folder was moved, the paths of its files have changed. A baseline, which was
     # trained for comparison, lies in a sub-folder of the recorded folder, and was not moved.
-    is_below_recorded = Path(recorded["out"]) in folder.parents
-    if not is_below_recorded:
+    if Path(recorded["out"]) not in folder.parents:
         settings = _move_paths(settings, recorded["out"], str(folder))
     merged = OmegaConf.create(settings)
     for override in OverridesParser.create().parse_overrides(list(overrides)):
@@ -152,23 +162,10 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
         if key != "out":
             value = OmegaConf.select(config, key)
             OmegaConf.update(merged, key, value, merge=False, force_add=True)
-    words = [*shlex.split(str(recorded.get("command", ""))), *_recorded(overrides)]
+    words = shlex.split(str(recorded.get("command", "")))
+    words += [override for override in overrides if not override.startswith(NOT_RECORDED)]
     # A dictionary has each word once, in the same order.
     return merged, shlex.join(dict.fromkeys(words))
-
-
-def _read_recorded(folder: Path) -> dict[str, Any]:
-    """Read the config.yaml of a training run that is to be resumed."""
-    recorded: Any = {}
-    if (folder / CONFIG).is_file():
-        recorded = OmegaConf.to_container(read_config(folder / CONFIG))
-    is_training = isinstance(recorded.get("train"), dict)
-    if not is_training or not isinstance(recorded.get("out"), str):
-        raise InputError(
-            f"out={folder} holds no run to resume: "
-            "give the folder of a training run, or leave train.resume out",
-        )
-    return recorded
 
 
 def require_same_run(
@@ -213,17 +210,13 @@ def require_same(
         new = now.get(key)
         if old != new and not is_permitted(key, old, new):
             raise InputError(
-                f"{folder} was made with {key}={old}, not {new}: "
-                f"set {key} to the former value, or choose another folder with {elsewhere}",
+                f"{folder} was made with {key}={old}, not {new}: set it so, or another {elsewhere}"
             )
     hashes = config.get("inputs") or {}
-    from train.fingerprints import fingerprints
-
     for path, fingerprint in fingerprints(settings).items():
         if hashes.get(path, fingerprint) != fingerprint:
             raise InputError(
-                f"{path} has changed since {folder} began: "
-                f"put it back, or start in another folder with {elsewhere}",
+                f"{path} has changed since {folder} began: put it back, or set another {elsewhere}"
             )
     return config
 
@@ -238,3 +231,91 @@ def mapped(value: Any, change: Callable[[str], str]) -> Any:
     if isinstance(value, list):
         return [mapped(item, change) for item in value]
     return change(value) if isinstance(value, str) else value
+
+
+def fingerprints(settings: Any) -> dict[str, str]:
+    """Compute the fingerprint of each input file and folder that the settings of a command name.
+
+    The fingerprint of a training run covers its selected network, that of a mesh its materials and
+    textures, and that of a network python:MODULE:FUNCTION the file of the module.
+    """
+    values = dict(dotted(asdict(settings)))
+    texts = _collect_texts([values.get(key) for key in INPUTS]) - {""}
+    paths = {text.removeprefix("run:"): _path_of(text) for text in sorted(texts)}
+    return {name: _fingerprint(path) for name, path in paths.items() if path.exists()}
+
+
+def _collect_texts(value: Any) -> set[str]:
+    """Collect the texts in a setting that may be paths of input files.
+
+    An object can have a "mesh" and "props", which are other meshes beside it.
+    """
+    if isinstance(value, dict):
+        value = [value.get("mesh"), value.get("props")]
+    if isinstance(value, list):
+        return set().union(*map(_collect_texts, value))
+    return {value} if isinstance(value, str) else set()
+
+
+def _path_of(text: str) -> Path:
+    """Return the file or folder that a setting such as run:FOLDER names, which may be missing."""
+    if text.startswith("python:"):
+        # `find_spec` imports the packages above the module.
+        with suppress(Exception):
+            spec = find_spec(text.split(":")[1])
+            if spec and spec.origin:
+                return Path(spec.origin)
+    return published(Path(text.removeprefix("run:")))
+
+
+def _fingerprint(path: Path) -> str:
+    """Compute the fingerprint of a file, of a training run or of another folder that exists."""
+    # Results of runs are read without torch, which these imports need.
+    from train.checkpoints import selected_file
+    from train.data.photographs import visible_files
+
+    path = selected_file(path) or path
+    if path.is_file():
+        companions = [(str(name), _hash_file(name)) for name in sorted(_companions(path))]
+        return _hash([_hash_file(path), *companions]) if companions else _hash_file(path)
+    names = sorted(map(str, visible_files(path)))
+    files = {name: path / name for name in names if (path / name).is_file()}
+    statuses = [file.stat() for file in files.values()]
+    if sum(status.st_size for status in statuses) > MAX_FOLDER_BYTES:
+        times = [(status.st_size, status.st_mtime_ns) for status in statuses]
+        return _hash([*zip(names, times, strict=False)])
+    return _hash([(name, _hash_file(file)) for name, file in files.items()])
+
+
+def _companions(mesh: Path) -> set[Path]:
+    """Find the materials, textures and buffers that a mesh file or its materials name."""
+    if mesh.suffix.lower() not in REFERRING:
+        return set()
+    found = set()
+    for line, uri in REFERENCE.findall(mesh.read_bytes()):
+        words = unquote((line or uri).decode(errors="replace")).replace("\\", "/").split(" ")
+        # A line may have options before the path.
+        for name in (" ".join(words[start:]).strip('"') for start in range(len(words))):
+            for file in (mesh.parent / name, mesh.parent / Path(name).name):
+                with suppress(OSError, ValueError):  # The name is too long or has a NUL.
+                    if file.is_file() and file != mesh:
+                        found.add(file)
+    return found.union(*(_companions(file) for file in found if file.suffix.lower() == ".mtl"))
+
+
+def _hash(value: object) -> str:
+    """Compute the SHA-256 of the representation of a plain value."""
+    return hashlib.sha256(repr(value).encode(errors="surrogateescape")).hexdigest()
+
+
+def _hash_file(path: Path) -> str:
+    """Compute the SHA-256 of a file."""
+    status = path.stat()
+    return _hash_version(path, status.st_size, status.st_mtime_ns)
+
+
+@cache
+def _hash_version(path: Path, size: int, modified: int) -> str:
+    """Compute the SHA-256 of a file, once for each of its sizes and times of change."""
+    with open(path, "rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()

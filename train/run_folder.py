@@ -2,11 +2,11 @@
 
 import json
 import math
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from filelock import FileLock, Timeout
@@ -37,6 +37,8 @@ BEFORE = "before"
 # Phases of an epoch. The log has the seconds of each phase. Together, the phases take
 # the whole time of the epoch.
 PHASES = ("attack", "training", "evaluation", "input_output")
+# Size in bytes of the temporary file that is written to test a folder.
+TEST_SIZE = 2**16
 
 
 @contextmanager
@@ -55,10 +57,10 @@ def opened_text(path: Path) -> Iterator[str]:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that contains one object."""
     with opened_text(path) as text:
-        return parse_object(text)
+        return _parse_object(text)
 
 
-def parse_object(text: str) -> dict[str, Any]:
+def _parse_object(text: str) -> dict[str, Any]:
     """Parse a JSON object. Raise ValueError if it is empty or no object."""
     parsed = json.loads(text)
     if not isinstance(parsed, dict) or not parsed:
@@ -77,11 +79,9 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         return []
     with opened_text(path) as text:
         # A complete line ends with a line break.
-        complete_lines = text.split("\n")[:-1]
-        lines = [parse_object(line) for line in complete_lines]
-        for line in lines:
-            if any(not isinstance(value, int | float) for value in line.values()):
-                raise ValueError("a value is not a number")
+        lines = [_parse_object(line) for line in text.split("\n")[:-1]]
+        if any(not isinstance(value, int | float) for line in lines for value in line.values()):
+            raise ValueError("a value is not a number")
         epochs = [line.get("epoch", math.inf) for line in lines]
         if not all(first < second for first, second in pairwise(epochs)):
             raise ValueError("epochs are repeated, or follow the final scores")
@@ -118,22 +118,15 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
         for folder in folders:
             if not stack.enter_context(locked(folder)):
                 raise InputError(
-                    f"{key}={folder} is being written by another process: "
-                    "wait, or choose another folder",
+                    f"{key}={folder} is being written by another process: choose another"
                 )
         try:
             yield
         finally:
             for folder in folders:
-                _remove_if_empty(folder)
-
-
-def _remove_if_empty(folder: Path) -> None:
-    """Remove a folder if it holds nothing but the lock file."""
-    names = [path.name for path in folder.iterdir()]
-    if names == [LOCK]:
-        (folder / LOCK).unlink()
-        folder.rmdir()
+                if [path.name for path in folder.iterdir()] == [LOCK]:
+                    (folder / LOCK).unlink()
+                    folder.rmdir()
 
 
 def state(folder: Path) -> str:
@@ -174,5 +167,24 @@ def folder_or_temporary(out: str | Path | None) -> Iterator[Path]:
     if out is not None:
         yield as_folder("out", out)
         return
-    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         yield Path(folder)
+
+
+def writable_folder(folder: str | Path, key: str) -> Path:
+    """Check that files can be written to a folder, by writing a temporary file.
+
+    If the folder does not exist, the file is written to the nearest parent
+    folder that exists.
+    """
+    path = Path(folder)
+    try:
+        candidates = (path, *path.absolute().parents)
+        existing = next(candidate for candidate in candidates if candidate.exists())
+        with tempfile.TemporaryFile(dir=existing) as file:
+            file.write(bytes(TEST_SIZE))
+    except OSError as error:
+        raise InputError(
+            f"{key}={path} cannot be written to ({error.strerror}): choose another folder",
+        ) from error
+    return path

@@ -10,7 +10,7 @@ from typing import Any
 
 from augment.augmentation_settings import MAX_EXAMPLES, AugmentationSettings, count_views
 from augment.settings import ObjectSettings, RendererSettings, SceneSettings, read_normalized_light
-from renderer.errors import InputError, composed, describe, is_whole, require_range
+from renderer.errors import InputError, composed, is_whole, require_range
 from renderer.settings import MAX_SIZE, MAX_VIEWS, Settings, setting, setting_like, settings_from
 from train.train_settings import NEEDS_INITIAL_NETWORK, ModelSettings, TrainSettings
 
@@ -95,22 +95,13 @@ class DataSettings(Settings):
     workers: int = setting(
         2,
         "Processes that read images larger than 64 pixels per side, which stay on disk.",
-        minimum=0,
-        maximum=MAX_WORKERS,
+        within=(0, MAX_WORKERS),
     )
     train_per_class: int = setting(
-        300,
-        "Training images per class of shapes.",
-        minimum=1,
-        maximum=MAX_IMAGES,
+        300, "Training images per class of shapes.", within=(1, MAX_IMAGES)
     )
-    test_per_class: int = setting(
-        60,
-        "Test images per class of shapes.",
-        minimum=1,
-        maximum=MAX_IMAGES,
-    )
-    seed: int = setting(0, "Seed of the shapes.", minimum=0, maximum=MAX_SEED)
+    test_per_class: int = setting(60, "Test images per class of shapes.", within=(1, MAX_IMAGES))
+    seed: int = setting(0, "Seed of the shapes.", within=(0, MAX_SEED))
 
     def __post_init__(self) -> None:
         """Check all values, and that data sets of the user have a path."""
@@ -129,8 +120,7 @@ class TrainingSceneSettings(SceneSettings):
     views: int | None = setting(
         None,
         "Number of cameras per mesh, at equal azimuths. null: as many as augment.examples needs.",
-        minimum=1,
-        maximum=MAX_VIEWS,
+        within=(1, MAX_VIEWS),
     )
 
 
@@ -147,19 +137,16 @@ class EvaluationSettings(Settings):
         "If photos is null: number of draws of light and camera of path-traced renders that are "
         "kept aside, of other instances and patterns than in training. Both networks are scored "
         "on them. A multiple of 5. 0: none.",
-        minimum=0,
-        maximum=MAX_IMAGES,
+        within=(0, MAX_IMAGES),
     )
 
     def __post_init__(self) -> None:
         """Check all values."""
         super().__post_init__()
         if self.laboratory_setups % KEPT_ASIDE_PATTERNS:
-            raise InputError(
-                f"laboratory_setups={self.laboratory_setups} must be a multiple of "
-                f"{KEPT_ASIDE_PATTERNS}, the number of projected patterns: "
-                f"set it to {KEPT_ASIDE_PATTERNS} or {2 * KEPT_ASIDE_PATTERNS}, for example",
+            raise self.wrong(
                 "laboratory_setups",
+                f"must be a multiple of {KEPT_ASIDE_PATTERNS}, the number of projected patterns",
             )
 
 
@@ -172,8 +159,7 @@ class NetworkSettings(Settings):
         None,
         "Pixels per side of the classifier's images. null: that of its source, and 224 if a file "
         "records none.",
-        minimum=1,
-        maximum=MAX_SIZE,
+        within=(1, MAX_SIZE),
     )
     weights: str | None = setting(
         None,
@@ -209,27 +195,12 @@ class NetworkSettings(Settings):
     def __post_init__(self) -> None:
         """Check all values, and convert those that YAML reads as another type."""
         super().__post_init__()
-        self.classes = class_texts(self.classes)
-        self.normalize_light = normalized_light_values(self.normalize_light)
-
-
-def normalized_light_values(value: Any) -> dict[str, float] | None:
-    """Convert a value of the setting `normalize_light` to a mapping, as files record it.
-
-    True takes the defaults, a mapping some fields, and None leaves the light as it is.
-    """
-    light = read_normalized_light(value)
-    return None if light is None else asdict(light)
-
-
-def class_texts(classes: Any) -> Any:
-    """Convert class names such as 0, which YAML reads as numbers, to texts.
-
-    None and the name of a file stay the same.
-    """
-    if not isinstance(classes, list):
-        return classes
-    return [str(name) if is_whole(name) else name for name in classes]
+        if isinstance(self.classes, list):
+            # The name of a class can be a number, which YAML reads as one.
+            self.classes = [str(name) if is_whole(name) else name for name in self.classes]
+        # Files record a mapping. True takes the defaults, and a mapping some fields.
+        light = read_normalized_light(self.normalize_light)
+        self.normalize_light = None if light is None else asdict(light)
 
 
 @dataclass
@@ -245,8 +216,7 @@ class ExperimentSettings(NetworkSettings):
     size: int | None = setting(
         None,
         "Pixels per side. null: the size of `network`, otherwise 32.",
-        minimum=MIN_SIZE,
-        maximum=MAX_SIZE,
+        within=(MIN_SIZE, MAX_SIZE),
     )
     meshes: list[Any] = setting(["solid:orange:0", "solid:orange:1"], MESHES)
     hard_negatives: list[Any] = setting(
@@ -266,11 +236,10 @@ class ExperimentSettings(NetworkSettings):
     )
     out: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
     sweep: str = setting(
-        "runs/sweep",
-        "Folder of the runs of a --multirun, each named by its overrides.",
+        "runs/sweep", "Folder of the runs of a --multirun, each named by its overrides."
     )
     overwrite: bool = setting(False, "Start anew in a folder that holds a run or other results.")
-    seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
+    seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     label: Any = setting(  # str | list[str], for which OmegaConf has no type
         None,
         "Positive class: the class of the meshes, whose recall and false positives are measured. "
@@ -288,8 +257,7 @@ class ExperimentSettings(NetworkSettings):
     )
     data: DataSettings = setting(DataSettings, "The data set.")
     augment: AugmentationSettings = setting(
-        AugmentationSettings,
-        "The renders among the training images.",
+        AugmentationSettings, "The renders among the training images."
     )
     scene: TrainingSceneSettings = setting(TrainingSceneSettings, "The scene of the renders.")
     renderer: RendererSettings = setting(
@@ -297,106 +265,79 @@ class ExperimentSettings(NetworkSettings):
         "How images are rendered. The defaults are the paper's.",
     )
     model: ModelSettings = setting(
-        ModelSettings,
-        "The network. model=NAME is short for model.name=NAME.",
+        ModelSettings, "The network. model=NAME is short for model.name=NAME."
     )
     train: TrainSettings = setting(TrainSettings, "How the network is trained.")
     evaluate: EvaluationSettings = setting(
-        EvaluationSettings,
-        "What the trained network is scored on.",
+        EvaluationSettings, "What the trained network is scored on."
     )
 
     def __post_init__(self) -> None:
         """Check all values, and compute the number of renders."""
         if self.network == "":
             raise InputError(
-                "network is not set: give a run folder, or torchvision:NAME with weights=FILE",
-                "network",
+                "network is not set: give a run folder, or torchvision:NAME", "network"
             )
         super().__post_init__()
-        self._check_initial_network()
-        self._check_photographs()
-        renders_meshes = self.augment.renders and self.augment.mode != "folder"
-        if renders_meshes:
-            self._check_silhouettes()
-        if self.label is None:
-            # The classes of the meshes will become the label when the classes of the network
-            # are known. `with_class_names` then creates these settings again.
-            return
-        self._remove_generated_positives()
-        if renders_meshes:
-            self._count_examples()
-
-    def _check_initial_network(self) -> None:
-        """Check that settings of the training that need an initial network have one."""
         for name in NEEDS_INITIAL_NETWORK:
             value = getattr(self.train, name)
             if value and not self.network:
                 raise InputError(
-                    f"train.{name}={value} needs a network to begin with: set network to it, "
-                    f"or leave train.{name} out",
+                    f"train.{name}={value} needs a network to begin with: set network",
                     f"train.{name}",
                 )
+        self._check_photographs()
+        renders_meshes = self.augment.renders and self.augment.mode != "folder"
+        attacks_pose = renders_meshes and "pose" in self.augment.attack.parameters
+        if attacks_pose and not self.renderer.silhouettes:
+            raise InputError(
+                "renderer.silhouettes=false: an attack on the pose needs true",
+                "renderer.silhouettes",
+            )
+        if self.label is None:
+            # The classes of the meshes will become the label when the classes of the network
+            # are known. `with_class_names` then creates these settings again.
+            return
+        # A generated hard negative whose name is a positive class is removed.
+        positives = {simplified(name) for name in label_names(self.label)}
+        self.hard_negatives = [
+            item
+            for item in self.hard_negatives
+            if not isinstance(item, str) or simplified(solid_name(item)) not in positives
+        ]
+        if renders_meshes:
+            # There is a render for each object, view and background.
+            backgrounds = len(self.scene.backgrounds)
+            self.augment.examples = self.views * self.object_count * backgrounds
+            factors = "meshes × views × backgrounds"
+            require_range(factors, self.augment.examples, 1, MAX_EXAMPLES)
 
     def _check_photographs(self) -> None:
         """Check the folders of photographs: each scored one can have a sub-folder of scores."""
         if self.data.name == UNLABELED and not self.unlabeled:
             raise InputError("unlabeled is not set: give a folder of photographs", "unlabeled")
-        photos = self.photos
-        if isinstance(photos, dict):
-            is_valid = all(isinstance(folder, str) for folder in photos.values())
-        else:
-            is_valid = photos is None or isinstance(photos, str)
-        if not is_valid:
-            raise InputError(
-                f"photos={photos} must be a folder, or a mapping of names to folders",
-                "photos",
-            )
+        folders = self.photos.values() if isinstance(self.photos, dict) else [self.photos or ""]
+        if not all(isinstance(folder, str) for folder in folders):
+            raise self.wrong("photos", "must be a folder, or a mapping of names to folders")
         for name in self.scored_folders:
             # Each name becomes the name of a sub-folder of the run.
             if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
                 raise InputError(
-                    f"photos has the name {name!r} for a folder: choose a name of letters, "
-                    f"digits, _ and - that is not one of {', '.join(RESERVED)}",
+                    f"photos has the name {name!r} for a folder: choose letters, digits, _ and -, "
+                    f"and none of {', '.join(RESERVED)}",
                     "photos",
                 )
 
-    def _check_silhouettes(self) -> None:
-        """Raise InputError if an attack on the pose lacks the gradient at silhouettes."""
-        if "pose" in self.augment.attack.parameters and not self.renderer.silhouettes:
-            raise InputError(
-                "renderer.silhouettes=false: an attack on the pose needs renderer.silhouettes=true",
-                "renderer.silhouettes",
-            )
-
-    def _count_examples(self) -> None:
-        """Set the number of renders: one for each object, view and background."""
-        backgrounds = len(self.scene.backgrounds)
-        self.augment.examples = self.views * self.object_count * backgrounds
-        factors = "meshes × views × backgrounds"
-        require_range(factors, self.augment.examples, 1, MAX_EXAMPLES)
-
-    def _remove_generated_positives(self) -> None:
-        """Remove hard negatives whose name is a positive class."""
-        positives = {simplified(name) for name in label_names(self.label)}
-        kept = []
-        for item in self.hard_negatives:
-            is_positive = isinstance(item, str) and simplified(solid_name(item)) in positives
-            if not is_positive:
-                kept.append(item)
-        self.hard_negatives = kept
-
     @property
     def label_follows_from_meshes(self) -> bool:
-        """Whether a label that is not set is the list of the classes of the meshes."""
-        has_meshes = bool(self.meshes) and self.augment.mode != "folder"
-        return self.label is None and has_meshes and self.shows_positives
+        """Whether a label that is not set is the list of the classes of the meshes.
 
-    @property
-    def shows_positives(self) -> bool:
-        """Whether the run trains on objects of the positive classes, or scores images of them."""
+        The run must train on objects of the positive classes, or score images of them.
+        """
         is_scored = bool(self.photos) or self.evaluate.laboratory_setups > 0
-        return self.augment.renders or self.train.ranking_weight > 0 or is_scored
+        is_used = self.augment.renders or self.train.ranking_weight > 0 or is_scored
+        has_meshes = bool(self.meshes) and self.augment.mode != "folder"
+        return self.label is None and has_meshes and is_used
 
     @property
     def scored_folders(self) -> dict[str, Path]:
@@ -453,16 +394,11 @@ class ExperimentSettings(NetworkSettings):
             item.label = item.label or solid_name(item.mesh)
             if not item.label:
                 raise InputError(
-                    f"{key} has no class: give {{mesh: {item.mesh}, label: CLASS}}",
-                    key,
+                    f"{key} has no class: give {{mesh: {item.mesh}, label: CLASS}}", key
                 )
         missing = set(labels) - {item.label for item in objects.values()}
         if missing and len(labels) > 1:
-            raise InputError(
-                f"label={self.label} has no mesh of {min(missing)}: "
-                "add a mesh of this class to meshes",
-                "label",
-            )
+            raise self.wrong("label", f"has no mesh of {min(missing)}: add one to meshes")
         return objects
 
 
@@ -471,11 +407,8 @@ def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, Object
 
     Keys are `key` followed by "[0]" and so on. An item without a class gets `label`.
     """
-    objects = {}
-    for index, item in enumerate(items):
-        item_key = f"{key}[{index}]"
-        objects[item_key] = read_object(item, label, item_key)
-    return objects
+    keys = [f"{key}[{index}]" for index in range(len(items))]
+    return {key: read_object(item, label, key) for key, item in zip(keys, items, strict=True)}
 
 
 def read_object(item: Any, label: str, key: str) -> ObjectSettings:
@@ -484,8 +417,7 @@ def read_object(item: Any, label: str, key: str) -> ObjectSettings:
     `item` is a file, "solid:NAME", or a mapping with fields of `ObjectSettings`, which can have its
     own class.
     """
-    values = item if isinstance(item, dict) else {"mesh": item}
-    values = {"label": label, **values}
+    values = {"label": label, **(item if isinstance(item, dict) else {"mesh": item})}
     # The name of a class can be a number, which YAML reads as one.
     if is_whole(values["label"]):
         values["label"] = str(values["label"])
@@ -517,24 +449,13 @@ def label_names(label: str | int | Sequence[str | int]) -> list[str]:
 
     There must be a name, and no name twice. A whole number is a name, too.
     """
-    is_one_name = isinstance(label, str) or is_whole(label)
-    listed = [label] if is_one_name else label
-    if not isinstance(listed, Sequence):
-        raise InputError(
-            f"label is {describe(label)}: give the name of a class, or a list of names",
-            "label",
-        )
-    for name in listed:
-        if not (isinstance(name, str) or is_whole(name)):
-            raise InputError(
-                f"label has {describe(name)} in its list: give only names of classes",
-                "label",
-            )
-    names = [composed(str(name)) for name in listed]
+    listed: Any = [label] if isinstance(label, str) or is_whole(label) else label
+    is_list = isinstance(listed, Sequence)
+    is_valid = is_list and all(isinstance(item, str) or is_whole(item) for item in listed)
+    names = [composed(str(name)) for name in listed] if is_valid else []
     if not names or len(set(names)) < len(names):
         raise InputError(
-            f"label=[{', '.join(names)}] must name a class, or several, each once",
-            "label",
+            f"label={label}: give the name of a class, or a list of several, each once", "label"
         )
     return names
 
@@ -549,12 +470,8 @@ def published(run: Path) -> Path:
     candidates = [run]
     if run.parts[:1] == ("pretrained",):
         package = Path(__file__).parent
-        clone = package.parent
-        candidates += [package / run, clone / run]
-    for path in candidates:
-        if path.exists():
-            return path
-    return run
+        candidates += [package / run, package.parent / run]
+    return next((path for path in candidates if path.exists()), run)
 
 
 def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

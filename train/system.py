@@ -1,9 +1,10 @@
-"""The process of a command: its start, signals, memory, verbosity and command line.
+"""The process of a command: its start, signals, memory, verbosity, errors and command line.
 
 This module imports neither torch nor NumPy, because --help would wait for them.
 """
 
 import ctypes
+import errno
 import gc
 import os
 import shlex
@@ -13,11 +14,11 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, cast
 
-from renderer.errors import InputError
+from renderer.errors import InputError, is_out_of_memory
 
 INTERRUPTED = "ended by SIGINT"
 # The names of all installed commands begin with this text.
@@ -42,14 +43,18 @@ VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES
 # Largest array in bytes whose memory is reused. For larger arrays, the time to get new
 # memory is small beside the time to fill it.
 LARGEST_REUSED = 2**30
+# Numbers of the system errors of a full disk, of an exceeded quota and of a file that
+# is too large.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+# Largest number of characters of a text that an error message quotes.
+MAX_NAME_LENGTH = 200
 
 
 def take_flag(words: list[str]) -> list[str]:
     """Remove --verbose and -v from a command line, and make the process verbose if one is there."""
-    others = [word for word in words if word not in VERBOSE_FLAGS]
-    if len(others) < len(words):
+    if not VERBOSE_FLAGS.isdisjoint(words):
         os.environ[VERBOSE] = "1"
-    return others
+    return [word for word in words if word not in VERBOSE_FLAGS]
 
 
 def is_verbose() -> bool:
@@ -66,16 +71,6 @@ def shortened(lines: Sequence[str], limit: int = MAX_LINES) -> list[str]:
         return list(lines)
     kept = limit - 1
     return [*lines[:kept], f"... {len(lines) - kept} more lines: -v shows them"]
-
-
-def require_current_folder() -> None:
-    """Raise InputError if the current folder was deleted, so that relative paths mean nothing."""
-    try:
-        os.getcwd()
-    except OSError as error:
-        raise InputError(
-            f"the current folder cannot be used ({error.strerror}): change to another folder"
-        ) from error
 
 
 def set_up_process() -> None:
@@ -131,47 +126,31 @@ def exits_on_sigterm() -> Iterator[None]:
 
 
 def import_function(path: str) -> Callable[..., Any]:
-    """Import a function by its path "module:function"."""
-    module, _, name = path.partition(":")
+    """Import a function by its path "module:function".
+
+    If this takes seconds, a line says so. Ctrl-C ends the process at once, since some modules catch
+    KeyboardInterrupt while they are imported, and would continue.
+    """
     is_torch_imported = "torch" in sys.modules
-    with _announced_if_slow(), _ended_by_ctrl_c():
-        function = getattr(import_module(module), name)
-    if not is_torch_imported:
-        skip_last_collection()
-    return cast(Callable[..., Any], function)
-
-
-@contextmanager
-def _announced_if_slow() -> Iterator[None]:
-    """Print that libraries are being loaded if the block takes longer than IMPORT_DELAY."""
     line = "loading PyTorch and other libraries ..."
     timer = threading.Timer(IMPORT_DELAY, print, [line], {"file": sys.stderr, "flush": True})
     timer.daemon = True
     timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-
-
-@contextmanager
-def _ended_by_ctrl_c() -> Iterator[None]:
-    """End the process at once if Ctrl-C is pressed during the block.
-
-    Some modules catch KeyboardInterrupt while they are imported, and would continue.
-    """
-    # Python lets only the main thread set a handler.
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous_handler = signal.getsignal(signal.SIGINT)
-    # A job in the background of a shell ignores SIGINT, and must still do so.
-    if previous_handler is signal.default_int_handler:
+    # Python lets only the main thread set a handler. A job in the background of a shell ignores
+    # SIGINT, and must still do so.
+    is_main = threading.current_thread() is threading.main_thread()
+    ends_at_once = is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if ends_at_once:
         signal.signal(signal.SIGINT, _end_at_once)
     try:
-        yield
+        function = resolve_name(path)
     finally:
-        signal.signal(signal.SIGINT, previous_handler)
+        timer.cancel()
+        if ends_at_once:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+    if not is_torch_imported:
+        skip_last_collection()
+    return cast(Callable[..., Any], function)
 
 
 def _end_at_once(number: int, frame: object) -> None:
@@ -204,7 +183,7 @@ def program(name: str, as_called: bool = False) -> list[str]:
         has_path = as_called and called.stem == installed_name
         words = [str(called) if has_path else installed_name]
     else:
-        words = ["-m", "train" if name == "train" else f"scripts.{name}"]
+        words = ["-m", *(["train"] if name == "train" else ["scripts", name])]
     if process_count > 1:
         torchrun = [python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
         no_python = ["--no-python"] if is_installed else []
@@ -215,3 +194,31 @@ def program(name: str, as_called: bool = False) -> list[str]:
 def command_line(name: str) -> str:
     """Return the command line of this process, as a user can type it again."""
     return shlex.join([*program(name), *sys.argv[1:]])
+
+
+def user_message(error: BaseException) -> str | None:
+    """Write a message for the user about an error that the user can fix.
+
+    None if it is a fault of the program, or unknown.
+    """
+    match error:
+        case InputError():
+            return str(error)
+        case UnicodeEncodeError():
+            name = ascii(error.object[:MAX_NAME_LENGTH])
+            fault = f"{name} has characters that this system or library cannot write"
+            return f"{fault}: rename it, or set PYTHONUTF8=1"
+        case OSError() if error.errno in NO_ROOM:
+            fault = f"{error.filename or 'the output'} cannot be written ({error.strerror})"
+            return f"{fault}: make room and start again"
+        case OSError() if error.filename is not None:
+            return f"{error.filename} cannot be read or written: {error.strerror}"
+        # NCCL and Gloo connect processes. Gloo has no class of errors; its messages contain the
+        # path of a source file.
+        case RuntimeError() if type(error).__name__.startswith("Dist") or "/gloo/" in str(error):
+            fault = "another process of this run has ended"
+            return f"{fault}: fix what ended it, and continue with train.resume=true"
+        case RuntimeError() | MemoryError() if is_out_of_memory(error):
+            advice = "ask for fewer or smaller images, views or meshes, or for a smaller batch_size"
+            return f"memory ran out: {advice}"
+    return None

@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from renderer.errors import MAX_SCALE, InputError
+from renderer.errors import MAX_SCALE
 from renderer.settings import Settings, setting
 
 # Default of model.name.
 WIDERESNET = "wideresnet"
 # Training settings that need a network with whose weights the training begins.
 NEEDS_INITIAL_NETWORK = (
-    "distillation_weight",
-    "soup",
-    "eval_mode",
-    "consistency_weight",
-    "interpolate",
+    *("distillation_weight", "soup", "eval_mode", "consistency_weight", "interpolate"),
 )
 # Value of train.freeze with which only the last layer is trained, as by Kirichenko
 # et al. (2023).
@@ -42,8 +38,7 @@ class ModelSettings(Settings):
     """Settings of the architecture of the network to train."""
 
     name: str = setting(
-        WIDERESNET,
-        "wideresnet, torchvision:NAME or python:package.module:function.",
+        WIDERESNET, "wideresnet, torchvision:NAME or python:package.module:function."
     )
     depth: int = setting(16, "Depth of the WideResNet.")
     width: int = setting(4, "Width of the WideResNet.")
@@ -61,29 +56,16 @@ class ModelSettings(Settings):
 class TrainSettings(Settings):
     """Settings of the training of the network. The defaults are those of the paper."""
 
-    epochs: int = setting(
-        150,
-        "Number of passes over the training images.",
-        minimum=1,
-        maximum=10**6,
-    )
+    epochs: int = setting(150, "Number of passes over the training images.", within=(1, 10**6))
     images_per_epoch: int | None = setting(
-        None,
-        "Number of training images, drawn anew for each epoch. null: all.",
-        minimum=1,
-        maximum=10**9,
+        None, "Number of training images, drawn anew for each epoch. null: all.", within=(1, 10**9)
     )
-    batch_size: int = setting(128, "Images per training step.", minimum=1, maximum=10**6)
+    batch_size: int = setting(128, "Images per training step.", within=(1, 10**6))
     accumulation_steps: int = setting(
-        1,
-        "Number of parts into which each batch is divided to save memory.",
-        minimum=1,
-        maximum=10**6,
+        1, "Number of parts into which each batch is divided to save memory.", within=(1, 10**6)
     )
     optimizer: str = setting(
-        "sgd",
-        "Optimizer. adamw decays no biases and norms.",
-        choices=OPTIMIZERS,
+        "sgd", "Optimizer. adamw decays no biases and norms.", choices=OPTIMIZERS
     )
     learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
     feature_norm: float | None = setting(
@@ -95,7 +77,7 @@ class TrainSettings(Settings):
         maximum=MAX_SCALE,
     )
     momentum: float = setting(0.9, "Nesterov momentum.", minimum=0, below=1)
-    weight_decay: float = setting(5e-4, "Weight decay.", minimum=0, maximum=MAX_SCALE)
+    weight_decay: float = setting(5e-4, "Weight decay.", within=(0, MAX_SCALE))
     clip_gradient: float | None = setting(
         None, "Largest norm of the gradient of a batch. null: any.", above=0, maximum=MAX_SCALE
     )
@@ -125,35 +107,28 @@ class TrainSettings(Settings):
         3.0,
         "Largest factor of a channel of a slide for augmentation=relight. Its inverse is the "
         "smallest.",
-        minimum=1,
-        maximum=100,
+        within=(1, 100),
     )
     relight_steps: int = setting(
-        0,
-        "Steps along the gradient that find these factors. 0: random factors.",
-        minimum=0,
-        maximum=1000,
+        0, "Steps along the gradient that find these factors. 0: random factors.", within=(0, 1000)
     )
     label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
     ranking_weight: float = setting(
         0.0,
         "Weight of the loss that ranks the images of `label` in a batch above the others.",
-        minimum=0,
-        maximum=MAX_SCALE,
+        within=(0, MAX_SCALE),
     )
     distillation_weight: float = setting(
         0.0,
         "Weight of the divergence from the predictions of `network`. "
         "On renders, this counts classes other than `label`.",
-        minimum=0,
-        maximum=MAX_SCALE,
+        within=(0, MAX_SCALE),
     )
     consistency_weight: float = setting(
         0.0,
         "Weight of the divergence of the predictions for augmented images from those of "
         "`network` for the same images without augmentation.",
-        minimum=0,
-        maximum=MAX_SCALE,
+        within=(0, MAX_SCALE),
     )
     interpolate: bool = setting(
         False,
@@ -186,13 +161,10 @@ class TrainSettings(Settings):
         None,
         "CPU threads, on which the last bits depend. "
         "null: all cores that the process may use, or one for small batches.",
-        minimum=1,
-        maximum=1024,
+        within=(1, 1024),
     )
     compile: str = setting(
-        "auto",
-        "Compile the training step. auto: CUDA graphs on one GPU.",
-        choices=COMPILE,
+        "auto", "Compile the training step. auto: CUDA graphs on one GPU.", choices=COMPILE
     )
     deterministic: bool = setting(
         False,
@@ -202,24 +174,19 @@ class TrainSettings(Settings):
     checkpoint_every: int = setting(
         1,
         "Epochs between two checkpoints. A single process also writes one about every minute.",
-        minimum=1,
-        maximum=10**6,
+        within=(1, 10**6),
     )
     resume: bool = setting(
-        False,
-        "Resume from the last checkpoint in `out`. out=FOLDER train.resume=true is enough.",
+        False, "Resume from the last checkpoint in `out`. out=FOLDER train.resume=true is enough."
     )
     cache: str | None = setting(
-        "auto",
-        "Folder of rendered data sets. auto: ~/.cache/parametric-norm-balls. null: none.",
+        "auto", "Folder of rendered data sets. auto: ~/.cache/parametric-norm-balls. null: none."
     )
 
     def __post_init__(self) -> None:
         """Check all values, and that attacked images have a loss."""
         super().__post_init__()
         if self.relight_steps and not self.consistency_weight:
-            raise InputError(
-                f"relight_steps={self.relight_steps} attacks the images of the consistency loss, "
-                "whose weight is 0: set consistency_weight",
-                "relight_steps",
+            raise self.wrong(
+                "relight_steps", "attacks the images of the consistency loss: set its weight"
             )

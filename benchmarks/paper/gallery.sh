@@ -24,7 +24,7 @@ picture() {
     local name=$1 folder
     shift
     folder=$(mktemp -d)
-    "${PYTHON:-python}" -m scripts.attack "out=$folder/out" "${as_in_the_paper[@]}" "$@"
+    "${PYTHON:-python}" -m scripts attack "out=$folder/out" "${as_in_the_paper[@]}" "$@"
     cp "$folder"/out/0_*/example_000.png "$OUT/gallery_$name.png"
     rm -r "$folder"
 }

@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +15,13 @@ import trimesh
 from PIL import Image
 
 import norm_balls as nb
+import scripts
 from renderer import export_mesh, save_light, solid
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import probe
 from renderer.light.lamps import Lamps
 from tests.helpers import save_colored_noise
+from train.__main__ import main
 
 ROOT = Path(__file__).parents[2]
 MAX_SECONDS = 300  # A process that should end is killed after this time.
@@ -111,12 +112,11 @@ def run_here(name: str, *arguments: str, folder: Path) -> int:
 
     Training writes no report.
     """
-    module = "train.__main__" if name == "train" else f"scripts.{name}"
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
         patch.setattr(sys, "argv", [f"{name}.py", *arguments])
         patch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
         try:
-            import_module(module).main()
+            (main if name == "train" else getattr(scripts, name))()
         except SystemExit as stop:
             return int(stop.code or 0)
     return 0

@@ -68,14 +68,8 @@ EVALUATE = ("evaluate", "photos=photographs", "out=out", "device=cpu", "precisio
 EVALUATE_RUN = (*EVALUATE, "run=finished")
 EVALUATE_PUBLISHED = (*EVALUATE, "run=published")
 ATTACK = (
-    "attack",
-    "network=run:finished",
-    "meshes=[mesh.obj]",
-    "out=out",
-    "device=cpu",
-    "attack.max_steps=1",
-    "attack.force=true",
-    "attack.checks=false",
+    *("attack", "network=run:finished", "meshes=[mesh.obj]", "out=out", "device=cpu"),
+    *("attack.max_steps=1", "attack.force=true", "attack.checks=false"),
     *RENDERER,
 )
 LAMPS = "scene.lamps={positions: [[2, 2, 2], [-2, 2, 2]], start: lamps.json}"
@@ -106,18 +100,8 @@ SLOW_COMMANDS = [file for file in COMMANDS if COMMANDS[file] == RESUME]
 
 NUMBER = re.compile(rb"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 TOKENS = (
-    b"nan",
-    b"inf",
-    b"-1",
-    b"0",
-    b"1e300",
-    b"1e-300",
-    b"9" * 19,
-    b"9" * 400,
-    b"word",
-    b"[]",
-    b"null",
-    b"",
+    *(b"nan", b"inf", b"-1", b"0", b"1e300", b"1e-300", b"9" * 19, b"9" * 400, b"word", b"[]"),
+    *(b"null", b""),
 )
 OTHER = (
     b"",

@@ -60,10 +60,3 @@ def test_a_mesh_of_no_class_is_refused_in_one_sentence(mesh, message, monkeypatc
     (tmp_path / "bananas.glb").touch()
     with pytest.raises(InputError, match=re.escape(message)):
         class_names.with_class_names(settings([mesh]), CLASSES)
-
-
-def test_a_mesh_tells_no_class_if_the_classes_have_no_names(tmp_path):
-    mesh = tmp_path / "orange.glb"
-    mesh.touch()
-    with pytest.raises(InputError, match="give label=INDEX, from 0 to 2"):
-        class_names.with_class_names(settings([str(mesh)]), ["0", "1", "2"])

@@ -7,6 +7,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -14,29 +15,20 @@ import pytest
 import torch
 import yaml
 
+import scripts
 from renderer.errors import InputError
 from train import console
-from train import user_errors as errors
-from train.cli import USER_ERROR, Command, HelpText
-from train.commands.compare import CompareSettings
+from train.cli import USER_ERROR
 from train.commands.experiment import logged_to
 from train.data.sets import content_hash
-from train.run_folder import LAST, locked
+from train.run_folder import LAST, locked, writable_folder
 from train.system import take_flag
-from train.user_errors import writable_folder
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
-    "experiment=paper",
-    "model.depth=10",
-    "model.width=1",
-    "train.epochs=1",
-    "train.precision=float32",
-    "train.threads=1",
-    "augment.examples=4",
-    "augment.attack.max_steps=2",
-    "scene.backgrounds=[0,1]",
-    "renderer.rasterizer=numpy",
+    *("experiment=paper", "model.depth=10", "model.width=1", "train.epochs=1"),
+    *("train.precision=float32", "train.threads=1", "augment.examples=4"),
+    *("augment.attack.max_steps=2", "scene.backgrounds=[0,1]", "renderer.rasterizer=numpy"),
     "renderer.samples=2",
 ]
 
@@ -53,44 +45,34 @@ def no_report(monkeypatch) -> None:
     monkeypatch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
 
 
-class TestTrainingOfTwoArms:
-    @pytest.fixture
-    def overrides(self, two_methods, photos) -> list[str]:
-        return ["out=here", *two_methods, f"photos={photos}"]
-
-    @pytest.fixture
-    def printed(self, call, capsys, overrides):
-        """Train in the background of a shell, which ignores SIGINT, and return what is printed."""
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
-            assert call("train", *overrides, *SMALL) == 0
-            assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-        finally:
-            signal.signal(signal.SIGINT, before)
-        return capsys.readouterr()
-
-    def test_ends_with_their_table_and_records_its_command(self, printed, overrides, tmp_path):
-        self.assert_output(printed, tmp_path / "here")
-        config = yaml.safe_load((tmp_path / "here" / "config.yaml").read_text())
-        arguments = [*overrides[1:], *SMALL]
-        assert shlex.split(config["command"]) == ["python", "-m", "train", *arguments]
-        assert config["working_folder"] == str(tmp_path)
-        assert [path.name for path in tmp_path.iterdir()] == ["here"]
-
-    def assert_output(self, printed, folder: Path) -> None:
-        """Check the output, the log and the files of a training."""
-        errors = re.sub(r".* \.\.\.\n", "", printed.err)  # Announcements end with dots.
-        assert errors == ""
-        lines = printed.out.splitlines()
-        assert len(lines) <= 15
-        names = [line.split()[1] for line in lines if line.startswith("| ")]
-        assert [name for name in names if name.isalpha()] == ["network", "none", "adversarial"]
-        for run in (folder, folder / "none"):
-            assert (run / LAST).is_file()
-            assert (run / "photographs" / "contact_sheet.png").is_file()
-        log = (folder / "train.log").read_text()
-        assert set(lines) <= set(log.splitlines())
-        assert "epoch 1/" in log
+def test_a_training_of_two_methods_ends_with_their_table_and_records_its_command(
+    call, capsys, tmp_path, two_methods, photos
+):
+    """It runs in the background of a shell, which ignores SIGINT."""
+    overrides = [*two_methods, f"photos={photos}", *SMALL]
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert call("train", "out=here", *overrides) == 0
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+    printed = capsys.readouterr()
+    assert re.sub(r".* \.\.\.\n", "", printed.err) == ""  # Announcements end with dots.
+    lines = printed.out.splitlines()
+    assert len(lines) <= 15
+    names = [line.split()[1] for line in lines if line.startswith("| ")]
+    assert [name for name in names if name.isalpha()] == ["network", "none", "adversarial"]
+    folder = tmp_path / "here"
+    for run in (folder, folder / "none"):
+        assert (run / LAST).is_file()
+        assert (run / "photographs" / "contact_sheet.png").is_file()
+    log = (folder / "train.log").read_text()
+    assert set(lines) <= set(log.splitlines())
+    assert "epoch 1/" in log
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert shlex.split(config["command"]) == ["python", "-m", "train", *overrides]
+    assert config["working_folder"] == str(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
 
 
 @pytest.mark.parametrize(
@@ -137,49 +119,45 @@ def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, two_met
     assert not list(tmp_path.rglob("metrics.jsonl"))
 
 
-class TestAStoppedRun:
-    @pytest.fixture
-    def stopped(self, call, capsys, no_report, tmp_path, two_methods, photos) -> Path:
-        """Stop a run of two methods by SIGTERM, and move its folder."""
-        folder = tmp_path / "begun"
-        overrides = [*two_methods, f"photos={photos}", "seed=3", *SMALL, "train.epochs=2"]
-        with pytest.MonkeyPatch.context() as patch:
+def test_a_stopped_run_is_resumed_by_its_folder_alone(
+    call, capsys, no_report, tmp_path, two_methods, photos
+):
+    """Both methods end with the weights of a whole run, though the folder was moved.
 
-            def save_and_stop(*arguments):
-                patch.undo()
-                torch.save(*arguments)
-                signal.raise_signal(signal.SIGTERM)
+    An additional setting is taken. Settings that affect the result cannot change.
+    """
+    folder = tmp_path / "begun"
+    overrides = [*two_methods, f"photos={photos}", "seed=3", *SMALL, "train.epochs=2"]
+    with pytest.MonkeyPatch.context() as patch:
 
-            patch.setattr(torch, "save", save_and_stop)
-            status = call("train", f"out={folder}", *overrides)
-        assert status == 128 + signal.SIGTERM
-        advice = shlex.split(capsys.readouterr().out.splitlines()[-1])
-        assert advice[-5:] == [sys.executable, "-m", "train", f"out={folder}", "train.resume=true"]
-        return folder.rename(tmp_path / "moved")
+        def save_and_stop(*arguments):
+            patch.undo()
+            torch.save(*arguments)
+            signal.raise_signal(signal.SIGTERM)
 
-    def test_is_resumed_by_its_folder_alone(self, call, tmp_path, stopped):
-        """Resume both methods, with an additional setting, to the weights of a whole run.
+        patch.setattr(torch, "save", save_and_stop)
+        assert call("train", f"out={folder}", *overrides) == 128 + signal.SIGTERM
+    advice = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert advice[-5:] == [sys.executable, "-m", "train", f"out={folder}", "train.resume=true"]
+    stopped = folder.rename(tmp_path / "moved")
+    for other in ("seed=4", "augment=random"):
+        assert call("train", f"out={stopped}", "train.resume=true", other) == USER_ERROR
+    before = yaml.safe_load((stopped / "config.yaml").read_text())
+    additional = "train.checkpoint_every=2"
+    assert call("train", f"out={stopped}", "train.resume=true", additional) == 0
+    config = yaml.safe_load((stopped / "config.yaml").read_text())
+    assert config["command"] == f"{before['command']} {additional}"
+    assert config["out"] == str(stopped)
 
-        Settings that affect the result cannot change.
-        """
-        for other in ("seed=4", "augment=random"):
-            assert call("train", f"out={stopped}", "train.resume=true", other) == USER_ERROR
-        before = yaml.safe_load((stopped / "config.yaml").read_text())
-        additional = "train.checkpoint_every=2"
-        assert call("train", f"out={stopped}", "train.resume=true", additional) == 0
-        config = yaml.safe_load((stopped / "config.yaml").read_text())
-        assert config["command"] == f"{before['command']} {additional}"
-        assert config["out"] == str(stopped)
-
-        whole = tmp_path / "whole"
-        _, _, _, *overrides = shlex.split(config["command"])
-        assert call("train", f"out={whole}", *overrides) == 0
-        for method in (".", "none"):
-            resumed_state = torch.load(stopped / method / LAST, weights_only=True)
-            whole_state = torch.load(whole / method / LAST, weights_only=True)
-            assert resumed_state["epoch"] == 2
-            assert content_hash(resumed_state["model"]) == content_hash(whole_state["model"])
-            assert (stopped / method / "photographs" / "summary.json").is_file()
+    whole = tmp_path / "whole"
+    _, _, _, *overrides = shlex.split(config["command"])
+    assert call("train", f"out={whole}", *overrides) == 0
+    for method in (".", "none"):
+        resumed_state = torch.load(stopped / method / LAST, weights_only=True)
+        whole_state = torch.load(whole / method / LAST, weights_only=True)
+        assert resumed_state["epoch"] == 2
+        assert content_hash(resumed_state["model"]) == content_hash(whole_state["model"])
+        assert (stopped / method / "photographs" / "summary.json").is_file()
 
 
 @pytest.mark.parametrize(
@@ -223,49 +201,22 @@ def test_ctrl_c_tells_how_to_resume_if_there_is_a_checkpoint(
     assert ("train.resume=true" in last_line) == has_trained
 
 
-COMPARE = Command("compare", CompareSettings, "builtins:print", HelpText("Compare."))
-
-
-WARNING = """
-import warnings
-from train.system import set_up_process
-set_up_process()
-warnings.warn("clamped")
-"""
-
-
 def run_python(code: str) -> subprocess.CompletedProcess:
     """Run code in a process of its own, in the folder of the repository."""
     arguments = [sys.executable, "-c", code]
     return subprocess.run(arguments, capture_output=True, text=True, timeout=100, cwd=ROOT)
 
 
-def test_a_warning_of_a_library_is_one_line_of_a_command():
-    ended = run_python(WARNING)
-    assert ended.returncode == 0
-    assert ended.stderr == "warning: clamped\n"
-
-
-def interrupt() -> None:
-    raise KeyboardInterrupt
-
-
-def interrupt_and_fail() -> None:
-    """Turn an interrupt into another error, as trimesh does while it imports optional parts."""
-    try:
-        raise KeyboardInterrupt
-    except KeyboardInterrupt:
-        raise TypeError("unsupported operand type(s) for |") from None
-
-
-@pytest.mark.parametrize("act", [interrupt, interrupt_and_fail])
-def test_ctrl_c_is_one_line_even_if_a_library_turns_it_into_an_error(capsys, act):
-    with pytest.raises(SystemExit) as stop, COMPARE.handle_errors():
-        act()
+def test_ctrl_c_is_one_line_even_if_a_library_turns_it_into_an_error(capsys):
+    """trimesh does so while it imports optional parts."""
+    with pytest.raises(SystemExit) as stop, scripts.compare.handle_errors():
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            raise TypeError("unsupported operand type(s) for |") from None
     assert stop.value.code == 128 + signal.SIGINT
     printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err == "ended by SIGINT\n"
+    assert (printed.out, printed.err) == ("", "ended by SIGINT\n")
 
 
 INTERRUPTED = """
@@ -276,12 +227,12 @@ class Finder:
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Finder)
 signal.signal(signal.SIGINT, signal.default_int_handler)
-sys.argv[1:] = []
+sys.argv[1:] = ["attack"] if "MODULE" == "scripts" else []
 runpy.run_module("MODULE", run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("module", ["train", "scripts.attack"])
+@pytest.mark.parametrize("module", ["train", "scripts"])
 def test_an_interrupt_while_torch_is_imported_is_one_line(module):
     ended = run_python(INTERRUPTED.replace("MODULE", module))
     assert ended.returncode == 128 + signal.SIGINT
@@ -294,22 +245,15 @@ def test_a_closed_output_pipe_ends_a_command_silently(capsys, monkeypatch):
     os.close(read)
     with monkeypatch.context() as patch, open(write, "w") as output:
         patch.setattr(sys, "stdout", output)
-        with pytest.raises(SystemExit) as stop, COMPARE.handle_errors():
+        with pytest.raises(SystemExit) as stop, scripts.compare.handle_errors():
             print("a table")
         assert stop.value.code == 128 + signal.SIGPIPE
         print("text that Python writes at its end", flush=True)
     assert capsys.readouterr().err == ""
 
 
-def test_trying_an_output_leaves_nothing_behind(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for folder in (".", "a/b", tmp_path / "c"):
-        assert writable_folder(folder, "out") == Path(folder)
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_full_disk_is_noticed_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr(errors.tempfile, "TemporaryFile", lambda dir: io.FileIO("/dev/full", "w"))
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda dir: io.FileIO("/dev/full", "w"))
     with pytest.raises(InputError, match=rf"out={tmp_path} .*No space left on device"):
         writable_folder(tmp_path, "out")
 

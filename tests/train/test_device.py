@@ -159,8 +159,5 @@ def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_an
         torch.testing.assert_close(gradient, exact)
     graphed.train()(images)
     graphed.eval()(images[:1].expand(SIZES[-1] + 1, -1, -1, -1))
-    assert sizes == [
-        16,
-        32,
-        64,
-    ]  # The model itself is used in training mode and for larger batches.
+    # The model itself is used in training mode and for larger batches.
+    assert sizes == [16, 32, 64]

@@ -155,51 +155,40 @@ def test_the_forward_pass_is_the_published_one():
     torch.testing.assert_close(network(images), expected)
 
 
-class TestDropout:
-    @pytest.fixture(params=[torch.contiguous_format, torch.channels_last], ids=str)
-    def layout(self, request) -> torch.memory_format:
-        return request.param
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+def test_dropout_drops_values_independently_and_keeps_the_mean(layout, dtype):
+    ones = torch.ones(16, 32, 31, 33, dtype=dtype).contiguous(memory_format=layout)
+    torch.manual_seed(0)
+    result = Dropout(0.3)(ones)
+    assert result.dtype == dtype
+    assert result.is_contiguous(memory_format=layout)
+    remaining = result[result != 0]
+    torch.testing.assert_close(remaining, torch.full_like(remaining, 1 / 0.7))
+    variance = 0.3 * 0.7
+    deviations = (result == 0).double() - 0.3
+    # All limits are four standard deviations of a mean.
+    assert abs(deviations.mean()) < 4 * (variance / ones.numel()) ** 0.5
+    for dim in range(4):
+        pair_count = ones.shape[dim] - 1
+        first = deviations.narrow(dim, 0, pair_count)
+        products = first * deviations.narrow(dim, 1, pair_count)
+        assert abs(products.mean()) < 4 * variance / products.numel() ** 0.5
 
-    @pytest.fixture(params=[torch.float32, torch.bfloat16], ids=str)
-    def ones(self, request, layout) -> Tensor:
-        values = torch.ones(16, 32, 31, 33, dtype=request.param)
-        return values.contiguous(memory_format=layout)
 
-    def test_scales_the_remaining_values_so_that_the_mean_stays(self, ones, layout):
-        torch.manual_seed(0)
-        result = Dropout(0.3)(ones)
-        assert result.dtype == ones.dtype
-        assert result.is_contiguous(memory_format=layout)
-        remaining = result[result != 0]
-        expected = torch.full_like(remaining, 1 / 0.7)
-        torch.testing.assert_close(remaining, expected)
+def test_dropout_passes_gradients_where_it_passes_values():
+    x = torch.randn(4, 8, 5, 7, requires_grad=True)
+    y = Dropout(0.5)(x)
+    y.sum().backward()
+    assert torch.equal(x.grad, torch.where(y != 0, 2.0, 0.0))
 
-    def test_drops_values_independently(self, ones):
-        torch.manual_seed(0)
-        is_dropped = Dropout(0.3)(ones) == 0
-        variance = 0.3 * 0.7
-        deviations = is_dropped.double() - 0.3
-        # All limits are four standard deviations of a mean.
-        assert abs(deviations.mean()) < 4 * (variance / ones.numel()) ** 0.5
-        for dim in range(4):
-            pair_count = ones.shape[dim] - 1
-            first = deviations.narrow(dim, 0, pair_count)
-            second = deviations.narrow(dim, 1, pair_count)
-            products = first * second
-            assert abs(products.mean()) < 4 * variance / products.numel() ** 0.5
 
-    def test_passes_gradients_where_it_passes_values(self):
-        x = torch.randn(4, 8, 5, 7, requires_grad=True)
-        y = Dropout(0.5)(x)
-        y.sum().backward()
-        assert torch.equal(x.grad, torch.where(y != 0, 2.0, 0.0))
-
-    @pytest.mark.parametrize("dropout", [Dropout(0.5).eval(), Dropout(0.0)], ids=["eval", "zero"])
-    def test_draws_nothing_in_eval_mode_or_at_rate_zero(self, dropout):
-        x = torch.randn(4, 8, 5, 7)
-        state = torch.get_rng_state()
-        assert dropout(x) is x
-        assert torch.equal(torch.get_rng_state(), state)
+@pytest.mark.parametrize("dropout", [Dropout(0.5).eval(), Dropout(0.0)], ids=["eval", "zero"])
+def test_dropout_draws_nothing_in_eval_mode_or_at_rate_zero(dropout):
+    x = torch.randn(4, 8, 5, 7)
+    state = torch.get_rng_state()
+    assert dropout(x) is x
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_a_torchvision_network_is_torchvisions_own_after_normalization():
@@ -290,12 +279,8 @@ def test_the_code_of_a_network_runs_only_if_it_is_named(tmp_path):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"version": 99},
-        {"size": None},
-        {"size": 10**9},
+        *({"version": 99}, {"size": None}, {"size": 10**9}, {"depth": "10"}, {"heads": 3}),
         {"classes": ["fig", "lime"]},
-        {"depth": "10"},
-        {"heads": 3},
     ],
     ids=str,
 )
@@ -342,12 +327,9 @@ def test_a_published_network_has_the_weights_in_half_precision(network, tmp_path
         assert (error <= limit).all(), name
 
 
-class TestANetworkThatIsPartOfThePackage:
-    @pytest.mark.parametrize("name", ["pretrained/none", "pretrained/none/model.safetensors"])
-    def test_is_found_from_any_folder(self, tmp_path, name):
-        assert load_run(name).name == f"run:{name}"
-
-    def test_gives_way_to_a_folder_of_the_same_name(self, tmp_path):
-        (tmp_path / "pretrained" / "none").mkdir(parents=True)
-        with pytest.raises(InputError, match=r"run=pretrained/none holds neither"):
-            load_run("pretrained/none")
+@pytest.mark.parametrize("name", ["pretrained/none", "pretrained/none/model.safetensors"])
+def test_a_network_of_the_package_is_found_from_any_folder_unless_that_has_its_name(tmp_path, name):
+    assert load_run(name).name == f"run:{name}"
+    (tmp_path / "pretrained" / "none").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"run=pretrained/none holds neither"):
+        load_run("pretrained/none")

@@ -17,10 +17,7 @@ from packaging.version import Version
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("norm_balls", "renderer", "augment", "train", "conf", "scripts")
 TINY = (
-    "data.train_per_class=4",
-    "data.test_per_class=2",
-    "data.validation=0.5",
-    "augment=none",
+    *("data.train_per_class=4", "data.test_per_class=2", "data.validation=0.5", "augment=none"),
     "train.epochs=1",
 )
 KINDS = ("*.py", "*.pyi", "py.typed", "*.yaml", "*.jinja", "*.safetensors")
@@ -91,11 +88,7 @@ def install(folder: Path, target: Path) -> None:
 def write_modules_of_the_same_names(folder: Path) -> None:
     """Write modules that end the process if they are imported."""
     for name in (
-        "train.py",
-        "renderer.py",
-        "augment.py",
-        "conf/__init__.py",
-        "scripts/__init__.py",
+        *("train.py", "renderer.py", "augment.py", "conf/__init__.py", "scripts/__init__.py"),
     ):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("raise SystemExit('not this')")
@@ -126,11 +119,8 @@ class TestAnInstallation:
         for path in sorted((target / "bin").glob("pnb-*")):
             assert path.name in self.run(target, user, path.name, "--help")
         attack = [
-            "network=run:pretrained/none",
-            "attack.max_steps=1",
-            "attack.checks=false",
-            "attack.force=true",
-            "renderer.shadows=false",
+            *("network=run:pretrained/none", "attack.max_steps=1", "attack.checks=false"),
+            *("attack.force=true", "renderer.shadows=false"),
         ]
         self.run(target, user, "pnb-attack", *attack, "out=out")
         self.run(target, user, "pnb-train", "--multirun", "launcher=joblib", "seed=0,1", *TINY)

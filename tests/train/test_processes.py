@@ -145,10 +145,7 @@ def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of
 def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_path):
     """The command of the README; the second call goes on where SIGTERM stopped the first."""
     small = [
-        "model.depth=10",
-        "model.width=1",
-        "train.batch_size=16",
-        "renderer.samples=2",
+        *("model.depth=10", "model.width=1", "train.batch_size=16", "renderer.samples=2"),
         "augment.examples=10",
     ]
     small += ["meshes=['solid:orange','solid:pear']", "hard_negatives=[]", "scene.views=1"]
@@ -157,9 +154,7 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
         "experiment=paper",
         *small,
         *data,
-        "train.device=cpu",
-        "train.epochs=20",
-        "train.checkpoint_every=1000",
+        *("train.device=cpu", "train.epochs=20", "train.checkpoint_every=1000"),
     ]
     start = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "-m", "train"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

@@ -51,10 +51,6 @@ class TestAPublishedNetwork:
         assert found.accuracy == expected.accuracy
         assert found.photographs == expected.photographs
 
-    def test_has_no_operating_point_unless_one_was_asked_for(self, published):
-        with pytest.raises(InputError, match="has no operating point"):
-            load_run(published).detect(torch.zeros(1, 3, 16, 16))
-
 
 def read_images(paths: list[Path]) -> Tensor:
     return torch.stack([read_image(path, 16) for path in paths])
@@ -96,39 +92,27 @@ class TestAnOperatingPoint:
 
 
 LABELS = ("orange", "apple")
+PRETRAINED = ["none", "random", "adversarial", "best"]
 
 
-@pytest.fixture(scope="module")
-def folders(finished, photos, tmp_path_factory) -> dict[str, Path]:
-    """Publish a network for both labels, and one for each, with thresholds."""
-    root = tmp_path_factory.mktemp("labels")
-    labels = {"both": list(LABELS), "orange": "orange", "apple": "apple"}
-    for name, label in labels.items():
-        options = {"calibrate": photos, "false_positive_rate": 0.5, "label": label}
-        nb.publish(finished, root / name, **options)
-    return {name: root / name for name in labels}
-
-
-class TestSeveralLabels:
-    def test_have_the_thresholds_that_each_has_alone(self, folders):
-        network = load_run(folders["both"])
-        images = torch.rand(9, 3, 16, 16)
-        for label, point in zip(LABELS, network.operating_points, strict=True):
-            alone = load_run(folders[label])
-            (expected,) = alone.operating_points
-            assert point.label == label
-            assert point.threshold == expected.threshold
-            assert torch.equal(network.detect(images, label), alone.detect(images))
-
-    def test_must_be_named_to_detect(self, folders):
-        with pytest.raises(InputError, match="orange, apple"):
-            load_run(folders["both"]).detect(torch.zeros(1, 3, 16, 16))
-
-    def test_are_scored_in_the_order_of_the_settings(self, folders, photos, tmp_path):
-        labels = list(reversed(LABELS))
-        nb.evaluate(load_run(folders["both"]), photos, labels, out=tmp_path)
-        summary = json.loads((tmp_path / "summary.json").read_text())
-        assert [point["label"] for point in summary["operating_point"]] == labels
+def test_several_labels_have_the_thresholds_that_each_has_alone(finished, photos, tmp_path):
+    options = {"calibrate": photos, "false_positive_rate": 0.5}
+    nb.publish(finished, tmp_path / "both", label=list(LABELS), **options)
+    network = load_run(tmp_path / "both")
+    images = torch.rand(9, 3, 16, 16)
+    for label, point in zip(LABELS, network.operating_points, strict=True):
+        nb.publish(finished, tmp_path / label, label=label, **options)
+        alone = load_run(tmp_path / label)
+        (expected,) = alone.operating_points
+        assert point.label == label
+        assert point.threshold == expected.threshold
+        assert torch.equal(network.detect(images, label), alone.detect(images))
+    with pytest.raises(InputError, match="orange, apple"):
+        network.detect(images)
+    labels = list(reversed(LABELS))
+    nb.evaluate(network, photos, labels, out=tmp_path / "scores")
+    summary = json.loads((tmp_path / "scores" / "summary.json").read_text())
+    assert [point["label"] for point in summary["operating_point"]] == labels
 
 
 def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
@@ -141,20 +125,13 @@ def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-PRETRAINED = ["none", "random", "adversarial", "best"]
-
-
-@pytest.mark.parametrize("name", PRETRAINED)
-def test_each_pretrained_network_was_validated_on_images_that_it_left_out(name):
-    _, state = load_selected(Path("pretrained", name))
-    assert state["architecture"]["validation"]["fraction"] == 0.02
-
-
 def test_all_pretrained_networks_are_scored_on_the_same_photographs():
+    """Each was validated on images that it left out."""
     images = set()
     for name in PRETRAINED:
-        scores = summarize(Path("pretrained", name)).photographs
-        images.add(scores["photographs"].images)
+        _, state = load_selected(Path("pretrained", name))
+        assert state["architecture"]["validation"]["fraction"] == 0.02
+        images.add(summarize(Path("pretrained", name)).photographs["photographs"].images)
     assert len(images) == 1
 
 
@@ -174,7 +151,7 @@ def rows_of_the_page() -> dict[str, list[str]]:
     return rows
 
 
-@pytest.mark.parametrize("name", ["none", "random", "adversarial", "best"])
+@pytest.mark.parametrize("name", PRETRAINED)
 def test_the_results_are_those_of_the_page(name):
     accuracy, *_, recall, false_positive_rate, auc, _ = rows_of_the_page()[name]
     results = nb.load(name).results
@@ -184,15 +161,6 @@ def test_the_results_are_those_of_the_page(name):
     assert errors.value == pytest.approx(float(false_positive_rate), abs=3e-3)
     assert results["photographs/recall"].value == pytest.approx(float(recall), abs=5e-3)
     assert results["photographs/auc"].value == pytest.approx(float(auc.split()[0]), abs=1e-3)
-
-
-def test_the_network_is_that_of_its_folder():
-    loaded = nb.load("best")
-    expected = nb.load_run("pretrained/best")
-    assert loaded.classes == expected.classes
-    weights = expected.state_dict()
-    assert all(value.equal(weights[name]) for name, value in loaded.state_dict().items())
-    assert loaded.operating_points == expected.operating_points
 
 
 def test_an_unknown_name_is_refused_with_the_known_ones():

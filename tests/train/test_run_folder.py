@@ -10,7 +10,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from renderer.errors import InputError
-from train import fingerprints
+from train import run_config
 from train.cli import read_settings
 from train.command_settings import AuditSettings
 from train.run_config import (
@@ -85,16 +85,10 @@ def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
 @pytest.mark.parametrize(
     "override",
     [
-        "meshes=[{}]",
-        "hard_negatives=[{{mesh: {}, label: apple}}]",
-        "meshes=[{{mesh: solid:orange, props: [{{mesh: {}, at: [1, 1]}}]}}]",
-        "scene.light={}",
-        "scene.backgrounds=[0.5,{}]",
-        "augment.vary.environments=[{}]",
-        "network={}",
-        "network={0.parent}",
-        "data.path={}",
-        "data.path={0.parent}",
+        *("meshes=[{}]", "hard_negatives=[{{mesh: {}, label: apple}}]"),
+        *("meshes=[{{mesh: solid:orange, props: [{{mesh: {}, at: [1, 1]}}]}}]", "scene.light={}"),
+        *("scene.backgrounds=[0.5,{}]", "augment.vary.environments=[{}]", "network={}"),
+        *("network={0.parent}", "data.path={}", "data.path={0.parent}"),
     ],
 )
 def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
@@ -117,7 +111,7 @@ def replace_content(file: Path) -> None:
     status = file.stat()
     file.write_bytes(file.read_bytes()[::-1])
     os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
-    fingerprints._hash_version.cache_clear()  # As in another process.
+    run_config._hash_version.cache_clear()  # As in another process.
 
 
 MATERIAL = "newmtl red\nmap_Kd -s 1 1 1 my skin.png\n"
@@ -175,15 +169,15 @@ def test_an_input_whose_content_alone_changed_is_refused(tmp_path, monkeypatch, 
 
 
 def test_a_folder_too_large_to_read_is_told_by_the_times_of_its_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(fingerprints, "MAX_FOLDER_BYTES", 1)
+    monkeypatch.setattr(run_config, "MAX_FOLDER_BYTES", 1)
     (tmp_path / "photographs").mkdir()
     file = tmp_path / "photographs" / "a.png"
     file.write_text("ab")
     settings = AuditSettings(**AUDIT | {"photos": str(file.parent)})
-    before = fingerprints.fingerprints(settings)
-    assert fingerprints.fingerprints(settings) == before
+    before = run_config.fingerprints(settings)
+    assert run_config.fingerprints(settings) == before
     os.utime(file, ns=(0, 0))
-    assert fingerprints.fingerprints(settings) != before
+    assert run_config.fingerprints(settings) != before
 
 
 def test_a_last_line_that_was_cut_short_is_skipped(tmp_path):

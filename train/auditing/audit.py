@@ -24,7 +24,7 @@ import torch
 from augment.classifier import Classifier
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
-from renderer.errors import InputError
+from renderer.errors import InputError, keyed
 from renderer.io.files import atomic_write
 from renderer.light.files import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
@@ -59,7 +59,7 @@ from train.auditing.relit import (
     write_photographs_page,
 )
 from train.checkpoints import load_chosen, load_network
-from train.class_names import class_name, class_of_meshes, require_others, with_class_name
+from train.class_names import class_of_meshes, require_others, with_class_name
 from train.command_settings import AuditSettings, LabSettings
 from train.data.photographs import find_photographs, find_unlabeled
 from train.device import choose_device
@@ -68,10 +68,9 @@ from train.results.overwrite import RESULTS, require_replaceable
 from train.results.page import PAGE
 from train.results.scoring import Predictor, evaluate_photographs
 from train.run_config import CONFIG, read_config, require_same, write_config
-from train.run_folder import read_json, sole_writer
+from train.run_folder import read_json, sole_writer, writable_folder
 from train.settings import OTHER_PREFIX, published, read_objects, simplified, solid_name
 from train.system import command_line
-from train.user_errors import keyed, writable_folder
 
 # Number of views of the meshes that are rendered in environment lighting.
 VIEW_COUNT = 24
@@ -294,10 +293,7 @@ def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
     The class is that of the meshes. Hard negatives are only filled in if test images must be
     rendered.
     """
-    if settings.label is None:
-        label = class_of_meshes(settings.meshes, classifier.classes, "meshes")
-    else:
-        label = class_name(classifier.classes, settings.label, "label")
+    label = class_of_meshes(settings.meshes, classifier.classes, "meshes", settings.label)
     negatives = [
         with_class_name(item, classifier.classes, "hard_negatives")
         for item in settings.hard_negatives
@@ -317,8 +313,7 @@ def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
 
     The keys CLASSIFIER and HARDENED also name the subfolders of their results.
     """
-    with keyed(name="network"):
-        classifier = load_chosen(settings)
+    classifier = load_chosen(settings)
     networks = {CLASSIFIER: classifier}
     if settings.hardened:
         with keyed(name="hardened"):

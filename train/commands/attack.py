@@ -5,18 +5,17 @@ be loaded again with reload=FOLDER.
 """
 
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from warnings import catch_warnings, filterwarnings
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.attack_settings import AttackSettings
+from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.attacks.adversary import Adversary, reload
 from augment.attacks.attack import attack
 from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
@@ -28,106 +27,28 @@ from augment.classifier import Classifier
 from augment.network import compute_outputs
 from augment.random_streams import generator
 from augment.scene.build import build_scene
-from augment.scene.objects import SceneObject, add_table, load_object
+from augment.scene.objects import add_table, load_object
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
-from renderer.errors import InputError
+from renderer.errors import InputError, keyed, keys_of
 from renderer.visibility import Rasterizer
 from train.checkpoints import load_chosen, load_network
-from train.class_names import class_name, class_of_meshes
+from train.class_names import class_of_meshes
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.device import choose_device, choose_rasterizer
-from train.results.attack_tables import (
-    FIGURE,
-    TABLE,
-    TRANSFERS,
-    Sweep,
-    format_attack,
-    format_sweep,
-    write_sweeps,
-    write_transfers,
-)
+from train.results import attack_tables
 from train.results.overwrite import remove_attack, require_replaceable
 from train.results.relit import MODELED, RELIT, attack_folder
 from train.results.tables import Table
 from train.run_config import write_config
-from train.run_folder import sole_writer
+from train.run_folder import sole_writer, writable_folder
 from train.settings import published, read_object, read_objects
 from train.system import command_line, is_verbose, shortened
-from train.user_errors import keyed, keys_of, writable_folder
 
 # Warnings about at most 3 unreadable files are printed if --verbose is not set.
 MAX_UNREADABLE = 3
 # The search for a scene in which a mesh is recognized may change these settings.
 SEARCHED_SETTINGS = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
-
-
-class MeshAttack(NamedTuple):
-    """Attack on one mesh.
-
-    Attributes:
-        name: File of the mesh, or name of the generated solid.
-        scene: Settings of the attacked scene.
-        result: Result of the attack.
-    """
-
-    name: str
-    scene: AttackSceneSettings
-    result: AttackResult
-
-
-@dataclass
-class Outcome:
-    """Text and numbers that pnb-attack prints about the attack on one mesh.
-
-    Attributes:
-        name: Name of the mesh.
-        heading: Sentence that says whether the attack succeeded.
-        details: Lines about other results.
-        success_count: Number of examples that were classified correctly before
-            the attack, and for which the attack succeeded.
-        correct_count: Number of examples that were classified correctly before
-            the attack.
-        example_count: Number of all examples.
-    """
-
-    name: str
-    heading: str
-    details: list[str]
-    success_count: int
-    correct_count: int
-    example_count: int
-
-
-@dataclass(frozen=True)
-class TransferTargets:
-    """Classifiers, views and objects other than the attacked ones.
-
-    pnb-attack tests whether successful attacks also succeed with each of them.
-
-    Attributes:
-        classifiers: Other classifiers.
-        azimuths: Angles in degrees. The cameras are rotated about the vertical
-            axis by each of them.
-        objects: Objects that replace the attacked object.
-    """
-
-    classifiers: Sequence[Classifier] = ()
-    azimuths: Sequence[float] = ()
-    objects: Sequence[SceneObject] = ()
-
-    def __bool__(self) -> bool:
-        """Return whether there is any classifier, azimuth or object."""
-        return bool(self.classifiers or self.azimuths or self.objects)
-
-    def transfer(self, result: AttackResult) -> list[dict[str, Any]]:
-        """Test whether the successful attacks of a result also succeed with each target."""
-        return transfer(
-            result,
-            classifiers=self.classifiers,
-            azimuths=self.azimuths,
-            objects=self.objects,
-        )
 
 
 def run(settings: AttackExperimentSettings) -> None:
@@ -137,17 +58,20 @@ def run(settings: AttackExperimentSettings) -> None:
     `settings.reload`, the predictions for a saved adversary are printed, and
     the attack, if there is one, starts at this adversary.
     """
-    if settings.attack.relighting is not None:
-        _attack_photographs(settings)
+    if settings.attack.relighting is not None and settings.unlabeled is not None:
+        _attack_photographs(settings, settings.attack.relighting, settings.unlabeled)
         return
-    _require_attack_settings(settings)
+    # These settings are checked before any file is read.
+    with keyed("transfer", **keys_of("transfer", settings.transfer)):
+        moved = settings.transfer.azimuths, settings.transfer.meshes
+        require_transferable(settings.attack.parameters, *moved)
     adversary = reload(settings.reload) if settings.reload else None
-    if adversary is None:
-        with keyed("attack"):
+    with keyed("attack", **keys_of("attack", settings.attack)):
+        require_renderers(settings.attack.renderers)
+        if adversary is None:
             settings.attack.require_parameters()
     device = choose_device(settings.device)
-    with keyed(name="network"):
-        classifier = load_chosen(settings).to(device)
+    classifier = load_chosen(settings).to(device)
     if adversary is not None:
         images = adversary.render_views(_start_rasterizer(settings)).to(device)
         views = format_reloaded(adversary, images, classifier, settings.attack, settings.seed)
@@ -157,21 +81,41 @@ def run(settings: AttackExperimentSettings) -> None:
     targets = load_targets(settings, classifier, device)
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
-    with sole_writer("out", out):
+    with sole_writer("out", out), catch_warnings():
         remove_attack(out)
-        mesh_attacks = attacks(settings, classifier, device, adversary)
-        with catch_warnings():
-            if settings.attack.checks is not False:
-                # The checks say this for each mesh.
-                filterwarnings("ignore", ZERO_GRADIENT)
-            outcomes, sweeps = _write_attacks(mesh_attacks, out, settings, targets)
+        if settings.attack.checks is not False:
+            # The checks say this for each mesh.
+            filterwarnings("ignore", ZERO_GRADIENT)
+        headings = []
+        # Name, examples, examples that were correct before, and successes for each mesh.
+        rows: list[tuple[str, int, int, int]] = []
+        details = []
+        sweeps: dict[str, attack_tables.Sweep] = {}
+        for index, (name, scene, result) in enumerate(
+            attacks(settings, classifier, device, adversary)
+        ):
+            # The name of a solid has colons, which Windows does not allow in file names.
+            folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
+            heading, lines = _write_attack(name, scene, result, folder, settings, targets)
+            if settings.attack.radius_scales:
+                sweep = success_by_radius(result, settings.attack.radius_scales)
+                sweeps[folder.name] = sweep
+                lines += attack_tables.format_sweep(sweep).splitlines()
+            if is_verbose():
+                print("\n".join([heading, *lines, ""]))
+            correct = result.clean_correct
+            hits = int(result.success[correct].sum())
+            rows.append((name, len(correct), int(correct.sum()), hits))
+            headings.append(heading)
+            details += lines
         if not is_verbose():
-            print("\n".join(shortened(format_outcomes(outcomes))))
+            print("\n".join(shortened([*_format_summary(headings, rows), *details])))
         if sweeps:
             norms = {name: steps.norm for name, steps in settings.attack.parameters.items()}
-            write_sweeps(sweeps, norms, out)
+            attack_tables.write_sweeps(sweeps, norms, out)
             if is_verbose():
-                print(f"success against radius: {out / TABLE} and {out / FIGURE}")
+                files = out / attack_tables.TABLE, out / attack_tables.FIGURE
+                print("success against radius: {} and {}".format(*files))
         write_config(out, settings, command=command_line("attack"))
     print(f"images, adversaries and numbers: {out}")
 
@@ -182,105 +126,50 @@ def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
         return choose_rasterizer(settings.renderer)
 
 
-def _require_attack_settings(settings: AttackExperimentSettings) -> None:
-    """Check the settings of the transfer and of the renderers before any file is read."""
-    with keyed("transfer", **keys_of("transfer", settings.transfer)):
-        require_transferable(
-            settings.attack.parameters,
-            settings.transfer.azimuths,
-            settings.transfer.meshes,
-        )
-    with keyed("attack", **keys_of("attack", settings.attack)):
-        require_renderers(settings.attack.renderers)
-
-
-def _write_attacks(
-    mesh_attacks: Iterable[MeshAttack],
-    out: Path,
-    settings: AttackExperimentSettings,
-    targets: TransferTargets,
-) -> tuple[list[Outcome], dict[str, Sweep]]:
-    """Run the attacks on several meshes, and write each result to its own folder.
-
-    The sweeps are by the name of the folder, and empty if `attack.radius_scales` is.
-    """
-    sweeps: dict[str, Sweep] = {}
-    outcomes = []
-    for index, mesh_attack in enumerate(mesh_attacks):
-        # The name of a solid has colons, which Windows does not allow in file names.
-        stem = Path(mesh_attack.name.replace(":", "_")).stem
-        folder = out / f"{index}_{stem}"
-        outcome = _write_attack(mesh_attack, folder, settings, targets)
-        if settings.attack.radius_scales:
-            sweep = success_by_radius(mesh_attack.result, settings.attack.radius_scales)
-            sweeps[folder.name] = sweep
-            outcome.details += format_sweep(sweep).splitlines()
-        outcomes.append(outcome)
-        if is_verbose():
-            print("\n".join([outcome.heading, *outcome.details, ""]))
-    return outcomes, sweeps
-
-
 def _write_attack(
-    mesh_attack: MeshAttack,
+    name: str,
+    scene: AttackSceneSettings,
+    result: AttackResult,
     folder: Path,
     settings: AttackExperimentSettings,
-    targets: TransferTargets,
-) -> Outcome:
-    """Check the result of the attack on one mesh, and write it to a folder."""
-    name = mesh_attack.name
-    result = mesh_attack.result
-    is_correct_before = result.clean_correct
+    targets: Mapping[str, Sequence[Any]],
+) -> tuple[str, list[str]]:
+    """Check the result of the attack on one mesh, and write it to a folder.
+
+    Return a sentence that says whether the attack succeeded, and lines about other results.
+    """
     details = []
-    if mesh_attack.scene != settings.scene:
-        changes = overrides(mesh_attack.scene, settings.scene)
+    if scene != settings.scene:
+        changes = overrides(scene, settings.scene)
         details.append(f"{name} is misclassified in the given scene, but not with {changes}")
     has_checks = settings.attack.checks
     if has_checks is None:
         has_checks = result.settings.uses_gradients
     checks = check(result) if has_checks else None
     lines = save(result, folder, checks, settings.attack.renderers)
+    heading, *more_lines = attack_tables.format_attack(name, result, checks, lines)
     if is_verbose():
-        heading, *more_lines = format_attack(name, result, checks, lines)
         details += [*more_lines, f"images, adversaries and numbers: {folder}"]
-    else:
-        (heading,) = format_attack(name, result, None)
-        texts = warnings(checks) if checks else []
-        details += [f"warning about {name}: {text}" for text in texts]
-    if targets:
-        table = write_transfers(targets.transfer(result), folder / TRANSFERS)
+    elif checks:
+        details += [f"warning about {name}: {text}" for text in warnings(checks)]
+    if any(targets.values()):
+        table = attack_tables.write_transfers(
+            transfer(result, **targets), folder / attack_tables.TRANSFERS
+        )
         details += table.splitlines()
-    return Outcome(
-        name,
-        heading,
-        details,
-        success_count=int(result.success[is_correct_before].sum()),
-        correct_count=int(is_correct_before.sum()),
-        example_count=len(is_correct_before),
-    )
+    return heading, details
 
 
-def format_outcomes(outcomes: Sequence[Outcome]) -> list[str]:
-    """Format the summary that pnb-attack prints about the attacks on all meshes.
-
-    Several meshes get a number of successes and a table. Details follow in any case.
-    """
-    (first, *others) = outcomes
-    lines = [first.heading]
-    if others:
-        success_count = sum(outcome.success_count for outcome in outcomes)
-        correct_count = sum(outcome.correct_count for outcome in outcomes)
-        counts = f"{success_count} of {correct_count} examples that were correct before"
-        lines = [f"{len(outcomes)} meshes: success on {counts}"]
-        header = ["mesh", "examples", "correct before", "success"]
-        rows = [
-            [item.name, item.example_count, item.correct_count, item.success_count]
-            for item in outcomes
-        ]
-        lines += str(Table("", header, rows)).splitlines()
-    for outcome in outcomes:
-        lines += outcome.details
-    return lines
+def _format_summary(
+    headings: Sequence[str], rows: Sequence[tuple[str, int, int, int]]
+) -> Sequence[str]:
+    """Return the sentence about one mesh, or the sum and a table of several."""
+    if len(rows) == 1:
+        return headings
+    correct, hits = (sum(row[column] for row in rows) for column in (2, 3))
+    total = f"success on {hits} of {correct} examples that were correct before"
+    table = Table("", ["mesh", "examples", "correct before", "success"], rows)
+    return [f"{len(rows)} meshes: {total}", *str(table).splitlines()]
 
 
 def attacks(
@@ -288,86 +177,45 @@ def attacks(
     classifier: Classifier,
     device: torch.device,
     adversary: Adversary | None = None,
-) -> Iterator[MeshAttack]:
+) -> Iterator[tuple[str, AttackSceneSettings, AttackResult]]:
     """Attack each mesh of the settings, or the scene of a saved adversary.
 
-    If a mesh is misclassified in its scene, a search looks for another scene in which it is
-    recognized. This scene is then attacked. The values of an adversary are the start of its attack
-    and the centers of the norm-balls.
+    Yield the name of each mesh, the settings of the attacked scene, and the result. If a mesh is
+    misclassified in its scene, a search looks for another scene in which it is recognized, unless
+    `scene.search` is 0 or `attack.force` is set. The values of an adversary are the start of its
+    attack and the centers of the norm-balls.
     """
+
+    def start(scene: Scene, force: bool) -> AttackResult:
+        with keyed("attack", **keys_of("attack", settings.attack)):
+            return attack(
+                classifier,
+                scene,
+                settings.target,
+                settings.attack,
+                seed=settings.seed,
+                force=force,
+            )
+
     if adversary is not None:
-        yield _attack_adversary(settings, classifier, device, adversary)
+        if adversary.pixels is not None:
+            raise InputError(
+                f"reload={settings.reload} has changed pixels, which cannot be attacked on"
+            )
+        scene = adversary.scene(_start_rasterizer(settings), device)
+        yield adversary.shown.name, settings.scene, start(scene, force=True)
         return
     for index, item in enumerate(settings.meshes):
         key = f"meshes[{index}]"
-        label = "" if settings.label is None else str(settings.label)
-        mesh = read_object(item, label, key)
-        if not mesh.label:
-            mesh.label = class_of_meshes([item], classifier.classes, key)
-        mesh.label = class_name(classifier.classes, mesh.label, "label")
-        yield _attack_mesh(settings, classifier, device, mesh)
-
-
-def _attack_adversary(
-    settings: AttackExperimentSettings,
-    classifier: Classifier,
-    device: torch.device,
-    adversary: Adversary,
-) -> MeshAttack:
-    """Attack the scene of a saved adversary, starting at its attacked values.
-
-    An adversary with changed pixels instead of a changed scene raises InputError.
-    """
-    if adversary.pixels is not None:
-        raise InputError(
-            f"reload={settings.reload} is an adversary with changed pixels, from which an attack "
-            "cannot continue: remove attack=",
-        )
-    scene = adversary.scene(_start_rasterizer(settings), device)
-    result = attack(
-        classifier,
-        scene,
-        settings.target,
-        settings.attack,
-        seed=settings.seed,
-        force=True,
-    )
-    return MeshAttack(adversary.shown.name, settings.scene, result)
-
-
-def _attack_mesh(
-    settings: AttackExperimentSettings,
-    classifier: Classifier,
-    device: torch.device,
-    mesh: ObjectSettings,
-) -> MeshAttack:
-    """Attack one mesh in the scene of the settings, or in a scene that a search finds.
-
-    The search looks for a scene in which the classifier recognizes the mesh. There is no search if
-    `scene.search` is 0, or if `attack.force` allows to attack a misclassified mesh.
-    """
-    build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
-    scene_settings = settings.scene
-    if scene_settings.search and not settings.attack.force:
-        scene_settings = find_scene(
-            classifier,
-            scene_settings,
-            settings.attack,
-            build,
-            scene_settings.search,
-            generator(settings.seed, mesh.mesh, "search"),
-        )
-    scene = build(scene_settings)
-    with keyed("attack", **keys_of("attack", settings.attack)):
-        result = attack(
-            classifier,
-            scene,
-            settings.target,
-            settings.attack,
-            seed=settings.seed,
-            force=settings.attack.force,
-        )
-    return MeshAttack(mesh.mesh, scene_settings, result)
+        mesh = read_object(item, "", key)
+        label = mesh.label or settings.label
+        mesh.label = class_of_meshes([item], classifier.classes, key, label)
+        build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
+        chosen = settings.scene
+        if chosen.search and not settings.attack.force:
+            draws = generator(settings.seed, mesh.mesh, "search")
+            chosen = find_scene(classifier, chosen, settings.attack, build, chosen.search, draws)
+        yield mesh.mesh, chosen, start(build(chosen), settings.attack.force)
 
 
 def build_attacked(
@@ -402,46 +250,35 @@ def load_targets(
     settings: AttackExperimentSettings,
     attacked: Classifier,
     device: torch.device,
-) -> TransferTargets:
-    """Load the other classifiers and meshes with which successful attacks are tested."""
+) -> dict[str, Sequence[Any]]:
+    """Load the other classifiers and meshes with which successful attacks are tested.
+
+    Return the arguments of `nb.transfer`.
+    """
     label = ""
     if settings.transfer.networks or settings.transfer.meshes:
         # The class is compared by name, because its index may differ in other classifiers.
-        if settings.label is None:
-            label = class_of_meshes(settings.meshes, attacked.classes, "meshes")
-        else:
-            label = class_name(attacked.classes, settings.label, "label")
+        label = class_of_meshes(settings.meshes, attacked.classes, "meshes", settings.label)
     classifiers = []
     for item in settings.transfer.networks:
-        classifier = _load_classifier(item, settings.trust).to(device)
+        values = item if isinstance(item, dict) else {"network": item}
+        if values.keys() - {"network", "weights"}:
+            raise InputError(
+                f"transfer.networks has {item}: give a name, or {{network: NAME, weights: FILE}}"
+            )
+        name = str(values.get("network"))
+        with keyed(name="transfer.networks", weights="transfer.networks: weights"):
+            other = load_network(name, values.get("weights"), trust_code=settings.trust)
         # `label` raises an InputError if the classifier lacks the class.
-        classifier.label(label)
-        classifiers.append(classifier)
+        other.label(label)
+        classifiers.append(other.to(device))
     objects = []
-    meshes = read_objects(settings.transfer.meshes, label, "transfer.meshes")
-    for mesh in meshes.values():
-        # `label` raises an InputError if the classifier lacks the class.
+    for mesh in read_objects(settings.transfer.meshes, label, "transfer.meshes").values():
         attacked.label(mesh.label)
         loaded = load_object(mesh, settings.scene.vertices)
         objects.append(add_table(loaded, settings.scene.ground))
-    return TransferTargets(classifiers, settings.transfer.azimuths, objects)
-
-
-def _load_classifier(item: Any, trust: bool) -> Classifier:
-    """Load one classifier that the setting `transfer.networks` names.
-
-    `item` is a name, or has the keys "network" and "weights".
-    """
-    values = item if isinstance(item, dict) else {"network": item}
-    for key in values:
-        if key not in ("network", "weights"):
-            raise InputError(
-                f"transfer.networks has an entry with the unknown key {key}: "
-                "give the name of a network, or {network: NAME, weights: FILE}",
-            )
-    with keyed(name="transfer.networks", weights="transfer.networks: weights"):
-        name = str(values.get("network"))
-        return load_network(name, values.get("weights"), trust_code=trust)
+    azimuths = settings.transfer.azimuths
+    return {"classifiers": classifiers, "azimuths": azimuths, "objects": objects}
 
 
 def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
@@ -474,37 +311,29 @@ def format_reloaded(
     criterion = Criterion(source=torch.full_like(predicted, NO_CLASS), target=predicted)
     objective = Objective(classifier, criterion, settings, seed)
     example = torch.zeros(1, dtype=torch.int64)
-    is_same_with_noise = objective.fooled_in_views(images[None], predicted, example)
-    saved_images = adversary.images_in_views.to(images)
-    max_differences = (images - saved_images).abs().flatten(1).amax(1)
+    is_same_with_noise = objective.fooled_in_views(images[None], predicted, example)[0]
+    difference = images - adversary.images_in_views.to(images)
+    levels = (255 * difference.abs().flatten(1).amax(1)).tolist()
     named = predictions(logits[0], classifier.classes)
     lines = []
     for view in range(len(images)):
-        predicted_name = named["predicted"][view]
-        confidence = named["confidence"][view]
-        line = f"view {view}: {adversary.shown.label} is classified as {predicted_name}"
-        line += f" ({confidence:.1%})"
+        line = f"view {view}: {adversary.shown.label} is classified as {named['predicted'][view]}"
+        line += f" ({named['confidence'][view]:.1%})"
         if settings.sensor_noise:
             same = ", and so with a sensor's noise"
             different = ", but not always with a sensor's noise"
-            line += same if is_same_with_noise[0, view] else different
-        difference = 255 * float(max_differences[view])
-        line += f"; values differ from the saved image's by {difference:.3g}/255 at most"
+            line += same if is_same_with_noise[view] else different
+        line += f"; values differ from the saved image's by {levels[view]:.3g}/255 at most"
         lines.append(line)
     return lines
 
 
-def _attack_photographs(settings: AttackExperimentSettings) -> None:
+def _attack_photographs(
+    settings: AttackExperimentSettings, relighting: RelightingSettings, folder: str
+) -> None:
     """Attack a network by the light of a projector on photographs, and print the results."""
-    relighting = settings.attack.relighting
-    if relighting is None or settings.unlabeled is None:
-        raise InputError(
-            "attack=relighting needs unlabeled=FOLDER, and unlabeled=FOLDER needs "
-            "attack=relighting: set both"
-        )
     device = choose_device(settings.device)
-    with keyed(name="network"):
-        classifier = load_chosen(settings).to(device)
+    classifier = load_chosen(settings).to(device)
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
     with sole_writer("out", out):
@@ -512,7 +341,7 @@ def _attack_photographs(settings: AttackExperimentSettings) -> None:
         with keyed("unlabeled"):
             scores = attack_folder(
                 classifier,
-                published(Path(settings.unlabeled)),
+                published(Path(folder)),
                 relighting,
                 out,
                 sensor_noise=settings.attack.sensor_noise,

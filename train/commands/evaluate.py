@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from augment.classifier import Classifier, Label, OperatingPoint
+from augment.classifier import Classifier
 from augment.plain_networks import (
     UNIT_RANGE,
     Normalization,
@@ -18,7 +18,7 @@ from augment.plain_networks import (
     require_no_facts,
 )
 from augment.settings import NormalizeLight
-from renderer.errors import as_folder
+from renderer.errors import as_folder, keyed
 from train.checkpoints import load_chosen, load_run
 from train.command_settings import EvaluateSettings, require_calibration
 from train.data.photographs import choose_labels, class_folders, require_outside
@@ -27,22 +27,26 @@ from train.results import scoring
 from train.results.overwrite import require_replaceable
 from train.results.scoring import Predictor, Scores, format_overall, format_scores
 from train.results.store import trained_labels
-from train.run_folder import sole_writer
+from train.run_folder import sole_writer, writable_folder
 from train.settings import label_names, published
 from train.system import is_verbose
-from train.user_errors import keyed, writable_folder
 
 
 def run(settings: EvaluateSettings) -> None:
     """Score a network on photographs, write tables and images, and print a summary."""
-    network = _load_network(settings)
     label = settings.label
-    if (
-        label is None
-        and settings.run
-        and class_folders(published(Path(settings.photos)), network.classes)
-    ):
-        label = trained_labels(Path(settings.run)) or None
+    if settings.run is None:
+        network = load_chosen(settings)
+    else:
+        # The file of a training run has its classes, size and normalization. These settings
+        # are therefore an error here.
+        given_values = as_facts(settings.classes, settings.size, settings.normalization)
+        require_no_facts(f"run={settings.run}", given_values)
+        loaded = load_run(settings.run, settings.weights, settings.network, settings.trust)
+        # The returned copy normalizes the light of each image, unless the setting is None.
+        network = loaded.normalizing_light(settings.normalize_light)
+        if label is None and class_folders(published(Path(settings.photos)), network.classes):
+            label = trained_labels(Path(settings.run)) or None
     with keyed("label"):
         for name in [] if label is None else label_names(label):
             network.label(name)
@@ -64,21 +68,6 @@ def run(settings: EvaluateSettings) -> None:
         print(f"positive classes: {', '.join(scores.predicted.labels)} ({source})")
     text = format_scores(scores) if is_verbose() else format_overall(scores)
     print(f"{text}\ntable, scores and image: {Path(settings.out)}")
-
-
-def _load_network(settings: EvaluateSettings) -> Classifier:
-    """Load the network of the training run `settings.run`, or else `settings.network`."""
-    if settings.run is None:
-        # Error messages about the argument `name` begin with the setting `network` instead.
-        with keyed(name="network"):
-            return load_chosen(settings)
-    # The file of a training run has its classes, size and normalization. These settings
-    # are therefore an error here.
-    given_values = as_facts(settings.classes, settings.size, settings.normalization)
-    require_no_facts(f"run={settings.run}", given_values)
-    classifier = load_run(settings.run, settings.weights, settings.network, settings.trust)
-    # The returned copy normalizes the light of each image, unless the setting is None.
-    return classifier.normalizing_light(settings.normalize_light)
 
 
 def evaluate(
@@ -179,40 +168,17 @@ def evaluate(
             require_replaceable(target, "out", overwrite)
             require_outside(target, folder)
         with sole_writer("out", target) if target else nullcontext():
-            points = _stored_operating_points(classifier, labels)
+            stored = {point.label: point for point in classifier.operating_points}
+            points = [stored[name] for name in labels] if stored.keys() >= set(labels) else []
             if calibrate is not None and false_positive_rate is not None:
-                points = _choose_operating_points(
-                    predictor, calibrate, labels, false_positive_rate, skip_unreadable
-                )
+                negatives = published(Path(calibrate))
+                # The caller knows this folder as the argument `calibrate`.
+                with keyed(folder="calibrate"):
+                    points = scoring.choose_operating_points(
+                        predictor, negatives, labels, false_positive_rate, skip_unreadable
+                    )
             predictions = predictor.predict(folder, labels, skip_unreadable)
             scores = scoring.score(predictions, by, points)
             if target:
                 scoring.write(scores, target)
     return scores
-
-
-def _stored_operating_points(classifier: Classifier, labels: Sequence[str]) -> list[OperatingPoint]:
-    """Return the operating points (thresholds on the log-odds) that are stored with a network.
-
-    The list is empty if one of the classes has none.
-    """
-    by_label = {point.label: point for point in classifier.operating_points}
-    has_all = by_label.keys() >= set(labels)
-    return [by_label[name] for name in labels] if has_all else []
-
-
-def _choose_operating_points(
-    predictor: Predictor,
-    folder: str | Path,
-    labels: Label,
-    rate: float,
-    skip_unreadable: bool,
-) -> list[OperatingPoint]:
-    """Choose a threshold on the log-odds of each positive class, on a folder of photographs.
-
-    `rate` is the false-positive rate of the thresholds, in (0, 1).
-    """
-    path = published(Path(folder))
-    # The caller of `evaluate` knows this folder as the argument `calibrate`.
-    with keyed(folder="calibrate"):
-        return scoring.choose_operating_points(predictor, path, labels, rate, skip_unreadable)

@@ -19,20 +19,21 @@ from omegaconf import DictConfig, OmegaConf
 
 from augment import distributed
 from augment.augmentation_settings import MODES
+from renderer.errors import keyed
 from train import checkpoints, console
-from train.cli import compose, read_settings
+from train.__main__ import main
+from train.cli import read_settings
 from train.processes import Interrupted, broadcast, process_group
 from train.results.compare import format_short_comparison, format_table
 from train.results.overwrite import remove_run, require_new_run
 from train.results.page import report_of
 from train.results.store import is_finished, summarize
 from train.run_config import CONFIG, format_command, require_same_run, resume_config
-from train.run_folder import sole_writer
+from train.run_folder import sole_writer, writable_folder
 from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings
 from train.system import is_verbose, program
 from train.training.inputs import with_label
 from train.training.run import make_runs
-from train.user_errors import keyed, writable_folder
 
 # An override such as experiment=photographs chooses a file of settings. These keys
 # are the folders of such files in conf/.
@@ -62,7 +63,8 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         config.out = str(folder)
         # A resumed run keeps its recorded settings, except for single values that the
         # overrides change. An override that chooses a whole file prevents this.
-        if config.train.resume and not any(map(_is_choice, overrides)):
+        keys = [override.partition("=")[0] for override in overrides]
+        if config.train.resume and not any(key in CHOICES or "@" in key for key in keys):
             config, command = resume_config(config, overrides)
         settings = with_label(read_settings(ExperimentSettings, config))
         if settings.photographs_first:
@@ -73,8 +75,7 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
 def _report_thread_error(error: threading.ExceptHookArgs) -> None:
     """Print an error that a thread did not catch, unless it is an OSError.
 
-    If the disk is full, the thread of TensorBoard raises an OSError. The main
-    thread then raises and prints the same error.
+    If the disk is full, the thread of TensorBoard and the main thread raise the same OSError.
     """
     if error.exc_type is not OSError:
         threading.__excepthook__(error)
@@ -93,7 +94,7 @@ def _train_on_photographs(
     changes = {name: values[name] for name in SHARED}
     changes["out"] = str(first)
     changes["train"] = {name: values["train"][name] for name in SHARED_IN_TRAIN}
-    config = OmegaConf.merge(compose("train", ["experiment=photographs"]), changes)
+    config = OmegaConf.merge(main.compose(["experiment=photographs"]), changes)
     on_photographs = read_settings(ExperimentSettings, cast(DictConfig, config))
     if settings.train.resume and is_finished(first):
         require_same_run(first, on_photographs, finished=True)
@@ -129,7 +130,13 @@ def _train_in(
     of that command without out= and train.resume=, and `resumed_folder` its folder, or None for
     `folder`.
     """
-    settings_of_runs = _settings_of_runs(settings, folder)
+    # The baselines come first. Each has a sub-folder with the name of its kind of renders.
+    settings_of_runs = {}
+    for mode in settings.compare:
+        with keyed("compare"):
+            augment = replace(settings.augment, mode=mode)
+            settings_of_runs[folder / mode] = replace(settings, compare=[], augment=augment)
+    settings_of_runs[folder] = settings
     for path, run_settings in settings_of_runs.items():
         if settings.train.resume and (path / CONFIG).is_file():
             require_same_run(path, run_settings)
@@ -160,45 +167,6 @@ def _train_in(
             raise
 
 
-def _settings_of_runs(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
-    """List the training runs of a command: the baselines, and then the main run.
-
-    The keys are folders: a baseline has a subfolder with the name of its kind of renders.
-    """
-    settings_of_runs = {}
-    for mode in settings.compare:
-        with keyed("compare"):
-            augment = replace(settings.augment, mode=mode)
-            settings_of_runs[folder / mode] = replace(settings, compare=[], augment=augment)
-    settings_of_runs[folder] = settings
-    return settings_of_runs
-
-
-def _is_choice(override: str) -> bool:
-    """Return whether an override such as experiment=photographs chooses a file of settings."""
-    key = override.partition("=")[0]
-    return key in CHOICES or "@" in key
-
-
-class _QuietHandler(logging.Handler):
-    """Logging handler that ignores its own errors.
-
-    If the disk is full, the log file lacks lines. The training then raises an
-    error of its own, which is enough for the user.
-    """
-
-    def handleError(self, record: logging.LogRecord) -> None:
-        """Do nothing. The method of `logging` would print a traceback."""
-
-
-class _LogFile(_QuietHandler, logging.FileHandler):
-    """Logging handler that writes to a file and ignores its own errors."""
-
-
-class _Terminal(_QuietHandler, logging.StreamHandler):
-    """Logging handler that writes to the terminal and ignores its own errors."""
-
-
 @contextmanager
 def logged_to(path: Path, prefix: str = "", level: int = logging.INFO) -> Iterator[None]:
     """Write log messages to a file and to the terminal, until the `with` block ends.
@@ -207,8 +175,11 @@ def logged_to(path: Path, prefix: str = "", level: int = logging.INFO) -> Iterat
     or with --verbose all messages.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    file = _LogFile(path, encoding="utf-8", errors="backslashreplace")
-    terminal = _Terminal(sys.stdout)
+    # If the disk is full, the log file lacks lines. The training then raises an error of its own,
+    # which is enough for the user.
+    logging.raiseExceptions = False
+    file = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+    terminal = logging.StreamHandler(sys.stdout)
     file.setFormatter(logging.Formatter("%(message)s"))
     terminal.setFormatter(logging.Formatter(f"{prefix}%(message)s"))
     # Messages of matplotlib about its font cache do not concern the user.
@@ -218,13 +189,14 @@ def logged_to(path: Path, prefix: str = "", level: int = logging.INFO) -> Iterat
     root.setLevel(logging.INFO)
     console.setLevel(logging.DEBUG)
     terminal.setLevel(logging.DEBUG if is_verbose() else level)
-    for handler in (terminal, file):
+    handlers = (terminal, file)
+    for handler in handlers:
         root.addHandler(handler)
     try:
         yield
     finally:
         root.setLevel(level_before)
         console.setLevel(logging.NOTSET)
-        for handler in (terminal, file):
+        for handler in handlers:
             root.removeHandler(handler)
             handler.close()

@@ -1,6 +1,7 @@
 """pnb-fit: find the camera and the lighting of a photograph that shows a mesh."""
 
 import shlex
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,7 @@ from renderer.photograph import fit_photograph
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings, FitSettings
 from train.commands.attack import build_attacked
 from train.results.overwrite import require_replaceable
-from train.settings import read_object
-from train.user_errors import writable_folder
+from train.run_folder import writable_folder
 
 # Width and height of the background image that is written, in pixels.
 BACKGROUND_SIZE = 448
@@ -73,94 +73,64 @@ def fit(settings: FitSettings) -> None:
     coverage = found.window.cut(mask[..., None], BACKGROUND_SIZE, beyond=0)
     write_values(out / "mask.png", coverage.expand(3, -1, -1))
     save_light(out / "light.json", found.scene.light)
-    attacked = attack_settings(settings, found.scene.camera, out)
-    error = _compare(attacked, out, settings.encoding)
+    scene, renderer = attacked_scene(settings, found.scene.camera, out)
+    photograph, rendered = render_attacked(settings, scene, renderer)
+    write_values(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
+    # The three channels of the mask are equal, so the first one is enough.
+    is_object = read_image(out / "mask.png", ATTACKED_SIZE)[0] > MIN_COVERAGE
+    error = relative_error(rendered[:, is_object], photograph[:, is_object], settings.encoding)
     overlap = found.scene.overlap
     print(f"outlines overlap by {overlap:.1%}; the object's pixels differ by {error:.1%}")
     if overlap < MIN_OVERLAP or error > MAX_ERROR:
         advice = "look at comparison.png, and check photograph, mask, mesh and fov"
         print(f"warning: the mesh hardly fits; {advice}")
-    print(shlex.join(attack_command(attacked)))
+    words = ["pnb-attack", "attack=lighting"]
+    if settings.label is not None:
+        words.append(f"label={settings.label}")
+    words.append(f"meshes=[{{mesh: '{settings.mesh}', albedo_scale: {settings.albedo_scale:g}}}]")
+    shown = scene | {"backgrounds": f"[{out / 'background.png'}]"}
+    words += [f"scene.{key}={value}" for key, value in shown.items()]
+    words += [f"renderer.{key}={value}" for key, value in renderer.items()]
+    print(shlex.join(words))
 
 
-def _compare(attacked: AttackExperimentSettings, out: Path, encoding: str) -> float:
-    """Write photograph and render side by side, and return the error within out/mask.png."""
-    photograph, rendered = render_attacked(attacked)
-    write_values(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
-    # The three channels of the mask are equal, so the first one is enough.
-    coverage = read_image(out / "mask.png", ATTACKED_SIZE)[0]
-    is_object = coverage > MIN_COVERAGE
-    return relative_error(rendered[:, is_object], photograph[:, is_object], encoding)
+def attacked_scene(
+    settings: FitSettings, camera: Camera, out: Path
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Choose settings of the scene and of the renderer with which pnb-attack shows the photograph.
 
-
-def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackExperimentSettings:
-    """Choose settings with which pnb-attack attacks the lighting of the photograph.
-
-    The camera looks at the center of the mesh. Numbers are rounded as in the printed command.
+    The camera looks at the center of the mesh. Numbers are rounded.
     """
-    fov = None
+    scene = {
+        "polar": round(camera.polar, 3),
+        "azimuth": round(camera.azimuth % 360, 3),
+        "width": round(camera.width, 4),
+        "light": str(out / "light.json"),
+        "backgrounds": [str(out / "background.png")],
+        "search": 0,
+    }
     if isinstance(camera, PerspectiveCamera):
-        fov = round(camera.angle, 3)
-    scene = AttackSceneSettings(
-        polar=round(camera.polar, 3),
-        azimuth=round(camera.azimuth % 360, 3),
-        width=round(camera.width, 4),
-        fov=fov,
-        light=str(out / "light.json"),
-        backgrounds=[str(out / "background.png")],
-        search=0,
-    )
-    renderer = RendererSettings(
-        encoding=settings.encoding,
-        shadows=settings.bounces > 0,
-        bounces=settings.bounces,
-    )
-    meshes = [{"mesh": settings.mesh, "albedo_scale": settings.albedo_scale}]
-    return AttackExperimentSettings(
-        label=settings.label, meshes=meshes, scene=scene, renderer=renderer
-    )
-
-
-def attack_command(settings: AttackExperimentSettings) -> list[str]:
-    """Write the command line of pnb-attack that attacks the lighting of the photograph."""
-    scene = settings.scene
-    renderer = settings.renderer
-    [mesh] = settings.meshes
-    words = [
-        "pnb-attack",
-        "attack=lighting",
-        *([] if settings.label is None else [f"label={settings.label}"]),
-        f"meshes=[{{mesh: '{mesh['mesh']}', albedo_scale: {mesh['albedo_scale']:g}}}]",
-        f"scene.polar={scene.polar:.3f}",
-        f"scene.azimuth={scene.azimuth:.3f}",
-        f"scene.width={scene.width:.4f}",
-    ]
-    if scene.fov is not None:
-        words.append(f"scene.fov={scene.fov:.3f}")
-    words += [
-        f"scene.light={scene.light}",
-        f"scene.backgrounds=[{scene.backgrounds[0]}]",
-        f"scene.search={scene.search}",
-        f"renderer.encoding={renderer.encoding}",
-    ]
-    if renderer.bounces:
-        words.append(f"renderer.bounces={renderer.bounces}")
-    else:
-        words.append("renderer.shadows=false")
-    return words
+        scene["fov"] = round(camera.angle, 3)
+    bounces = {"bounces": settings.bounces} if settings.bounces else {"shadows": False}
+    return scene, {"encoding": settings.encoding, **bounces}
 
 
 def render_attacked(
-    settings: AttackExperimentSettings,
+    settings: FitSettings, scene: Mapping[str, Any], renderer: Mapping[str, Any]
 ) -> tuple[Float[torch.Tensor, "3 size size"], Float[torch.Tensor, "3 size size"]]:
     """Return the encoded background, and the render as it is before an attack by pnb-attack."""
-    mesh = read_object(settings.meshes[0], settings.label or "", "meshes[0]")
+    attacked = AttackExperimentSettings(
+        scene=AttackSceneSettings(**scene),
+        renderer=RendererSettings(**{"shadows": True, **renderer}),
+    )
+    label = settings.label or ""
+    mesh = ObjectSettings(settings.mesh, label=label, albedo_scale=settings.albedo_scale)
     device = torch.device("cpu")
-    scene = build_attacked(settings, mesh, settings.scene, ATTACKED_SIZE, device)
+    shown = build_attacked(attacked, mesh, attacked.scene, ATTACKED_SIZE, device)
     first_example = torch.arange(1)
-    images = scene.render(scene.conditions(first_example), first_example)
+    images = shown.render(shown.conditions(first_example), first_example)
     # `images` has one example and one view, shape (1, 1, 3, size, size).
-    return scene.backgrounds[0], images[0, 0]
+    return shown.backgrounds[0], images[0, 0]
 
 
 def relative_error(
@@ -275,42 +245,23 @@ def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndar
         cv2: Any = import_module("cv2")
     except ImportError as error:
         raise InputError(
-            "box= needs OpenCV, which is not installed: run pip install "
-            "opencv-python-headless, or give mask=FILE instead of box=",
+            "box= needs OpenCV: run pip install opencv-python-headless, or give mask=FILE"
         ) from error
     height, width = image.shape[:2]
-    if not _is_box_within(box, height, width):
+    left, top, right, bottom = box if len(box) == 4 else [0, 0, 0, 0]
+    if not (0 <= left < right <= width and 0 <= top < bottom <= height):
         raise InputError(
-            f"box={box} is not [left, top, right, bottom] within {width} × {height} pixels: "
-            "give four whole numbers with left < right and top < bottom",
+            f"box={box} is not [left, top, right, bottom] within {width} × {height} pixels"
         )
-    left, top, right, bottom = box
     rectangle = (left, top, right - left, bottom - top)
     labels = np.zeros((height, width), np.uint8)
     # OpenCV takes the color channels in the order blue, green, red.
     bgr = image[..., ::-1].copy()
     # `grabCut` stores its color models in two arrays of this size.
-    background_model = np.zeros((1, 65))
-    foreground_model = np.zeros((1, 65))
-    cv2.grabCut(
-        bgr,
-        labels,
-        rectangle,
-        background_model,
-        foreground_model,
-        GRAB_CUT_STEPS,
-        cv2.GC_INIT_WITH_RECT,
-    )
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.grabCut(bgr, labels, rectangle, *models, GRAB_CUT_STEPS, cv2.GC_INIT_WITH_RECT)
     is_object = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
     return np.where(is_object, 255, 0).astype(np.uint8)
-
-
-def _is_box_within(box: list[int], height: int, width: int) -> bool:
-    """Return whether a box (left, top, right, bottom) is not empty and lies within an image."""
-    if len(box) != 4:
-        return False
-    left, top, right, bottom = box
-    return 0 <= left < right <= width and 0 <= top < bottom <= height
 
 
 def write_values(path: Path, image: Float[torch.Tensor, "3 H W"]) -> None:

@@ -11,28 +11,15 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
+from augment import plain_networks
 from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import Classifier
 from augment.network import unwrapped
-from augment.plain_networks import (
-    UNIT_RANGE,
-    Normalization,
-    as_classifier,
-    device_of,
-    require_evaluation_mode,
-)
 from augment.settings import NormalizeLight, RendererSettings
 from renderer.errors import InputError, as_path, describe, require_kind
 from renderer.settings import Settings
-from train import console
+from train import class_names, console
 from train.__main__ import main
-from train.class_names import (
-    MeshItem,
-    as_mappings,
-    find_positive_classes,
-    require_others,
-    with_class_names,
-)
 from train.cli import read_settings
 from train.results.overwrite import require_new_run
 from train.results.page import report_of
@@ -54,15 +41,15 @@ Section = Mapping[str, Any] | None
 
 def harden(
     network: nn.Module,
-    meshes: Sequence[MeshItem],
+    meshes: Sequence[class_names.MeshItem],
     unlabeled: str | Path,
     label: str | int | None = None,
     *,
-    hard_negatives: Sequence[MeshItem] | None = None,
+    hard_negatives: Sequence[class_names.MeshItem] | None = None,
     classes: Sequence[str] | None = None,
     size: int | None = None,
-    normalization: Normalization = None,
-    value_range: tuple[float, float] = UNIT_RANGE,
+    normalization: plain_networks.Normalization = None,
+    value_range: tuple[float, float] = plain_networks.UNIT_RANGE,
     normalize_light: NormalizeLight = None,
     train: TrainSettings | Section = None,
     augment: AugmentationSettings | Section = None,
@@ -137,17 +124,17 @@ def harden(
         >>> torch.save(hardened.state_dict(), "hardened.pth")  # doctest: +SKIP
     """
     require_kind("network", network, nn.Module, "a torch.nn.Module, whose weights are trained")
-    device = device_of(network) if device is None else device
+    device = plain_networks.device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with folder_or_temporary(out) as folder:
         require_new_run(folder, "out", overwrite, resume=False)
-        classifier = as_classifier(
+        classifier = plain_networks.as_classifier(
             _trainable_copy(network), *options, normalize_light=normalize_light
         )
         if next(classifier.parameters(), None) is None:
             raise InputError("network has no parameters: give a network that can be trained")
-        items = as_mappings("meshes", meshes, classifier)
-        labels = find_positive_classes(label, meshes, items, classifier)
+        items = class_names.as_mappings("meshes", meshes, classifier)
+        labels = class_names.find_positive_classes(label, meshes, items, classifier)
         changes: dict[str, Any] = {
             "out": str(folder.absolute()),
             "seed": seed,
@@ -160,44 +147,50 @@ def harden(
             "train": {"device": str(device)},
         }
         if hard_negatives is not None:
-            negatives = as_mappings("hard_negatives", hard_negatives, classifier)
+            negatives = class_names.as_mappings("hard_negatives", hard_negatives, classifier)
             named = read_objects(negatives, OTHER, "hard_negatives")
-            require_others(named, labels, classifier.classes)
+            class_names.require_others(named, labels, classifier.classes)
             changes["hard_negatives"] = negatives
         if out is None:
             changes["train"]["cache"] = None
-        sections = {
-            "train": train,
-            "augment": augment,
-            "scene": scene,
-            "renderer": renderer,
-            "data": data,
-        }
-        settings = _read_settings(changes, sections)
+        settings = _read_settings(
+            changes, train=train, augment=augment, scene=scene, renderer=renderer, data=data
+        )
         if settings.label is None:
-            settings = with_class_names(settings, classifier.classes)
+            settings = class_names.with_class_names(settings, classifier.classes)
         with sole_writer("out", folder), _restores_torch():
-            trained = _train(settings, classifier, has_report=out is not None)
-    return _copy_with_weights(network, classifier, trained)
+            initial = initial_of(classifier, settings.size)
+            run = Run(settings, load_data(settings, initial), folder, initial)
+            run.begin()
+            run.train()
+            if out is not None:
+                console.info("%s", report_of([folder], folder))
+    copy = deepcopy(network)
+    target = copy
+    if isinstance(network, Classifier):
+        # A returned classifier has no operating points, because its logits differ.
+        target = deepcopy(classifier.network)
+        copy = Classifier(target, classifier.size, classifier.classes, classifier.name)
+    unwrapped(target).load_state_dict(unwrapped(run.trainer.selected.network).state_dict())
+    return copy
 
 
 def _trainable_copy(network: nn.Module) -> nn.Module:
     """Copy a network, and check that the weights of the copy can be trained."""
     if not isinstance(network, Classifier):
-        require_evaluation_mode(network, "network")
+        plain_networks.require_evaluation_mode(network, "network")
     copy = deepcopy(network)
     # An optimizer can change a parameter only if it is a leaf of the autograd graph.
     if not all(weight.is_leaf for weight in copy.parameters()):
         raise InputError(
-            "network contains a module of torch.jit, whose copy cannot be trained: "
-            "write it with torch.jit.save to network.pt, and give "
-            "norm_balls.load_classifier('network.pt', trust_code=True)"
+            "network contains a module of torch.jit, which cannot be trained: write it with "
+            "torch.jit.save, and give norm_balls.load_classifier(FILE, trust_code=True)"
         )
     return copy
 
 
 def _read_settings(
-    changes: Mapping[str, Any], sections: Mapping[str, Settings | Section]
+    changes: Mapping[str, Any], **sections: Settings | Section
 ) -> ExperimentSettings:
     """Combine the settings of the experiment "classifier" with the arguments of `harden`.
 
@@ -208,18 +201,16 @@ def _read_settings(
     settings = OmegaConf.create({name: composed[name] for name in names})
     # `harden` returns only the network, so scores on test renders are not needed.
     settings.evaluate.laboratory_setups = 0
-    given = {name: _as_mapping(name, section) for name, section in sections.items()}
+    given = {}
+    for name, section in sections.items():
+        values = asdict(cast(Any, section)) if isinstance(section, Settings) else section or {}
+        if not isinstance(values, Mapping):
+            raise InputError(
+                f"{name} is {describe(section)}: give a mapping of fields, or settings"
+            )
+        given[name] = values
     merged = OmegaConf.merge(settings, changes, given)
     return read_settings(ExperimentSettings, cast(DictConfig, merged))
-
-
-def _as_mapping(name: str, section: Settings | Section) -> Mapping[str, Any]:
-    """Return the fields that a caller gave for a group of settings, by the name of the field."""
-    if isinstance(section, Settings):
-        return asdict(cast(Any, section))
-    if section is None or isinstance(section, Mapping):
-        return section or {}
-    raise InputError(f"{name} is {describe(section)}: give a mapping of fields, or settings")
 
 
 @contextmanager
@@ -233,31 +224,3 @@ def _restores_torch() -> Iterator[None]:
     finally:
         torch.set_num_threads(threads)
         torch.backends.cudnn.benchmark = is_benchmarked
-
-
-def _train(settings: ExperimentSettings, classifier: Classifier, has_report: bool) -> nn.Module:
-    """Train a copy of a classifier with files in `settings.out`; return the selected network."""
-    folder = Path(settings.out)
-    initial = initial_of(classifier, settings.size)
-    data = load_data(settings, initial)
-    run = Run(settings, data, folder, initial)
-    run.begin()
-    run.train()
-    if has_report:
-        console.info("%s", report_of([folder], folder))
-    return run.trainer.selected.network
-
-
-def _copy_with_weights(network: nn.Module, classifier: Classifier, trained: nn.Module) -> nn.Module:
-    """Return a copy of the network of the caller with the weights after the training.
-
-    A returned classifier has no operating points, because its logits differ.
-    """
-    if isinstance(network, Classifier):
-        target = deepcopy(classifier.network)
-        copy: nn.Module = Classifier(target, classifier.size, classifier.classes, classifier.name)
-    else:
-        copy = deepcopy(network)
-        target = copy
-    unwrapped(target).load_state_dict(unwrapped(trained).state_dict())
-    return copy

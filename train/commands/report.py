@@ -34,7 +34,7 @@ def run(settings: ReportSettings) -> None:
     # --help does not wait for these imports.
     from train.results.overwrite import OF_AUDIT, RESULTS, require_replaceable
     from train.results.page import write_report
-    from train.user_errors import writable_folder
+    from train.run_folder import writable_folder
 
     folders = [Path(run) for run in settings.runs]
     parent = Path(os.path.commonpath([folder.absolute() for folder in folders]))

@@ -7,6 +7,7 @@ the runs in this process or in others. The results are read from the folders.
 """
 
 import logging
+import os
 import shutil
 import sys
 import traceback
@@ -22,20 +23,19 @@ from omegaconf import DictConfig
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train import checkpoints, console
-from train.__main__ import run_name
-from train.cli import compose, quoted, read_settings
+from train.__main__ import main, run_name
+from train.cli import quoted, read_settings
 from train.commands.experiment import LOG, logged_to
 from train.results.compare import format_short_comparison, format_table
 from train.results.overwrite import require_new_run, require_replaceable
 from train.results.page import PAGE, report_of
 from train.results.store import is_finished, summarize
 from train.run_config import format_command, require_same_run
-from train.run_folder import FAILURE, locked, state
+from train.run_folder import FAILURE, locked, state, writable_folder
 from train.settings import ExperimentSettings
-from train.system import is_verbose, shortened
+from train.system import is_verbose, shortened, user_message
 from train.training.inputs import load_inputs, with_label
 from train.training.run import Run, make_runs
-from train.user_errors import user_message, writable_folder
 
 # Largest number of lines of the table of finished runs, if --verbose is not set.
 MAX_TABLE_LINES = 10
@@ -49,8 +49,11 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     Wrong settings, and folders of other runs, are found before any training. The exit status is 1
     if a run is not finished.
     """
+    # torchrun sets this variable in the processes that it starts.
+    if "TORCHELASTIC_RUN_ID" in os.environ:
+        raise InputError("torchrun cannot start a sweep: start it with pnb-train --multirun")
     runs = _expand([word for word in words if not word.startswith("-")])
-    first_config = compose("train", runs[0])
+    first_config = main.compose(runs[0])
     if first_config.photographs_first:
         raise InputError(
             "photographs_first=true cannot be used in a sweep: start the runs one by one"
@@ -59,15 +62,20 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     parent = writable_folder(str(first_config.sweep), "sweep")
     # An earlier report about the same sweep may be replaced.
     require_replaceable(parent, "sweep", overwrite, own=[PAGE])
-    shared_keys = _shared_keys(runs)
+    # Settings on the command line that have the same value in all runs.
+    shared = set.intersection(*map(set, runs))
+    shared_keys = [override.partition("=")[0] for override in shared]
     folders = [parent / run_name(overrides, shared_keys, str(parent)) for overrides in runs]
     if len(set(folders)) < len(runs):
         raise InputError("the sweep has two runs with the same settings: give each value once")
     # Settings of the runs that have not begun, by the texts among their settings.
     new_runs: dict[frozenset[str], tuple[Path, ExperimentSettings]] = {}
     for folder, overrides in zip(folders, runs, strict=True):
-        settings = with_label(read_settings(ExperimentSettings, compose("train", overrides)))
-        if _is_new(folder, settings, overwrite):
+        settings = with_label(main.read(overrides))
+        if is_finished(folder) or checkpoints.exists(folder):
+            require_same_run(folder, settings, finished=True)
+        else:
+            require_new_run(folder, "sweep", overwrite, resume=True)
             new_runs.setdefault(frozenset(filter(_is_text, overrides)), (folder, settings))
     # Numbers are checked now. The files and networks that texts name are checked by loading them.
     # The nodes of a cluster have other devices, so their runs are not loaded here.
@@ -85,21 +93,6 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     print(report_of(existing, parent))
     if not all(map(is_finished, folders)):
         sys.exit(1)
-
-
-def _shared_keys(runs: Sequence[Sequence[str]]) -> list[str]:
-    """List the settings on the command line that have the same value in all runs of a sweep."""
-    shared = set.intersection(*map(set, runs))
-    return [override.partition("=")[0] for override in shared]
-
-
-def _is_new(folder: Path, settings: ExperimentSettings, overwrite: bool) -> bool:
-    """Return whether a run of a sweep is new: its folder holds no run that goes on there."""
-    if is_finished(folder) or checkpoints.exists(folder):
-        require_same_run(folder, settings, finished=True)
-        return False
-    require_new_run(folder, "sweep", overwrite, resume=True)
-    return True
 
 
 def _is_text(override: str) -> bool:
@@ -122,8 +115,7 @@ def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
             )
         if key == "launcher" and override.value() == "slurm" and not shutil.which("sbatch"):
             raise InputError(
-                "launcher=slurm needs the command sbatch of Slurm, which this computer does not "
-                "have: start the sweep on the cluster, or remove launcher=slurm",
+                "launcher=slurm needs the command sbatch of Slurm: start the sweep on the cluster"
             )
         if override.is_sweep_override():
             values = list(override.sweep_string_iterator())
@@ -142,24 +134,20 @@ def run_in_sweep(config: DictConfig) -> None:
     """
     folder = Path(config.out)
     with locked(folder) as has_lock:
-        if not has_lock:
-            _print_detail(f"in training elsewhere: {folder}")
-        elif is_finished(folder):
-            _print_detail(f"finished before: {folder}")
-        else:
+        is_over = is_finished(folder)
+        doing = "training" if not is_over else "finished before"
+        if is_verbose():
+            print(f"{doing if has_lock else 'in training elsewhere'}: {folder}", flush=True)
+        if has_lock and not is_over:
             (folder / FAILURE).unlink(missing_ok=True)
-            _print_detail(f"training: {folder}")
-            _run_and_record_failure(config, folder)
+            _run(config, folder)
 
 
-def _print_detail(line: str) -> None:
-    """Print a line about one run of a sweep, but only with --verbose."""
-    if is_verbose():
-        print(line, flush=True)
+def _run(config: DictConfig, folder: Path) -> None:
+    """Train, score and export one run. If it has a checkpoint, the training is resumed.
 
-
-def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
-    """Train one run of a sweep. If it fails, write the reason to failed.txt."""
+    If it fails, the reason is written to failed.txt.
+    """
     job = HydraConfig.get()
     # Hydra's joblib launcher trains several runs at once. Their lines on the terminal
     # then start with the number of the run.
@@ -167,7 +155,11 @@ def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
     prefix = f"#{job.job.num} " if is_parallel else ""
     with logged_to(folder / LOG, prefix, level=logging.CRITICAL):
         try:
-            _run(config, folder, list(job.overrides.task))
+            settings = with_label(read_settings(ExperimentSettings, config))
+            settings.train.resume = checkpoints.exists(folder)
+            command = format_command([_unescaped(override) for override in job.overrides.task])
+            (run,) = make_runs({folder: settings}, command)
+            run.train()
         except Exception as error:
             sentence = user_message(error)
             reason = sentence or traceback.format_exception_only(error)[-1].strip()
@@ -177,18 +169,6 @@ def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
             # If the disk is full, the file cannot be written.
             with suppress(OSError):
                 atomic_write(folder / FAILURE, f"{reason}\n")
-
-
-def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
-    """Train, score and export one run. If it has a checkpoint, the training is resumed.
-
-    `overrides` are escaped as Hydra escapes them.
-    """
-    settings = with_label(read_settings(ExperimentSettings, config))
-    settings.train.resume = checkpoints.exists(folder)
-    command = format_command([_unescaped(override) for override in overrides])
-    (run,) = make_runs({folder: settings}, command)
-    run.train()
 
 
 def _unescaped(override: str) -> str:

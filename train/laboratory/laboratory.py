@@ -38,7 +38,7 @@ from train.command_settings import OTHER_PATTERNS, LabSettings
 from train.data.photo import DESCRIPTION
 from train.data.photographs import TABLE
 from train.laboratory.shots import FOV, Shot, draw_shots
-from train.run_folder import LOCK, read_json, sole_writer
+from train.run_folder import LOCK, read_json, sole_writer, writable_folder
 from train.settings import (
     OTHER_PREFIX,
     ExperimentSettings,
@@ -47,7 +47,6 @@ from train.settings import (
     simplified,
     solid_name,
 )
-from train.user_errors import writable_folder
 
 # Glob pattern of the renders in the folder of the test set. Their paths are
 # LABEL/NUMBER_LIGHTING.png.

@@ -33,7 +33,7 @@ from train.results.store import Methods, RunSummary, Scored, ScoredRun
 from train.run_config import CONFIG, read_config
 from train.run_folder import RENDERS, attack_success, read_json
 from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, in_words, published
-from train.user_errors import user_message
+from train.system import user_message
 
 # File name of the page.
 PAGE = "report.html"

@@ -19,7 +19,7 @@ from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
 from augment.sources import load_source
-from renderer.errors import InputError, as_path, require_range
+from renderer.errors import InputError, as_path, keyed, keys_of, require_range
 from renderer.settings import MAX_SIZE
 from train import checkpoints, console
 from train.class_names import (
@@ -37,7 +37,6 @@ from train.networks import CLASSIFIER, PYTHON, describe
 from train.processes import main_process_first
 from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, label_names
 from train.train_settings import WIDERESNET
-from train.user_errors import keyed, keys_of
 
 # Entries in the description of a network. They must be equal in two networks if the
 # weights of one are copied to the other.

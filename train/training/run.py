@@ -16,7 +16,7 @@ from augment import distributed
 from augment import network as wrappers
 from augment.plain_networks import say_inputs
 from augment.random_streams import stream_seed
-from renderer.errors import InputError
+from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
 from train import checkpoints, console, run_folder
 from train.data import photographs as photos
@@ -43,7 +43,6 @@ from train.training.inputs import Initial
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate, scale_learning_rate
 from train.training.run_log import RunLog
-from train.user_errors import keyed, keys_of
 
 # If the training images are on disk, the mean and the standard deviation of their color
 # channels are estimated from this number of images.

@@ -13,7 +13,7 @@ from augment import distributed
 from augment.network import eval_mode
 from augment.progress import progress_message
 from augment.service import AugmentationService
-from renderer.errors import InputError, require_memory
+from renderer.errors import InputError, keyed, require_memory
 from train import console
 from train.data.batches import Batch
 from train.device import GraphedNetwork, MixedPrecision, compiles
@@ -22,7 +22,6 @@ from train.train_settings import RELIGHT, TrainSettings
 from train.training.augmentations import Baseline, RelitBatches
 from train.training.averages import Averages
 from train.training.recipe import TrainingLoss, build_optimizer, learning_rate, share_layers
-from train.user_errors import keyed
 
 
 class TrainingStep:

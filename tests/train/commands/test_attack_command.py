@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
@@ -17,12 +17,8 @@ from train.cli import USER_ERROR
 
 PRETRAINED = Path(__file__).parents[3] / "pretrained"
 SMALL = [
-    f"network=run:{PRETRAINED / 'none'}",
-    "attack.force=true",
-    "attack.max_steps=2",
-    "attack.allow_negative=true",
-    "device=cpu",
-    "renderer.rasterizer=numpy",
+    *(f"network=run:{PRETRAINED / 'none'}", "attack.force=true", "attack.max_steps=2"),
+    *("attack.allow_negative=true", "device=cpu", "renderer.rasterizer=numpy"),
     "renderer.shadows=false",
 ]
 WITHOUT_CHECKS = ["attack.checks=false", "attack.verify=null"]
@@ -40,71 +36,44 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 ADVERSARY_FILES = {
-    "adversary.json",
-    "mesh.glb",
-    "light.json",
-    "light_before.json",
-    "before_0.png",
-    "after_0.png",
-    "before.npy",
-    "after.npy",
-    "mitsuba/scene.xml",
-    "mitsuba/part_0.ply",
-    "mitsuba/light.exr",
+    *("adversary.json", "mesh.glb", "light.json", "light_before.json", "before_0.png"),
+    *("after_0.png", "before.npy", "after.npy"),
+    *("mitsuba/scene.xml", "mitsuba/part_0.ply", "mitsuba/light.exr"),
 }
 
 
-class Attacked(NamedTuple):
-    """What an attack printed, and the files that it wrote."""
+@pytest.mark.parametrize("attacked", ["skylight", "geometry,albedo,pixels"])
+def test_an_attack_prints_what_it_attacked_writes_its_files_and_records_its_settings(
+    run, tmp_path, capsys, attacked
+):
+    assert run(f"attack=[{attacked}]") == 0
+    names = attacked.split(",")
+    start = f"solid:orange:0: {'+'.join(names)} against run:"
+    assert capsys.readouterr().out.startswith(start)
+    config = OmegaConf.load(tmp_path / "out" / "config.yaml")
+    assert set(config.attack) >= set(names)
+    arguments = ["out=out", *SMALL, f"attack=[{attacked}]"]
+    assert config.command == shlex.join(["python", "-m", "scripts", "attack", *arguments])
 
-    names: list[str]
-    printed: str
-    folder: Path
-    lines: list[dict[str, Any]]
+    folder = tmp_path / "out" / FOLDER_OF_ORANGE
+    example, summary = read_lines(folder / "attack.jsonl")
+    assert list(example["largest_change"]) == names
+    assert all(example["largest_change"].values())
+    assert example["cost"] < example["cost_before"]
+    assert example["versions"]["reload"]["largest_difference"] <= 1 / 255
+    assert 0 <= summary["checks"]["random_search"] <= 1
+    assert summary["checks"]["cost_fell"] == 1
 
-
-class TestAnAttack:
-    @pytest.fixture(params=["skylight", "geometry,albedo,pixels"])
-    def attacked(self, run, request, tmp_path, capsys) -> Attacked:
-        assert run(f"attack=[{request.param}]") == 0
-        folder = tmp_path / "out" / FOLDER_OF_ORANGE
-        names = request.param.split(",")
-        lines = read_lines(folder / "attack.jsonl")
-        return Attacked(names, capsys.readouterr().out, folder, lines)
-
-    def test_prints_what_it_attacked_writes_its_files_and_records_its_settings(
-        self, attacked, tmp_path
-    ):
-        parameters = "+".join(attacked.names)
-        assert attacked.printed.startswith(f"solid:orange:0: {parameters} against run:")
-        self.assert_files(attacked)
-        self.assert_results(attacked)
-        config = OmegaConf.load(tmp_path / "out" / "config.yaml")
-        assert set(config.attack) >= set(attacked.names)
-        arguments = ["out=out", *SMALL, f"attack=[{','.join(attacked.names)}]"]
-        assert config.command == shlex.join(["python", "-m", "scripts.attack", *arguments])
-
-    def assert_files(self, attacked: Attacked) -> None:
-        names = {path.name for path in attacked.folder.iterdir()}
-        assert names == {"attack.jsonl", "example_000.png", "example_000"}
-        example_folder = attacked.folder / "example_000"
-        paths = example_folder.rglob("*.*")
-        files = {str(path.relative_to(example_folder)) for path in paths}
-        expected = set(ADVERSARY_FILES)
-        if attacked.lines[0]["negative_light"] < 1e-6:
-            expected |= {"light.hdr", "light.exr"}
-        if "pixels" in attacked.names:
-            expected.add("pixels.npy")
-        assert files == expected
-
-    def assert_results(self, attacked: Attacked) -> None:
-        example, summary = attacked.lines
-        assert list(example["largest_change"]) == attacked.names
-        assert all(example["largest_change"].values())
-        assert example["cost"] < example["cost_before"]
-        assert example["versions"]["reload"]["largest_difference"] <= 1 / 255
-        assert 0 <= summary["checks"]["random_search"] <= 1
-        assert summary["checks"]["cost_fell"] == 1
+    written = {path.name for path in folder.iterdir()}
+    assert written == {"attack.jsonl", "example_000.png", "example_000"}
+    paths = (folder / "example_000").rglob("*.*")
+    files = {str(path.relative_to(folder / "example_000")) for path in paths}
+    expected = set(ADVERSARY_FILES)
+    if example["negative_light"] < 1e-6:
+        expected |= {"light.hdr", "light.exr"}
+    if "pixels" in names:
+        expected.add("pixels.npy")
+    assert files == expected
 
 
 def test_the_class_is_that_of_the_name_of_each_mesh(run, tmp_path):
@@ -115,56 +84,45 @@ def test_the_class_is_that_of_the_name_of_each_mesh(run, tmp_path):
         assert line["label"] == [label]
 
 
-class TestFilesOfAnAttack:
-    @pytest.fixture
-    def example(self, run, tmp_path) -> Path:
-        """Attack light and shape, and return the folder of the example."""
-        assert run("attack=lighting+geometry", *WITHOUT_CHECKS) == 0
-        return tmp_path / "out" / FOLDER_OF_ORANGE / "example_000"
-
-    def test_are_meshes_and_lights_of_another_attack(self, run, example, tmp_path):
-        light = example / "light.json"
-        shape = example / "mesh.glb"
-        assert load_light(str(light)).shape == (49, 3)
-        assert len(load_mesh(shape).faces) > 0
-        meshes = f"meshes=[{shape},{{mesh: 'solid:orange:0', label: apple}}]"
-        shown = meshes, f"scene.light={light}"
-        assert run("attack=pixels", "out=again", "label=orange", *shown, *WITHOUT_CHECKS) == 0
-        folders = {path.name for path in (tmp_path / "again").iterdir() if path.is_dir()}
-        assert folders == {"0_mesh", "1_solid_orange_0"}
-        (line,) = read_lines(tmp_path / "again" / "1_solid_orange_0" / "attack.jsonl")
-        assert line["label"] == ["apple"]
+def test_files_of_an_attack_are_meshes_and_lights_of_another(run, tmp_path):
+    assert run("attack=lighting+geometry", *WITHOUT_CHECKS) == 0
+    example = tmp_path / "out" / FOLDER_OF_ORANGE / "example_000"
+    light = example / "light.json"
+    shape = example / "mesh.glb"
+    assert load_light(str(light)).shape == (49, 3)
+    assert len(load_mesh(shape).faces) > 0
+    meshes = f"meshes=[{shape},{{mesh: 'solid:orange:0', label: apple}}]"
+    shown = meshes, f"scene.light={light}"
+    assert run("attack=pixels", "out=again", "label=orange", *shown, *WITHOUT_CHECKS) == 0
+    folders = {path.name for path in (tmp_path / "again").iterdir() if path.is_dir()}
+    assert folders == {"0_mesh", "1_solid_orange_0"}
+    (line,) = read_lines(tmp_path / "again" / "1_solid_orange_0" / "attack.jsonl")
+    assert line["label"] == ["apple"]
 
 
-class TestAnAdversary:
-    @pytest.fixture
-    def folder(self, run, tmp_path, capsys) -> Path:
-        """Attack two views together, and return the folder of the attack."""
-        shared = "scene.views=2", "attack.shared=true"
-        assert run("attack=lighting+geometry+albedo", *WITHOUT_CHECKS, *shared) == 0
-        capsys.readouterr()
-        return tmp_path / "out" / FOLDER_OF_ORANGE
+def test_an_adversary_of_two_views_is_rendered_again_and_attacked_further(run, tmp_path, capsys):
+    shared = "scene.views=2", "attack.shared=true"
+    assert run("attack=lighting+geometry+albedo", *WITHOUT_CHECKS, *shared) == 0
+    capsys.readouterr()
+    folder = tmp_path / "out" / FOLDER_OF_ORANGE
+    (line,) = read_lines(folder / "attack.jsonl")
+    reload = f"reload={folder / 'example_000'}"
+    assert run(reload, "out=none") == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert not (tmp_path / "none").exists()
+    assert len(printed) == 2
+    for view, text in enumerate(printed):
+        predicted = line["predicted"][view]
+        confidence = line["confidence"][view]
+        start = f"view {view}: orange is classified as {predicted} ({confidence:.1%}), "
+        assert text.startswith(start)
+        levels = float(text.rpartition("by ")[2].partition("/255")[0])
+        assert levels <= 1
 
-    def test_is_rendered_again_and_attacked_further(self, run, folder, tmp_path, capsys):
-        (line,) = read_lines(folder / "attack.jsonl")
-        reload = f"reload={folder / 'example_000'}"
-
-        assert run(reload, "out=none") == 0
-        printed = capsys.readouterr().out.splitlines()
-        assert not (tmp_path / "none").exists()
-        assert len(printed) == 2
-        for view, text in enumerate(printed):
-            predicted = line["predicted"][view]
-            confidence = line["confidence"][view]
-            start = f"view {view}: orange is classified as {predicted} ({confidence:.1%}), "
-            assert text.startswith(start)
-            levels = float(text.rpartition("by ")[2].partition("/255")[0])
-            assert levels <= 1
-
-        assert run(reload, "attack=lighting", *WITHOUT_CHECKS, "out=again") == 0
-        (again,) = read_lines(tmp_path / "again" / FOLDER_OF_ORANGE / "attack.jsonl")
-        assert again["predicted_before"] == line["predicted"]
-        assert again["cost_before"] == pytest.approx(line["cost"], abs=0.05)
+    assert run(reload, "attack=lighting", *WITHOUT_CHECKS, "out=again") == 0
+    (again,) = read_lines(tmp_path / "again" / FOLDER_OF_ORANGE / "attack.jsonl")
+    assert again["predicted_before"] == line["predicted"]
+    assert again["cost_before"] == pytest.approx(line["cost"], abs=0.05)
 
 
 def test_success_against_radius_is_a_table_and_a_figure(run, tmp_path, capsys):
@@ -192,18 +150,14 @@ def test_success_against_radius_is_a_table_and_a_figure(run, tmp_path, capsys):
 def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_other_meshes(
     run, tmp_path, capsys
 ):
-    assert (
-        run(
-            "attack=lighting",
-            "attack.checks=false",
-            "attack.sensor_noise=0",  # The few steps do not find a margin for noise.
-            "scene.views=2",
-            f"transfer.networks=[run:{PRETRAINED / 'none'},run:{PRETRAINED / 'best'}]",
-            "transfer.azimuths=[-20,0]",
-            "transfer.meshes=['solid:orange:0',{mesh: 'solid:apple:0', label: apple}]",
-        )
-        == 0
-    )
+    targets = [
+        f"transfer.networks=[run:{PRETRAINED / 'none'},run:{PRETRAINED / 'best'}]",
+        "transfer.azimuths=[-20,0]",
+        "transfer.meshes=['solid:orange:0',{mesh: 'solid:apple:0', label: apple}]",
+    ]
+    # The few steps do not find a margin for noise.
+    words = "attack.checks=false", "attack.sensor_noise=0", "scene.views=2"
+    assert run("attack=lighting", *words, *targets) == 0
     assert "| network run:" in capsys.readouterr().out
     folder = tmp_path / "out" / FOLDER_OF_ORANGE
     own, other, turned, still, same, apple = read_lines(folder / "transfer.jsonl")

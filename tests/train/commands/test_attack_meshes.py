@@ -13,7 +13,7 @@ from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.files import probe
 from renderer.visibility import opengl
-from scripts.attack import main as attack_command
+from scripts import attack as attack_command
 from tests.runs import loaded_run
 from train.command_settings import AttackExperimentSettings
 from train.commands.attack import attacks, overrides
@@ -85,41 +85,30 @@ def test_a_class_whose_name_is_a_number_is_a_target():
     assert result.criterion.target.tolist() == [[1]]
 
 
-class TestAClassifierThatKnowsOrangesBeforeLightGrayAlone:
-    @pytest.fixture
-    def classifier(self) -> Classifier:
-        def is_light(images: Tensor) -> Tensor:
-            score = 100 * (images[..., 0, 0].mean(1) - 0.8)
-            return torch.stack([score, -score], dim=1)
+@pytest.mark.filterwarnings("ignore:the first gradient")  # it sees the background alone
+def test_a_scene_in_which_the_mesh_is_recognized_is_searched_for():
+    """The classifier knows oranges before light gray alone."""
 
-        return Classifier(is_light, 8, ("orange", "other"))
+    def is_light(images: Tensor) -> Tensor:
+        score = 100 * (images[..., 0, 0].mean(1) - 0.8)
+        return torch.stack([score, -score], dim=1)
 
-    @pytest.mark.filterwarnings("ignore:the first gradient")  # it sees the background alone
-    def test_is_attacked_in_a_scene_that_is_searched_for(self, classifier):
-        settings = configured()
-        ((name, scene, result),) = attacks(settings, classifier, torch.device("cpu"))
-        assert name == "solid:orange:0"
-        assert result.clean_correct.all()
-        assert overrides(scene, settings.scene) == "'scene.backgrounds=[0.9]'"
-
-    def test_is_not_attacked_without_a_search(self, classifier):
-        with pytest.raises(InputError, match=r"^attack\.force=.* 1 of 1 images"):
-            attacked("scene.search=0", classifier=classifier)
+    classifier = Classifier(is_light, 8, ("orange", "other"))
+    settings = configured()
+    ((name, scene, result),) = attacks(settings, classifier, torch.device("cpu"))
+    assert name == "solid:orange:0"
+    assert result.clean_correct.all()
+    assert overrides(scene, settings.scene) == "'scene.backgrounds=[0.9]'"
+    with pytest.raises(InputError, match=r"^attack\.force=.* 1 of 1 images"):
+        attacked("scene.search=0", classifier=classifier)
 
 
-class TestARasterizerThatDoesNotStart:
-    @pytest.fixture(autouse=True)
-    def no_device(self, monkeypatch) -> None:
-        monkeypatch.setattr(opengl, "device", Mock(side_effect=InputError("no EGL device")))
-
-    def test_is_an_error_of_its_key_in_an_attack(self):
-        with pytest.raises(InputError, match=r"^renderer\.rasterizer: no EGL device$"):
-            attacked("renderer.rasterizer=opengl")
-
-    def test_is_an_error_of_its_key_in_a_training(self, tiny, tmp_path):
-        settings = tiny("renderer.rasterizer=opengl")
-        with pytest.raises(InputError, match=r"^renderer\.rasterizer: no EGL device$"):
-            loaded_run(settings, tmp_path)
+def test_a_rasterizer_that_does_not_start_is_an_error_of_its_key(monkeypatch, tiny, tmp_path):
+    monkeypatch.setattr(opengl, "device", Mock(side_effect=InputError("no EGL device")))
+    with pytest.raises(InputError, match=r"^renderer\.rasterizer: no EGL device$"):
+        attacked("renderer.rasterizer=opengl")
+    with pytest.raises(InputError, match=r"^renderer\.rasterizer: no EGL device$"):
+        loaded_run(tiny("renderer.rasterizer=opengl"), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -146,13 +135,9 @@ def test_bad_input_is_refused_in_one_sentence(arguments, message):
     assert "\n" not in str(refused.value)
 
 
-class TestExamplesThatWereWrongBefore:
-    @pytest.fixture
-    def result(self) -> AttackResult:
-        return attacked("label=sky", "attack.force=true", "attack.max_steps=1", "scene.views=2")
-
-    def test_are_no_successes_in_the_checks(self, result):
-        checks = check(result)
-        assert checks["success"] == 0
-        assert checks["random_search"] == 0
-        assert set(checks["success_by_steps"].values()) == {0}
+def test_examples_that_were_wrong_before_are_no_successes_in_the_checks():
+    result = attacked("label=sky", "attack.force=true", "attack.max_steps=1", "scene.views=2")
+    checks = check(result)
+    assert checks["success"] == 0
+    assert checks["random_search"] == 0
+    assert set(checks["success_by_steps"].values()) == {0}

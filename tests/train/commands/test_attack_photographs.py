@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from renderer.errors import InputError
-from scripts.attack import list_parameters, main
+from scripts import attack, list_parameters
 from tests.helpers import bright_or_dark
 from train.commands.attack import run
 from train.results.relit import PICTURE_COUNT, RELIT, read_relit
@@ -34,7 +34,7 @@ def photographs(tmp_path_factory):
 
 def settings_of(*words):
     name = "network=python:tests.train.commands.test_attack_photographs:load_bright_or_dark"
-    return main.read(list_parameters([name, *words]))
+    return attack.read(list_parameters([name, *words]))
 
 
 @pytest.fixture(scope="module")

@@ -37,42 +37,27 @@ def here(tmp_path) -> Path:
     return tmp_path
 
 
-class TestEvaluation:
-    @pytest.fixture
-    def scores(self, call, here, capsys) -> Path:
-        """Score photographs in folders whose names are numbers or not in UTF-8."""
-        assert call(*EVALUATE, "out=1e3") == 0
-        return here / "1e3"
-
-    def test_prints_how_many_photographs_were_scored(self, scores, capsys):
-        assert "1 images of orange, 1 negatives" in capsys.readouterr().out
-
-    def test_writes_its_files(self, scores):
-        assert {path.name for path in scores.iterdir()} == {
-            "predictions.csv",
-            "summary.json",
-            "contact_sheet.png",
-            "roc.csv",
-            "roc.png",
-            LOCK,
-        }
-        assert json.loads((scores / "summary.json").read_text())["size"] == 64
-
-    def test_writes_the_log_odds_of_the_network_for_each_photograph(self, scores, here):
-        with open(scores / "predictions.csv", encoding="utf-8", newline="") as file:
-            rows = {row["path"]: row for row in csv.DictReader(file)}
-        assert set(rows) == {"orange/a.png", r"other_\udcff/a.png"}
-        image = read_image(here / "2024" / "orange" / "a.png", 64)
-        with torch.no_grad():
-            fig, lime, orange = load_run(here / "1.10")(image[None])[0]
-        log_odds = float(orange - torch.logaddexp(fig, lime))
-        found = float(rows["orange/a.png"]["orange_log_odds"])
-        assert found == pytest.approx(log_odds, abs=1e-4)
-
-    def test_of_a_classifier_named_by_its_run_is_the_same(self, call, scores, here):
-        assert call(*EVALUATE_CLASSIFIER, "network=run:1.10", "out=classifier") == 0
-        same = (here / "classifier" / "predictions.csv").read_bytes()
-        assert (scores / "predictions.csv").read_bytes() == same
+def test_an_evaluation_writes_the_log_odds_of_the_network_for_each_photograph(call, here, capsys):
+    """The folders of photographs have names that are numbers or not in UTF-8."""
+    assert call(*EVALUATE, "out=1e3") == 0
+    assert "1 images of orange, 1 negatives" in capsys.readouterr().out
+    scores = here / "1e3"
+    names = {"predictions.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png", LOCK}
+    assert {path.name for path in scores.iterdir()} == names
+    assert json.loads((scores / "summary.json").read_text())["size"] == 64
+    with open(scores / "predictions.csv", encoding="utf-8", newline="") as file:
+        rows = {row["path"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"orange/a.png", r"other_\udcff/a.png"}
+    image = read_image(here / "2024" / "orange" / "a.png", 64)
+    with torch.no_grad():
+        fig, lime, orange = load_run(here / "1.10")(image[None])[0]
+    log_odds = float(orange - torch.logaddexp(fig, lime))
+    found = float(rows["orange/a.png"]["orange_log_odds"])
+    assert found == pytest.approx(log_odds, abs=1e-4)
+    # A classifier that is named by its run is the same.
+    assert call(*EVALUATE_CLASSIFIER, "network=run:1.10", "out=classifier") == 0
+    same = (here / "classifier" / "predictions.csv").read_bytes()
+    assert (scores / "predictions.csv").read_bytes() == same
 
 
 class TestEvaluationWithoutALabel:

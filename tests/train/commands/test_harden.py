@@ -101,22 +101,12 @@ def test_the_weights_are_those_of_the_command(network, photographs, tmp_path, mo
     torch.save(network.state_dict(), "weights.pth")
     (tmp_path / "module_of_a_user.py").write_text(MODULE)
     overrides = [
-        "experiment=classifier",
-        "network=python:module_of_a_user:make",
-        f"unlabeled={photographs}",
-        "data.workers=0",
-        "meshes=[solid:orange:0]",
-        "hard_negatives=[solid:lemon]",
-        "scene.views=1",
-        "scene.backgrounds=[0.5]",
-        "renderer.rasterizer=numpy",
-        "renderer.samples=1",
-        "train.epochs=1",
-        "train.images_per_epoch=16",
-        "train.batch_size=8",
-        "train.cache=null",
-        "train.device=cpu",
-        "evaluate.laboratory_setups=0",
+        *("experiment=classifier", "network=python:module_of_a_user:make"),
+        *(f"unlabeled={photographs}", "data.workers=0", "meshes=[solid:orange:0]"),
+        *("hard_negatives=[solid:lemon]", "scene.views=1", "scene.backgrounds=[0.5]"),
+        *("renderer.rasterizer=numpy", "renderer.samples=1", "train.epochs=1"),
+        *("train.images_per_epoch=16", "train.batch_size=8", "train.cache=null"),
+        *("train.device=cpu", "evaluate.laboratory_setups=0"),
     ]
     completed_run(main.read(overrides), tmp_path / "run")
     expected = torch.load(tmp_path / "run" / "weights.pt")
@@ -141,7 +131,7 @@ def test_each_mesh_trains_the_class_that_it_or_its_file_names(network, photograp
     file = tmp_path / "PEAR.ply"
     trimesh.creation.box().export(file)
     meshes = ["solid:orange:0", file]
-    options = {"hard_negatives": ["solid:fruit"], "train": SHORT["train"] | {"epochs": 3}}
+    options = {"hard_negatives": ["solid:fruit"]}
     hardened = harden(network, photographs, meshes=meshes, **options)
     named = harden(
         network, photographs, meshes=[("solid:orange:0", 1), (str(file), "pear")], **options
@@ -191,7 +181,10 @@ def exported(network: nn.Module, path: Path) -> nn.Module:
 
 
 @pytest.mark.filterwarnings("ignore:.*deprecated")
-@pytest.mark.parametrize(("write", "suffix"), [(torchscript, "pt"), (exported, "pt2")])
+@pytest.mark.parametrize(
+    ("write", "suffix"),
+    [(torchscript, "pt"), pytest.param(exported, "pt2", marks=pytest.mark.slow)],
+)
 def test_a_network_of_a_file_is_hardened_for_the_index_of_a_class(
     network, photographs, tmp_path, write, suffix
 ):

@@ -12,13 +12,8 @@ PRETRAINED = Path(__file__).parents[3] / "pretrained"
 MAX_LINES = 15
 SOLIDS = ",".join(f"solid:orange:{seed}" for seed in range(14))
 ATTACK = [
-    f"network=run:{PRETRAINED / 'none'}",
-    "attack.max_steps=1",
-    "attack.force=true",
-    "attack.checks=false",
-    "attack.verify=null",
-    "device=cpu",
-    "renderer.rasterizer=numpy",
+    *(f"network=run:{PRETRAINED / 'none'}", "attack.max_steps=1", "attack.force=true"),
+    *("attack.checks=false", "attack.verify=null", "device=cpu", "renderer.rasterizer=numpy"),
     "renderer.shadows=false",
 ]
 TRANSFER = [

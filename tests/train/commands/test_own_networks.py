@@ -2,7 +2,6 @@
 
 import argparse
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -21,7 +20,6 @@ from tests.train.own_networks import (
     NAME,
     SIZE,
     STD,
-    VIEWS,
     renders,
     trained_network,
     trained_weights,
@@ -33,10 +31,7 @@ from train.training.inputs import load_initial
 from train.training.run import _network_shape
 
 OWN = [
-    f"network=torchvision:{NAME}",
-    "weights=mine.pth",
-    "classes=classes.txt",
-    f"size={SIZE}",
+    *(f"network=torchvision:{NAME}", "weights=mine.pth", "classes=classes.txt", f"size={SIZE}"),
     "device=cpu",
 ]
 # Sums of some thousand products in another order.
@@ -48,7 +43,7 @@ def here(tmp_path) -> Path:
     """A folder with weights, the names of the classes, and a rendered photograph of each class."""
     torch.save(trained_weights(), tmp_path / "mine.pth")
     (tmp_path / "classes.txt").write_text("\n".join(CLASSES) + "\n")
-    for name, image in zip(CLASSES, renders()[0][::VIEWS], strict=True):
+    for name, image in zip(CLASSES, renders(), strict=True):
         (tmp_path / "photos" / name).mkdir(parents=True)
         pixels = to_bytes(image.permute(1, 2, 0)).numpy()
         Image.fromarray(pixels).save(tmp_path / "photos" / name / "0.png")
@@ -61,7 +56,7 @@ def normalized_logits(network: nn.Module, images: torch.Tensor) -> torch.Tensor:
 
 
 def test_a_state_dict_of_ten_classes_gives_the_networks_own_logits(here):
-    images = renders()[0][:4]
+    images = renders()[:4]
     classifier = augment.load_classifier(
         f"torchvision:{NAME}", here / "mine.pth", list(CLASSES), SIZE
     )
@@ -136,49 +131,20 @@ def test_photographs_are_scored_in_the_users_classes(call, here):
     assert scores["recall"]["value"] == 1
 
 
-@pytest.fixture
-def harden(here, monkeypatch) -> Callable[..., Path]:
-    """Harden a network in one short epoch; return the folder of the run."""
-
-    def run(*words: str) -> Path:
-        monkeypatch.chdir(here)
-        folder = here / "hardened"
-        recipe = [
-            "train.epochs=1",
-            "train.images_per_epoch=8",
-            "train.batch_size=8",
-            "train.precision=float32",
-        ]
-        scene = ["meshes=solid:orange", "hard_negatives=solid:lemon", "scene.backgrounds=[0.2]"]
-        machine = [
-            "train.device=cpu",
-            "train.threads=1",
-            "train.cache=null",
-            "renderer.shadows=false",
-            "evaluate.laboratory_setups=0",
-        ]
-        data = [
-            "unlabeled=photos",
-            "data.workers=0",
-            "data.validation=0.2",
-            "data.test_fraction=0.2",
-        ]
-        words = ("experiment=classifier", f"out={folder}", *recipe, *scene, *machine, *data, *words)
-        completed_run(train_command.read(list(words)), folder)
-        return folder
-
-    return run
-
-
-def test_a_hardened_network_loads_where_the_original_weights_did(harden, here):
-    start = [
-        f"network=torchvision:{NAME}",
-        "weights=mine.pth",
-        "classes=classes.txt",
-        f"size={SIZE}",
+def test_a_hardened_network_loads_where_the_original_weights_did(here, monkeypatch):
+    """It was hardened in one short epoch."""
+    monkeypatch.chdir(here)
+    folder = here / "hardened"
+    words = [
+        *("experiment=classifier", f"out={folder}", *OWN[:4], "label=Orange", "unlabeled=photos"),
+        *("train.epochs=1", "train.images_per_epoch=8", "train.batch_size=8", "train.device=cpu"),
+        *("train.precision=float32", "train.threads=1", "train.cache=null", "data.workers=0"),
+        *("meshes=solid:orange", "hard_negatives=solid:lemon", "scene.backgrounds=[0.2]"),
+        *("renderer.shadows=false", "evaluate.laboratory_setups=0"),
+        *("data.validation=0.2", "data.test_fraction=0.2"),
     ]
-    folder = harden(*start, "label=Orange")
-    images = renders()[0][:4]
+    completed_run(train_command.read(words), folder)
+    images = renders()[:4]
     network = mobilenet_v3_small(num_classes=len(CLASSES))
     network.load_state_dict(torch.load(folder / "weights.pt"))
     hardened = normalized_logits(network, images)
@@ -188,11 +154,6 @@ def test_a_hardened_network_loads_where_the_original_weights_did(harden, here):
     assert not torch.allclose(hardened, normalized_logits(trained_network(), images))
 
 
-def save_torchscript(network: nn.Module) -> str:
-    torch.jit.trace(network, torch.rand(2, 3, SIZE, SIZE)).save("mine.ts")
-    return "mine.ts"
-
-
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 @pytest.mark.parametrize("normalization", ["imagenet", "null"])
 def test_a_network_in_a_file_begins_with_the_normalization_of_the_user(
@@ -200,7 +161,8 @@ def test_a_network_in_a_file_begins_with_the_normalization_of_the_user(
 ):
     monkeypatch.chdir(here)
     network = trained_network().eval()
-    words = [f"network={save_torchscript(network)}", f"normalization={normalization}"]
+    torch.jit.trace(network, torch.rand(2, 3, SIZE, SIZE)).save("mine.ts")
+    words = ["network=mine.ts", f"normalization={normalization}"]
     words += ["trust=true", "classes=classes.txt", f"size={SIZE}", "unlabeled=photos"]
     scene = ["meshes=[solid:orange]", "label=Orange"]
     settings = train_command.read(["experiment=classifier", *words, *scene])
@@ -208,18 +170,6 @@ def test_a_network_in_a_file_begins_with_the_normalization_of_the_user(
     shape = _network_shape(settings, initial)
     built = build_network(initial.classes, SIZE, trust_code=True, **shape)
     initial.copy_to(built, shape | {"classes": list(initial.classes), "size": SIZE})
-    images = renders()[0][:4]
-    given = images if normalization == "null" else Normalize(MEAN, STD)(images)
+    images = renders()[:4]
+    given = images if normalization == "null" else (images - MEAN) / STD
     torch.testing.assert_close(built(images), network(given), **ROUNDING)
-
-
-class Normalize(nn.Module):
-    """Normalization of images."""
-
-    def __init__(self, mean: torch.Tensor, std: torch.Tensor):
-        super().__init__()
-        self.register_buffer("mean", mean)
-        self.register_buffer("std", std)
-
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
-        return (images - self.mean) / self.std

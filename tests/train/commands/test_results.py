@@ -16,10 +16,7 @@ from train.run_folder import LAST
 # Arguments of each command except for out=.
 COMMANDS = {
     "attack": [
-        "network=run:network",
-        "meshes=['solid:orange']",
-        "attack.force=true",
-        "device=cpu",
+        *("network=run:network", "meshes=['solid:orange']", "attack.force=true", "device=cpu"),
         "renderer.shadows=false",
     ],
     "audit": [

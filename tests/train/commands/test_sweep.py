@@ -26,17 +26,9 @@ from train.training.run import Run
 
 ROOT = Path(__file__).parents[3]
 SMALL = [
-    "experiment=paper",
-    "augment=none",
-    "data=npz",
-    "model.depth=10",
-    "model.width=1",
-    "train.epochs=2",
-    "train.batch_size=16",
-    "train.learning_rate=0.05",
-    "train.precision=float32",
-    "train.device=cpu",
-    "photos=null",
+    *("experiment=paper", "augment=none", "data=npz", "model.depth=10", "model.width=1"),
+    *("train.epochs=2", "train.batch_size=16", "train.learning_rate=0.05"),
+    *("train.precision=float32", "train.device=cpu", "photos=null"),
 ]
 
 

@@ -29,9 +29,9 @@ from train.processes import Interrupted
 from train.results.overwrite import remove_run
 from train.results.store import is_finished, summarize
 from train.run_folder import read_metrics
+from train.system import user_message
 from train.training import loop
 from train.training.inputs import choose_validation, load_data, load_initial
-from train.user_errors import user_message
 
 WITHOUT_RENDERS = ("augment=none", "train.epochs=1")
 
