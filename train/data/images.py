@@ -53,8 +53,6 @@ class ImageFiles:
     workers: int
     skip: bool
 
-    device = torch.device("cpu")
-
     def __len__(self) -> int:
         return len(self.paths)
 

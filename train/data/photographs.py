@@ -109,8 +109,6 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
 
 def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
     """List the classes for which a folder has a subfolder."""
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder: give a folder of photographs")
     names = {*folder_names(folder)}
     return sorted(name for name in classes if composed(name) in names)
 
@@ -142,6 +140,8 @@ def choose_labels(
 
 def folder_names(folder: Path) -> list[str]:
     """Return the sorted names of the subfolders, in the form of `composed`, without hidden ones."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: give a folder of photographs")
     folders = {composed(entry.name) for entry in folder.iterdir() if entry.is_dir()}
     return sorted(name for name in folders if not is_hidden(name))
 

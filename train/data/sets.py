@@ -17,15 +17,8 @@ from augment.progress import progress
 from augment.random_streams import generator
 from renderer.errors import InputError, single_line
 from train import console
+from train.data import photographs
 from train.data.images import MAX_SIZE_IN_MEMORY, ImageFiles
-from train.data.photographs import (
-    Photograph,
-    find_photographs,
-    find_unlabeled,
-    folder_names,
-    load_photographs,
-    unsupported_files,
-)
 
 # Folders with these names hold splits of a data set. All other folders hold the
 # images of a class.
@@ -287,7 +280,7 @@ def load_folder(
             f"path={path} is not a folder: give a folder with one folder of images per class",
             "path",
         )
-    split_names = [name for name in folder_names(root) if name.lower() in SPLIT_NAMES]
+    split_names = [name for name in photographs.folder_names(root) if name.lower() in SPLIT_NAMES]
     if split_names not in ([], ["test", "train"]):
         raise InputError(
             f"path={path} holds the folders {', '.join(split_names)}: "
@@ -295,19 +288,19 @@ def load_folder(
             "path",
         )
     train_root = root / "train" if split_names else root
-    classes = tuple(folder_names(train_root))
+    classes = tuple(photographs.folder_names(train_root))
     if len(classes) < 2:
         raise InputError(
             f"path={path} holds {len(classes)} class folders: give a folder with two or more",
             "path",
         )
-    other_files = unsupported_files(root)
+    other_files = photographs.unsupported_files(root)
     if other_files:
         shown = ", ".join(map(str, other_files[:3]))
         console.warning("%d files in %s are not images: %s", len(other_files), root, shown)
 
-    options = (size, skip_unreadable, workers)
-    train = _read(train_root, find_photographs(train_root, classes, classes[0]), classes, *options)
+    options = (classes, size, skip_unreadable, workers)
+    train = _read(train_root, *options)
     empty_classes = set(range(len(classes))).difference(train.labels.tolist())
     if empty_classes:
         name = classes[min(empty_classes)]
@@ -315,8 +308,7 @@ def load_folder(
             f"{train_root / name} holds no image: put images there, or remove the folder"
         )
     if split_names:
-        found = find_photographs(root / "test", classes, classes[0])
-        return DataSet(classes, train, _read(root / "test", found, classes, *options))
+        return DataSet(classes, train, _read(root / "test", *options))
     is_test = held_out_rows(train, test_fraction, "test_fraction")
     return DataSet(classes, train[~is_test], train[is_test])
 
@@ -328,33 +320,31 @@ def load_unlabeled(
 
     It has no classes, every label is 0, and at most HELD_OUT images are test images.
     """
-    found = find_unlabeled(Path(path))
-    split = _read(Path(path), found, None, size, skip_unreadable, workers)
+    split = _read(Path(path), (), size, skip_unreadable, workers)
     fraction = min(test_fraction, HELD_OUT / len(split))
     is_test = held_out_rows(split, fraction, "test_fraction")
     return DataSet((), split[~is_test], split[is_test], labeled=False)
 
 
 def _read(
-    root: Path,
-    found: list[Photograph],
-    classes: Sequence[str] | None,
-    size: int,
-    skip_unreadable: bool,
-    workers: int,
+    root: Path, classes: Sequence[str], size: int, skip_unreadable: bool, workers: int
 ) -> Split:
-    """Read photographs into memory if `size` is small. Otherwise leave them on disk.
+    """Read the images of a folder into memory if `size` is small. Otherwise leave them on disk.
 
-    Unreadable photographs are left out, but files on disk are not read yet. Without `classes`,
-    every label is 0.
+    Unreadable images are left out, but files on disk are not read yet. Without `classes`, every
+    label is 0.
     """
+    if classes:
+        found = photographs.find_photographs(root, classes, classes[0])
+    else:
+        found = photographs.find_unlabeled(root)
     images: Tensor | ImageFiles
     if size > MAX_SIZE_IN_MEMORY:
         paths = tuple(item.path for item in found)
         images = ImageFiles(root, paths, size, workers, skip_unreadable)
     else:
         count = len(found)
-        found, images, broken = load_photographs(root, found, size, skip_unreadable)
+        found, images, broken = photographs.load_photographs(root, found, size, skip_unreadable)
         if broken:
             counts = f"{len(broken)} of {count} images cannot be read and are skipped"
             console.warning("%s: %s", counts, broken[0])

@@ -7,6 +7,7 @@ adversarial attacks on pixels (PGD). "relight" shows the images in the light of 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -35,20 +36,18 @@ PGD_STEPS = 3
 CELLS = RelightingSettings().cells
 
 
+@dataclass
 class Baseline:
-    """Augmentation of training images, chosen by its name."""
+    """Augmentation of training images, chosen by its name.
 
-    def __init__(self, name: str, model: nn.Module, seed: int, absent: Sequence[int] = ()):
-        """Create the augmentation.
+    "pgd" attacks the pixels of the images, and any other name but "none" is a transform of
+    torchvision.
+    """
 
-        "pgd" attacks the pixels of the images, and any other name but "none" is a transform of
-        torchvision.
-        """
-        self._name = name
-        self._model = model
-        self._seed = seed
-        self._absent = absent
-        self._transform = None if name in ("none", "pgd") else _transform(name)
+    name: str
+    model: nn.Module
+    seed: int
+    absent: Sequence[int] = ()
 
     def apply(
         self, images: UInt8[Tensor, "B 3 H W"], labels: Int[Tensor, " B"], step: int
@@ -58,11 +57,11 @@ class Baseline:
         The random numbers for an image depend on the seed, the step and the index of the image in
         the batch.
         """
-        if self._name == "none":
+        if self.name == "none":
             return images
-        if self._transform is None:
-            draws = generator(self._seed, step, "pgd", distributed.rank())
-            return pgd(self._model, images, labels, draws, self._absent)
+        if self.name == "pgd":
+            draws = generator(self.seed, step, "pgd", distributed.rank())
+            return pgd(self.model, images, labels, draws, self.absent)
         # A transform of torchvision draws the same random numbers for all images of a batch, from
         # the global generator. So it is called for each image, with a seed of its own.
         transformed = []
@@ -70,24 +69,21 @@ class Baseline:
             # Each process has a part of the batch. This is the index of its first image.
             first = distributed.rank() * len(images)
             for index, image in enumerate(images, first):
-                torch.manual_seed(stream_seed(self._seed, step, index, "distortion"))
+                torch.manual_seed(stream_seed(self.seed, step, index, "distortion"))
                 transformed.append(self._transform(image))
         return torch.stack(transformed)
 
+    @cached_property
+    def _transform(self) -> Any:
+        """Transform of torchvision with the name of the augmentation."""
+        # This import takes a second, and most runs need no transform.
+        from torchvision.transforms import v2
 
-def _transform(name: str) -> Any:
-    """Create a transform of torchvision by its name in the setting `augmentation`."""
-    # This import takes a second, and most runs need no transform.
-    from torchvision.transforms import v2
-
-    jitter = v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
-    if name == "color_jitter":
-        return jitter
-    if name == "trivial_augment":
-        return v2.TrivialAugmentWide()
-    if name == "augmix":
-        return v2.AugMix()
-    return v2.Compose([jitter, v2.AugMix()])
+        jitter = v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
+        transforms = {"color_jitter": jitter, "trivial_augment": v2.TrivialAugmentWide()}
+        transforms["augmix"] = v2.AugMix()
+        transforms["color_jitter+augmix"] = v2.Compose([jitter, v2.AugMix()])
+        return transforms[self.name]
 
 
 def pgd(
@@ -148,46 +144,40 @@ class _LossOfLabels(Criterion):
         return torch.zeros_like(predicted, dtype=torch.bool)
 
 
+@dataclass
 class RelitBatches:
     """Augmentation that shows the images of a batch in the light of a projector.
 
     A slide is the picture that the projector shows. It is a random pattern or
     another image of the batch, and each of its color channels is multiplied by
     smooth factors. The factors are random, or are changed by gradient descent
-    until the network predicts another class.
+    until the network predicts another class than the teacher predicts for the unchanged image.
+    Without a teacher, they are random.
     """
 
-    def __init__(
-        self, settings: TrainSettings, model: nn.Module, teacher: nn.Module | None, seed: int
-    ):
-        """Store the arguments.
-
-        The attack leads away from the classes that `teacher` predicts; without it, the light is
-        random.
-        """
-        self._radius = math.log(settings.relight_gain)
-        self._steps = settings.relight_steps
-        self._model = model
-        self._teacher = teacher
-        self._seed = seed
+    settings: TrainSettings
+    model: nn.Module
+    teacher: nn.Module | None
+    seed: int
 
     def apply(
         self, images: UInt8[Tensor, "B 3 size size"], labels: Tensor, step: int
     ) -> UInt8[Tensor, "B 3 size size"]:
         """Show the images of a batch in the light of a projector, each in a light of its own."""
         # The random numbers differ between steps, and between the processes of a run.
-        draws = generator(self._seed, step, "relight", distributed.rank())
+        draws = generator(self.seed, step, "relight", distributed.rank())
         count, _, size, _ = images.shape
         light = draw_projected_light(count, size, draws, images).to(images.device)
         unit = to_unit(images)
         # The linear colors of an image stand for the albedo of what it shows.
         albedo = decode(unit, "srgb")
-        problem = RelitPhotographs(albedo, light, CELLS, self._radius, self._steps)
+        radius, steps = math.log(self.settings.relight_gain), self.settings.relight_steps
+        problem = RelitPhotographs(albedo, light, CELLS, radius, steps)
         values = problem.sample(draws)
-        if self._steps and self._radius and self._teacher is not None:
+        if steps and radius and self.teacher is not None:
             with torch.no_grad():
-                criterion = Criterion(self._teacher(unit).argmax(1)[:, None])
-            values = _attack(problem, values, self._model, criterion, self._steps)
+                criterion = Criterion(self.teacher(unit).argmax(1)[:, None])
+            values = _attack(problem, values, self.model, criterion, steps)
         with torch.no_grad():
             return to_bytes(light.expose(albedo, problem.log_gain(values)))
 

@@ -22,13 +22,7 @@ from augment.sources import load_source
 from renderer.errors import InputError, as_path, keyed, keys_of, require_range
 from renderer.settings import MAX_SIZE
 from train import checkpoints, console
-from train.class_names import (
-    class_name,
-    class_of_name,
-    name_of_mesh,
-    require_others,
-    with_class_names,
-)
+from train.class_names import class_of_name, name_of_mesh, require_others, with_class_names
 from train.data import sets
 from train.data.photographs import find_photographs, load_photographs
 from train.data.rendered_shapes import cache_folder, load_shapes
@@ -296,7 +290,7 @@ def require_label(settings: ExperimentSettings, data: sets.DataSet) -> None:
             "label",
         )
     for label in () if settings.label is None else label_names(settings.label):
-        name = class_name(data.classes, label, "label")
+        name = data.classes[class_index(data.classes, label, "label")]
         if name != label and settings.scored_folders:
             raise InputError(f"label={label} is an index: give the name, label={name}", "label")
 
