@@ -43,23 +43,12 @@ MEMORY = 12 * 2**30
 MESHES = ("mesh.obj", "mesh.glb", "mesh.ply", "mesh.stl", "mesh.off")
 
 
-def load_mesh_of_same_folder(path: Path) -> Any:
-    return load_mesh(path.with_name("mesh.obj"))
-
-
-def load_light_file(path: Path) -> Any:
-    return load_light(str(path))
-
-
+LIGHTS = ("light.npy", "light.hdr", "light.exr", "light.json")
 # Functions of the library by the files that they read.
 READERS: dict[str, Callable[[Path], Any]] = {
     **dict.fromkeys(MESHES, load_mesh),
-    "mesh.mtl": load_mesh_of_same_folder,
-    "peel.png": load_mesh_of_same_folder,
-    "light.npy": load_light_file,
-    "light.hdr": load_light_file,
-    "light.exr": load_light_file,
-    "light.json": load_light_file,
+    **dict.fromkeys(("mesh.mtl", "peel.png"), lambda path: load_mesh(path.with_name("mesh.obj"))),
+    **dict.fromkeys(LIGHTS, lambda path: load_light(str(path))),
     "background.png": lambda path: gray_or_image("background", str(path), 16),
     "data.npz": lambda path: load_npz(str(path)),
     "images/apple/0.png": lambda path: load_folder(str(path.parents[1]), 16, 0.3),
@@ -99,19 +88,10 @@ SLOW_COMMANDS = [file for file in COMMANDS if COMMANDS[file] == RESUME]
 
 
 NUMBER = re.compile(rb"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
-TOKENS = (
-    *(b"nan", b"inf", b"-1", b"0", b"1e300", b"1e-300", b"9" * 19, b"9" * 400, b"word", b"[]"),
-    *(b"null", b""),
-)
-OTHER = (
-    b"",
-    np.random.default_rng(0).bytes(1000),
-    b"<html>404</html>\n",
-    b"[" * 10**5,
-    b"1",
-    b"[]",
-    b"{}",
-)
+WORDS = b"nan inf -1 0 1e300 1e-300 word [] null"
+TOKENS = (*WORDS.split(), b"9" * 19, b"9" * 400, b"")
+NOISE = np.random.default_rng(0).bytes(1000)
+OTHER = (b"", NOISE, b"<html>404</html>\n", b"[" * 10**5, b"1", b"[]", b"{}")
 VALUES = (-1, 0, 10**9, 10**30, float("nan"), float("inf"), "word", None, [], {}, [1, "a"])
 ARRAY_EDITS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (
     lambda values: values[: len(values) // 2],
@@ -186,11 +166,8 @@ def checkpoint_changed(draw: st.DrawFn, good: bytes) -> bytes:
 
 
 def damages(file: str, good: bytes) -> st.SearchStrategy[bytes]:
-    if file.endswith(".npz"):
-        return bytes_changed(good) | arrays_changed(good)
-    if file.endswith(".pt"):
-        return bytes_changed(good) | checkpoint_changed(good)
-    return bytes_changed(good)
+    by_suffix = {".npz": arrays_changed, ".pt": checkpoint_changed}
+    return bytes_changed(good) | by_suffix.get(Path(file).suffix, bytes_changed)(good)
 
 
 @pytest.fixture(autouse=True)
@@ -288,14 +265,11 @@ def test_a_damaged_file_is_used_or_refused_in_one_sentence_that_names_it(
     corpus, outcome, file, examples
 ):
     good = (corpus / file).read_bytes()
-    damaged = given(content=damages(file, good))
-    limits = settings(max_examples=examples, derandomize=examples == QUICK, **UNLIMITED)
-    read = partial(outcome, file)
 
-    @limits
-    @damaged
+    @settings(max_examples=examples, derandomize=examples == QUICK, **UNLIMITED)
+    @given(content=damages(file, good))
     def used_or_refused(content: bytes) -> None:
-        read(partial(Path.write_bytes, data=content))
+        outcome(file, partial(Path.write_bytes, data=content))
 
     used_or_refused()
 
@@ -409,23 +383,13 @@ INSTEAD: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
-    "file, content",
-    [
-        pytest.param(
-            file,
-            content,
-            id=f"{file}: {fault}",
-            marks=[pytest.mark.slow] if file in SLOW_COMMANDS else [],
-        )
-        for file, fault, content in FORGED
-    ],
+    "file, fault, content",
+    [pytest.param(*one, marks=[pytest.mark.slow] * (one[0] in SLOW_COMMANDS)) for one in FORGED],
 )
-def test_a_forged_file_is_refused(outcome, file, content):
+def test_a_forged_file_is_refused(outcome, file, fault, content):
     content = content.encode() if isinstance(content, str) else content
-    assert (
-        outcome(file, content if callable(content) else partial(Path.write_bytes, data=content))
-        is not None
-    )
+    edit = content if callable(content) else partial(Path.write_bytes, data=content)
+    assert outcome(file, edit) is not None
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import torch
@@ -158,14 +159,14 @@ def _draw_shot(
     scale = rng.uniform(*SCALES)
     center = np.array([0, 0, CENTER_HEIGHT * scale])
     aim = center + rng.uniform(-MAX_AIM_OFFSET, MAX_AIM_OFFSET, 3)
-    roughness = extra_rng.uniform(*settings.roughness)
+    roughness = _between(settings.roughness, extra_rng)
     patterns = [draw_lab_pattern(name, draws, slides) for name, draws in sources]
-    ambient = rng.uniform(*settings.ambient) * draw_lab_color(rng)
-    table = rng.uniform(*settings.albedo) * draw_lab_color(rng)
+    ambient = _between(settings.ambient, rng) * draw_lab_color(rng)
+    table = _between(settings.albedo, rng) * draw_lab_color(rng)
     projectors = []
     for _, draws in sources:
-        projector_azimuth = azimuth + draws.uniform(*settings.azimuth)
-        elevation = draws.uniform(*settings.elevation)
+        projector_azimuth = azimuth + _between(settings.azimuth, draws)
+        elevation = _between(settings.elevation, draws)
         distance = draws.uniform(*PROJECTOR_DISTANCES)
         projectors.append(center + _from_angles(projector_azimuth, elevation, distance))
     camera_distance = half_width / math.tan(math.radians(FOV / 2))
@@ -182,9 +183,14 @@ def _draw_shot(
     is_behind_wall = [(position - center) @ to_wall >= to_wall @ to_wall for position in projectors]
     # A wall between a projector and the object would block the light.
     wall = center + to_wall if wants_wall and not any(is_behind_wall) else None
-    lights = (patterns, ambient, table, projectors)
-    places = (camera, center, aim, rotation, scale)
+    lights: tuple[Any, ...] = (patterns, ambient, table, projectors)
+    places: tuple[Any, ...] = (camera, center, aim, rotation, scale)
     return Shot(pattern_names, brightness, *lights, *places, roughness, wall)
+
+
+def _between(limits: Sequence[float], rng: np.random.Generator) -> float:
+    """Draw a random number from the uniform distribution between two limits."""
+    return rng.uniform(limits[0], limits[1])
 
 
 def _from_angles(azimuth: float, elevation: float, distance: float) -> Float[np.ndarray, " 3"]:

@@ -220,8 +220,8 @@ class Trainer:
                 title += f", round {index + 1} of {len(rounds)}"
             # Number of the steps of this round that were taken before.
             first = state.step - sum(steps[:index])
-            renders = Split(to_bytes(state.renders.images), state.renders.labels)
-            images = TrainingImages(split, rows, renders)
+            shown = Split(to_bytes(state.renders.images), state.renders.labels)
+            images = TrainingImages(split, rows, shown)
             with self.phases("training"):
                 set_training_mode(self.model, settings)
                 batches = training_batches(

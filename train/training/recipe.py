@@ -120,8 +120,6 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
 
     The stage "all_but_last" leaves only the layer that the network calls last.
     """
-    if next(network.parameters(), None) is None:
-        raise InputError("the network has no parameters: give a network that can be trained")
     if stage == ALL_BUT_LAST:
         last = _last_called_layer(network, size)
         for name, parameter in network.named_parameters():

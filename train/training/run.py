@@ -105,7 +105,8 @@ class Run:
         fraction, record = inputs.choose_validation(settings, self.data, initial)
         with keyed(fraction="data.validation"):
             self.held_out = held_out_rows(self.data.train, fraction)
-        self.trainer = _build_trainer(settings, self.data, folder, initial, record, threads)
+        with keyed(**keys_of("train", settings.train)):
+            self.trainer = _build_trainer(settings, self.data, folder, initial, record, threads)
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if earlier is not None:
@@ -143,15 +144,10 @@ class Run:
         # Another run that was made in between may have set another number of threads.
         torch.set_num_threads(self._threads)
         trainer = self.trainer
-        console.debug(
-            "%d images, %d classes; %s, %s, threads: %d, processes: %d",
-            (~self.held_out).sum(),
-            len(self.data.classes),
-            trainer.device,
-            trainer.model.precision,
-            self._threads,
-            distributed.world_size(),
-        )
+        line = "%d images, %d classes; %s, %s, threads: %d, processes: %d"
+        counts = (int((~self.held_out).sum()), len(self.data.classes))
+        hardware = (trainer.device, trainer.model.precision, self._threads)
+        console.debug(line, *counts, *hardware, distributed.world_size())
         is_first = distributed.rank() == 0
         log = RunLog(self.folder, trainer.history) if is_first else None
         if is_first:
@@ -222,10 +218,6 @@ class Run:
         if distributed.rank() > 0:
             return {}
         accuracy = (predictions == self.data.test.labels).float().mean().item()
-        if self.data.labeled:
-            images = inputs.describe_test_images(self.settings, self.data)
-            name = self.settings.network
-            console.debug("before: %s has accuracy %.4f on %s", name, accuracy, images)
         self._score_photographs(model, self.folder / BEFORE)
         return {"test/accuracy_before": accuracy}
 
@@ -278,7 +270,6 @@ class Run:
                 before = Split(test.images, predictions.to(trainer.device))
                 agreement = evaluate(trainer.selected, before)["accuracy"]
             scores["test/agreement"] = agreement
-            console.debug("agreement with %s: %.4f", self.settings.network, agreement)
             if has_consistency:
                 scores |= self._relit_agreement(predictions, agreement)
         return scores
@@ -315,13 +306,11 @@ class Run:
             relit = self._predict(cast(Model, model), self.data.test, self.settings.seed, "test")
             agreement = (relit == targets).double().mean().item()
             scores[f"test/relit_agreement_{name}"] = agreement
-        console.info(
+        line = (
             "agreement with the original on %d photographs kept aside: unchanged %.3f; "
-            "in the light of a projector %.3f before, %.3f after",
-            len(targets),
-            unchanged,
-            *scores.values(),
+            "in the light of a projector %.3f before, %.3f after"
         )
+        console.info(line, len(targets), unchanged, *scores.values())
         return scores
 
     def _score_photographs(self, model: Model, out: Path) -> dict[str, float]:
@@ -375,9 +364,8 @@ def _build_trainer(
     `validation` is the record of the validation images. Without `threads`, `choose_threads`
     chooses them.
     """
-    keys = keys_of("train", settings.train)
-    with keyed(**keys):
-        device = choose_device(settings.train.device)
+    recipe = settings.train
+    device = choose_device(recipe.device)
     shape = _network_shape(settings, initial)
     images = data.train.images
     if not isinstance(images, Tensor):
@@ -402,28 +390,23 @@ def _build_trainer(
     if light is not None:
         facts[checkpoints.NORMALIZE_LIGHT] = light
         network = wrappers.with_normalized_light(network, light)
-    if settings.train.freeze:
+    if recipe.freeze:
         with keyed(stage="train.freeze"):
-            freeze(wrappers.unwrapped(network), settings.train.freeze, data.size)
-    with keyed(**keys):
-        precision = choose_precision(settings.train.precision, device, network)
+            freeze(wrappers.unwrapped(network), recipe.freeze, data.size)
+    precision = choose_precision(recipe.precision, device, network)
     model = MixedPrecision(network.to(device), precision)
-    torch.set_num_threads(threads or choose_threads(model, settings.train.batch_size, data.size))
-    recipe = settings.train
+    torch.set_num_threads(threads or choose_threads(model, recipe.batch_size, data.size))
     if recipe.eval_mode is None:
         recipe = replace(recipe, eval_mode=bool(initial and initial.is_classifier))
-    with keyed(**keys):
-        rate = scale_learning_rate(recipe, model, to_unit(images[:NORM_IMAGES].to(device)))
+    rate = scale_learning_rate(recipe, model, to_unit(images[:NORM_IMAGES].to(device)))
     if rate != recipe.learning_rate:
         console.info("learning rate %.3g, by the norm of the features of the network", rate)
         recipe = replace(recipe, learning_rate=rate)
-    description = describe(
-        wrappers.without_normalized_light(network), **facts, validation=validation
-    )
+    inner = wrappers.without_normalized_light(network)
+    description = describe(inner, **facts, validation=validation)
     service = inputs.build_service(settings, data, device)
-    with keyed(**keys):
-        has_initial = initial is not None
-        return Trainer(recipe, model, description, service, folder, data.labeled, has_initial)
+    has_initial = initial is not None
+    return Trainer(recipe, model, description, service, folder, data.labeled, has_initial)
 
 
 def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:

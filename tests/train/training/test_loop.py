@@ -188,30 +188,28 @@ def test_a_batch_whose_activations_need_more_than_the_free_memory_is_refused(tmp
         fit_noise(make_trainer(tmp_path))
 
 
-class Step:
-    """One step of a linear network on a batch of eight images."""
+def one_step(folder: Path, **settings) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Take a step of a linear network on a batch of eight images.
 
-    def __init__(self, folder: Path, **settings):
-        images = single_colors(8)
-        network = color_network()
-        linear = network[2]
-        self.before = [value.detach().clone().requires_grad_() for value in linear.parameters()]
-        colors = images.images[:, :, 0, 0] / 255
-        loss = F.cross_entropy(F.linear(colors, *self.before), images.labels)
-        self.gradients = torch.autograd.grad(loss, self.before)
-        one_step = {"epochs": 1, "batch_size": 8, "schedule": "cosine"}
-        trainer = make_trainer(folder, network, **one_step | settings)
-        fit(trainer, images, single_colors(3))
-        self.after = list(linear.parameters())
+    Return the weights, and then the biases: before and after the step, and their gradient.
+    """
+    images = single_colors(8)
+    network = color_network()
+    linear = network[2]
+    before = [value.detach().clone().requires_grad_() for value in linear.parameters()]
+    colors = images.images[:, :, 0, 0] / 255
+    loss = F.cross_entropy(F.linear(colors, *before), images.labels)
+    gradients = torch.autograd.grad(loss, before)
+    once = {"epochs": 1, "batch_size": 8, "schedule": "cosine"}
+    fit(make_trainer(folder, network, **once | settings), images, single_colors(3))
+    return list(zip(before, linear.parameters(), gradients, strict=True))
 
 
 def test_adamw_decays_weights_but_no_biases(tmp_path):
     """The first step of Adam is as long as the rate, by the signs of the gradient."""
-    step = Step(tmp_path, optimizer="adamw", learning_rate=0.01, weight_decay=0.1)
-    weight, bias = step.before
-    weight_sign, bias_sign = (gradient.sign() for gradient in step.gradients)
-    torch.testing.assert_close(step.after[0], weight * (1 - 0.001) - 0.01 * weight_sign)
-    torch.testing.assert_close(step.after[1], bias - 0.01 * bias_sign)
+    weight, bias = one_step(tmp_path, optimizer="adamw", learning_rate=0.01, weight_decay=0.1)
+    for (before, after, gradient), decay in ((weight, 0.001), (bias, 0)):
+        torch.testing.assert_close(after, before * (1 - decay) - 0.01 * gradient.sign())
 
 
 PLAIN_SGD = {"momentum": 0.0, "weight_decay": 0.0, "learning_rate": 1.0}
@@ -226,11 +224,11 @@ def test_a_step_in_parts_follows_the_clipped_mean_gradient_of_the_batch(
 ):
     """In float16 the gradient is clipped after the scale of the loss is divided out."""
     options = {"accumulation_steps": 4, "clip_gradient": clip, **PLAIN_SGD}
-    step = Step(tmp_path, precision=precision, **options)
-    length = torch.cat([part.flatten() for part in step.gradients]).norm()
+    parts = one_step(tmp_path, precision=precision, **options)
+    length = torch.cat([gradient.flatten() for *_, gradient in parts]).norm()
     assert length > 0.2
     scale = 1 if clip is None else clip / length
-    for before, after, gradient in zip(step.before, step.after, step.gradients, strict=True):
+    for before, after, gradient in parts:
         torch.testing.assert_close(before - after, scale * gradient, rtol=0, atol=tolerance)
 
 
@@ -387,39 +385,23 @@ def test_best_pt_holds_the_first_epoch_of_the_highest_validation_accuracy(tmp_pa
     torch.testing.assert_close(last["model"], states[4], rtol=0, atol=0)
 
 
-class DivergingNetwork(nn.Module):
-    """A network whose logits are infinite from one pass on."""
+@pytest.mark.parametrize(
+    ("in_training", "first_pass"),
+    [pytest.param(True, 5, id="in a step, before a signal"), pytest.param(False, 2)],
+)
+def test_a_run_that_diverges_ends_with_the_last_good_checkpoint(tmp_path, in_training, first_pass):
+    """In the second epoch of three, the logits are infinite from one pass on."""
 
-    def __init__(self, in_training: bool, first_pass: int, number: signal.Signals | None = None):
-        super().__init__()
-        self.network = WideResNet(3, 10, 1, dropout=0.0)
-        self.in_training = in_training
-        self.first_pass = first_pass
-        self.number = number
-        self.passes = 0
-
-    def forward(self, images: Tensor) -> Tensor:
-        logits = self.network(images)
-        if self.training != self.in_training:
+    def diverge(module: nn.Module, _: object, logits: Tensor) -> Tensor:
+        module.passes = getattr(module, "passes", 0) + (module.training == in_training)
+        if module.passes < first_pass or module.training != in_training:
             return logits
-        self.passes += 1
-        if self.passes < self.first_pass:
-            return logits
-        if self.passes == self.first_pass and self.number:
-            signal.raise_signal(self.number)
+        if in_training and module.passes == first_pass:
+            signal.raise_signal(signal.SIGTERM)
         return logits * math.inf
 
-
-@pytest.mark.parametrize(
-    "network",
-    [
-        pytest.param(DivergingNetwork(True, 5, signal.SIGTERM), id="in a step, before a signal"),
-        pytest.param(DivergingNetwork(False, 2), id="in validation"),
-    ],
-)
-def test_a_run_that_diverges_ends_with_the_last_good_checkpoint(tmp_path, network):
-    """The second epoch of three diverges."""
-    trainer = make_trainer(tmp_path, network, has_initial=False)
+    trainer = make_trainer(tmp_path, has_initial=False)
+    trainer.model.network.register_forward_hook(diverge)
     with pytest.raises(InputError, match=r"\blearning_rate=0.05\b.*\bweight_decay\b.*epoch 2\b"):
         fit_noise(trainer)
     assert load(tmp_path)["epoch"] == 1

@@ -13,7 +13,7 @@ from augment import distributed
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.networks import WideResNet
-from train.train_settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
+from train.train_settings import TRANSFORMS, TrainSettings
 from train.training.augmentations import PGD, Baseline
 from train.training.recipe import (
     TrainingLoss,
@@ -56,15 +56,6 @@ def kl_divergence(targets: Tensor, logits: Tensor) -> Tensor:
     return (q * (q / p).log()).sum()
 
 
-@pytest.mark.parametrize("epochs", [10, 150])
-def test_the_step_schedule_falls_to_a_fifth_at_30_60_and_80_percent(epochs):
-    settings = TrainSettings(schedule="step", learning_rate=1.0)
-    rates = [learning_rate(settings, epoch / epochs) for epoch in range(epochs)]
-    tenth = epochs // 10
-    expected = 3 * tenth * [1.0] + 3 * tenth * [0.2] + 2 * tenth * [0.04] + 2 * tenth * [0.008]
-    assert rates == pytest.approx(expected)
-
-
 PROGRESS = np.linspace(0, 1, 1001)
 
 
@@ -74,9 +65,10 @@ PROGRESS = np.linspace(0, 1, 1001)
         # The half-angle formula makes this half a period of a cosine.
         ("cosine", np.cos(math.pi / 2 * PROGRESS) ** 2),
         ("one_cycle", np.interp(PROGRESS, [0, 0.2, 1], [0.1, 1, 0])),
+        ("step", 0.2 ** np.digitize(PROGRESS, [0.3, 0.6, 0.8])),
     ],
 )
-def test_a_continuous_schedule_is_its_closed_form(schedule, expected):
+def test_a_schedule_is_its_closed_form(schedule, expected):
     settings = TrainSettings(schedule=schedule, learning_rate=0.5)
     rates = [learning_rate(settings, progress) for progress in PROGRESS]
     np.testing.assert_allclose(rates, 0.5 * expected, atol=1e-12)
@@ -136,9 +128,8 @@ def test_the_mean_ranking_of_the_positive_classes_is_added_by_its_weight(
     labels = LABELS - 1
     batch = (images, labels, labels == 0)
     alone, _ = TrainingLoss(model.eval(), TrainSettings(), positive_classes, None).compute(*batch)
-    both, _ = TrainingLoss(
-        model, TrainSettings(ranking_weight=4.0), positive_classes, None
-    ).compute(*batch)
+    settings = TrainSettings(ranking_weight=4.0)
+    both, _ = TrainingLoss(model, settings, positive_classes, None).compute(*batch)
     logits = model(images / 255)
     rankings = [ranking_loss(logits, labels, label) for label in positive_classes]
     torch.testing.assert_close(both, alone + 4 * torch.stack(rankings).mean())
@@ -158,9 +149,15 @@ def test_a_hard_negative_shows_none_of_several_positive_classes(model, images):
     assert hits == (predicted[:5] == labels[:5]).sum() + last_is_right
 
 
-@pytest.mark.parametrize("name", AUGMENTATIONS)
-def test_an_augmentation_is_a_function_of_seed_and_step(name, images, model):
+@pytest.mark.parametrize("name", ["none", *TRANSFORMS, "pgd"])
+def test_an_augmentation_is_a_function_of_seed_and_step_and_leaves_the_model_alone(
+    name, images, model
+):
+    before = torch.get_rng_state()
     first = Baseline(name, model, 3).apply(images, LABELS, 7)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert model.training
+    assert all(parameter.grad is None for parameter in model.parameters())
     assert first.dtype == torch.uint8
     assert first.shape == images.shape
     assert torch.equal(Baseline(name, model, 3).apply(images, LABELS, 7), first)
@@ -169,15 +166,6 @@ def test_an_augmentation_is_a_function_of_seed_and_step(name, images, model):
         return
     assert not torch.equal(Baseline(name, model, 3).apply(images, LABELS, 8), first)
     assert not torch.equal(Baseline(name, model, 4).apply(images, LABELS, 7), first)
-
-
-@pytest.mark.parametrize("name", AUGMENTATIONS)
-def test_an_augmentation_leaves_model_and_random_state_alone(name, images, model):
-    before = torch.get_rng_state()
-    Baseline(name, model, 3).apply(images, LABELS, 7)
-    assert torch.equal(torch.get_rng_state(), before)
-    assert model.training
-    assert all(parameter.grad is None for parameter in model.parameters())
 
 
 @pytest.mark.parametrize("name", TRANSFORMS)
@@ -217,6 +205,13 @@ def test_pgd_raises_the_probability_of_the_classes_that_hard_negatives_are_not(i
     assert with_both[[0, 2]].sum() > max(with_2[[0, 2]].sum(), before[[0, 2]].sum())
 
 
+def learning_layers(network: nn.Module) -> set[str]:
+    """Freeze all layers but the last, and return the names of the others."""
+    freeze(network, "all_but_last", size=2)
+    names = [name for name, value in network.named_parameters() if value.requires_grad]
+    return {name.rpartition(".")[0] for name in names}
+
+
 class HeadFirst(nn.Module):
     """Network that defines its layers in another order than it calls them."""
 
@@ -231,9 +226,7 @@ class HeadFirst(nn.Module):
 
 def test_the_layer_that_is_called_last_learns_even_if_it_is_defined_first():
     network = HeadFirst()
-    freeze(network, "all_but_last", size=2)
-    learning = [name for name, value in network.named_parameters() if value.requires_grad]
-    assert learning == ["head.weight", "head.bias"]
+    assert learning_layers(network) == {"head"}
     images = torch.full((1, 3, 2, 2), 0.5)
     features = network.body(images.flatten(1))
     assert feature_norm(network, images) == pytest.approx(features.norm().item(), rel=1e-6)
@@ -242,22 +235,15 @@ def test_the_layer_that_is_called_last_learns_even_if_it_is_defined_first():
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 def test_only_the_last_layer_of_a_script_learns():
     network = torch.jit.script(nn.Sequential(nn.Flatten(), nn.Linear(12, 4), nn.Linear(4, 2)))
-    freeze(network, "all_but_last", size=2)
-    learning = [name for name, value in network.named_parameters() if value.requires_grad]
-    assert learning == ["2.weight", "2.bias"]
+    assert learning_layers(network) == {"2"}
 
 
 @pytest.mark.parametrize("last", [nn.BatchNorm1d(4), nn.LayerNorm(4), nn.PReLU(), nn.Softmax(1)])
 def test_the_last_layer_with_a_matrix_learns_whatever_is_called_after_it(last):
-    network = nn.Sequential(nn.Flatten(), nn.Linear(12, 4), last)
-    freeze(network, "all_but_last", size=2)
-    learning = [name for name, value in network.named_parameters() if value.requires_grad]
-    assert learning == ["1.weight", "1.bias"]
+    assert learning_layers(nn.Sequential(nn.Flatten(), nn.Linear(12, 4), last)) == {"1"}
 
 
 def test_a_network_that_cannot_learn_in_its_last_layer_is_refused():
-    with pytest.raises(InputError, match="no parameters"):
-        freeze(nn.Sequential(nn.Flatten()), "all_but_last", size=2)
     vectors = nn.Sequential(nn.Flatten(), nn.LayerNorm(12))
     freeze(vectors, "all_but_last", size=2)
     detached = HeadFirst()
