@@ -100,29 +100,19 @@ def black_and_white_with_alpha() -> Image.Image:
     return image
 
 
-@pytest.mark.parametrize(
-    "image",
-    [
-        three_colors(),
-        palette((0, 0, 200), (200, 0, 0)),
-        Image.fromarray(np.arange(192, dtype=np.uint8).reshape(12, 16) // 64),
-        Image.new("L", (16, 12), 255),
-        Image.new("L", (16, 12), 0),
-        black_and_white_with_alpha(),
-        Image.fromarray(WHITE_ON_BLACK).resize((17, 12)),
-        Image.fromarray(np.where(np.arange(16) > 10, 128, WHITE_ON_BLACK).astype(np.uint8)),
-    ],
-    ids=[
-        "three colors",
-        "no black",
-        "labels 0, 1, 2",
-        "white",
-        "black",
-        "two masks",
-        "size",
-        "gray area",
-    ],
-)
-def test_a_mask_that_does_not_tell_where_the_object_is_is_refused(tmp_path, image):
+NO_MASKS = {
+    "three colors": three_colors(),
+    "no black": palette((0, 0, 200), (200, 0, 0)),
+    "labels 0, 1, 2": Image.fromarray(np.arange(192, dtype=np.uint8).reshape(12, 16) // 64),
+    "white": Image.new("L", (16, 12), 255),
+    "black": Image.new("L", (16, 12), 0),
+    "two masks": black_and_white_with_alpha(),
+    "size": Image.fromarray(WHITE_ON_BLACK).resize((17, 12)),
+    "gray area": Image.fromarray(np.where(np.arange(16) > 10, np.uint8(128), WHITE_ON_BLACK)),
+}
+
+
+@pytest.mark.parametrize("name", NO_MASKS)
+def test_a_mask_that_does_not_tell_where_the_object_is_is_refused(tmp_path, name):
     with pytest.raises(InputError, match=r"mask=.*mask\.png"):
-        read_mask(save(tmp_path / "mask.png", image), 12, 16)
+        read_mask(save(tmp_path / "mask.png", NO_MASKS[name]), 12, 16)

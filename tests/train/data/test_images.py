@@ -14,6 +14,11 @@ from train.data.sets import Split, load_folder, load_unlabeled
 SIZE = 72
 
 
+def load_files(folder: Path, skip: bool = False) -> ImageFiles:
+    paths = tuple(item.path for item in find_unlabeled(folder))
+    return ImageFiles(folder, paths, SIZE, workers=0, skip=skip)
+
+
 def ramp(width: int, height: int) -> Image.Image:
     """Make an image whose red grows with the column, and whose green grows with the row."""
     x, y = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
@@ -33,9 +38,7 @@ def files(tmp_path) -> ImageFiles:
     Image.fromarray(np.full((80, 100), 40_000, np.uint16)).save(tmp_path / "e.png")
     image.save(tmp_path / "f.gif", save_all=True, append_images=[ramp(90, 120).rotate(90)])
     ramp(1500, 1200).save(tmp_path / "g.jpg")
-    return ImageFiles(
-        tmp_path, tuple(item.path for item in find_unlabeled(tmp_path)), SIZE, workers=0, skip=False
-    )
+    return load_files(tmp_path)
 
 
 def test_center_squares_are_those_of_images_in_memory_whatever_their_mode(files):
@@ -68,28 +71,18 @@ def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_proc
 
 
 def test_a_broken_file_is_named_or_another_of_its_folder_stands_in(tmp_path, caplog):
-    for name, color in {
-        "lemon/a": "yellow",
-        "lemon/b": "yellow",
-        "orange/a": "red",
-        "orange/b": "red",
-    }.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        Image.new("RGB", (80, 80), color).save(tmp_path / f"{name}.png")
+    for name, color in (("lemon", "yellow"), ("orange", "red")):
+        (tmp_path / name).mkdir()
+        for file in ("a.png", "b.png"):
+            Image.new("RGB", (80, 80), color).save(tmp_path / name / file)
     whole = (tmp_path / "lemon" / "b.png").read_bytes()
     (tmp_path / "lemon" / "b.png").write_bytes(whole[:100])
     rows = [torch.arange(4)]
     with pytest.raises(InputError, match=r"lemon/b\.png cannot be read .*skip_unreadable"):
-        list(load_files(tmp_path, skip=False).squares(rows))
+        list(load_files(tmp_path).squares(rows))
     (images,) = load_files(tmp_path, skip=True).squares(rows)
     assert images[:, 1, 0, 0].tolist() == [255, 255, 0, 0]
     assert "1 images cannot be read" in caplog.text
-
-
-def load_files(folder: Path, skip: bool) -> ImageFiles:
-    return ImageFiles(
-        folder, tuple(item.path for item in find_unlabeled(folder)), SIZE, workers=0, skip=skip
-    )
 
 
 def test_batches_from_disk_hold_images_and_renders_with_their_labels_and_go_on_where_they_stopped(

@@ -64,15 +64,9 @@ def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
     "changes, fault",
     [
         ({"test_labels": None}, "test_labels is not a file in the archive"),
-        (
-            {"train_images": np.zeros((5, 8, 8, 3), np.uint8)},
-            r"images are uint8 of shape \(5, 8, 8, 3\)",
-        ),
+        ({"train_images": np.zeros((5, 8, 8, 3), np.uint8)}, r"images are uint8 of shape \(5, 8"),
         ({"test_images": np.zeros((2, 3, 9, 9), np.uint8)}, "differ in size"),
-        (
-            {"train_labels": np.zeros(4, int)},
-            r"labels are int64 of shape \(4,\); they must be integers \(5,\)",
-        ),
+        ({"train_labels": np.zeros(4, int)}, r"\(4,\); they must be integers \(5,\)"),
         ({"test_labels": np.array([0, 2])}, "labels must be 0 to 1"),
         ({"test_labels": np.array([0, 2**64 - 1], np.uint64)}, "labels must be 0 to 1"),
         ({"classes": np.array(["fig", "fig"])}, "classes must be distinct strings"),
@@ -122,14 +116,8 @@ def test_train_and_test_folders_are_the_splits(tmp_path):
     [
         ([], "is not a folder"),
         (["fig/a.png"], "holds 1 class folders: give a folder with two or more"),
-        (
-            ["fig/a.png", "lime/.a.png"],
-            "data/lime holds no image: put images there, or remove the folder",
-        ),
-        (
-            ["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"],
-            "holds the folders test, train, val: give",
-        ),
+        (["fig/a.png", "lime/.a.png"], "data/lime holds no image"),
+        (["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"], "the folders test, train, val: "),
         (["fig/a.png", "lime/a.png"], "^test_fraction=0.1 selects 0 of the 1 images of class 0"),
     ],
 )

@@ -1,6 +1,7 @@
 """Schedules, losses and augmentations against their formulas."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +13,12 @@ from torch import Tensor, nn
 from augment import distributed
 from renderer.errors import InputError
 from renderer.image import to_unit
+from train.device import MixedPrecision
 from train.networks import WideResNet
 from train.train_settings import TRANSFORMS, TrainSettings
 from train.training.augmentations import PGD, Baseline
 from train.training.recipe import (
+    SharedTeacher,
     TrainingLoss,
     build_optimizer,
     feature_norm,
@@ -23,6 +26,7 @@ from train.training.recipe import (
     learning_rate,
     ranking_loss,
     scale_learning_rate,
+    share_layers,
 )
 
 LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
@@ -304,3 +308,55 @@ def test_features_without_a_finite_positive_norm_have_no_learning_rate(images, b
     features = torch.full_like(to_unit(images), brightness)
     with pytest.raises(InputError, match="feature_norm"):
         scale_learning_rate(settings, Scaled(9.0), features)
+
+
+TINY = 4
+LAST_LAYER_ONLY = {"freeze": "all_but_last", "eval_mode": True}
+
+
+class Counted(nn.Module):
+    """Layer that counts its calls."""
+
+    calls = 0
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        self.calls += 1
+        return images.flatten(1).tanh()
+
+
+def pair(*layers_after: nn.Module) -> tuple[MixedPrecision, MixedPrecision]:
+    """Build a pupil and its teacher."""
+    torch.manual_seed(0)
+    layers = [Counted(), nn.Linear(3 * TINY**2, 8), nn.Dropout(), nn.Linear(8, 5)]
+    pupil = MixedPrecision(nn.Sequential(*layers, *layers_after), "float32")
+    return pupil, deepcopy(pupil).eval()
+
+
+def test_the_logits_are_those_of_the_teacher_after_the_last_layer_has_learned():
+    pupil, teacher = pair()
+    shared = share_layers(TrainSettings(**LAST_LAYER_ONLY), pupil, teacher, TINY)
+    assert isinstance(shared, SharedTeacher)
+    pupil.eval()
+    images = torch.rand(6, 3, TINY, TINY)
+    expected = teacher(images)
+    calls = teacher.network[0].calls
+    with torch.no_grad():
+        pupil.network[3].weight += 1
+    assert not torch.equal(pupil(images), expected)
+    assert torch.equal(shared(images), expected)
+    assert teacher.network[0].calls == calls
+
+
+@pytest.mark.parametrize(
+    ("changes", "layers_after"),
+    [
+        ({"freeze": None}, ()),
+        ({"freeze": "1"}, ()),
+        ({"eval_mode": False}, ()),
+        ({}, (nn.Softmax(1),)),
+    ],
+)
+def test_a_teacher_with_other_features_or_more_layers_computes_its_own(changes, layers_after):
+    pupil, teacher = pair(*layers_after)
+    settings = TrainSettings(**LAST_LAYER_ONLY | changes)
+    assert share_layers(settings, pupil, teacher, TINY) is teacher

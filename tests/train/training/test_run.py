@@ -44,11 +44,8 @@ def weight_hashes(folder: Path) -> list[str]:
 
 def metrics(folder: Path) -> list[dict]:
     """Read the log of a run without the entries that are times."""
-    lines = []
-    for line in read_metrics(folder):
-        names = [name for name in line if not name.startswith("seconds/")]
-        lines.append({name: line[name] for name in names})
-    return lines
+    lines = read_metrics(folder)
+    return [{name: line[name] for name in line if name[:8] != "seconds/"} for line in lines]
 
 
 def modification_times(folder: Path) -> dict[Path, int]:
@@ -94,68 +91,46 @@ def renders_of_rounds(monkeypatch) -> list[Split]:
 HANDLED_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
-class TestASignalDuringTraining:
+@pytest.mark.parametrize(
+    ("number", "average"),
+    [
+        (signal.SIGTERM, "train.ema_decay=0.8"),
+        pytest.param(signal.SIGINT, "train.soup=true", marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+def test_a_signal_ends_a_run_after_the_step_and_resuming_ends_as_if_it_had_not_come(
+    tiny, finished, tmp_path, number, average
+):
     """An epoch has 40 of 54 images, in rounds of 16, 16 and 8 images with 4 renders each.
 
     The rounds have 2, 2 and 1 steps. The lights continue from round to round,
     and the network has dropout and a teacher.
     """
+    rounds = ("augment.regenerate_every=16", "train.images_per_epoch=40")
+    teacher = ("train.distillation_weight=2", f"network={finished}")
+    settings = tiny("train.epochs=2", "train.resume=true", *rounds, *teacher, average)
+    whole = tmp_path / "whole"
+    stopped = tmp_path / "stopped"
+    completed_run(settings, whole)
 
-    @pytest.mark.parametrize(
-        ("number", "average"),
-        [
-            (signal.SIGTERM, "train.ema_decay=0.8"),
-            pytest.param(signal.SIGINT, "train.soup=true", marks=pytest.mark.slow),
-        ],
-        ids=str,
-    )
-    def test_ends_it_after_the_step_and_resuming_ends_as_if_it_had_not_come(
-        self, tiny, finished, tmp_path, number, average
-    ):
-        settings = tiny(
-            "train.epochs=2",
-            "augment.regenerate_every=16",
-            "train.images_per_epoch=40",
-            "train.resume=true",
-            "train.distillation_weight=2",
-            f"network={finished}",
-            average,
-        )
-        whole = tmp_path / "whole"
-        stopped = tmp_path / "stopped"
-        completed_run(settings, whole)
-
-        self.stop(settings, stopped, 1, 2, number)
-        self.assert_state(stopped, epoch=0, step=4)
-        self.stop(settings, stopped, 2, 1, number)
-        self.assert_state(stopped, epoch=1, step=None)
-        self.stop(settings, stopped, 4, 1, number)
-        self.assert_state(stopped, epoch=1, step=3)
-
-        torch.manual_seed(17)  # The run does not depend on the global random stream.
-        completed_run(settings, stopped)
-        assert weight_hashes(stopped) == weight_hashes(whole)
-        assert metrics(stopped) == metrics(whole)
-        picture = Path("renders", "epoch_002.png")
-        assert (stopped / picture).read_bytes() == (whole / picture).read_bytes()
-
-    def stop(self, settings, folder: Path, round_number: int, step: int, number) -> None:
-        """Send a signal at a step, and check how the run ends."""
+    # Round and step at which a signal comes, and epochs and steps in the checkpoint then.
+    for round_number, step, epoch, steps in ((1, 2, 0, 4), (2, 1, 1, None), (4, 1, 1, 3)):
         handlers = [signal.getsignal(name) for name in HANDLED_SIGNALS]
-        with pytest.raises(Interrupted) as stopped:
-            train_with_signal(settings, folder, round_number, step, number)
-        assert stopped.value.code == 128 + number
-        assert stopped.value.signal == number.name
+        with pytest.raises(Interrupted) as stop:
+            train_with_signal(settings, stopped, round_number, step, number)
+        assert (stop.value.code, stop.value.signal) == (128 + number, number.name)
         assert [signal.getsignal(name) for name in HANDLED_SIGNALS] == handlers
-
-    def assert_state(self, folder: Path, epoch: int, step: int | None) -> None:
-        """Check the epochs that a checkpoint has completed, and the steps of the next one."""
-        state = checkpoints.load(folder / run_folder.LAST)
+        state = checkpoints.load(stopped / run_folder.LAST)
         assert state["epoch"] == epoch
-        if step is None:
-            assert state["under_way"] is None
-        else:
-            assert state["under_way"]["step"] == step
+        assert (state["under_way"] and state["under_way"]["step"]) == steps
+
+    torch.manual_seed(17)  # The run does not depend on the global random stream.
+    completed_run(settings, stopped)
+    assert weight_hashes(stopped) == weight_hashes(whole)
+    assert metrics(stopped) == metrics(whole)
+    picture = Path("renders", "epoch_002.png")
+    assert (stopped / picture).read_bytes() == (whole / picture).read_bytes()
 
 
 def test_the_signal_of_a_batch_system_writes_a_checkpoint_before_its_own_handler_acts(
@@ -427,16 +402,9 @@ class TestAFolderOfRenders:
     @pytest.fixture
     def settings(self, tiny, label_of_image, tmp_path):
         """Return settings of two epochs with two rounds of 4 images each."""
-        return tiny(
-            "augment=folder",
-            f"augment.folder={tmp_path / 'lab'}",
-            "augment.warm_start=false",
-            "augment.regenerate_every=27",
-            "augment.examples=4",
-            "train.resume=true",
-            "train.ranking_weight=1",
-            "train.epochs=2",
-        )
+        folder = ("augment=folder", f"augment.folder={tmp_path / 'lab'}", "augment.examples=4")
+        rounds = ("augment.warm_start=false", "augment.regenerate_every=27", "train.epochs=2")
+        return tiny(*folder, *rounds, "train.resume=true", "train.ranking_weight=1")
 
     def test_is_shown_in_turn_with_its_labels(
         self, settings, label_of_image, renders_of_rounds, tmp_path
