@@ -301,18 +301,13 @@ def test_a_network_starts_with_the_weights_and_the_normalization_of_another(netw
     assert torch.equal(fresh.eval()(images), network(images))
 
 
-@pytest.mark.parametrize(
-    ("change", "fault"),
-    [
-        ({"classes": ["pear", "apple", "orange"]}, "other classes"),
-        ({"depth": 16}, "depth 10, not 16"),
-    ],
-)
-def test_an_initial_network_that_contradicts_the_run_is_refused(network, tmp_path, change, fault):
+def test_an_initial_network_that_contradicts_the_run_is_refused(network, tmp_path):
     initial = initial_of(write(tmp_path, network))
-    message = f"network={initial.source} was trained with {fault}"
-    with pytest.raises(InputError, match=message):
-        initial.copy_to(network, description_of(network) | change)
+    other_classes = {"classes": ["pear", "apple", "orange"]}
+    with pytest.raises(InputError, match=f"network={initial.source} .* classes"):
+        initial.copy_to(network, description_of(network) | other_classes)
+    with pytest.raises(InputError, match=f"{initial.source} is from another architecture"):
+        initial.copy_to(WideResNet(3, 16, 1), description_of(network))
 
 
 def test_a_published_network_has_the_weights_in_half_precision(network, tmp_path):

@@ -156,24 +156,19 @@ def _render_solid(
     Each image has another light.
     """
     polar, azimuth, width = torch.rand(3, CAMERAS, generator=draws, dtype=torch.float64).tolist()
-    cameras = []
-    for index in range(CAMERAS):
-        polar_angle = 40 + 45 * polar[index]
-        camera = OrthographicCamera(polar_angle, 360 * azimuth[index], 2 + width[index])
-        cameras.append(camera)
-    backgrounds = torch.rand(BACKGROUNDS, generator=draws).tolist()
+    cameras = [
+        OrthographicCamera(40 + 45 * polar[index], 360 * azimuth[index], 2 + width[index])
+        for index in range(CAMERAS)
+    ]
+    grays = torch.rand(BACKGROUNDS, generator=draws).tolist()
     lights = []
     for camera in cameras:
         to_camera = torch.tensor(camera.axes()[2], dtype=torch.float32)
-        lights += [soft_front_light(to_camera, draws) for _ in backgrounds]
-    scene = Scene.grid(
-        [SceneObject("", normalize(mesh))],
-        cameras,
-        load_backgrounds(backgrounds, settings.size),
-        torch.stack(lights),
-        settings,
-        choose("numpy"),
-    )
+        lights += [soft_front_light(to_camera, draws) for _ in grays]
+    subject = SceneObject("", normalize(mesh))
+    backgrounds = load_backgrounds(grays, settings.size)
+    options = (torch.stack(lights), settings, choose("numpy"))
+    scene = Scene.grid([subject], cameras, backgrounds, *options)
     examples = torch.arange(len(scene))
     images = scene.render(scene.conditions(examples), examples)
     return to_bytes(images.flatten(0, 1))

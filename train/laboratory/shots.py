@@ -183,9 +183,9 @@ def _draw_shot(
     is_behind_wall = [(position - center) @ to_wall >= to_wall @ to_wall for position in projectors]
     # A wall between a projector and the object would block the light.
     wall = center + to_wall if wants_wall and not any(is_behind_wall) else None
-    lights: tuple[Any, ...] = (patterns, ambient, table, projectors)
-    places: tuple[Any, ...] = (camera, center, aim, rotation, scale)
-    return Shot(pattern_names, brightness, *lights, *places, roughness, wall)
+    values: tuple[Any, ...] = (patterns, ambient, table, projectors, camera, center)
+    values += (aim, rotation, scale, roughness, wall)
+    return Shot(pattern_names, brightness, *values)
 
 
 def _between(limits: Sequence[float], rng: np.random.Generator) -> float:

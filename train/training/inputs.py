@@ -30,11 +30,7 @@ from train.device import choose_rasterizer
 from train.networks import CLASSIFIER, PYTHON, describe
 from train.processes import main_process_first
 from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, label_names
-from train.train_settings import WIDERESNET
 
-# Entries in the description of a network. They must be equal in two networks if the
-# weights of one are copied to the other.
-SHARED = ("classes", "size", "name", "depth", "width")
 # Default fraction of the training images that validate the network.
 VALIDATION = 0.1
 # Pixels per side of the images if neither the setting `size` nor the network with
@@ -90,16 +86,10 @@ class Initial:
 
         Networks that differ in classes, image size or architecture raise InputError.
         """
-        own = {"name": WIDERESNET, **self.architecture}
-        other = {"name": WIDERESNET, **description}
-        for key in SHARED:
-            if key in own and own[key] != other.get(key):
-                difference = f"{key} {own[key]}, not {other.get(key)}"
-                if key == "classes":
-                    difference = "other classes"
+        for key in ("classes", "size"):
+            if self.architecture[key] != description[key]:
                 raise InputError(
-                    f"network={self.source} was trained with {difference}: "
-                    f"give this run the same {key}"
+                    f"network={self.source} differs from this run in {key}: give the same {key}"
                 )
         with checkpoints.checks_architecture(self.source):
             network.load_state_dict(self.weights)
@@ -360,7 +350,7 @@ def build_service(
         require_others(settings.negative_objects, positive_names, data.classes)
         # An object of no class of the network has a complementary label: the negative
         # number says only that it is not of a positive class.
-        label_of_class = {OTHER: complementary_label(positive_classes[0])}
+        label_of_class: dict[str | int, int] = {OTHER: complementary_label(positive_classes[0])}
         for key, item in settings.objects.items():
             if item.label != OTHER:
                 index = class_index(data.classes, item.label, f"label of {key}")

@@ -58,21 +58,16 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
     has no weight decay for biases and normalization layers, as is usual.
     """
     if settings.optimizer == "sgd":
+        momentum, decay = settings.momentum, settings.weight_decay
+        options: dict[str, Any] = {"momentum": momentum, "weight_decay": decay}
         return torch.optim.SGD(
-            model.parameters(),
-            settings.learning_rate,
-            momentum=settings.momentum,
-            weight_decay=settings.weight_decay,
-            nesterov=settings.momentum > 0,
-            fused=True,
+            model.parameters(), settings.learning_rate, nesterov=momentum > 0, fused=True, **options
         )
     # Biases and the weights of normalization layers are vectors.
     vectors = [parameter for parameter in model.parameters() if parameter.ndim <= 1]
     matrices = [parameter for parameter in model.parameters() if parameter.ndim > 1]
-    groups = [
-        {"params": vectors, "weight_decay": 0.0},
-        {"params": matrices, "weight_decay": settings.weight_decay},
-    ]
+    decayed = {"params": matrices, "weight_decay": settings.weight_decay}
+    groups = [{"params": vectors, "weight_decay": 0.0}, decayed]
     return torch.optim.AdamW(groups, settings.learning_rate, fused=True)
 
 
