@@ -10,31 +10,45 @@ from typing import Self
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from augment.network import (
+    ChannelNormalization,
+    Function,
     Network,
     Remembered,
     are_probabilities,
+    device_of,
     light_settings,
+    normalization_of,
+    own_size,
+    say_inputs,
     with_normalized_light,
 )
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
-from renderer.errors import (
-    InputError,
-    as_list,
-    as_tensor,
-    composed,
-    describe,
-    is_out_of_memory,
-    require_kind,
-    require_whole,
-    single_line,
-)
+from renderer import errors
+from renderer.errors import InputError
 from renderer.settings import MAX_SIZE
 
+# normalization="imagenet" stands for the following mean and standard deviation of red, green and
+# blue, which most networks use that were trained on ImageNet.
+IMAGENET = "imagenet"
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+# Default values of black and white that a network takes.
+UNIT_RANGE = (0.0, 1.0)
+# Pixels per side of the images of most networks that were trained on ImageNet.
+USUAL_SIZE = 224
+# Number of images with which a network is called to count its outputs. With a single image, logits
+# could look like probabilities by chance.
+CHECKED_COUNT = 2
+# Names of module classes of torchvision, kornia and this library that normalize images.
+NORMALIZING = frozenset({"Normalize", "ChannelNormalization"})
+# Names of buffers that contain the mean in networks that normalize images themselves.
+MEANS = frozenset({"mean", "image_mean", "pixel_mean"})
 # Name of one positive class, or names of several.
 Label = str | Sequence[str]
+Normalization = str | tuple[Sequence[float], Sequence[float]] | None
 # Image values may exceed the range [0, 1] by at most this much, because of interpolation and noise.
 OVERSHOOT = 0.1
 # A network is refused if its outputs for this many images look like probabilities. The logits of a
@@ -96,53 +110,42 @@ class LogitNetwork(Network):
             logits = self.network(images)
         except Exception as error:
             # The caller handles errors of memory. An `InputError` already tells what is wrong.
-            if isinstance(error, InputError) or is_out_of_memory(error):
+            if isinstance(error, InputError) or errors.is_out_of_memory(error):
                 raise
             raise InputError(self._failure(images, error)) from error
-        count = self.class_count
-        has_row_per_image = (
-            isinstance(logits, Tensor) and logits.ndim == 2 and len(logits) == len(images)
-        )
-        if not has_row_per_image or count not in (None, logits.shape[1]):
-            shape = tuple(images.shape)
-            returned = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
-            expected = (len(images), "C" if count is None else count)
-            remedy = f"it must return logits {expected}"
+        is_tensor = isinstance(logits, Tensor)
+        has_row_per_image = is_tensor and logits.ndim == 2 and len(logits) == len(images)
+        if not has_row_per_image or self.class_count not in (None, logits.shape[1]):
+            returned = tuple(logits.shape) if is_tensor else type(logits).__name__
+            remedy = f"it must return logits {(len(images), self.class_count or 'C')}"
             if hasattr(logits, "logits") or (isinstance(logits, dict) and "logits" in logits):
                 remedy = "give a function that returns its logits alone"
+            shape = tuple(images.shape)
             raise InputError(f"{self.title} returned {returned} for images {shape}: {remedy}")
-        self._require_no_probabilities(logits)
+        if self.probability_rows is not None and len(logits):
+            are_suspicious = are_probabilities(logits)
+            self.probability_rows = self.probability_rows + len(logits) if are_suspicious else None
+        # A network is refused only if all outputs so far look like probabilities.
+        if (self.probability_rows or 0) >= MIN_PROBABILITY_ROWS:
+            raise InputError(
+                f"{self.title} returned probabilities (values in [0, 1] that sum to 1) instead of "
+                "logits: "
+                "remove the softmax of the network, or return the logarithms of the probabilities"
+            )
         return logits
 
     def _failure(self, images: Float[Tensor, "N 3 H W"], error: Exception) -> str:
         """Return the message of the error for a network that failed on images."""
-        weights = [weight for weight in self.parameters() if weight.is_floating_point()]
-        dtypes = {weight.dtype for weight in weights}
         given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
-        reason = f"{self.title} fails on {given} ({type(error).__name__}: {single_line(error)})"
+        reason = (
+            f"{self.title} fails on {given} ({type(error).__name__}: {errors.single_line(error)})"
+        )
+        dtypes = {weight.dtype for weight in self.parameters() if weight.is_floating_point()}
         if dtypes and images.dtype not in dtypes:
             of_weights = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
             remedy = f"convert it with network.to({images.dtype}), or use light in {of_weights}"
             return f"{reason}: its weights are {of_weights}, {remedy}"
         return f"{reason}: give the size of its images, or use a network that takes such images"
-
-    def _require_no_probabilities(self, logits: Float[Tensor, "N C"]) -> None:
-        """Check that the network does not return probabilities instead of logits.
-
-        It fails only if all outputs so far look like probabilities.
-        """
-        if self.probability_rows is None or not len(logits):
-            return
-        if not are_probabilities(logits):
-            self.probability_rows = None
-            return
-        self.probability_rows += len(logits)
-        if self.probability_rows >= MIN_PROBABILITY_ROWS:
-            raise InputError(
-                f"{self.title} returned probabilities (values in [0, 1] that sum to 1) instead "
-                "of logits: "
-                "remove the softmax of the network, or return the logarithms of the probabilities",
-            )
 
 
 class Classifier(LogitNetwork):
@@ -189,11 +192,11 @@ class Classifier(LogitNetwork):
         normalize_light: NormalizeLight = None,
     ):
         """Check the arguments, which the docstring of the class explains. Freeze the network."""
-        require_kind("name", name, str, "a string for messages")
-        require_kind(
+        errors.require_kind("name", name, str, "a string for messages")
+        errors.require_kind(
             "network", network, Callable, "a torch.nn.Module, or a function from images to logits"
         )
-        require_whole(f"classifier {name}: size", size, 1, MAX_SIZE)
+        errors.require_whole(f"classifier {name}: size", size, 1, MAX_SIZE)
         names = as_class_names(f"classifier {name}: classes", classes)
         super().__init__(network, f"classifier {name}", len(names))
         self.network = with_normalized_light(self.network, normalize_light)
@@ -209,7 +212,7 @@ class Classifier(LogitNetwork):
             raise InputError(
                 f"classifier {name}: classes has {len(self.classes)} names, "
                 f"of which {len(set(self.classes))} are different: "
-                "give each class a name of its own, in the order of the logits",
+                "give each class a name of its own, in the order of the logits"
             )
         self.requires_grad_(False).eval()
 
@@ -228,7 +231,12 @@ class Classifier(LogitNetwork):
                 with a gradient.
         """
         size = self.size
-        images = as_images("images", images)
+        if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
+            raise InputError(
+                f"images is {errors.describe(images)}: use floating-point RGB in [0, 1], such as "
+                "images / 255"
+            )
+        images = errors.as_tensor("images", images)
         if images.shape[1:] != (3, size, size):
             remedy = f"render at {size} pixels per side"
             if images.shape == (3, size, size):
@@ -239,12 +247,16 @@ class Classifier(LogitNetwork):
                 f"{self.title} takes images (N, 3, {size}, {size}), "
                 f"not {tuple(images.shape)}: {remedy}"
             )
-        # Lowest and highest value of all images. There are none if the batch is empty.
-        extremes = torch.aminmax(images.detach()) if len(images) else ()
         logits = super().forward(images)
         # Check the range of the images after the call of the network. The check waits until the
         # GPU is idle.
-        require_unit_range("images", *extremes)
+        if len(images):
+            low, high = torch.stack(torch.aminmax(images.detach())).tolist()
+            if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
+                raise InputError(
+                    f"images has values from {low:g} to {high:g}: "
+                    "use RGB in [0, 1], without normalization (divide bytes by 255)"
+                )
         if not logits.is_floating_point() or not logits.isfinite().all():
             raise InputError(
                 f"{self.title} returned NaN or infinite logits: check the weights of the network"
@@ -325,14 +337,12 @@ class Classifier(LogitNetwork):
             InputError: If the class has no operating point, or if `forward`
                 refuses the images.
         """
-        require_kind("label", label, str | None, "the name of a class")
+        errors.require_kind("label", label, str | None, "the name of a class")
         points = [point for point in self.operating_points if label in (None, point.label)]
         if len(points) != 1:
             known = ", ".join(point.label for point in self.operating_points)
             remedy = f"set label to one of {known}" if known else "store one with nb.publish"
-            raise InputError(
-                f"{self.title} has no operating point for label={label}: {remedy}",
-            )
+            raise InputError(f"{self.title} has no operating point for label={label}: {remedy}")
         (point,) = points
         return log_odds(self(images).double(), self.label(point.label)) > point.threshold
 
@@ -353,36 +363,12 @@ class Classifier(LogitNetwork):
         return class_index(self.classes, class_name, self.title)
 
 
-def as_images(name: str, images: object) -> Tensor:
-    """Convert images to a tensor of floating-point numbers."""
-    if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
-        raise InputError(
-            f"{name} is {describe(images)}: use floating-point RGB in [0, 1], such as {name} / 255"
-        )
-    return as_tensor(name, images)
-
-
-def require_unit_range(name: str, *extremes: Tensor) -> None:
-    """Check that the values of images are in [0, 1], with a tolerance of `OVERSHOOT`.
-
-    `extremes` are the lowest and the highest value, or nothing without images.
-    """
-    if not extremes:
-        return
-    low, high = torch.stack(extremes).tolist()
-    if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
-        raise InputError(
-            f"{name} has values from {low:g} to {high:g}: "
-            "use RGB in [0, 1], without normalization (divide bytes by 255)",
-        )
-
-
 def as_class_names(name: str, classes: object) -> tuple[str, ...]:
     """Convert a list of names of classes to a tuple of strings."""
-    names = as_list(
+    names = errors.as_list(
         name, classes, str, "a list of the names of the classes, in the order of the logits"
     )
-    return tuple(map(composed, names))
+    return tuple(map(errors.composed, names))
 
 
 def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
@@ -391,32 +377,25 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
     The name may be an index, also as text. `subject` starts the error, which suggests similar
     names.
     """
-    require_kind("label", name, str | int, "the name of a class, or its index")
-    text = composed(str(name))
-    names = [*map(composed, classes)]
+    errors.require_kind("label", name, str | int, "the name of a class, or its index")
+    text = errors.composed(str(name))
+    names = [*map(errors.composed, classes)]
     if isinstance(name, str) and text in names:
         return names.index(text)
     is_index = text.isascii() and text.isdecimal()
-    if isinstance(name, str) and not is_index and _are_indices(classes):
-        raise InputError(
-            f"{subject}: {name!r} is a name, but the classes have only indices: "
-            f"give an index from 0 to {len(classes) - 1}, or name the classes",
-        )
+    if is_index and int(text) < len(classes):
+        return int(text)
     if is_index:
-        if int(text) < len(classes):
-            return int(text)
-        raise InputError(
-            f"{subject}: the label {text} is not a class: indices go from 0 to {len(classes) - 1}",
+        reason = f"the label {text} is not a class: indices go from 0 to {len(classes) - 1}"
+    elif isinstance(name, str) and names == [str(index) for index in range(len(classes))]:
+        reason = (
+            f"{name!r} is a name, but the classes have only indices: "
+            f"give an index from 0 to {len(classes) - 1}, or name the classes"
         )
-    raise InputError(
-        f"{subject}: {name!r} is not a class of the model: "
-        f"choose one, such as {nearest(text, classes)}",
-    )
-
-
-def _are_indices(classes: Sequence[str]) -> bool:
-    """Return whether the names of classes are "0", "1" and so on."""
-    return [*classes] == [str(index) for index in range(len(classes))]
+    else:
+        similar = nearest(text, classes)
+        reason = f"{name!r} is not a class of the model: choose one, such as {similar}"
+    raise InputError(f"{subject}: {reason}")
 
 
 def nearest(name: str, choices: Sequence[str]) -> str:
@@ -441,3 +420,143 @@ def log_odds(logits: Float[Tensor, "N classes"], label: int) -> Float[Tensor, " 
     """
     others = torch.cat([logits[:, :label], logits[:, label + 1 :]], dim=1)
     return logits[:, label] - others.logsumexp(dim=1)
+
+
+def as_classifier(
+    network: Classifier | Callable[[Tensor], Tensor],
+    size: int | None = None,
+    classes: Sequence[str] | None = None,
+    normalization: Normalization = None,
+    value_range: tuple[float, float] = UNIT_RANGE,
+    device: torch.device | str | None = None,
+    argument: str = "network",
+    name: str | None = None,
+    normalize_light: NormalizeLight = None,
+    dtype: torch.dtype = torch.float32,
+) -> Classifier:
+    """Make a classifier of a plain network, and check it on gray images.
+
+    Without a size, that of the network counts or, if it tells none, 224. Classes are "0", "1" and
+    so on by default. Mean and standard deviation are in units of `value_range`, the values of black
+    and white. A `Classifier` only gets `normalize_light`.
+    """
+    if isinstance(network, Classifier):
+        if classes is not None or normalization is not None or value_range != UNIT_RANGE:
+            raise InputError(
+                "classes, normalization and value_range are for a plain network: "
+                "leave them out, because the given Classifier already defines them"
+            )
+        if size not in (None, network.size):
+            raise InputError(
+                f"size={size} does not fit classifier {network.name}, "
+                f"which takes images of {network.size} pixels per side: use this size"
+            )
+        return network.normalizing_light(normalize_light)
+    errors.require_kind(
+        argument, network, Callable, "a torch.nn.Module, a function to logits, or a Classifier"
+    )
+    names = None if classes is None else as_class_names("classes", classes)
+    if isinstance(network, type):
+        name = network.__name__
+        raise InputError(f"{argument} is the class {name}: give a network, such as {name}(...)")
+    require_evaluation_mode(network, argument)
+    device = device_of(network) if device is None else errors.as_device(device)
+    function = _preprocessed(network, normalization, value_range).to(device)
+    name = name or type(network).__name__
+    if size is None:
+        known_size = own_size(network)
+        assumed = assumed_facts(known_size, normalization_of(function) or None)
+        # timm records the size of the published weights, which need not be those of the network.
+        published = getattr(network, "pretrained_cfg", {}).get("input_size", [USUAL_SIZE])
+        size = known_size or published[-1]
+        say_inputs(name, function, size, assumed)
+    shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device, dtype=dtype)
+    images = shades.view(-1, 1, 1, 1).expand(-1, 3, size, size).contiguous()
+    with torch.no_grad():
+        count = LogitNetwork(function, argument)(images).shape[1]
+    if names is not None and len(names) != count:
+        raise InputError(
+            f"classes has {len(names)} names, but the network returns {count} outputs: "
+            "give one name per output"
+        )
+    return Classifier(function, size, names or [*map(str, range(count))], name, normalize_light)
+
+
+def assumed_facts(size: int | None, normalization: Normalization) -> tuple[str, ...]:
+    """Return which of the two arguments neither the user nor the network gives."""
+    given = {"size": size, "normalization": normalization}
+    return tuple(name for name, value in given.items() if value is None)
+
+
+def require_evaluation_mode(network: object, argument: str) -> None:
+    """Check that no module of a network is in training mode."""
+    if not isinstance(network, nn.Module) or not any(part.training for part in network.modules()):
+        return
+    # A module of torch.export has its own attribute `eval`, which raises an error.
+    if "eval" in vars(network):
+        raise InputError(
+            f"{argument} is a module of torch.export, which has no eval(): save it by "
+            "torch.export.save, and give norm_balls.load_classifier('network.pt2', "
+            "trust_code=True)"
+        )
+    raise InputError(
+        f"{argument} is a network in training mode: call the method eval() of the network first"
+    )
+
+
+def _preprocessed(
+    network: Callable[[Tensor], Tensor],
+    normalization: Normalization,
+    value_range: tuple[float, float],
+) -> nn.Module:
+    """Return a network that takes images in [0, 1], scales and normalizes them."""
+    module = network if isinstance(network, nn.Module) else Function(network)
+    mean, std = mean_and_std(normalization)
+    black, white = errors.as_list(
+        "value_range", value_range, float | int, "the values of black and white"
+    )
+    if not black < white:
+        raise InputError(f"value_range is ({black}, {white}): give black before white")
+    if normalization is None and (black, white) == UNIT_RANGE:
+        return module.eval()
+    if normalization is not None:
+        # Networks of several libraries are known by the names of their modules and buffers.
+        kinds = {type(part).__name__ for part in module.modules()}
+        buffers = {name for name, _ in module.named_buffers() if name.rpartition(".")[2] in MEANS}
+        found = sorted(kinds & NORMALIZING) + sorted(buffers)
+        if found:
+            raise InputError(
+                f"normalization is given, and the network contains {found[0]}, so that images "
+                "would be normalized twice: leave normalization out"
+            )
+    if normalization == IMAGENET:
+        # Scaling the mean and the standard deviation of ImageNet to the range of the network is
+        # the same as normalizing values in [0, 1] with them.
+        black, white = UNIT_RANGE
+    if normalization is not None and not black <= min(mean) <= max(mean) <= white:
+        raise InputError(
+            f"normalization has the mean {tuple(mean)}, which is not between black, {black:g}, and "
+            f"white, {white:g}: give the mean in the units of value_range, or another value_range"
+        )
+    # A value x in [0, 1] becomes (black + span · x - mean) / std for the network. This is equal to
+    # (x - scaled_mean) / scaled_std, which `ChannelNormalization` computes.
+    span = white - black
+    scaled_mean = [(value - black) / span for value in mean]
+    scaled_std = [value / span for value in std]
+    return Network(module, [ChannelNormalization(scaled_mean, scaled_std)]).eval()
+
+
+def mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequence[float]]:
+    """Return the mean and the standard deviation of the channels red, green and blue.
+
+    None stands for mean 0 and standard deviation 1.
+    """
+    if normalization is None:
+        return (0.0,) * 3, (1.0,) * 3
+    if normalization == IMAGENET:
+        return IMAGENET_MEAN, IMAGENET_STD
+    expected = "'imagenet', or (mean, std) of three numbers each"
+    rows = errors.as_list("normalization", normalization, tuple | list, expected)
+    if [len(row) for row in rows] != [3, 3] or not min(rows[1]) > 0:
+        raise InputError(f"normalization is {errors.describe(normalization)}: give {expected}")
+    return rows[0], rows[1]

@@ -24,17 +24,22 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from augment.classifier import Classifier
-from augment.network import ARRAYS, Function, Network, unwrapped
-from augment.plain_networks import (
+from augment.classifier import (
     USUAL_SIZE,
-    NetworkFacts,
+    Classifier,
+    Normalization,
+    as_class_names,
     as_classifier,
     assumed_facts,
-    normalization_of,
-    own_size,
+    mean_and_std,
 )
-from renderer.errors import InputError, require_file, single_line
+from augment.network import ARRAYS, Function, Network, normalization_of, own_size, unwrapped
+from renderer.errors import InputError, require_file, require_whole, single_line
+from renderer.settings import MAX_SIZE
+
+# A network from images (N, 3, size, size) to logits, and the sizes of the four dimensions of its
+# images. None stands for any size, or an unknown one.
+Content = tuple[Callable[[Tensor], Tensor], Sequence[int | None]]
 
 EXPORTED = ".pt2"
 ONNX = ".onnx"
@@ -61,18 +66,54 @@ _PREFIXES = ("module.", "_orig_mod.", "model.", "network.", "net.")
 
 
 @dataclass(frozen=True)
-class Content:
-    """Network in a file, and the shape of the images that it takes.
+class NetworkFacts:
+    """Classes, image size and normalization that the user gives for a network.
+
+    None leaves the choice to the source of the network, such as torchvision.
 
     Attributes:
-        network: Module or function from images (N, 3, size, size) to logits.
-        shape: Sizes of the four dimensions of the images, as the file tells
-            them. None for a dimension that may have any size, or whose size is
-            unknown.
+        classes: Names of the classes in the order of the outputs. If neither
+            the user nor the source gives names, they are "0", "1" and so on.
+        size: Pixels per side of the images.
+        normalization: "imagenet", or mean and standard deviation of the
+            channels red, green and blue, in units of [0, 1].
     """
 
-    network: Callable[[Tensor], Tensor]
-    shape: Sequence[int | None] = (None, None, None, None)
+    classes: tuple[str, ...] | None = None
+    size: int | None = None
+    normalization: Normalization = None
+
+
+def as_facts(
+    classes: Sequence[str] | str | Path | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+) -> NetworkFacts:
+    """Check the classes, size and normalization that the user gives for a network.
+
+    Classes may be a text file with a name in each line.
+    """
+    if isinstance(classes, str | Path):
+        require_file(classes, "give a text file with the name of a class in each line")
+        lines = Path(classes).read_text(encoding="utf-8").splitlines()
+        classes = [line.strip() for line in lines if line.strip()]
+    names = None if classes is None else as_class_names("classes", classes)
+    if size is not None:
+        require_whole("size", size, 1, MAX_SIZE)
+    if normalization is not None:
+        mean_and_std(normalization)
+    return NetworkFacts(names, size, normalization)
+
+
+def require_no_facts(name: str, facts: NetworkFacts) -> None:
+    """Check that the user gives no facts about a network that defines them itself."""
+    for setting, value in vars(facts).items():
+        if value is not None:
+            raise InputError(
+                f"{setting} cannot be set for {name}, because this network already defines "
+                f"{setting}: leave {setting} out",
+                setting,
+            )
 
 
 def is_network_file(name: str) -> bool:
@@ -87,6 +128,11 @@ def is_network_file(name: str) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
+def name_error(name: str | Path, reason: str) -> InputError:
+    """Return an error about the argument `name`, which names a network."""
+    return InputError(f"name={name} {reason}", "name")
+
+
 def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
     """Load a classifier from a file that contains its network.
 
@@ -95,9 +141,23 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
     """
     path = Path(name)
     require_file(path, "give the path of a file that contains a network")
-    content = _read(path, trust_code)
-    batch_size, _, height, _ = content.shape
-    network = content.network
+    if not trust_code and (path.suffix.lower() == EXPORTED or is_torchscript(path)):
+        raise name_error(
+            path,
+            "is a program, which can run any code and overwrite your files: "
+            "set trust=true (trust_code=True in Python) if you made the file or trust its author, "
+            "otherwise ask for a state dict, safetensors or ONNX",
+        )
+    readers = {EXPORTED: _read_exported, ONNX: read_onnx}
+    try:
+        content = readers.get(path.suffix.lower(), _read_torchscript)(path)
+    except InputError:
+        raise
+    except Exception as error:  # A damaged file may raise many types of errors.
+        advice = "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
+        raise name_error(path, f"cannot be read ({single_line(error)}): {advice}") from error
+
+    network, (batch_size, _, height, _) = content
     if batch_size is not None:
         network = InBatches(network, batch_size)
     if isinstance(network, nn.Module):
@@ -124,36 +184,7 @@ def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
     with torch.no_grad():
         first, second = (classifier.network(images[[0, other]]).float() for other in (1, 2))
     if (first[0] - second[0]).abs().max() > MAX_CHANGE * (first.max() - first.min()):
-        raise InputError(f"name={name} {IN_TRAINING_MODE}", "name")
-
-
-def _read(path: Path, trust_code: bool) -> Content:
-    """Read a file with a network, in the format that the suffix of its name tells."""
-    if path.suffix.lower() == EXPORTED or is_torchscript(path):
-        _require_trust(path, trust_code)
-    readers = {EXPORTED: _read_exported, ONNX: read_onnx}
-    read = readers.get(path.suffix.lower(), _read_torchscript)
-    try:
-        return read(path)
-    except InputError:
-        raise
-    except Exception as error:  # A damaged file may raise many types of errors.
-        raise InputError(
-            f"name={path} cannot be read ({single_line(error)}): "
-            "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)",
-            "name",
-        ) from error
-
-
-def _require_trust(path: Path, trust_code: bool) -> None:
-    """Raise InputError if a program, a file of TorchScript or `torch.export`, is not trusted."""
-    if not trust_code:
-        raise InputError(
-            f"name={path} is a program, which can run any code and overwrite your files: "
-            "set trust=true (trust_code=True in Python) if you made the file or trust its author, "
-            "otherwise ask for a state dict, safetensors or ONNX",
-            "name",
-        )
+        raise name_error(name, IN_TRAINING_MODE)
 
 
 def _read_torchscript(path: Path) -> Content:
@@ -165,10 +196,11 @@ def _read_torchscript(path: Path) -> Content:
                 "contains weights without their network: give its architecture and the weights, "
                 f"as in network=torchvision:resnet50 weights={path}"
             )
-        raise InputError(f"name={path} cannot be loaded, because it {advice}", "name")
+        raise name_error(path, f"cannot be loaded, because it {advice}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
-        return Content(Scripted(torch.jit.load(path, map_location="cpu").eval()))
+        network = Scripted(torch.jit.load(path, map_location="cpu").eval())
+    return network, (None, None, None, None)
 
 
 class Scripted(Network):
@@ -203,13 +235,13 @@ def _read_exported(path: Path) -> Content:
         # `train` is an argument of dropout, and `training` one of batch normalization.
         modes = [place.name.startswith("train") for place in schema.arguments] if schema else []
         if any(value is True for value in compress(node.args, modes)):
-            raise InputError(f"name={path} {IN_TRAINING_MODE}", "name")
+            raise name_error(path, IN_TRAINING_MODE)
     [name] = program.graph_signature.user_inputs
     [node] = [node for node in program.graph.nodes if node.name == name]
     # `node.meta["val"]` is an example of the images. In its shape, the dimensions of fixed size are
     # whole numbers, and the others are symbols.
     sizes = [size if isinstance(size, int) else None for size in node.meta["val"].shape]
-    return Content(Exported(program.module()), sizes)
+    return Exported(program.module()), sizes
 
 
 def _require_plain_members(path: Path) -> None:
@@ -227,7 +259,7 @@ def _require_plain_members(path: Path) -> None:
                 names.count(name) > 1
                 or file_name.startswith(CODE_MEMBERS)
                 or COMPILED in name
-                or (file_name.endswith(".json") and _uses_pickle(json.loads(archive.read(name))))
+                or (file_name.endswith(".json") and _uses_pickle(archive.read(name)))
                 or (file_name.endswith(".pt") and not _is_readable(archive.read(name)))
             ):
                 raise InputError(
@@ -237,13 +269,11 @@ def _require_plain_members(path: Path) -> None:
                 )
 
 
-def _uses_pickle(config: Any) -> bool:
-    """Return whether a value read from JSON has, at any depth, an entry use_pickle that is true."""
-    if isinstance(config, list):
-        return any(map(_uses_pickle, config))
-    if not isinstance(config, dict):
-        return False
-    return bool(config.get("use_pickle")) or any(map(_uses_pickle, config.values()))
+def _uses_pickle(content: bytes) -> bool:
+    """Return whether a JSON text has, at any depth, an entry use_pickle that is true."""
+    found: list[Any] = []
+    json.loads(content, object_hook=lambda entries: found.append(entries.get("use_pickle")))
+    return any(found)
 
 
 def _is_readable(content: bytes) -> bool:
@@ -297,10 +327,8 @@ def read_onnx(path: Path) -> Content:
     try:
         onnxruntime: Any = importlib.import_module("onnxruntime")
     except ImportError as error:
-        raise InputError(
-            f'name={path} needs onnxruntime: pip install "parametric-norm-balls[onnx]"',
-            "name",
-        ) from error
+        advice = 'pip install "parametric-norm-balls[onnx]"'
+        raise name_error(path, f"needs onnxruntime: {advice}") from error
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # Log errors and fatal errors.
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
@@ -310,7 +338,7 @@ def read_onnx(path: Path) -> Content:
     def logits(batch: np.ndarray) -> np.ndarray:
         return session.run(None, {images.name: batch.astype(np.float32)})[0]
 
-    return Content(Function(logits, ARRAYS), sizes)
+    return Function(logits, ARRAYS), sizes
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:

@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from hashlib import blake2b
 from typing import Any, TypeVar
 
@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
 
+from augment.distributed import rank
 from augment.progress import progress
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
 from renderer.errors import InputError, is_out_of_memory
@@ -173,43 +174,23 @@ def normalize_light(
     The result is differentiable almost everywhere.
     """
     linear = decode(clamp(images), "srgb")
-    balanced = linear * _balance(linear, settings.white_balance)
-    exposed = clamp(balanced * _exposure(balanced, settings))
-    encoded = encode(exposed, "srgb")
-    return _apply_gamma(encoded, settings.gamma)
-
-
-def _balance(linear: Float[Tensor, "N 3 H W"], degree: float) -> Float[Tensor, "N 3 1 1"]:
-    """Compute the factors of the white balance: (mean of all channels / mean of channel)^degree.
-
-    With degree 1 all channels get the same mean, and with 0 they stay as they are.
-    """
     channel_means = linear.mean((2, 3), keepdim=True)
     mean = channel_means.mean(1, keepdim=True)
     ratio = mean.clamp(min=DARKEST) / channel_means.clamp(min=DARKEST)
-    return ratio**degree
+    balanced = linear * ratio**settings.white_balance
 
-
-def _exposure(
-    linear: Float[Tensor, "N 3 H W"], settings: NormalizedLightSettings
-) -> Float[Tensor, "N 1 1 1"]:
-    """Compute the factors of the exposure, which map a percentile of an image to a given value."""
-    values = linear.flatten(1)
+    values = balanced.flatten(1)
     # The percentile is the value with this rank among the sorted values. Ranks start at 1.
     rank = math.ceil(settings.percentile / 100 * values.shape[1])
     bright = values.kthvalue(rank, dim=1).values
     factors = settings.level / bright.clamp(min=DARKEST)
-    return factors.view(-1, 1, 1, 1)
+    encoded = encode(clamp(balanced * factors.view(-1, 1, 1, 1)), "srgb")
 
-
-def _apply_gamma(encoded: Float[Tensor, "N 3 H W"], gamma: float) -> Tensor:
-    """Raise the values of images to a power, except that the curve is a line near black."""
-    if gamma == 1:
+    if settings.gamma == 1:
         return encoded
     # x^gamma is x · x^(gamma - 1). The second factor is constant below `DARKEST_ENCODED`, because
     # it would be infinite at 0 if gamma is less than 1.
-    factor = encoded.clamp(min=DARKEST_ENCODED) ** (gamma - 1)
-    return encoded * factor
+    return encoded * encoded.clamp(min=DARKEST_ENCODED) ** (settings.gamma - 1)
 
 
 class Function(nn.Module):
@@ -240,11 +221,9 @@ class Function(nn.Module):
 
         def note(module: nn.Module, _: object) -> None:
             # Transformations of images are modules in training mode, too, but have no weights.
-            has_weights = any(True for _ in module.parameters(recurse=False))
-            has_mode = isinstance(
-                module, nn.modules.dropout._DropoutNd | nn.modules.batchnorm._NormBase
-            )
-            if module.training and (has_weights or has_mode):
+            has_weights = next(module.parameters(recurse=False), None) is not None
+            kinds = nn.modules.dropout._DropoutNd | nn.modules.batchnorm._NormBase
+            if module.training and (has_weights or isinstance(module, kinds)):
                 in_training.append(type(module).__name__)
 
         hook = register_module_forward_pre_hook(note)
@@ -262,22 +241,21 @@ class Function(nn.Module):
 
     def _first_call(self, images: Tensor) -> Any:
         """Compute the scores of images, and find out what the function takes."""
-        failure = None
-        try:
-            scores = self.function(images)
-            if isinstance(scores, Tensor):
-                self.takes = TENSORS
-                return scores
-        except Exception as error:  # Users' functions raise errors of many kinds.
-            failure = error
-        for takes in (ARRAYS, DETACHED):
-            with suppress(Exception):
+        returned = None
+        failures = []
+        for takes in (TENSORS, ARRAYS, DETACHED):
+            try:
                 scores = self._call(images, takes)
+            except Exception as error:  # Users' functions raise errors of many kinds.
+                failures.append(error)
+                continue
+            if isinstance(scores, Tensor):
                 self.takes = takes
                 return scores
-        if failure is not None:
-            raise failure
-        return scores  # The caller raises an error, because this is not a tensor.
+            returned = scores
+        if len(failures) == 3:
+            raise failures[0]
+        return returned  # The caller raises an error, because this is not a tensor.
 
     def _call(self, images: Tensor, takes: str) -> Tensor:
         """Compute the scores of images in the form that the function takes."""
@@ -323,7 +301,9 @@ class Remembered(Network):
         self.outputs: dict[bytes, Tensor] = {}
 
     def forward(self, images: Tensor) -> Tensor:
-        keys = [_digest(image) for image in images.detach().cpu()]
+        key = str(images.dtype).encode()
+        contents = [image.numpy().tobytes() for image in images.detach().cpu()]
+        keys = [blake2b(content, digest_size=16, key=key).digest() for content in contents]
         # Index of each new image in the batch, by its hash. Equal images have one entry.
         new_images = {key: index for index, key in enumerate(keys) if key not in self.outputs}
         if new_images:
@@ -331,12 +311,6 @@ class Remembered(Network):
             outputs = self.network(images.detach()[indices])
             self.outputs.update(zip(new_images, outputs.detach(), strict=True))
         return torch.stack([self.outputs[key] for key in keys]).to(images)
-
-
-def _digest(image: Tensor) -> bytes:
-    """Return a hash of the dtype and the values of an image (3, H, W)."""
-    content = image.numpy().tobytes()
-    return blake2b(content, digest_size=16, key=str(image.dtype).encode()).digest()
 
 
 @torch.no_grad()
@@ -361,20 +335,13 @@ def compute_outputs(
         for batch in batches:
             moved = batch if device is None else batch.to(device)
             shown = to_unit(moved) if moved.dtype == torch.uint8 else moved
-            compute = partial(_outputs_of_rows, network, shown)
             # No images are a batch, too, which gives outputs their shape.
-            computed = limit.map(compute, len(shown) or 1)
+            count = len(shown) or 1
+            computed = limit.map(lambda rows, images=shown: network(images[rows]), count)
             # The network may compute in half precision.
             outputs += [output.to(shown.dtype) for output in computed]
     joined = torch.cat(outputs)
     return joined.unflatten(0, images.shape[:-3]) if isinstance(images, Tensor) else joined
-
-
-def _outputs_of_rows(
-    network: Callable[[Tensor], Tensor], images: Float[Tensor, "N 3 H W"], rows: slice
-) -> Tensor:
-    """Compute the outputs of some of the images."""
-    return network(images[rows])
 
 
 @dataclass
@@ -402,7 +369,7 @@ class BatchSize:
                 if self.images == 1 or not is_out_of_memory(error):
                     raise
                 self.images //= 2
-                warn_once(self.images)
+                say_once(f"memory ran out: {self.images} images per pass from now on")
             else:
                 yield result
                 begin = part.stop
@@ -410,13 +377,6 @@ class BatchSize:
             # Empty the cache outside of the `except` block, because the error refers to tensors
             # there.
             torch.cuda.empty_cache()
-
-
-@cache
-def warn_once(images: int) -> None:
-    """Warn that memory ran out and batches have fewer images, once for each number of images."""
-    logger = logging.getLogger(__name__)
-    logger.warning("memory ran out: the attack goes on with %d images per pass", images)
 
 
 @contextmanager
@@ -444,13 +404,78 @@ def frozen_eval_mode(network: nn.Module) -> Iterator[None]:
     The mode of each module, `requires_grad` of each parameter and the state of
     the global random generators are restored after the block.
     """
-    trainable = [parameter for parameter in network.parameters() if parameter.requires_grad]
     gpus = {parameter.device for parameter in network.parameters() if parameter.is_cuda}
-    for parameter in trainable:
-        parameter.requires_grad_(False)
+    random_state = torch.random.fork_rng(devices=sorted(gpus, key=str))
+    with gradient_flags_kept(network), eval_mode(network), random_state:
+        network.requires_grad_(False)
+        yield
+
+
+def device_of(network: object) -> torch.device:
+    """Return the device of the parameters of a network. It is the CPU if there are none."""
+    parameters = network.parameters() if isinstance(network, nn.Module) else iter(())
+    first = next(parameters, None)
+    return torch.device("cpu") if first is None else first.device
+
+
+@contextmanager
+def gradient_flags_kept(network: object) -> Iterator[None]:
+    """Restore `requires_grad` of all parameters of a network at the end of a `with` block."""
+    parameters = list(network.parameters()) if isinstance(network, nn.Module) else []
+    flags = [parameter.requires_grad for parameter in parameters]
     try:
-        with eval_mode(network), torch.random.fork_rng(devices=sorted(gpus, key=str)):
-            yield
+        yield
     finally:
-        for parameter in trainable:
-            parameter.requires_grad_(True)
+        for parameter, flag in zip(parameters, flags, strict=True):
+            parameter.requires_grad_(flag)
+
+
+def own_size(network: object) -> int | None:
+    """Return the pixels per side that a transformer of torchvision or timm was built for.
+
+    Its position embeddings have a fixed size. None for any other network.
+    """
+    for module in network.modules() if isinstance(network, nn.Module) else ():
+        for size in (getattr(module, "image_size", None), getattr(module, "img_size", None)):
+            found = size[0] if isinstance(size, tuple) and size else size
+            if isinstance(found, int):
+                return found
+    return None
+
+
+def say_inputs(name: str, network: Any, size: int, assumed: Sequence[str] = ()) -> None:
+    """Log the size and the normalization of the images of a network, once for each text.
+
+    `assumed` are the arguments that neither the user nor the network gave.
+    """
+    text = f"network {name}: images of {size} × {size} pixels, "
+    text += normalization_of(network) or "values in [0, 1], not normalized before the network"
+    if assumed:
+        are = " and ".join(assumed) + (" is assumed" if len(assumed) == 1 else " are assumed")
+        text += f"; {are}: give {'it' if len(assumed) == 1 else 'them'} if the network needs others"
+    if rank() == 0:
+        say_once(text)
+
+
+@cache
+def say_once(text: str) -> None:
+    """Log a text, which is shown without any settings of `logging`."""
+    logging.getLogger(__name__).warning(text)
+
+
+def normalization_of(network: Any) -> str:
+    """Describe the first mean and standard deviation of three channels in a network, if any."""
+    for module in network.modules() if isinstance(network, nn.Module) else ():
+        mean, std = (_channels(getattr(module, name, None)) for name in ("mean", "std"))
+        if mean and std:
+            order = " of blue, green and red" if getattr(module, "bgr", False) else ""
+            return f"normalized by mean {mean} and std {std}{order}"
+    return ""
+
+
+def _channels(value: Any) -> str:
+    """Write three numbers, such as "(0.485, 0.456, 0.406)". Any other value gives ""."""
+    if not isinstance(value, Tensor | list | tuple):
+        return ""
+    numbers = torch.as_tensor(value).flatten().tolist()
+    return f"({', '.join(f'{number:.3g}' for number in numbers)})" if len(numbers) == 3 else ""

@@ -30,18 +30,10 @@ from augment.attack_settings import (
     StepSettings,
 )
 from augment.attacks.loop import minimize
-from augment.attacks.norm_ball import NormBalls, sample
 from augment.attacks.objective import Criterion, Objective
-from augment.attacks.optimizers import Gradient, Optimizer
-from augment.classifier import Classifier
-from augment.network import Network, Quantization, frozen_eval_mode
-from augment.plain_networks import (
-    UNIT_RANGE,
-    Normalization,
-    as_classifier,
-    device_of,
-    gradient_flags_kept,
-)
+from augment.attacks.optimizers import Gradient, NormBalls, Optimizer, sample
+from augment.classifier import UNIT_RANGE, Classifier, Normalization, as_classifier
+from augment.network import Network, Quantization, device_of, frozen_eval_mode, gradient_flags_kept
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.patterns import draw_slides, interpolate_smoothly, luminance

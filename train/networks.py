@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment import distributed
+from augment.files import as_facts
 from augment.network import ChannelNormalization, Network, eval_mode
-from augment.plain_networks import as_facts
 from augment.sources import build_classifier, call_python, require_architecture
 from renderer.errors import InputError, single_line
 from train.train_settings import WIDERESNET

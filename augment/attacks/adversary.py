@@ -9,24 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from augment.attacks.objective import Examples, Images, Values
 from augment.attacks.problem import SceneProblem
 from augment.progress import progress
 from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.scene import Scene
+from renderer import errors
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.errors import (
-    MAX_SCALE,
-    InputError,
-    as_folder,
-    require_bounded,
-    require_file,
-    require_range,
-    single_line,
-)
+from renderer.errors import MAX_SCALE, InputError
 from renderer.image import to_bytes
 from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.io.images import gray_or_image, write_image
@@ -198,25 +192,19 @@ def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> S
     """
     mesh = item.mesh
     albedo_scale = item.albedo_scale
-    if changed.albedo is not None:
-        added_albedo = _as_numpy(changed.albedo)
-        hue = None if changed.hue is None else _as_numpy(changed.hue)
-        mesh, albedo_scale = with_added_albedo(mesh, added_albedo, encoding, albedo_scale, hue)
-    if changed.vertices is not None:
-        mesh = replace(mesh, vertices=_as_numpy(changed.vertices))
+    arrays = {}
+    for name in ("albedo", "hue", "vertices"):
+        values = getattr(changed, name)
+        arrays[name] = None if values is None else values.detach().cpu().double().numpy()
+    if arrays["albedo"] is not None:
+        mesh, albedo_scale = with_added_albedo(
+            mesh, arrays["albedo"], encoding, albedo_scale, arrays["hue"]
+        )
+    if arrays["vertices"] is not None:
+        mesh = replace(mesh, vertices=arrays["vertices"])
     if changed.gloss is not None:
         mesh = Gloss(*changed.gloss.unbind(1), textured=True).on(mesh)
     return replace(item, mesh=mesh, albedo_scale=albedo_scale)
-
-
-def _as_numpy(values: Tensor) -> np.ndarray:
-    """Convert a tensor to an array of float64."""
-    return values.detach().cpu().double().numpy()
-
-
-def _exact_numpy(values: Tensor) -> np.ndarray:
-    """Convert a tensor on the CPU to an array. NumPy has no bfloat16, which becomes float32."""
-    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
 
 
 def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
@@ -229,58 +217,58 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     folder.mkdir(parents=True, exist_ok=True)
     shown = adversary.shown
     settings = adversary.settings
-    export_mesh(shown.mesh, folder / MESH, settings.normals, adversary.cameras, shown.own)
+    cameras = adversary.cameras
+    export_mesh(shown.mesh, folder / MESH, settings.normals, cameras, shown.own)
     (_, light), *local_lights = save_lights(folder, adversary.light, adversary.basis)
-    local_light_names = [basis.name for basis, _ in local_lights]
-    background = _write_background(adversary.background, folder)
+    background: float | str = float(adversary.background.flatten()[0])
+    if (adversary.background != background).any():
+        background = BACKGROUND
+        _write_png(folder / BACKGROUND, adversary.background.expand(3, -1, -1))
     if adversary.pixels is not None:
-        write_numbers(folder / PIXELS, _exact_numpy(adversary.pixels))
-    _write_views(adversary.images_in_views_before, folder, BEFORE)
-    _write_views(adversary.images_in_views, folder, AFTER)
-    description = _describe(adversary, local_light_names, background)
+        write_numbers(folder / PIXELS, _as_numpy(adversary.pixels))
+    # NAME.npy has the exact values of all views, and NAME_0.png and so on have 8 bits.
+    views = {BEFORE: adversary.images_in_views_before, AFTER: adversary.images_in_views}
+    for name, images in views.items():
+        write_numbers(folder / f"{name}.npy", _as_numpy(images))
+        for view, image in enumerate(images):
+            _write_png(folder / f"{name}_{view}.png", image)
+    description = {
+        "label": str(shown.label),
+        "name": Path(shown.name).name,
+        "own_faces": shown.own,
+        "albedo_scale": shown.albedo_scale,
+        "gloss": shown.mesh.gloss is not None,
+        "local_lights": [basis.name for basis, _ in local_lights],
+        "background": background,
+        "cameras": [asdict(camera) for camera in cameras],
+        "image": asdict(settings),
+        "pixels": adversary.pixels is not None,
+    }
     atomic_write(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
 
     radiance = to_map(light, MAP_HEIGHT)
     if radiance.min() >= -RGBE_TOLERANCE * radiance.max():
         for suffix in (".hdr", ".exr"):
             write_map(folder / f"light{suffix}", radiance)
-    write_mitsuba_scene(
-        folder / MITSUBA,
-        shown.mesh,
-        shown.albedo_scale,
-        adversary.cameras,
-        settings,
-        "light.exr",
-        local_lights,
-    )
-    write_map(folder / MITSUBA / "light.exr", mitsuba_map(light, MAP_HEIGHT).clamp(min=0))
+    mitsuba = folder / MITSUBA
+    scale = shown.albedo_scale
+    write_mitsuba_scene(mitsuba, shown.mesh, scale, cameras, settings, "light.exr", local_lights)
+    write_map(mitsuba / "light.exr", mitsuba_map(light, MAP_HEIGHT).clamp(min=0))
     return {"negative_light": negative_fraction(radiance)}
 
 
-def _describe(
-    adversary: Adversary, local_light_names: list[str], background: float | str
-) -> dict[str, Any]:
-    """Return the content of adversary.json, which has all that is in no other file."""
-    shown = adversary.shown
-    return {
-        "label": str(shown.label),
-        "name": Path(shown.name).name,
-        "own_faces": shown.own,
-        "albedo_scale": shown.albedo_scale,
-        "gloss": shown.mesh.gloss is not None,
-        "local_lights": local_light_names,
-        "background": background,
-        "cameras": [asdict(camera) for camera in adversary.cameras],
-        "image": asdict(adversary.settings),
-        "pixels": adversary.pixels is not None,
-    }
+def _as_numpy(values: Tensor) -> np.ndarray:
+    """Convert a tensor on the CPU to an array. NumPy has no bfloat16, which becomes float32."""
+    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
+
+
+def _write_png(path: Path, image: Float[Tensor, "3 size size"]) -> None:
+    """Write an image with 8 bits per channel."""
+    write_image(path, Image.fromarray(to_bytes(image).permute(1, 2, 0).numpy()))
 
 
 def save_lights(
-    folder: Path,
-    light: Float[Tensor, "_ 3"],
-    basis: Basis,
-    when: str = "",
+    folder: Path, light: Float[Tensor, "_ 3"], basis: Basis, when: str = ""
 ) -> list[tuple[Any, Tensor]]:
     """Write the environment light to light.json, and each local light to a file of its name.
 
@@ -295,31 +283,6 @@ def save_lights(
         save_light(folder / f"{name}{when}.json", coefficients, basis_of_light)
         lights.append((basis_of_light, coefficients))
     return lights
-
-
-def _write_background(background: Float[Tensor, "_ size size"], folder: Path) -> float | str:
-    """Write a background to an image file, except if all its values are the same.
-
-    Return the value of all pixels, or the name of the written file.
-    """
-    gray = float(background.flatten()[0])
-    if (background == gray).all():
-        return gray
-    pixels = to_bytes(background.expand(3, -1, -1)).permute(1, 2, 0)
-    write_image(folder / BACKGROUND, Image.fromarray(pixels.numpy()))
-    return BACKGROUND
-
-
-def _write_views(images: Float[Tensor, "V 3 size size"], folder: Path, name: str) -> None:
-    """Write the images of the V views of an adversary.
-
-    NAME.npy has the exact values of all views. NAME_0.png, NAME_1.png and so on have one view
-    each, with 8 bits per channel.
-    """
-    write_numbers(folder / f"{name}.npy", _exact_numpy(images))
-    for view, image in enumerate(to_bytes(images)):
-        pixels = image.permute(1, 2, 0).numpy()
-        write_image(folder / f"{name}_{view}.png", Image.fromarray(pixels))
 
 
 def reload(folder: str | Path) -> Adversary:
@@ -341,9 +304,9 @@ def reload(folder: str | Path) -> Adversary:
         >>> bool((adversary.render() - result.images[0]).abs().max() < 1e-5)
         True
     """
-    folder = as_folder("folder", folder)
+    folder = errors.as_folder("folder", folder)
     path = folder / DESCRIPTION
-    require_file(path, "give a folder that an attack wrote, such as .../example_000")
+    errors.require_file(path, "give a folder that an attack wrote, such as .../example_000")
     try:
         return _read_adversary(folder, json.loads(path.read_text(encoding="utf-8")))
     except InputError as error:
@@ -353,34 +316,37 @@ def reload(folder: str | Path) -> Adversary:
         raise InputError(str(error) if is_named else f"{path}: {error}") from error
     # A damaged file, or JSON of another kind, can raise errors of many types here.
     except Exception as error:
-        message = f"{path} does not describe an adversary ({single_line(error)}): write it again"
+        message = (
+            f"{path} does not describe an adversary ({errors.single_line(error)}): write it again"
+        )
         raise InputError(message) from error
 
 
 def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     """Read the files of an adversary."""
+    from renderer.io.meshes import load_mesh  # Importing trimesh takes half a second.
+
     settings = ImageSettings(**description["image"])
     cameras = tuple(_camera(camera) for camera in description["cameras"])
-    attacked_object = _read_object(folder, description)
+    mesh = load_mesh(folder / MESH, gloss=bool(description["gloss"]))
+    albedo_scale = float(description["albedo_scale"])
+    errors.require_range("albedo_scale", albedo_scale, 1 / MAX_SCALE, MAX_SCALE)
+    own_faces = description["own_faces"]
+    errors.require_range("own_faces", own_faces, 1, len(mesh.faces))
+    label, name = str(description["label"]), str(description["name"])
     for camera in cameras:
         # This raises InputError if the camera is inside of the mesh.
-        camera.depths(attacked_object.mesh.vertices)
-    local_lights = []
-    for name in description["local_lights"]:
-        path = folder / f"{Path(name).name}.json"
-        local_lights.append(read_light(path, *LOCAL_LIGHTS.values()))
+        camera.depths(mesh.vertices)
+    paths = [folder / f"{Path(light).name}.json" for light in description["local_lights"]]
+    local_lights = [read_light(path, *LOCAL_LIGHTS.values()) for path in paths]
     sky = load_light(str(folder / LIGHT), degree=None)
     basis, light = with_local_lights(sky, local_lights)
     background = description["background"]
     if isinstance(background, str):
         background = folder / BACKGROUND
     shape = (len(cameras), 3, settings.size, settings.size)
-    # An attack on single pixels also stores the offset of each pixel value.
-    pixel_offsets = None
-    if description["pixels"]:
-        pixel_offsets = _read_images(folder / PIXELS, shape)
     return Adversary(
-        shown=attacked_object,
+        shown=SceneObject(label, mesh, albedo_scale, name, own_faces),
         cameras=cameras,
         light=light,
         basis=basis,
@@ -388,7 +354,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
         settings=settings,
         images_in_views_before=_read_images(folder / f"{BEFORE}.npy", shape),
         images_in_views=_read_images(folder / f"{AFTER}.npy", shape),
-        pixels=pixel_offsets,
+        pixels=_read_images(folder / PIXELS, shape) if description["pixels"] else None,
     )
 
 
@@ -400,46 +366,24 @@ def _camera(fields: dict[str, Any]) -> Camera:
     return kind(**fields)
 
 
-def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:
-    """Read the attacked object of an adversary."""
-    from renderer.io.meshes import load_mesh  # Importing trimesh takes half a second.
-
-    mesh = load_mesh(folder / MESH, gloss=bool(description.get("gloss")))
-    own_faces = description["own_faces"]
-    own_faces = None if own_faces is None else int(own_faces)
-    albedo_scale = float(description["albedo_scale"])
-    require_range("albedo_scale", albedo_scale, 1 / MAX_SCALE, MAX_SCALE)
-    require_range("own_faces", own_faces, 1, len(mesh.faces))
-    return SceneObject(
-        str(description["label"]),
-        mesh,
-        albedo_scale,
-        str(description["name"]),
-        own_faces,
-    )
-
-
 def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
     """Read images from a .npy file."""
-    require_file(path, "write the adversary again")
+    errors.require_file(path, "write the adversary again")
     try:
         images = torch.from_numpy(read_numbers(path))
-        require_bounded(images=images)
+        errors.require_bounded(images=images)
         if images.shape != shape:
             raise InputError(f"the images have shape {tuple(images.shape)}, not {shape}")
     # A damaged file may raise many types of errors.
     except Exception as error:
-        message = f"{path} cannot be read ({single_line(error)}): write the adversary again"
+        message = f"{path} cannot be read ({errors.single_line(error)}): write the adversary again"
         raise InputError(message) from error
     return images
 
 
 def final_images(
-    problem: SceneProblem,
-    values: Float[Tensor, "A D"],
-    examples: Int[Tensor, " A"],
-    images: Float[Tensor, "A V 3 size size"],
-) -> Float[Tensor, "A V 3 size size"]:
+    problem: SceneProblem, values: Values, examples: Examples, images: Images
+) -> Images:
     """Return the images after a search, with the shadows and bounces of the attacked shape.
 
     A search that changes shape, colors or gloss computes shadows and bounces
@@ -448,10 +392,9 @@ def final_images(
     """
     scene = problem.scene
     conditions = problem.conditions(values, examples)
-    surface_changes = (conditions.vertices, conditions.albedo, conditions.gloss)
-    has_changed_surface = any(change is not None for change in surface_changes)
-    needs_renders = has_changed_surface and scene.settings.global_illumination
-    if not needs_renders or not len(examples):
+    changes = (conditions.vertices, conditions.albedo, conditions.gloss)
+    has_changed_surface = any(change is not None for change in changes)
+    if not (has_changed_surface and scene.settings.global_illumination and len(examples)):
         return images
     rendered = []
     for row, example in enumerate(progress(examples.tolist(), "final images")):

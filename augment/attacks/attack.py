@@ -1,11 +1,13 @@
-"""The function `attack`, which attacks a classifier through a scene."""
+"""The function `attack`, which attacks a classifier through a scene, and a search for a scene."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from numbers import Integral
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -13,28 +15,55 @@ from torch import Tensor
 
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings, StepSettings
 from augment.attacks.adversary import final_images
-from augment.attacks.loop import Minimum, minimize
-from augment.attacks.objective import NOISE_DRAWS, Criterion, Objective, preprocessed_model
-from augment.attacks.problem import (
-    SceneProblem,
-    build_problem,
-    source_labels,
-    warn_of_changed_light,
-)
+from augment.attacks.loop import minimize
+from augment.attacks.objective import NOISE_DRAWS, Criterion, Objective
+from augment.attacks.problem import build_problem, source_labels, warn_of_changed_light
 from augment.attacks.result import ZERO_GRADIENT, AttackResult
-from augment.classifier import Classifier, class_index, remembering
-from augment.network import compute_outputs
-from augment.plain_networks import UNIT_RANGE, Normalization, as_classifier, gradient_flags_kept
-from augment.progress import Phases
+from augment.classifier import (
+    UNIT_RANGE,
+    Classifier,
+    Normalization,
+    as_classifier,
+    class_index,
+    remembering,
+)
+from augment.network import gradient_flags_kept
+from augment.progress import Phases, progress
 from augment.random_streams import generator
 from augment.scene.build import with_needed_degree
 from augment.scene.scene import Scene
-from augment.settings import NormalizeLight
+from augment.settings import NormalizeLight, SceneSettings
 from renderer.errors import InputError, as_list, is_whole, require_flag, require_kind, require_whole
+from renderer.light.basis import harmonics_of
+from renderer.light.files import PROBES, UNIFORM, load_light
 
 # `attack(..., target="least_likely")` makes the target the class with the lowest confidence
 # before the attack.
 LEAST_LIKELY = "least_likely"
+# `_with_random_camera` draws the polar angle of a camera from the range `POLAR`, in degrees, and
+# the width of the visible region from the range `WIDTH`, in world units.
+POLAR = (20.0, 100.0)
+WIDTH = (1.8, 3.5)
+
+# Smallest distance of a random perspective camera from the origin, in world units. A
+# normalized mesh lies within this distance, so the camera is outside of the mesh.
+CLOSEST = 2.0
+
+# If the camera of the scene is orthographic, every second camera that the search tries is a
+# perspective camera with this field of view in degrees.
+FOV = 45.0
+
+# Gray value of the background that the search tries, like that of product photographs.
+LIGHT_GRAY = 0.9
+
+# Exposures that are tried, as factors of the exposure of the scene.
+EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)
+
+# The search for a scene ends when the classifier gives the true class at least this probability
+# in all images.
+CONFIDENCE_TO_STOP = 0.5
+
+Settings = TypeVar("Settings", bound=SceneSettings)
 
 
 def attack(
@@ -150,35 +179,47 @@ def _attack(
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
     has_gradients = classifier.is_differentiable(scene.lights)
-    settings = with_optimizer(settings, classifier, has_gradients)
+    if settings.optimizer is None and not has_gradients:
+        settings = replace(settings, optimizer=RANDOM_SEARCH)
+        # `stacklevel` makes Python name the user's call of `attack` in the warning.
+        warnings.warn(
+            f"classifier {classifier.name} has no gradients: random search attacks it with at most "
+            f"{settings.query_limit} queries for each example (max_queries, optimizer)",
+            stacklevel=3,
+        )
     if not has_gradients:
         # Classify each image once only, because a function without gradients may be slow.
         classifier = remembering(classifier)
     scene = with_needed_degree(scene, settings.material)
     problem = build_problem(settings, scene)
-    # `stacklevel` makes Python name the user's call of `attack` in the warning.
     warn_of_changed_light(scene, problem.scene, stacklevel=4)
 
     images_before = problem.images(problem.start)
-    model = preprocessed_model(settings, classifier)
-    logits_before = compute_outputs(model, images_before, settings.batch_size)
-    source = source_labels(scene, logits_before, classifier)
+    source = source_labels(scene, images_before.device, classifier)
+    phases = Phases(images_before.device)
+    objective = Objective(classifier, Criterion(source), settings, seed, phases)
+    logits_before = objective.logits(images_before)
     if not force:
         require_clean_correct(scene, logits_before, source, classifier)
     criterion = Criterion(source, target_labels(target, source, logits_before, classifier))
-
-    phases = Phases(problem.start.device)
-    objective = Objective(classifier, criterion, settings, seed, phases)
+    objective.criterion = criterion
     with phases("attack"):
-        restarts = random_starts(problem, settings.restarts, seed)
+        numbers = range(1, settings.restarts + 1)
+        restarts = (problem.sample(generator(seed, number, "restart")) for number in numbers)
         minimum = minimize(problem, objective, restarts=restarts)
         images = final_images(problem, minimum.values, problem.all_examples, minimum.images)
 
     if minimum.zero_gradient.any():
         warnings.warn(ZERO_GRADIENT, stacklevel=3)
 
-    logits = objective.logits(images)
-    success_in_views = objective.fooled_in_views(images, logits.argmax(2), problem.all_examples)
+    logits, success_in_views, _ = objective.judge(images, problem.all_examples)
+    # Images that the search or `final_images` showed to the classifier.
+    queries = minimum.queries + scene.views * (images is not minimum.images)
+    if settings.sensor_noise:
+        # `fooled_in_views` tests an example with noise if at least one view meets the
+        # criterion. It then classifies all views of the example in each draw of the noise.
+        is_tested = criterion.reached_in_views(logits.argmax(2)).any(1)
+        queries += NOISE_DRAWS * scene.views * is_tested
     return AttackResult(
         problem=problem,
         classifier=classifier,
@@ -191,54 +232,13 @@ def _attack(
         logits_in_views=logits,
         success_in_views=success_in_views,
         minimum=minimum,
-        queries=_count_queries(minimum, images, logits.argmax(2), criterion, settings),
+        queries=queries,
         seconds=phases.take(),
     )
 
 
-def with_optimizer(
-    settings: AttackSettings, classifier: Classifier, has_gradients: bool
-) -> AttackSettings:
-    """Choose random search for a classifier without gradients, and warn."""
-    if settings.optimizer is not None or has_gradients:
-        return settings
-    chosen = replace(settings, optimizer=RANDOM_SEARCH)
-    # `stacklevel` makes Python name the user's call of `attack` in the warning.
-    warnings.warn(
-        f"classifier {classifier.name} has no gradients: random search attacks it with at most "
-        f"{chosen.query_limit} queries for each example (max_queries, optimizer)",
-        stacklevel=4,
-    )
-    return chosen
-
-
-def _count_queries(
-    minimum: Minimum,
-    images: Float[Tensor, "E V 3 size size"],
-    predicted: Int[Tensor, "E V"],
-    criterion: Criterion,
-    settings: AttackSettings,
-) -> Int[Tensor, " E"]:
-    """Count the different images of each example that an attack showed to the classifier."""
-    view_count = images.shape[1]
-    queries = minimum.queries.clone()
-    # `final_images` may render images again that differ from those of the search. The
-    # classifier saw them, too.
-    if images is not minimum.images:
-        queries += view_count
-    if settings.sensor_noise:
-        # `fooled_in_views` tests an example with noise if at least one view meets the
-        # criterion. It then classifies all views of the example in each draw of the noise.
-        is_tested = criterion.reached_in_views(predicted).any(1)
-        queries += NOISE_DRAWS * view_count * is_tested
-    return queries
-
-
 def require_clean_correct(
-    scene: Scene,
-    logits: Float[Tensor, "E V C"],
-    source: Int[Tensor, "E V"],
-    classifier: Classifier,
+    scene: Scene, logits: Float[Tensor, "E V C"], source: Int[Tensor, "E V"], classifier: Classifier
 ) -> None:
     """Check that every image of a scene is classified correctly.
 
@@ -249,17 +249,15 @@ def require_clean_correct(
         return
     example, view = misclassified[0]
     item = scene.objects[scene.examples[example].object]
-    shown_count = min(5, len(classifier.classes))
-    confidences, classes = logits[example, view].softmax(0).topk(shown_count)
-    most_probable = [
-        f"{classifier.classes[index]} {confidence:.1%}"
-        for confidence, index in zip(confidences.tolist(), classes.tolist(), strict=True)
-    ]
-    wrong = f"{len(misclassified)} of {source.numel()} images"
+    highest = logits[example, view].softmax(0).topk(min(5, len(classifier.classes)))
+    pairs = zip(highest.values.tolist(), highest.indices.tolist(), strict=True)
+    most_probable = ", ".join(
+        f"{classifier.classes[index]} {confidence:.1%}" for confidence, index in pairs
+    )
     raise InputError(
-        f"force=False, and {wrong} are not classified as their class before any attack "
-        f"(the first, of {item.name}, class {item.label!r}: {', '.join(most_probable)}): "
-        "change the scene, or set force=True",
+        f"force=False, and {len(misclassified)} of {source.numel()} images are not classified as "
+        f"their class before any attack (the first, of {item.name}, class {item.label!r}: "
+        f"{most_probable}): change the scene, or set force=True",
         "force",
     )
 
@@ -279,16 +277,20 @@ def target_labels(
     if isinstance(target, str) and target == LEAST_LIKELY:
         return logits.argmin(2)
     view_count = logits.shape[1]
-    is_one_class = isinstance(target, str) or is_whole(target)
-    names = _targets([target] * view_count if is_one_class else target)
+    names = [target] * view_count
+    if not isinstance(target, str) and not is_whole(target):
+        advice = "the name or the index of a class, or one for each view"
+        names = as_list("target", target, str | Integral, advice)
     if len(names) != view_count:
         raise InputError(
-            f"target={names} names "
-            f"{len(names)} classes for {view_count} views of each example: "
-            "give one class for each view, and build the scene with shared=True",
+            f"target={names} names {len(names)} classes for {view_count} views of each example: "
+            "give one class for each view, and build the scene with shared=True"
         )
-    indices = [class_index(classifier.classes, name, f"target={name}") for name in names]
-    labels = torch.tensor(indices, device=logits.device).expand(len(logits), view_count)
+    labels = torch.empty_like(source)
+    for view, name in enumerate(names):
+        # An integer of NumPy is no `int`.
+        known = name if isinstance(name, str) else int(name)
+        labels[:, view] = class_index(classifier.classes, known, f"target={name}")
     if torch.eq(labels, source).any():
         raise InputError(
             f"target={target} is the true class of an example: choose another target class"
@@ -296,15 +298,127 @@ def target_labels(
     return labels
 
 
-def _targets(target: object) -> list[str | int]:
-    """Return a list of names and indices of classes, or raise InputError if it is not a list."""
-    advice = "the name or the index of a class, or one for each view"
-    names = as_list("target", target, str | Integral, advice)
-    # An integer of NumPy is no `int`.
-    return [name if isinstance(name, str) else int(name) for name in names]
+def find_scene(
+    classifier: Classifier,
+    settings: Settings,
+    attack_settings: AttackSettings,
+    build: Callable[[Settings], Scene],
+    cameras: int,
+    draws: torch.Generator,
+) -> Settings:
+    """Search for a scene whose images a classifier recognizes before the attack.
+
+    The search tries several cameras. Each is tried in the light of the scene, in the built-in
+    environments and in uniform light, with several exposures, and also in front of a light gray
+    background. It ends when the classifier gives the true class a probability of at least
+    `CONFIDENCE_TO_STOP` in all images. The given settings are returned if the classifier is right
+    in all their images, or if no other scene is recognized.
+    """
+    [confidence] = _confidences(build(settings), attack_settings, classifier)
+    # `_confidences` returns 0 if an image is misclassified.
+    if confidence > 0:
+        return settings
+    highest = 0.0
+    best_settings = settings
+    for candidate in progress(_candidates(settings, cameras, draws), "search for a scene"):
+        confidence, lit_candidate = _best_light(
+            build(candidate), candidate, attack_settings, classifier
+        )
+        if confidence > highest:
+            highest = confidence
+            best_settings = lit_candidate
+        if highest >= CONFIDENCE_TO_STOP:
+            break
+    return best_settings
 
 
-def random_starts(problem: SceneProblem, count: int, seed: int) -> Iterator[Tensor]:
-    """Draw the initial attack values of restarts from the norm-balls."""
-    for number in range(1, count + 1):
-        yield problem.sample(generator(seed, number, "restart"))
+def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Iterator[Settings]:
+    """Yield copies of the settings of a scene with different cameras and backgrounds.
+
+    If the only background is a gray value, each camera is used twice: with this
+    background and with a light gray one.
+    """
+    has_one_gray = len(settings.backgrounds) == 1 and not isinstance(settings.backgrounds[0], str)
+    for index in range(cameras):
+        candidate = settings
+        if index > 0:
+            becomes_perspective = settings.fov is None and index % 2 == 1
+            fov = FOV if becomes_perspective else settings.fov
+            candidate = _with_random_camera(replace(settings, fov=fov), draws)
+        yield candidate
+        if has_one_gray:
+            yield replace(candidate, backgrounds=[LIGHT_GRAY])
+
+
+def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
+    """Return a copy of a scene's settings with a camera at a random place.
+
+    The field of view stays the same, or the camera stays orthographic.
+    """
+    polar, azimuth, width = torch.rand(3, generator=draws).tolist()
+    lowest_polar, highest_polar = POLAR
+    narrowest, widest = WIDTH
+    if settings.fov is not None:
+        # Width of what a perspective camera sees at the origin if it is `CLOSEST` away. A
+        # smaller width would bring the camera closer.
+        closest_width = 2 * CLOSEST * math.tan(math.radians(settings.fov) / 2)
+        narrowest = max(narrowest, closest_width)
+        widest = max(widest, 2 * closest_width)
+    return replace(
+        settings,
+        polar=round(lowest_polar + (highest_polar - lowest_polar) * polar, 1),
+        azimuth=round(360 * azimuth, 1),
+        width=round(narrowest + (widest - narrowest) * width, 2),
+    )
+
+
+def _best_light(
+    scene: Scene, settings: Settings, attack_settings: AttackSettings, classifier: Classifier
+) -> tuple[float, Settings]:
+    """Find the light and the exposure in which a classifier recognizes a scene best.
+
+    Return the confidence (the lowest probability of the true class in all images, or 0 if one is
+    misclassified), and the settings that give it.
+    """
+    degree = harmonics_of(scene.basis).degree
+    candidates = []
+    coefficients = []
+    for name in dict.fromkeys([settings.light, *PROBES, UNIFORM]):
+        light = load_light(name, degree)
+        for factor in EXPOSURES:
+            exposure = settings.exposure * factor
+            candidates.append(replace(settings, light=name, exposure=exposure))
+            coefficients.append(light * exposure)
+    # Put all candidates into one scene, so that they are rendered and classified in large batches.
+    # Example n · E + e is example e of the scene in light n.
+    count = len(candidates)
+    skies = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(scene.lights.device)
+    # The first coefficients of an example are its environment light, and the others its projector
+    # and lamps.
+    local_lights = scene.lights.repeat(count, 1, 1)[:, skies.shape[1] :]
+    lights = torch.cat([skies, local_lights], dim=1)
+    scene_of_candidates = scene.changed(examples=[*scene.examples] * count, lights=lights)
+    highest, index = _confidences(scene_of_candidates, attack_settings, classifier, count).max(0)
+    return float(highest), candidates[index]
+
+
+@torch.no_grad()
+def _confidences(
+    scene: Scene, attack_settings: AttackSettings, classifier: Classifier, groups: int = 1
+) -> Float[Tensor, " groups"]:
+    """Compute how surely a classifier recognizes each group of examples before an attack.
+
+    The confidence of an image is the probability of its true class, or 0 if the image is
+    misclassified. The confidence of a group is the lowest one of its images. Each group has
+    E / groups successive examples.
+    """
+    problem = build_problem(attack_settings, scene)
+    images = problem.images(problem.start)
+    labels = source_labels(scene, images.device, classifier)
+    # Probability of each of the C classes in each view of each example, shape (E, V, C).
+    probabilities = (
+        Objective(classifier, Criterion(labels), attack_settings).logits(images).softmax(2)
+    )
+    confidence = probabilities.gather(2, labels[..., None])[..., 0]
+    is_correct = probabilities.argmax(2) == labels
+    return (confidence * is_correct).view(groups, -1).amin(1)

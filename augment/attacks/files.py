@@ -28,6 +28,18 @@ JPEG_QUALITY = 90
 # Renderers that `save` may use to render the saved files again.
 RENDERERS = ("reload", MITSUBA)
 
+# Entries of attack.jsonl that are attributes of `AttackResult`.
+NUMBERS = (
+    "clean_correct",
+    "success_before",
+    "success",
+    "success_without_noise",
+    "success_with_margin",
+    "success_in_views",
+    "steps",
+    "queries",
+    "backward_passes",
+)
 # Smallest width in pixels of an image in the figure of an example. Smaller images are enlarged by
 # a whole factor.
 SIDE = 192
@@ -85,11 +97,25 @@ def save(
     require_renderers(verify)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"example_{example:03d}" for example in range(len(result.images_in_views))]
+    lines = [_write_example(result, *pair) for pair in enumerate(progress(paths, "saving"))]
 
-    lines = _write_examples(result, paths)
-    versions = _versions(result, paths, verify)
-    for example, line in enumerate(lines):
-        line["versions"] = {name: numbers[example] for name, numbers in versions.items()}
+    images = result.images_in_views.cpu()
+    versions = {
+        "float": images,
+        "8 bits": to_unit(to_bytes(images)),
+        f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY),
+    }
+    rasterizer = result.problem.scene.rasterizer
+    if verify:
+        rendered = []
+        for path in progress(paths, "rendering the saved files"):
+            rendered.append(render_again(path, verify, rasterizer))
+        for name in verify:
+            versions[name] = torch.stack([by_renderer[name] for by_renderer in rendered])
+    for name, version in versions.items():
+        numbers = _numbers_of_version(result, version.to(result.images_in_views))
+        for line, numbers_of_example in zip(lines, numbers, strict=True):
+            line["versions"][name] = numbers_of_example
 
     all_lines = list(lines)
     if checks is not None:
@@ -108,93 +134,38 @@ def require_renderers(names: Sequence[str]) -> None:
             pass
 
 
-def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[str, Any]]:
-    """Write the figure and the folder of each example.
+def _write_example(result: AttackResult, example: int, path: Path) -> dict[str, Any]:
+    """Write the figure and the folder of an example.
 
-    Return the numbers of each example for attack.jsonl, without the key "versions".
+    Return its numbers for attack.jsonl, where the dictionary "versions" is empty.
     """
     problem = result.problem
     scene = problem.scene
-    conditions_before = problem.conditions(problem.start, problem.all_examples)
-    conditions_after = result.conditions
-    lines = []
-    for example, path in enumerate(progress(paths, "saving")):
-        write_image(path.with_suffix(".png"), figure(result, example))
-        adversary = Adversary.of(
-            scene,
-            example,
-            conditions_after,
-            before=result.images_in_views_before[example],
-            images=result.images_in_views[example],
-        )
-        light_numbers = write_adversary(adversary, path)
-        exposure = scene.examples[example].exposure
-        light_before = conditions_before.light[example].cpu() * exposure
-        save_lights(path, light_before, scene.basis_under(conditions_before, example), "_before")
-        lines.append({"example": example, **_numbers(result, example), **light_numbers})
-    return lines
+    images = result.images_in_views_before[example], result.images_in_views[example]
+    write_image(path.with_suffix(".png"), figure(result, example))
+    adversary = Adversary.of(scene, example, result.conditions, *images)
+    light_numbers = write_adversary(adversary, path)
+    light_before, basis_before = result.light(problem.start, example)
+    exposed = light_before.cpu() * scene.examples[example].exposure
+    save_lights(path, exposed, basis_before, "_before")
 
-
-def _numbers(result: AttackResult, example: int) -> dict[str, object]:
-    """Return the successes, costs and predictions of one example for attack.jsonl."""
-    minimum = result.minimum
     classes = result.classifier.classes
-    before = predictions(result.logits_in_views_before[example], classes)
+    minimum = result.minimum
     # Change of each of the D attack values of this example, shape (1, D).
-    change = minimum.values[[example]] - result.problem.start[[example]]
-    # Largest change of a value of each attacked parameter, such as "pose".
-    largest_change = {}
-    for parameter, part in result.problem.split_by_parameter(change):
-        largest_change[parameter.name] = float(part.abs().max())
+    change = minimum.values[[example]] - problem.start[[example]]
+    parts = problem.split_by_parameter(change)
     return {
-        "clean_correct": bool(result.clean_correct[example]),
-        "success_before": bool(result.success_before[example]),
-        "success": bool(result.success[example]),
-        "success_without_noise": bool(result.success_without_noise[example]),
-        "success_with_margin": bool(result.success_with_margin[example]),
-        "success_in_views": result.success_in_views[example].tolist(),
-        "steps": int(result.steps[example]),
-        "queries": int(result.queries[example]),
-        "backward_passes": int(result.backward_passes[example]),
+        "example": example,
+        **{name: getattr(result, name)[example].tolist() for name in NUMBERS},
         "cost_before": float(minimum.cost_before[example]),
         "cost": float(minimum.cost[example]),
         "label": [classes[index] for index in result.criterion.source[example].tolist()],
-        "predicted_before": before["predicted"],
-        "confidence_before": before["confidence"],
+        **predictions(result.logits_in_views_before[example], classes, "_before"),
         **predictions(result.logits_in_views[example], classes),
-        "largest_change": largest_change,
+        "largest_change": {parameter.name: float(part.abs().max()) for parameter, part in parts},
+        **light_numbers,
+        "versions": {},
     }
-
-
-def _versions(
-    result: AttackResult,
-    paths: Sequence[Path],
-    renderers: Sequence[str],
-) -> dict[str, list[dict[str, Any]]]:
-    """Classify several versions of the images after an attack.
-
-    The versions are the images as floats, with 8 bits, as JPEG, and as each renderer renders them
-    from the saved files. Return, for the name of each version, a dictionary for each example: its
-    successes, predictions, and differences from the floats.
-    """
-    # Images of V views of each of the E examples, shape (E, V, 3, size, size).
-    images = result.images_in_views.cpu()
-    versions = {
-        "float": images,
-        "8 bits": to_unit(to_bytes(images)),
-        f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY),
-    }
-    if renderers:
-        rasterizer = result.problem.scene.rasterizer
-        rendered = []
-        for path in progress(paths, "rendering the saved files"):
-            rendered.append(render_again(path, renderers, rasterizer))
-        for name in renderers:
-            versions[name] = torch.stack([by_renderer[name] for by_renderer in rendered])
-    numbers = {}
-    for name, version in versions.items():
-        numbers[name] = _numbers_of_version(result, version.to(result.images_in_views))
-    return numbers
 
 
 def _numbers_of_version(
@@ -205,19 +176,16 @@ def _numbers_of_version(
     Return a dictionary for each example: its successes, predictions, and differences from the
     images of the result.
     """
-    objective = result.objective()
-    logits = objective.logits(images)
-    predicted = logits.argmax(2)
-    success_in_views = objective.fooled_in_views(images, predicted, result.problem.all_examples)
-    success = success_in_views.all(1) & ~result.success_before
-    without_noise = result.criterion.reached(predicted) & ~result.success_before
+    judged = result.objective().judge(images, result.problem.all_examples)
+    logits, fooled_in_views, without_noise = judged
+    is_counted = ~result.success_before
     differences = (images - result.images_in_views).abs().flatten(1)
     numbers = []
     for example, difference in enumerate(differences):
         numbers.append(
             {
-                "success": bool(success[example]),
-                "success_without_noise": bool(without_noise[example]),
+                "success": bool((fooled_in_views.all(1) & is_counted)[example]),
+                "success_without_noise": bool((without_noise & is_counted)[example]),
                 **predictions(logits[example], result.classifier.classes),
                 "largest_difference": float(difference.max()),
                 "mean_difference": float(difference.mean()),
@@ -227,9 +195,7 @@ def _numbers_of_version(
 
 
 def render_again(
-    folder: Path,
-    renderers: Sequence[str],
-    rasterizer: Rasterizer,
+    folder: Path, renderers: Sequence[str], rasterizer: Rasterizer
 ) -> dict[str, Tensor]:
     """Render the V views of an example from its saved files alone.
 
@@ -283,28 +249,14 @@ def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile
     Return the two columns by their titles, or an empty dictionary if the attack did not change the
     light.
     """
-    problem = result.problem
-    scene = problem.scene
-    examples = problem.all_examples[[example]]
-    conditions_before = problem.conditions(problem.start[examples], examples)
-    conditions_after = problem.conditions(result.minimum.values[examples], examples)
-    # Both conditions contain one example only, at index 0.
-    basis_before = scene.basis_under(conditions_before, 0)
-    basis_after = scene.basis_under(conditions_after, 0)
-    is_same_light = torch.equal(conditions_before.light, conditions_after.light)
-    if is_same_light and basis_before == basis_after:
+    light_before, basis_before = result.light(result.problem.start, example)
+    light_after, basis_after = result.light(result.minimum.values, example)
+    if torch.equal(light_before, light_after) and basis_before == basis_after:
         return {}
-    light_before = conditions_before.light[0]
-    light_after = conditions_after.light[0]
-    spheres_before = []
-    spheres_after = []
-    for camera in scene.cameras[example]:
-        spheres_before.append(light_sphere(light_before, SIDE, camera, basis_before))
-        spheres_after.append(light_sphere(light_after, SIDE, camera, basis_after))
-    return {
-        "initial light": tiles_of(spheres_before),
-        "adversarial light": tiles_of(spheres_after),
-    }
+    cameras = result.problem.scene.cameras[example]
+    before = [light_sphere(light_before, SIDE, camera, basis_before) for camera in cameras]
+    after = [light_sphere(light_after, SIDE, camera, basis_after) for camera in cameras]
+    return {"initial light": tiles_of(before), "adversarial light": tiles_of(after)}
 
 
 def _captions(

@@ -19,15 +19,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
-from augment.attacks.objective import NOISE_DRAWS, Objective, Rows, Score
-from augment.attacks.optimizers import (
-    CMAES,
-    Evaluation,
-    Gradient,
-    Optimizer,
-    Problem,
-    RandomSearch,
-)
+from augment.attacks.objective import NOISE_DRAWS, Examples, Images, Objective, Rows, Score, Values
+from augment.attacks.optimizers import CMAES, Evaluation, Gradient, Optimizer, Problem, RandomSearch
 from augment.network import frozen_eval_mode
 from augment.progress import progress
 from renderer.short_repr import ShortRepr
@@ -71,11 +64,11 @@ class Minimum(Rows, ShortRepr):
             gradient was computed.
     """
 
-    values: Float[Tensor, "E D"]
-    images: Float[Tensor, "E V _ H W"]
-    steps: Int[Tensor, " E"]
-    queries: Int[Tensor, " E"]
-    backward_passes: Int[Tensor, " E"]
+    values: Values
+    images: Images
+    steps: Examples
+    queries: Examples
+    backward_passes: Examples
     success_before: Bool[Tensor, " E"]
     success: Bool[Tensor, " E"]
     cost_before: Float[Tensor, " E"]
@@ -112,7 +105,7 @@ class Minimum(Rows, ShortRepr):
         for name, candidates in found.items():
             getattr(self, name)[rows[kept]] = candidates[kept]
 
-    def add_restart(self, rows: Int[Tensor, " A"], restart: Minimum) -> None:
+    def add_restart(self, rows: Examples, restart: Minimum) -> None:
         """Add an attack on some examples from other initial values.
 
         Its steps and passes are added to the counts. Where it succeeds, its candidate replaces that
@@ -129,8 +122,8 @@ def minimize(
     problem: Problem,
     objective: Objective,
     *,
-    examples: Int[Tensor, " A"] | None = None,
-    start: Float[Tensor, "A D"] | None = None,
+    examples: Examples | None = None,
+    start: Values | None = None,
     restarts: Iterable[Tensor] = (),
     optimizer: type[Optimizer] | None = None,
 ) -> Minimum:
@@ -164,11 +157,11 @@ def minimize(
 def _minimize_group(
     optimizer: Optimizer,
     objective: Objective,
-    examples: Int[Tensor, " A"],
-    start: Float[Tensor, "A D"],
+    examples: Examples,
+    start: Values,
     restarts: Iterable[Tensor],
 ) -> Minimum:
-    """Attack A examples from one or more initial values, until they succeed.
+    """Attack E examples from one or more initial values, until they succeed.
 
     Further initial values are used for the examples that have not succeeded, or whose success does
     not survive sensor noise, unless their share of the queries is less than one evaluation.
@@ -206,13 +199,13 @@ def _minimize_group(
 
 @torch.no_grad()
 def minimize_from(
-    start: Float[Tensor, "A D"],
+    start: Values,
     optimizer: Optimizer,
     objective: Objective,
-    examples: Int[Tensor, " A"],
+    examples: Examples,
     scores_last: bool = True,
 ) -> Minimum:
-    """Attack A examples from one set of initial values.
+    """Attack E examples from one set of initial values.
 
     Each example takes steps until it reaches its criterion with the required margin, or has used up
     its steps or queries. Without `scores_last`, the values after the last step are the result of
@@ -259,8 +252,8 @@ def minimize_from(
 def evaluate(
     problem: Problem,
     objective: Objective,
-    candidates: Float[Tensor, "N P D"],
-    examples: Int[Tensor, " N"],
+    candidates: Float[Tensor, "E P D"],
+    examples: Examples,
     needs_gradient: bool,
 ) -> Evaluation:
     """Render and score P candidates of each example, in groups that fit in memory."""
@@ -283,26 +276,18 @@ def evaluate(
             # to the values.
             gradients += torch.autograd.grad(rendered, part, image_gradient)
     score = Score.join(scores)
-    best = _best_candidates(score, count)
+    # One row for each example, one column for each of its candidates.
+    costs = score.cost.unflatten(0, (-1, count))
+    is_success = score.is_success.unflatten(0, (-1, count))
+    is_excluded = is_success.any(1, keepdim=True) & ~is_success
+    # Indices among all candidates: the one of lowest cost, among those that succeed if any does.
+    column = costs.masked_fill(is_excluded, torch.inf).argmin(1)
+    best = column + count * torch.arange(len(costs), device=costs.device)
     return Evaluation(
         candidates=candidates,
-        costs=score.cost.unflatten(0, (-1, count)),
+        costs=costs,
         values=values[best],
         images=torch.cat(images)[best],
         score=score.select(best),
         gradient=torch.cat(gradients)[best] if needs_gradient else None,
     )
-
-
-def _best_candidates(score: Score, count: int) -> Int[Tensor, " N"]:
-    """Choose the candidate of lowest cost of each example, among those that succeed if any does.
-
-    The candidates of an example follow each other, and the result has indices among all N · count.
-    """
-    # One row for each example, one column for each of its candidates.
-    costs = score.cost.unflatten(0, (-1, count))
-    is_success = score.is_success.unflatten(0, (-1, count))
-    is_excluded = is_success.any(1, keepdim=True) & ~is_success
-    best_column = costs.masked_fill(is_excluded, torch.inf).argmin(1)
-    first_of_row = torch.arange(len(costs), device=costs.device) * count
-    return first_of_row + best_column

@@ -7,9 +7,9 @@ class c. The cost is that of the paper's equation 1, summed over the views:
     cost = Σ −CE(f(I), s) + CE(f(I), t)
 
 An example succeeds when the predictions reach its criterion in every view. It is finished when the
-logit gap (`logit_gap`) is also at least `AttackSettings.margin` in every view. If the settings ask
-for it, or if the network is overconfident (`is_overconfident`), the gap must also be larger than
-its changes by the noise of a sensor.
+logit gap (`Criterion.gap`) is also at least `AttackSettings.margin` in every view. If the settings
+ask for it, or if the network is overconfident (`is_overconfident`), the gap must also be larger
+than its changes by the noise of a sensor.
 
 A label is the index of a class. A complementary label says that an image does not show a class. It
 is the number −1 − class. If there are several positive classes, the argument `absent` contains the
@@ -39,6 +39,11 @@ from renderer.image import clamp, to_bytes, to_unit
 
 if TYPE_CHECKING:
     from augment.attack_settings import AttackSettings, EOTSettings
+
+# Attack values of E examples, the indices of examples, and images of their V views.
+Values = Float[Tensor, "E D"]
+Examples = Int[Tensor, " E"]
+Images = Float[Tensor, "E V _ H W"]
 
 # Index that stands for "no class" in attacks without a source or a target class. It differs from
 # all labels.
@@ -100,12 +105,46 @@ class Criterion(Rows):
         return self.source.shape[1]
 
     def cost(self, logits: Float[Tensor, "N C"]) -> Float[Tensor, " N"]:
-        """Compute the cost of single images, for a criterion that is flat."""
-        return adversarial_cost(logits, self.source, self.target)
+        """Compute the cost of single images, for a criterion that is flat.
+
+        Without a target, the cost and its gradient round to 0 if the log-odds o of the source are
+        large. Where they exceed 50, o − 50 is therefore added.
+        """
+        # `require_known` refuses NO_CLASS, which is negative. Class 0 stands for it.
+        source = self.source.clamp(min=0)
+        require_known(source, logits)
+        # The logarithm of the probability is log σ of the log-odds. Its gradient is accurate even
+        # if the probability rounds to 1. The gradient of `cross_entropy` then loses the term of
+        # the class.
+        other_logits = logits.scatter(1, source[:, None], -torch.inf)
+        odds = logits.gather(1, source[:, None])[:, 0] - other_logits.logsumexp(1)
+        is_added = odds > OVERCONFIDENT
+        if self.target is not None:
+            is_added = is_added & (self.target == NO_CLASS)
+        cost = F.logsigmoid(odds) + torch.where(is_added, odds - OVERCONFIDENT, 0)
+        cost = torch.where(self.source == NO_CLASS, 0, cost)
+        if self.target is not None:
+            target_cost = F.cross_entropy(
+                logits, self.target, reduction="none", ignore_index=NO_CLASS
+            )
+            cost = cost + target_cost
+        return cost
 
     def gap(self, logits: Float[Tensor, "... C"]) -> Float[Tensor, " ..."]:
-        """Compute by how much each view reaches the criterion. It is negative if it does not."""
-        return logit_gap(logits, self.source, self.target)
+        """Compute by how much each view reaches the criterion: its logit gap.
+
+        With a target class, it is the logit of the target minus the largest other logit. Without
+        one, it is the largest logit of the other classes minus the logit of the source class. It is
+        negative if the view does not reach the criterion.
+        """
+        target = torch.full_like(self.source, NO_CLASS) if self.target is None else self.target
+        has_target = target != NO_CLASS
+        # Class whose logit is compared with the others, shape (..., 1).
+        compared_class = torch.where(has_target, target, self.source)[..., None]
+        compared_logit = logits.gather(-1, compared_class)[..., 0]
+        largest_other = logits.scatter(-1, compared_class, -torch.inf).amax(-1)
+        difference = compared_logit - largest_other
+        return torch.where(has_target, difference, -difference)
 
     def reached(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, " E"]:
         """Return a mask of the examples that reach the criterion in all their views."""
@@ -129,7 +168,7 @@ class Score(Rows):
 
     Attributes:
         cost: Cost that the attack lowers.
-        gap: By how much the criterion is reached, see `logit_gap`.
+        gap: By how much the criterion is reached, see `Criterion.gap`.
         predicted: Predicted classes of the images before any random transformation. Shape (N, V)
             for examples with V views, (N,) for single images.
         is_success: Whether the predictions reach the criterion, in all views of an example.
@@ -191,9 +230,7 @@ class Objective:
         """
         return self.criterion.view_count * (1 + self.settings.eot.draws)
 
-    def score(
-        self, images: Float[Tensor, "E V _ H W"], needs_gradient: bool
-    ) -> tuple[Score, Tensor | None]:
+    def score(self, images: Images, needs_gradient: bool) -> tuple[Score, Tensor | None]:
         """Score all examples, batch by batch.
 
         Return also the gradients of the costs with respect to the images, if they are needed.
@@ -244,8 +281,8 @@ class Objective:
         )
 
     def finished(
-        self, score: Score, images: Float[Tensor, "E V _ H W"], examples: Int[Tensor, " E"]
-    ) -> tuple[Bool[Tensor, " E"], Int[Tensor, " E"]]:
+        self, score: Score, images: Images, examples: Examples
+    ) -> tuple[Bool[Tensor, " E"], Examples]:
         """Return a mask of the successes with the required margin, also with sensor noise.
 
         Only overconfident networks, and settings with a noise margin, are shown noisy images. Their
@@ -269,9 +306,7 @@ class Objective:
         return torch.where(is_overconfident, *margins)
 
     @torch.no_grad()
-    def is_robust(
-        self, images: Float[Tensor, "E V _ H W"], examples: Int[Tensor, " E"]
-    ) -> Bool[Tensor, " E"]:
+    def is_robust(self, images: Images, examples: Examples) -> Bool[Tensor, " E"]:
         """Return a mask of the examples whose logit gaps change little with sensor noise.
 
         In every view, the smallest gap, without noise and in several draws of it, must be at least
@@ -288,12 +323,12 @@ class Objective:
         is_extreme = torch.stack([*map(is_overconfident, logits)]).any(0)
         return (smallest >= self._noise_margin(is_extreme) * (largest - smallest)).all(1)
 
-    def logits(self, images: Float[Tensor, "E V _ H W"]) -> Float[Tensor, "E V C"]:
+    def logits(self, images: Images) -> Float[Tensor, "E V C"]:
         """Compute the logits of all views, batch by batch."""
         return compute_outputs(self.model, images, self.settings.batch_size)
 
     def judge(
-        self, images: Float[Tensor, "E V _ H W"], examples: Int[Tensor, " E"]
+        self, images: Images, examples: Examples
     ) -> tuple[Float[Tensor, "E V C"], Bool[Tensor, "E V"], Bool[Tensor, " E"]]:
         """Decide about images that an attack found.
 
@@ -306,10 +341,7 @@ class Objective:
         return logits, fooled_in_views, self.criterion.reached(predicted)
 
     def fooled_in_views(
-        self,
-        images: Float[Tensor, "E V _ H W"],
-        predicted: Int[Tensor, "E V"],
-        examples: Int[Tensor, " E"],
+        self, images: Images, predicted: Int[Tensor, "E V"], examples: Examples
     ) -> Bool[Tensor, "E V"]:
         """Decide which views count as a success of an attack.
 
@@ -340,10 +372,7 @@ def preprocessed_model(settings: AttackSettings, classifier: nn.Module) -> nn.Mo
 
 
 def add_sensor_noise(
-    images: Float[Tensor, "A V _ H W"],
-    deviation: float,
-    examples: Int[Tensor, " A"],
-    *key: int | str,
+    images: Images, deviation: float, examples: Examples, *key: int | str
 ) -> Iterator[Tensor]:
     """Add sensor noise to images and round them to 8 bits, as a camera does.
 
@@ -435,70 +464,10 @@ def _moved(
     return F.grid_sample(images, grid, padding_mode="border", align_corners=False)
 
 
-def adversarial_cost(
-    logits: Float[Tensor, "N classes"],
-    source: Int[Tensor, " N"],
-    target: Int[Tensor, " N"] | None = None,
-) -> Float[Tensor, " N"]:
-    """Compute the cost that an attack decreases.
-
-    It is −CE(logits, source) + CE(logits, target), where CE is the cross entropy. Without a target,
-    the cost and its gradient round to 0 if the log-odds o of the source are large. Where they
-    exceed 50, o − 50 is therefore added. The attack lowers the probability of the source class and
-    raises that of the target class. `NO_CLASS` omits a term of an image, and a target of None omits
-    it for all images.
-    """
-    # `require_known` refuses NO_CLASS, which is negative. `clamp` replaces it by class 0.
-    require_known(source.clamp(min=0), logits)
-    odds = _log_odds(logits, source)
-    is_added = odds > OVERCONFIDENT
-    if target is not None:
-        is_added = is_added & (target == NO_CLASS)
-    cost = F.logsigmoid(odds) + torch.where(is_added, odds - OVERCONFIDENT, 0)
-    cost = torch.where(source == NO_CLASS, 0, cost)
-    if target is not None:
-        cost = cost + F.cross_entropy(logits, target, reduction="none", ignore_index=NO_CLASS)
-    return cost
-
-
-def _log_odds(logits: Tensor, classes: Tensor) -> Tensor:
-    """Compute the log-odds of a class of each image, where NO_CLASS stands for any class.
-
-    Their log σ is the logarithm of the probability. Its gradient is accurate even if the
-    probability rounds to 1. The gradient of `cross_entropy` then loses the term of the class.
-    """
-    columns = torch.where(classes == NO_CLASS, 0, classes)[:, None]
-    other_logits = logits.scatter(1, columns, -torch.inf)
-    return logits.gather(1, columns)[:, 0] - other_logits.logsumexp(1)
-
-
 def is_overconfident(logits: Float[Tensor, "... classes"]) -> Bool[Tensor, " ..."]:
     """Return a mask of the images with a class of log-odds above 50 or below −50."""
     lowest, highest = logits.aminmax(dim=-1)
     return highest - lowest > OVERCONFIDENT
-
-
-def logit_gap(
-    logits: Float[Tensor, "... classes"],
-    source: Int[Tensor, " ..."],
-    target: Int[Tensor, " ..."] | None = None,
-) -> Float[Tensor, " ..."]:
-    """Compute by how much logits reach the aim of an attack.
-
-    With a target class, the logit gap is the logit of the target minus the largest other logit.
-    Without one, it is the largest logit of the other classes minus the logit of the source class.
-    It is positive if the attack succeeds, and negative if it does not. A target of `NO_CLASS`
-    stands for no target of an image, and None for none of all images.
-    """
-    if target is None:
-        target = torch.full_like(source, NO_CLASS)
-    has_target = target != NO_CLASS
-    # Class whose logit is compared with the others, shape (..., 1).
-    compared_class = torch.where(has_target, target, source)[..., None]
-    compared_logit = logits.gather(-1, compared_class)[..., 0]
-    largest_other = logits.scatter(-1, compared_class, -torch.inf).amax(-1)
-    difference = compared_logit - largest_other
-    return torch.where(has_target, difference, -difference)
 
 
 def complementary_label(label: int) -> int:
@@ -546,16 +515,11 @@ def is_correct(
     −1 − c says that the image does not show class c. It demands a prediction that is neither c
     nor one of the classes `absent`.
     """
-    is_complementary = labels < 0
     is_class_of_label = predicted == _class_of(labels)
-    is_absent = torch.zeros_like(is_class_of_label)
+    is_excluded = is_class_of_label
     for index in absent:
-        is_absent = is_absent | (predicted == index)
-    return torch.where(
-        is_complementary,
-        ~is_class_of_label & ~is_absent,
-        is_class_of_label,
-    )
+        is_excluded = is_excluded | (predicted == index)
+    return torch.where(labels < 0, ~is_excluded, is_class_of_label)
 
 
 def _class_of(labels: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Problems, and optimizers that are asked for candidates and told their costs.
+"""Problems, norm-balls, and optimizers that are asked for candidates and told their costs.
 
 A candidate is a vector of attack values that is evaluated next.
 
@@ -12,20 +12,23 @@ from __future__ import annotations
 import importlib
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from augment.attacks.objective import Score
+from augment.attacks.objective import Examples, Images, Score, Values
 from augment.random_streams import generator, stream_seed
 from renderer.errors import InputError
+from renderer.vectors import Ball, nearest_in_box
 
 if TYPE_CHECKING:
-    from augment.attack_settings import AttackSettings
+    from augment.attack_settings import AttackSettings, StepSettings
 
 # Random search multiplies the length of its random changes by GROWTH after an accepted candidate
 # and by SHRINKAGE after a rejected one. Four rejections undo one acceptance (the 1/5 success rule
@@ -35,6 +38,9 @@ SHRINKAGE = GROWTH**-0.25
 # CMA-ES with more values than this uses a diagonal covariance (Ros and Hansen
 # 2008), because the size of a full covariance is the square of their number.
 MAX_FULL_COVARIANCE = 1000
+# If a parameter has no radius, a search without gradients begins with random changes that are as
+# long as this many steps.
+STEPS_OF_SEARCH = 4
 
 
 class Problem(Protocol):
@@ -46,29 +52,154 @@ class Problem(Protocol):
             so that they fit in memory.
     """
 
-    start: Float[Tensor, "E D"]
+    start: Values
     group_size: int
 
-    def render(
-        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A V 3 size size"]:
+    def render(self, values: Values, examples: Examples) -> Images:
         """Render the V views of examples, differentiable in the values."""
 
-    def project(
-        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A D"]:
+    def project(self, values: Values, examples: Examples) -> Values:
         """Find the nearest values that are feasible and lie in the norm-balls."""
 
-    def scale_gradient(self, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
+    def scale_gradient(self, gradient: Values) -> Values:
         """Compute the step that gradient descent subtracts from the values."""
 
-    def search_scale(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
+    def search_scale(self, examples: Examples) -> Values:
         """Return how much a search without gradients should change each value at first."""
+
+
+def sample(
+    settings: StepSettings,
+    center: Float[Tensor, " ..."],
+    draws: torch.Generator,
+    used: Bool[Tensor, "A D"] | None = None,
+) -> Float[Tensor, " ..."]:
+    """Draw a vector of values uniformly from the norm-ball around each center.
+
+    Values outside of the mask `used` are those of the center. None draws all values.
+    """
+    if settings.radius is None:
+        raise InputError(
+            "radius is None, but random values are drawn from the norm-ball: set radius"
+        )
+    is_used = None if used is None else used.cpu()
+    if settings.norm == "linf":
+        offset = 2 * torch.rand(center.shape, generator=draws) - 1
+    else:
+        direction = torch.randn(center.shape, generator=draws)
+        dimension_count: int | Tensor = center.shape[1]
+        if is_used is not None:
+            direction = direction * is_used
+            dimension_count = is_used.sum(1, keepdim=True)
+        # A uniform point of the unit ball in n dimensions has a distance below r with probability
+        # r^n. Its distance is distributed like the n-th root of a uniform number in [0, 1].
+        distance = torch.rand(len(center), 1, generator=draws) ** (1 / dimension_count)
+        offset = direction / direction.norm(dim=1, keepdim=True) * distance
+    if is_used is not None:
+        offset = offset * is_used
+    return center + settings.radius * offset.to(center)
+
+
+class NormBalls:
+    """Values of E examples, in norm-balls around those at which attacks start.
+
+    A subclass whose values are not all feasible overrides `project_feasible`.
+
+    Attributes:
+        settings: Norm-ball and steps of the attack.
+        start: Values at which attacks start and on which the norm-balls are
+            centered, shape (E, D).
+        used_mask: Mask of the values that an attack may change, shape (E, D).
+            The other values have no effect on the image. None if every example
+            uses all values.
+    """
+
+    def __init__(self, settings: StepSettings, start: Tensor, used_mask: Tensor | None = None):
+        self.settings = settings
+        self.start = start
+        self.used_mask = used_mask
+        if used_mask is not None and used_mask.all():
+            self.used_mask = None
+
+    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
+        """Find the nearest feasible values. By default, all values are feasible.
+
+        The nearest values are meant in the Euclidean sense, and the centers of `within` are
+        feasible.
+        """
+        return nearest_in_box(values, -math.inf, math.inf, within)
+
+    def scale_gradient(self, gradient: Values) -> Values:
+        """Compute the step that gradient descent subtracts from the values.
+
+        The step is the gradient ("raw"), its sign ("sign") or its direction ("unit"), times the
+        step size. A step is zero if its gradient is zero.
+        """
+        if self.settings.step == "raw":
+            return self.settings.step_size * gradient
+        if self.settings.step == "sign":
+            return self.settings.step_size * gradient.sign()
+        # The gradient is first divided by its largest entry, because the squares of tiny entries
+        # would be rounded to zero.
+        tiny = torch.finfo(gradient.dtype).tiny
+        largest = gradient.abs().amax(1, keepdim=True)
+        scaled = gradient / largest.clamp(min=tiny)
+        return self.settings.step_size * F.normalize(scaled, eps=tiny)
+
+    def search_scale(self, examples: Examples) -> Values:
+        """Return how much a search without gradients should change each value at first.
+
+        With the norm "l2", a random change is about as long as the radius. With the norm "linf", it
+        changes each value by about half the radius. Without a radius, `STEPS_OF_SEARCH` times the
+        step size takes its place. The result is 0 for values that have no effect.
+        """
+        settings = self.settings
+        length = settings.radius
+        limits_each_value = settings.norm == "linf"
+        if length is None:
+            length = STEPS_OF_SEARCH * settings.step_size
+            limits_each_value = settings.step == "sign"
+        # 1 for values that have an effect, and 0 for the others, shape (E, D).
+        used = torch.ones_like(self.start[examples])
+        if self.used_mask is not None:
+            used = self.used_mask[examples].to(used)
+        if limits_each_value:
+            return length / 2 * used
+        # n independent numbers with the standard deviation length / √n form a vector that is
+        # about `length` long.
+        used_count = used.sum(1, keepdim=True)
+        return length * used / used_count.clamp(min=1).sqrt()
+
+    def project(self, values: Values, examples: Examples) -> Values:
+        """Find the nearest values that are feasible and lie in the norm-balls around the start."""
+        return self._project(values, self.start[examples])
+
+    def _project(self, values: Values, center: Values) -> Values:
+        radius = self.settings.radius
+        ball = None if radius is None else Ball(center, radius, self.settings.norm)
+        return self.project_feasible(values, ball)
+
+    def sample(self, draws: torch.Generator, reached: Values | None = None) -> Values:
+        """Draw random feasible values for all E examples.
+
+        With a radius, values are drawn uniformly from the norm-balls and then
+        projected onto the feasible values. Without a radius, they are drawn in
+        random directions, as far from the start as the values of an attack.
+        """
+        if self.settings.radius is None and reached is not None:
+            direction = torch.randn(reached.shape, generator=draws).to(reached)
+            if self.used_mask is not None:
+                direction = direction * self.used_mask
+            distance = (reached - self.start).norm(dim=1, keepdim=True)
+            offset = direction * distance / direction.norm(dim=1, keepdim=True)
+            return self.project_feasible(self.start + offset)
+        drawn = sample(self.settings, self.start, draws, self.used_mask)
+        return self._project(drawn, self.start)
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Costs of P candidates of each of N examples, and the best candidate of each example.
+    """Costs of P candidates of each of E examples, and the best candidate of each example.
 
     The best candidate has the lowest cost of those that succeed or, if none does, of all.
 
@@ -81,12 +212,12 @@ class Evaluation:
         gradient: Gradient of the cost at the best candidates. None if it was not computed.
     """
 
-    candidates: Float[Tensor, "N P D"]
-    costs: Float[Tensor, "N P"]
-    values: Float[Tensor, "N D"]
-    images: Float[Tensor, "N V _ H W"]
+    candidates: Float[Tensor, "E P D"]
+    costs: Float[Tensor, "E P"]
+    values: Values
+    images: Images
     score: Score
-    gradient: Float[Tensor, "N D"] | None
+    gradient: Values | None
 
     @property
     def found(self) -> dict[str, Tensor]:
@@ -101,18 +232,21 @@ class Evaluation:
 
 
 class Optimizer(ABC):
-    """Search for attack values of low cost, for each of A examples by itself.
+    """Search for attack values of low cost, for each of E examples by itself.
 
     `begin`, then `tell` with the initial values, then `ask` and `tell` by turns. Rows are those of
     the examples that are still attacked.
 
     Attributes:
         uses_gradients: Whether `tell` needs the gradient of the cost.
-        values: Values of the accepted candidate of each example, shape (A, D).
-        cost: Its cost, shape (A,).
+        values: Values of the accepted candidate of each example, shape (E, D).
+        cost: Its cost, shape (E,).
+        length: Length of the next change of each example, from 1 on, shape (E, 1).
+        length_factors: Factors of the length after an accepted candidate, and after another.
     """
 
     uses_gradients: ClassVar[bool] = False
+    length_factors: ClassVar[tuple[float, float]] = (1.0, 1.0)
 
     def __init__(self, problem: Problem, settings: AttackSettings, seed: int):
         self.problem = problem
@@ -120,13 +254,14 @@ class Optimizer(ABC):
         self.seed = seed
         # Generator of the random numbers of each example, so that its numbers do not depend on the
         # other examples. Further starts continue with the same generators.
-        self._draws: dict[int, torch.Generator] = {}
+        self._generator = cache(lambda example: generator(seed, example, "directions"))
 
-    def begin(self, examples: Int[Tensor, " A"], start: Float[Tensor, "A D"]) -> None:
+    def begin(self, examples: Examples, start: Values) -> None:
         """Begin a search at initial values. `examples` are indices in the problem."""
         self.examples = examples
         self.values = start.clone()
         self.cost = start.new_full((len(start),), torch.inf)
+        self.length = start.new_ones(len(start), 1)
 
     @property
     def candidate_count(self) -> int:
@@ -145,16 +280,11 @@ class Optimizer(ABC):
         is_accepted = self._is_accepted(rows, evaluation.score.cost)
         self.values[rows] = _chosen(is_accepted, evaluation.values, self.values[rows])
         self.cost[rows] = _chosen(is_accepted, evaluation.score.cost, self.cost[rows])
+        self.length[rows] *= torch.where(is_accepted, *self.length_factors)[:, None]
         return is_accepted
 
     def _is_accepted(self, rows: Int[Tensor, " N"], cost: Float[Tensor, " N"]) -> Tensor:
         return cost < self.cost[rows]
-
-    def _generator(self, example: int) -> torch.Generator:
-        """Return the generator of the random numbers of an example."""
-        if example not in self._draws:
-            self._draws[example] = generator(self.seed, example, "directions")
-        return self._draws[example]
 
 
 def _chosen(mask: Bool[Tensor, " N"], new: Tensor, old: Tensor) -> Tensor:
@@ -170,12 +300,12 @@ class Gradient(Optimizer):
     """
 
     uses_gradients = True
+    length_factors = (1.0, 0.5)
 
-    def begin(self, examples: Int[Tensor, " A"], start: Float[Tensor, "A D"]) -> None:
-        """Begin with steps of length 1."""
+    def begin(self, examples: Examples, start: Values) -> None:
+        """Begin with a gradient of zero."""
         super().begin(examples, start)
         self.gradient = torch.zeros_like(start)
-        self.length = start.new_ones(len(start), 1)
 
     def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N 1 D"]:
         """Return the values after a step from the accepted values."""
@@ -184,12 +314,11 @@ class Gradient(Optimizer):
         return self.problem.project(moved, self.examples[rows])[:, None]
 
     def tell(self, rows: Int[Tensor, " N"], evaluation: Evaluation) -> Bool[Tensor, " N"]:
-        """Keep the gradient of accepted candidates, and halve the next step after others."""
+        """Keep the gradient of accepted candidates."""
         is_accepted = super().tell(rows, evaluation)
         if evaluation.gradient is not None:
-            gradient = evaluation.gradient
-            self.gradient[rows] = _chosen(is_accepted, gradient, self.gradient[rows])
-        self.length[rows] *= torch.where(is_accepted, 1.0, 0.5)[:, None]
+            kept = self.gradient[rows]
+            self.gradient[rows] = _chosen(is_accepted, evaluation.gradient, kept)
         return is_accepted
 
     def _is_accepted(self, rows: Int[Tensor, " N"], cost: Float[Tensor, " N"]) -> Tensor:
@@ -204,72 +333,18 @@ class RandomSearch(Optimizer):
     an accepted candidate and shorter after another.
     """
 
-    def begin(self, examples: Int[Tensor, " A"], start: Float[Tensor, "A D"]) -> None:
-        """Begin with changes of length 1, in units of the search scale."""
-        super().begin(examples, start)
-        self.length = start.new_ones(len(start), 1)
+    length_factors = (GROWTH, SHRINKAGE)
 
     def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N 1 D"]:
         """Return a random change of the accepted values."""
         examples = self.examples[rows]
+        shape = self.values.shape[1:]
+        generators = map(self._generator, examples.tolist())
+        normal = [torch.randn(shape, generator=draws) for draws in generators]
         # Standard deviation of each change, shape (N, D).
         deviation = self.length[rows] * self.problem.search_scale(examples)
-        shape = self.values.shape[1:]
-        normal = [
-            torch.randn(shape, generator=self._generator(example)) for example in examples.tolist()
-        ]
         moved = self.values[rows] + deviation * torch.stack(normal).to(self.values)
         return self.problem.project(moved, examples)[:, None]
-
-    def tell(self, rows: Int[Tensor, " N"], evaluation: Evaluation) -> Bool[Tensor, " N"]:
-        """Adapt the length of the next change."""
-        is_accepted = super().tell(rows, evaluation)
-        self.length[rows] *= torch.where(is_accepted, GROWTH, SHRINKAGE)[:, None]
-        return is_accepted
-
-
-@dataclass
-class Population:
-    """CMA-ES of one example, with P candidates in each step.
-
-    The strategy draws points. A point p stands for the candidate with the
-    attack values start + scale · p.
-
-    Attributes:
-        strategy: A `cma.CMAEvolutionStrategy`.
-        start: The D attack values at which the strategy began, shape (D,).
-        scale: Unit of each value, shape (D,). It is 0 for values without effect.
-        drawn: The P points that were drawn last, shape (P, D).
-    """
-
-    strategy: Any
-    start: Float[Tensor, " D"]
-    scale: Float[Tensor, " D"]
-    drawn: Float[np.ndarray, "P D"] = field(init=False)
-
-    def ask(self) -> Float[Tensor, "P D"]:
-        """Draw the P candidates of a step."""
-        self.drawn = np.stack(self.strategy.ask())
-        return self._unprojected()
-
-    def _unprojected(self) -> Tensor:
-        """Return the attack values of the points that were drawn last, shape (P, D)."""
-        return self.start + self.scale * torch.from_numpy(self.drawn).to(self.scale)
-
-    def tell(self, values: Float[Tensor, "P D"], costs: Float[Tensor, " P"]) -> None:
-        """Adapt the strategy to the costs of the P candidates that were drawn last.
-
-        A candidate outside of the norm-ball was evaluated at the nearest values inside. A penalty
-        is added to its cost: the interquartile range of the costs times the mean squared distance
-        to these values, in units of `scale`.
-        """
-        offsets = self._unprojected() - values
-        # Distance of each value from the norm-ball in units of `scale`, shape (P, D).
-        relative_offsets = torch.where(self.scale > 0, offsets / self.scale, 0.0)
-        lower, upper = costs.double().quantile(costs.new_tensor([0.25, 0.75]).double())
-        interquartile_range = upper - lower
-        penalties = interquartile_range * relative_offsets.double().square().mean(1)
-        self.strategy.tell(list(self.drawn), (costs.double() + penalties).tolist())
 
 
 class CMAES(Optimizer):
@@ -284,10 +359,17 @@ class CMAES(Optimizer):
     of the first standard deviations (as Hansen et al. 2009 scale it).
     """
 
-    def begin(self, examples: Int[Tensor, " A"], start: Float[Tensor, "A D"]) -> None:
-        """Begin new evolution strategies, by the rows of their examples."""
+    def begin(self, examples: Examples, start: Values) -> None:
+        """Begin new evolution strategies. A point p of one stands for the values start + scale · p.
+
+        The scale is 0 for values that have no effect.
+        """
         super().begin(examples, start)
-        self._populations: dict[int, Population] = {}
+        self._start = start
+        self._scale = self.problem.search_scale(examples)
+        self._strategies: dict[int, Any] = {}
+        # The P points that each strategy drew last, shape (P, D), by the row of the example.
+        self._drawn: dict[int, np.ndarray] = {}
 
     @property
     def candidate_count(self) -> int:
@@ -298,49 +380,52 @@ class CMAES(Optimizer):
         """Draw candidates of each example, and project them to the norm-balls."""
         candidates = []
         for row in rows.tolist():
-            if row not in self._populations:
-                self._populations[row] = self._population(row)
-            values = self._populations[row].ask()
+            if row not in self._strategies:
+                seed = stream_seed(self.seed, int(self.examples[row]), "cma")
+                self._strategies[row] = self._strategy(seed)
+            self._drawn[row] = np.stack(self._strategies[row].ask())
+            values = self._unprojected(row)
             # `project` needs the example of each of the P candidates, which is the same for all.
             examples = self.examples[row].expand(len(values))
             candidates.append(self.problem.project(values, examples))
         return torch.stack(candidates)
 
-    def _population(self, row: int) -> Population:
-        """Start the evolution strategy of an example at its accepted values."""
-        example = self.examples[[row]]
-        strategy = start_strategy(
-            self.values.shape[1],
-            population_size=self.candidate_count,
-            seed=stream_seed(self.seed, int(example), "cma"),
-        )
-        [scale] = self.problem.search_scale(example)
-        return Population(strategy, self.values[row].clone(), scale)
+    def _unprojected(self, row: int) -> Float[Tensor, "P D"]:
+        """Return the attack values of the points that were drawn last for an example."""
+        points = torch.from_numpy(self._drawn[row]).to(self._scale)
+        return self._start[row] + self._scale[row] * points
 
     def tell(self, rows: Int[Tensor, " N"], evaluation: Evaluation) -> Bool[Tensor, " N"]:
-        """Adapt the strategies to the costs of their candidates."""
+        """Adapt the strategies to the costs of their candidates, and to the penalties."""
         # No strategy drew the initial values.
-        for index, row in enumerate(rows.tolist() if self._populations else []):
-            self._populations[row].tell(evaluation.candidates[index], evaluation.costs[index])
+        for index, row in enumerate(rows.tolist() if self._strategies else []):
+            offsets = self._unprojected(row) - evaluation.candidates[index]
+            scale = self._scale[row]
+            # Distance of each value from the norm-ball in units of `scale`, shape (P, D).
+            relative_offsets = torch.where(scale > 0, offsets / scale, 0.0).double()
+            costs = evaluation.costs[index].double()
+            lower, upper = costs.quantile(costs.new_tensor([0.25, 0.75]))
+            penalties = (upper - lower) * relative_offsets.square().mean(1)
+            self._strategies[row].tell(list(self._drawn[row]), (costs + penalties).tolist())
         return super().tell(rows, evaluation)
 
-
-def start_strategy(value_count: int, population_size: int, seed: int) -> Any:
-    """Start an evolution strategy at 0 with standard deviation 1."""
-    try:
-        cma: Any = importlib.import_module("cma")
-    except ImportError as error:
-        raise InputError(
-            'optimizer=cma_es needs cma: pip install "parametric-norm-balls[search]"',
-            "optimizer",
-        ) from error
-    numbers = np.random.default_rng(seed)
-    options = {
-        "verbose": -9,
-        "popsize": population_size,
-        "CMA_diagonal": value_count > MAX_FULL_COVARIANCE,
-        # If cma got a seed, it would seed NumPy for the whole process.
-        "seed": np.nan,
-        "randn": lambda *shape: numbers.standard_normal(shape),
-    }
-    return cma.CMAEvolutionStrategy(np.zeros(value_count), 1.0, options)
+    def _strategy(self, seed: int) -> Any:
+        """Start an evolution strategy at 0 with standard deviation 1."""
+        try:
+            cma: Any = importlib.import_module("cma")
+        except ImportError as error:
+            raise InputError(
+                'optimizer=cma_es needs cma: pip install "parametric-norm-balls[search]"',
+                "optimizer",
+            ) from error
+        draws = np.random.default_rng(seed)
+        value_count = self.values.shape[1]
+        options = {
+            "verbose": -9,
+            "popsize": self.candidate_count,
+            "CMA_diagonal": value_count > MAX_FULL_COVARIANCE,
+            # If cma got a seed, it would seed NumPy for the whole process.
+            "seed": np.nan,
+            "randn": lambda *shape: draws.standard_normal(shape),
+        }
+        return cma.CMAEvolutionStrategy(np.zeros(value_count), 1.0, options)

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings
+from augment.attacks.objective import Examples, Images, Values
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.lights import Lighting, Skylight, environment_light
 from augment.attacks.parameters.parameter import Parameter
@@ -45,7 +46,7 @@ class SceneProblem:
         self.all_examples = torch.arange(len(scene), device=self.start.device)
         self._value_counts = [parameter.start.shape[1] for parameter in parameters]
 
-    def conditions(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Conditions:
+    def conditions(self, values: Values, examples: Examples) -> Conditions:
         """Convert attack values of examples to conditions, differentiable in the values.
 
         What no parameter changes is that of the scene. `examples` are indices in the scene.
@@ -55,15 +56,13 @@ class SceneProblem:
             conditions = parameter.apply(parameter_values, conditions, examples)
         return conditions
 
-    def render(
-        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A V 3 size size"]:
+    def render(self, values: Values, examples: Examples) -> Images:
         """Render the V views of each example with the given attack values."""
         return self.scene.render(self.conditions(values, examples), examples)
 
     @torch.no_grad()
     def images(
-        self, values: Float[Tensor, "E D"], examples: Int[Tensor, " A"] | None = None
+        self, values: Values, examples: Int[Tensor, " A"] | None = None
     ) -> Float[Tensor, "A V 3 size size"]:
         """Render the V views of examples without gradients, `group_size` examples at a time.
 
@@ -72,31 +71,22 @@ class SceneProblem:
         """
         if examples is None:
             examples = self.all_examples
-        size = self.scene.settings.size
-        images = values.new_empty(len(examples), self.scene.views, 3, size, size)
-        image_parts = images.split(self.group_size)
-        example_parts = examples.split(self.group_size)
-        parts: Iterable[tuple[Tensor, Tensor]] = zip(image_parts, example_parts, strict=True)
-        if len(image_parts) > 1:
-            parts = progress(list(parts), "images")
-        for image_part, example_part in parts:
-            # A part of the images is a view of `images`, so this fills `images`.
-            image_part.copy_(self.render(values[example_part], example_part))
-        return images
+        groups: Iterable[Tensor] = examples.split(self.group_size)
+        if len(examples) > self.group_size:
+            groups = progress(groups, "images")
+        return torch.cat([self.render(values[group], group) for group in groups])
 
-    def scale_gradient(self, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
+    def scale_gradient(self, gradient: Values) -> Values:
         """Compute the step of each parameter that gradient descent subtracts from the values."""
         parts = self.split_by_parameter(gradient)
         return torch.cat([parameter.scale_gradient(part) for parameter, part in parts], dim=1)
 
-    def search_scale(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
+    def search_scale(self, examples: Examples) -> Values:
         """Return how much random search should change each attack value at first."""
         scales = [parameter.search_scale(examples) for parameter in self.parameters]
         return torch.cat(scales, dim=1).to(self.start)
 
-    def project(
-        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A D"]:
+    def project(self, values: Values, examples: Examples) -> Values:
         """Find the nearest values that are feasible and lie in the norm-balls.
 
         The values of each parameter are projected separately.
@@ -105,23 +95,20 @@ class SceneProblem:
         projected = [parameter.project(part, examples) for parameter, part in parts]
         return torch.cat(projected, dim=1)
 
-    def sample(
-        self, generator: torch.Generator, reached: Float[Tensor, "E D"] | None = None
-    ) -> Float[Tensor, "E D"]:
+    def sample(self, generator: torch.Generator, reached: Values | None = None) -> Values:
         """Draw random feasible attack values for all examples.
 
         A parameter with a radius draws from its norm-ball. A parameter without one draws changes
         that are as long as those of an attack. `reached` are the values at the end of this attack.
         They are needed only if a parameter has no radius.
         """
-        if reached is None:
-            samples = [parameter.sample(generator) for parameter in self.parameters]
-        else:
-            parts = self.split_by_parameter(reached)
-            samples = [parameter.sample(generator, part) for parameter, part in parts]
-        return torch.cat([sample.to(self.start) for sample in samples], dim=1)
+        samples = []
+        for parameter, part in self.split_by_parameter(self.start if reached is None else reached):
+            sample = parameter.sample(generator, None if reached is None else part)
+            samples.append(sample.to(self.start))
+        return torch.cat(samples, dim=1)
 
-    def split_by_parameter(self, values: Float[Tensor, "A D"]) -> list[tuple[Parameter, Tensor]]:
+    def split_by_parameter(self, values: Values) -> list[tuple[Parameter, Tensor]]:
         """Split the attack values of examples into the values of each parameter."""
         parts = values.split(self._value_counts, dim=1)
         return list(zip(self.parameters, parts, strict=True))
@@ -164,7 +151,7 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
         warnings.warn(message, stacklevel=stacklevel)
 
 
-def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Int[Tensor, "E V"]:
+def source_labels(scene: Scene, device: torch.device, classifier: Classifier) -> Int[Tensor, "E V"]:
     """Return the true class of each view as an index of the classifier."""
     labels = [classifier.label(label) for label in scene.labels]
-    return torch.tensor(labels, device=logits.device)[:, None].expand(-1, scene.views)
+    return torch.tensor(labels, device=device)[:, None].expand(-1, scene.views)

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
+from PIL import Image, ImageOps
 from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
@@ -20,7 +22,8 @@ from augment.attacks.problem import SceneProblem
 from augment.classifier import Classifier
 from augment.scene.objects import Conditions
 from renderer.errors import as_path, require_choice, require_kind, require_whole
-from renderer.io.images import write_image
+from renderer.io.images import PAPER, draw_grid, tiles_of, write_image
+from renderer.light.basis import Basis
 from renderer.rendering import light_sphere
 from renderer.short_repr import ShortRepr
 
@@ -29,22 +32,31 @@ if TYPE_CHECKING:
 
 # Pixels per side of the white ball with which `AttackResult.plot` shows the light.
 BALL_SIZE = 96
+# Largest number of classes in its bar chart. The most probable classes are drawn.
+SHOWN_CLASSES = 5
+# Colors of the bars of the probabilities before and after the attack.
+BEFORE_COLOR = "#4c78a8"
+AFTER_COLOR = "#e45756"
 # File formats that `AttackResult.save_animation` can write.
 ANIMATION_SUFFIXES = (".gif", ".webp")
-# Largest number of frames that `AttackResult.save_animation` writes.
+# Largest number of frames that it writes.
 MAX_FRAME_COUNT = 1000
+# Pixels per side of the white ball in a frame. Smaller images are enlarged by a whole factor to at
+# least this width.
+SIDE = 160
+# Larger images are reduced to this number of pixels per side, because a .gif file takes up to a
+# byte for each pixel of a frame.
+MAX_SIDE = 224
+# Milliseconds for which a frame is shown, except the first and the last.
+FRAME_TIME = 120
+# Milliseconds for which the first and the last frame of an animation are shown.
+PAUSE = 1200
 # What `attack` and its checks say if gradient descent finds no direction.
 ZERO_GRADIENT = (
     "the first gradient of some examples is exactly zero: optimizer=random_search needs none"
 )
 # Keys of the result of `check` that `warnings` reads. `nb.save` refuses checks without them.
-CHECKED = {
-    "success",
-    "success_without_noise",
-    "random_search",
-    "cost_fell",
-    "zero_gradient",
-}
+CHECKED = {"success", "success_without_noise", "random_search", "cost_fell", "zero_gradient"}
 
 
 @dataclass(frozen=True, repr=False)
@@ -152,7 +164,7 @@ class AttackResult(ShortRepr):
     def success_with_margin(self) -> Tensor:
         """Return a mask of the successful examples with a sufficient logit gap, shape (E,).
 
-        The logit gap, see `augment.losses.logit_gap`, is at least `settings.margin` in all views.
+        The logit gap, see `Criterion.gap`, is at least `settings.margin` in all views.
         """
         gaps = self.criterion.gap(self.logits_in_views)
         return self.success & (gaps >= self.settings.margin).all(1)
@@ -206,31 +218,52 @@ class AttackResult(ShortRepr):
         Raises:
             InputError: If there is no such example or view.
         """
-        # Importing matplotlib takes half a second.
-        from augment.attacks.figures import draw_attack
+        from matplotlib.figure import Figure  # This import takes half a second.
 
         example, view = self._shown_view(example, view)
-        conditions = self.conditions
-        basis = self.problem.scene.basis_under(conditions, example)
-        before = self.logits_in_views_before[example, view].softmax(0)
-        after = self.logits_in_views[example, view].softmax(0)
-        return draw_attack(
-            self.images_in_views_before[example, view].cpu(),
-            light_sphere(conditions.light[example], BALL_SIZE, basis=basis),
-            self.images_in_views[example, view].cpu(),
-            before.cpu(),
-            after.cpu(),
-            self.classifier.classes,
-            int(self.criterion.source[example, view]),
-        )
+        classes = self.classifier.classes
+        pair = self.logits_in_views_before[example, view], self.logits_in_views[example, view]
+        logits = torch.stack(pair).cpu()
+        before_title, after_title = _titles(logits, classes)
+        light, basis = self.light(self.minimum.values, example)
+        pictures = {
+            f"before: {before_title}": self.images_in_views_before[example, view],
+            "light after the attack": light_sphere(light, BALL_SIZE, basis=basis),
+            f"after: {after_title}": self.images_in_views[example, view],
+        }
+        figure = Figure(figsize=(10, 2.6), layout="constrained")
+        *panels, chart = figure.subplots(1, 4, width_ratios=[1, 1, 1, 1.2])
+        for axes, (title, image) in zip(panels, pictures.items(), strict=True):
+            # NumPy has no bfloat16.
+            pixels = image.permute(1, 2, 0).clamp(0, 1).float().cpu().numpy()
+            axes.imshow(pixels, interpolation="nearest")
+            axes.set_title(title, fontsize=9)
+            axes.axis("off")
+
+        before, after = logits.softmax(1).float()
+        # Order the classes by the larger of their two probabilities.
+        shown = before.maximum(after).topk(min(SHOWN_CLASSES, len(classes))).indices
+        true_class = int(self.criterion.source[example, view])
+        if true_class not in shown:
+            shown[-1] = true_class
+        # matplotlib draws bars from the bottom to the top, so the most probable class comes last.
+        ranked = shown.flip(0)
+        heights = np.arange(len(ranked))
+        chart.barh(heights + 0.2, before[ranked].numpy(), 0.4, color=BEFORE_COLOR, label="before")
+        chart.barh(heights - 0.2, after[ranked].numpy(), 0.4, color=AFTER_COLOR, label="after")
+        chart.set_yticks(heights, [classes[index] for index in ranked.tolist()], fontsize=8)
+        chart.set_xlim(0, 1)
+        chart.set_xlabel("probability", fontsize=8)
+        chart.legend(fontsize=8, loc="lower right")
+        return figure
 
     def _shown_view(self, example: int | None, view: int | None) -> tuple[int, int]:
         """Return an example and a view, where None is replaced by what shows the attack best."""
         example_count, view_count = self.images_in_views.shape[:2]
         if example is not None:
-            _require_index("example", example, example_count)
+            require_whole("example", example, 0, example_count - 1)
         if view is not None:
-            _require_index("view", view, view_count)
+            require_whole("view", view, 0, view_count - 1)
         was_correct = self.logits_in_views_before.argmax(2) == self.criterion.source
         # 2 for views that the attack turned from correct to wrong, 1 for others that were correct.
         scores = was_correct * (1 + self.success_in_views.to(was_correct.device).int())
@@ -277,55 +310,41 @@ class AttackResult(ShortRepr):
             >>> Path("attack.gif").exists()
             True
         """
-        # Importing matplotlib takes half a second.
-        from augment.attacks.figures import draw_frames, frame_times
-
         path = as_path("path", path)
         require_choice("path: its suffix", path.suffix.lower(), ANIMATION_SUFFIXES)
         example, view = self._shown_view(example, view)
         require_whole("frame_count", frame_count, 2, MAX_FRAME_COUNT)
-        fractions = [index / (frame_count - 1) for index in range(frame_count)]
-        images = [self._image_between(fraction, example, view) for fraction in fractions]
-        balls = [self._ball_between(fraction, example) for fraction in fractions]
-        logits = self.objective().logits(torch.stack(images)[:, None])
-        predicted = predictions(logits[:, 0], self.classifier.classes)
-        captions = []
-        for name, confidence in zip(predicted["predicted"], predicted["confidence"], strict=True):
-            captions.append(f"{name} {confidence:.0%}")
-        first, *others = draw_frames(images, balls, captions)
-        times = frame_times(frame_count)
+        start = self.problem.start
+        change = self.minimum.values.to(start) - start
+        images = []
+        balls = []
+        for index in range(frame_count):
+            values = start + index / (frame_count - 1) * change
+            rendered = self.problem.images(values, self.problem.all_examples[[example]])
+            images.append(rendered[0, view])
+            light, basis = self.light(values, example)
+            balls.append(light_sphere(light, SIDE, basis=basis))
+        images[0] = self.images_in_views_before[example, view]
+        images[-1] = self.images_in_views[example, view]
+        shown = torch.stack(images)
+        logits = self.objective().logits(shown[:, None])[:, 0]
+        titles = _titles(logits, self.classifier.classes)
+        if shown.shape[-1] > MAX_SIDE:
+            size = (MAX_SIDE, MAX_SIDE)
+            shown = F.interpolate(shown.float(), size, mode="bilinear", antialias=True)
+        tiles = tiles_of(shown.cpu().float(), [(title,) for title in titles], SIDE)
+        ball_tiles = tiles_of(balls, [("light",)] * frame_count, SIDE)
+        pairs = zip(tiles, ball_tiles, strict=True)
+        first, *others = _with_equal_sizes([draw_grid([pair]) for pair in pairs])
+        times = [PAUSE, *[FRAME_TIME] * (frame_count - 2), PAUSE]
         write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
 
-    def _values_between(self, fraction: float) -> Float[Tensor, "E D"]:
-        """Interpolate linearly between the attack values before and after the attack.
-
-        The fraction is 0 before the attack and 1 after it.
-        """
-        start = self.problem.start
-        return start + fraction * (self.minimum.values.to(start) - start)
-
-    def _image_between(
-        self, fraction: float, example: int, view: int
-    ) -> Float[Tensor, "3 size size"]:
-        """Render a view with values that are interpolated between before and after the attack."""
-        if fraction == 0:
-            return self.images_in_views_before[example, view]
-        if fraction == 1:
-            return self.images_in_views[example, view]
+    def light(self, values: Float[Tensor, "E D"], example: int) -> tuple[Tensor, Basis]:
+        """Return coefficients and basis of the light of an example with some attack values."""
         examples = self.problem.all_examples[[example]]
-        # Shape (1, V, 3, size, size).
-        images = self.problem.images(self._values_between(fraction), examples)
-        return images[0, view]
-
-    def _ball_between(self, fraction: float, example: int) -> Float[Tensor, "3 size size"]:
-        """Render a white ball in light that is interpolated between before and after the attack."""
-        from augment.attacks.figures import SIDE
-
-        examples = self.problem.all_examples[[example]]
-        conditions = self.problem.conditions(self._values_between(fraction)[examples], examples)
+        conditions = self.problem.conditions(values[examples], examples)
         # `conditions` contain one example only, at index 0.
-        basis = self.problem.scene.basis_under(conditions, 0)
-        return light_sphere(conditions.light[0], SIDE, basis=basis)
+        return conditions.light[0], self.problem.scene.basis_under(conditions, 0)
 
     def _repr_png_(self) -> bytes:
         """Return `plot()` as a PNG file. Notebooks display it."""
@@ -334,9 +353,22 @@ class AttackResult(ShortRepr):
         return content.getvalue()
 
 
-def _require_index(name: str, index: int, count: int) -> None:
-    """Raise InputError unless an index is a whole number from 0 to count - 1."""
-    require_whole(name, index, 0, count - 1)
+def _with_equal_sizes(frames: list[Image.Image]) -> list[Image.Image]:
+    """Add empty space at the right and the bottom of frames, so that all have the same size."""
+    width = max(frame.width for frame in frames)
+    height = max(frame.height for frame in frames)
+    extended = []
+    for frame in frames:
+        border = (0, 0, width - frame.width, height - frame.height)
+        extended.append(ImageOps.expand(frame, border, PAPER))
+    return extended
+
+
+def _titles(logits: Float[Tensor, "N C"], classes: Sequence[str]) -> list[str]:
+    """Write the predicted class of each image with its probability, such as "orange 97%"."""
+    found = predictions(logits, classes)
+    pairs = zip(found["predicted"], found["confidence"], strict=True)
+    return [f"{name} {confidence:.0%}" for name, confidence in pairs]
 
 
 def require_result(result: object) -> None:
@@ -344,27 +376,28 @@ def require_result(result: object) -> None:
     require_kind("result", result, AttackResult, "the result of norm_balls.attack")
 
 
-def predictions(logits: Float[Tensor, "... C"], classes: Sequence[str]) -> dict[str, Any]:
-    """Return the names and the probabilities of the predicted classes, for a JSON file."""
+def predictions(
+    logits: Float[Tensor, "... C"], classes: Sequence[str], when: str = ""
+) -> dict[str, Any]:
+    """Return the names and the probabilities of the predicted classes, for a JSON file.
+
+    The suffix `when`, such as "_before", ends the two keys.
+    """
     highest = logits.softmax(-1).max(-1)
     names = np.asarray(classes)[highest.indices.cpu().numpy()]
-    return {"predicted": names.tolist(), "confidence": highest.values.tolist()}
+    return {f"predicted{when}": names.tolist(), f"confidence{when}": highest.values.tolist()}
 
 
 def warnings(checks: Mapping[str, Any]) -> list[str]:
     """Return reasons to doubt the strength of an attack, as one sentence each."""
     success = checks["success"]
-    lost_to_noise = checks["success_without_noise"] - success
-    reasons = []
-    if lost_to_noise > success:
-        reasons.append(
-            "most successes are lost with sensor noise, and a larger margin helps",
-        )
-    if 0 < success <= checks["random_search"]:
-        reasons.append("random search does as well or better")
-    # The following two are fractions of the examples.
-    if checks["cost_fell"] < 1:
-        reasons.append("the attack did not lower the cost of some examples")
-    if checks["zero_gradient"] > 0:
-        reasons.append(ZERO_GRADIENT)
-    return reasons
+    reasons = {
+        "most successes are lost with sensor noise, and a larger margin helps": (
+            checks["success_without_noise"] - success > success
+        ),
+        "random search does as well or better": 0 < success <= checks["random_search"],
+        # The following two are fractions of the examples.
+        "the attack did not lower the cost of some examples": checks["cost_fell"] < 1,
+        ZERO_GRADIENT: checks["zero_gradient"] > 0,
+    }
+    return [reason for reason, is_given in reasons.items() if is_given]

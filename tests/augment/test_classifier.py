@@ -1,27 +1,37 @@
-"""A classifier shows normalized images to its network, stays frozen, and refuses wrong calls."""
+"""Classifiers of networks, which stay frozen; what a plain network does not tell is assumed."""
 
 import re
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torchvision.transforms import Normalize
 
-from augment.classifier import Classifier
-from augment.network import ChannelNormalization, Network
-from renderer.errors import InputError
+import augment
+import norm_balls as nb
+import renderer
+from augment.classifier import Classifier, as_classifier
+from augment.network import ChannelNormalization, Network, say_once
+from renderer import InputError
 
+MEAN = (0.485, 0.456, 0.406)
+STD = (0.229, 0.224, 0.225)
+SIZE = 8
+CLASSES = ("orange", "lemon", "apple")
 COLORS = ("red", "green", "blue")
 EPS = torch.finfo(torch.float64).eps
-MEAN = (0.1, 0.4, 0.6)
-STD = (0.2, 0.5, 3.0)
+SHIFT = (0.1, 0.4, 0.6)
+SCALE = (0.2, 0.5, 3.0)
 
 
-def random_images(size: int, count: int = 2) -> torch.Tensor:
-    """Draw images (count, 3, size, size)."""
-    return torch.rand(count, 3, size, size, generator=torch.Generator().manual_seed(0))
+def random_images(size: int = 8) -> Tensor:
+    """Draw images (2, 3, size, size)."""
+    return torch.rand(2, 3, size, size, generator=torch.Generator().manual_seed(0))
 
 
-def mean_color(images: torch.Tensor) -> torch.Tensor:
+def mean_color(images: Tensor) -> Tensor:
     """Return the mean (N, 3) of each channel."""
     return images.mean((2, 3))
 
@@ -29,15 +39,15 @@ def mean_color(images: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize(("bgr", "order"), [(False, [0, 1, 2]), (True, [2, 1, 0])])
 def test_a_linear_network_gets_normalized_images_in_its_order_of_channels(bgr, order):
     layer = nn.Linear(3 * 5 * 5, 2)
-    network = Network(nn.Sequential(nn.Flatten(), layer), [ChannelNormalization(MEAN, STD, bgr)])
+    network = Network(nn.Sequential(nn.Flatten(), layer), [ChannelNormalization(SHIFT, SCALE, bgr)])
     classifier = Classifier(network, 5, ["fig", "lime"]).double()
     images = random_images(5).double().requires_grad_()
     logits = classifier(images)[:, 1]
     (gradient,) = torch.autograd.grad(logits.sum(), images)
-    weight = layer.weight[1].view(3, 5, 5) / torch.tensor(STD)[:, None, None]
+    weight = layer.weight[1].view(3, 5, 5) / torch.tensor(SCALE)[:, None, None]
     expected_gradient = weight[order].expand(2, 3, 5, 5)
     torch.testing.assert_close(gradient, expected_gradient, rtol=4 * EPS, atol=0)
-    offset = layer.bias[1] - (weight * torch.tensor(MEAN)[:, None, None]).sum()
+    offset = layer.bias[1] - (weight * torch.tensor(SHIFT)[:, None, None]).sum()
     expected = (images * weight[order]).sum((1, 2, 3)) + offset
     # Each logit is a sum of 75 products.
     torch.testing.assert_close(logits, expected, rtol=0, atol=75 * 16 * EPS)
@@ -45,7 +55,7 @@ def test_a_linear_network_gets_normalized_images_in_its_order_of_channels(bgr, o
 
 def test_a_callable_is_a_classifier_of_the_images_as_they_are():
     classifier = Classifier(mean_color, 8, COLORS, name="color")
-    images = random_images(8).requires_grad_()
+    images = random_images().requires_grad_()
     assert torch.equal(classifier(images), images.mean((2, 3)))
     (gradient,) = torch.autograd.grad(classifier(images)[:, 1].sum(), images)
     expected = torch.zeros_like(images)
@@ -59,7 +69,7 @@ def test_a_classifier_is_frozen_and_stays_in_eval_mode():
         nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Dropout(0.5), nn.Flatten(), nn.Linear(144, 2)
     )
     classifier = Classifier(network, 8, ["fig", "lime"])
-    images = random_images(8)
+    images = random_images()
     statistics = network[1].running_mean.clone()
     before = classifier(images)
     assert classifier.train() is classifier
@@ -98,3 +108,252 @@ def test_a_wrong_class_name_is_refused_with_similar_ones():
     classifier = Classifier(mean_color, 8, ["lemon", "orange", "pear"], name="mine")
     with pytest.raises(InputError, match=r"'ornage'.*orange"):
         classifier.label("ornage")
+
+
+# --------------------------------------------------------------- plain networks
+
+
+@pytest.fixture
+def network() -> nn.Module:
+    """Return a network of three classes, in evaluation mode."""
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 3), nn.Tanh()).eval()
+
+
+@pytest.fixture
+def images() -> Tensor:
+    return torch.rand(4, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
+
+
+def scene(label: str | int) -> augment.Scene:
+    """Build the scene of an orange under any label."""
+    return augment.build_scene([("solid:orange", label)], SIZE)
+
+
+def light() -> augment.AttackSettings:
+    """Return settings of an attack on light of two steps."""
+    lighting = augment.StepSettings(step_size=0.5)
+    return augment.AttackSettings(lighting=lighting, max_steps=2, allow_negative=True)
+
+
+BYTES = ((100.0, 110.0, 120.0), (50.0, 60.0, 70.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"normalization": "imagenet"}, Normalize(MEAN, STD)),
+        (
+            {"normalization": BYTES, "value_range": (0, 255)},
+            lambda images: Normalize(*BYTES)(255 * images),
+        ),
+        # The mean and the standard deviation of ImageNet are scaled to the range of the network.
+        ({"normalization": "imagenet", "value_range": (0, 255)}, Normalize(MEAN, STD)),
+        ({"normalization": "imagenet", "value_range": (-1, 1)}, Normalize(MEAN, STD)),
+        ({"value_range": (-1, 1)}, lambda images: 2 * images - 1),
+    ],
+)
+def test_a_network_gets_images_in_its_own_units(network, images, options, expected):
+    classifier = as_classifier(network, SIZE, **options)
+    torch.testing.assert_close(classifier(images), network(expected(images)))
+    assert classifier.classes == ("0", "1", "2")
+
+
+def test_a_plain_network_is_attacked_like_its_classifier(network):
+    classifier = augment.Classifier(network, SIZE, CLASSES)
+    expected = augment.attack(classifier, scene("orange"), settings=light(), force=True)
+    options = {"settings": light(), "force": True}
+    by_name = augment.attack(network, scene("orange"), classes=CLASSES, **options)
+    by_index = augment.attack(network, scene(0), **options)
+    for result in (by_name, by_index):
+        assert torch.equal(result.images, expected.images)
+        assert torch.equal(result.logits, expected.logits)
+
+
+def test_a_number_is_an_index_even_if_a_class_has_this_number_as_its_name(network):
+    options = {"settings": light(), "force": True, "classes": ("1", "2", "0")}
+    by_index = augment.attack(network, scene(1), target=2, **options).criterion
+    assert (by_index.source.item(), by_index.target.item()) == (1, 2)
+    by_name = augment.attack(network, scene("1"), target="2", **options).criterion
+    assert (by_name.source.item(), by_name.target.item()) == (0, 1)
+    of_a_list = augment.attack(network, scene(1), target=[np.int64(2)], **options).criterion
+    assert of_a_list.target.item() == 2
+    mesh = renderer.solid("orange", 0)
+    of_a_mesh = augment.attack(network, augment.build_scene([(mesh, 1)], SIZE), **options)
+    assert of_a_mesh.criterion.source.item() == 1
+
+
+def test_the_parameters_of_the_network_require_gradients_as_before(network):
+    network[1].bias.requires_grad_(False)
+    augment.attack(network, scene(0), settings=light(), force=True)
+    assert [parameter.requires_grad for parameter in network.parameters()] == [True, False]
+
+
+def without_eval(network: nn.Sequential) -> nn.Module:
+    """Return a network with a module in training mode."""
+    network[2].train()
+    return network
+
+
+def with_pixel_mean(network: nn.Module) -> nn.Module:
+    """Return a network that seems to subtract a mean."""
+    network.register_buffer("pixel_mean", torch.zeros(3))
+    return network
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        (without_eval, {}, "training mode"),
+        (lambda _: lambda images: {"logits": images.mean((2, 3))}, {}, "dict"),
+        (
+            lambda network: nn.Sequential(Normalize(MEAN, STD), network).eval(),
+            {"normalization": "imagenet"},
+            "Normalize",
+        ),
+        (with_pixel_mean, {"normalization": "imagenet"}, "pixel_mean"),
+        (lambda network: network, {"classes": CLASSES[:2]}, "classes has 2 names"),
+        (lambda network: network, {"normalization": BYTES}, "value_range"),
+        (lambda _: nn.Flatten, {}, "Flatten"),
+        (
+            lambda network: augment.Classifier(network, SIZE, CLASSES),
+            {"classes": CLASSES},
+            "plain network",
+        ),
+    ],
+)
+def test_a_mistake_is_refused(network, change, options, message):
+    with pytest.raises(InputError, match=message):
+        as_classifier(change(network), SIZE, **options)
+
+
+def test_a_network_with_a_single_output_is_refused():
+    """The softmax of one logit is 1, so that no attack could succeed."""
+    network = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 1)).eval()
+    for attacked in (network, lambda images: network(images)):
+        with pytest.raises(InputError, match="at least two"):
+            augment.attack(attacked, scene(0), settings=light())
+
+
+@pytest.mark.parametrize(("label", "message"), [(3, "label 3"), ("orange", "name the classes")])
+def test_a_label_that_is_no_class_is_refused(network, label, message):
+    with pytest.raises(InputError, match=message):
+        augment.attack(network, scene(label))
+
+
+def test_adversaries_are_shown_to_a_plain_network_as_to_its_classifier(network):
+    result = augment.attack(network, scene(0), settings=light(), force=True)
+    classifier = augment.Classifier(network, SIZE, ["0", "1", "2"])
+    [expected] = augment.transfer(result, [classifier])
+    network.requires_grad_(True)
+    [row] = augment.transfer(result, [network])
+    assert row | {"network": ""} == expected | {"network": ""}
+    assert all(parameter.requires_grad for parameter in network.parameters())
+
+
+@pytest.mark.parametrize("layer", [nn.BatchNorm2d(3), nn.Dropout(0.5)])
+@pytest.mark.parametrize(
+    "wrap", [lambda network: partial(network.forward), nn.Module.__call__.__get__]
+)
+def test_a_function_whose_network_is_in_training_mode_is_refused(layer, wrap):
+    network = nn.Sequential(layer, nn.AdaptiveAvgPool2d(1), nn.Flatten()).train()
+    with pytest.raises(InputError, match=r"eval\(\)"):
+        as_classifier(wrap(network), size=8)
+    as_classifier(wrap(network.eval()), size=8)
+
+
+IMAGENET = "mean (0.485, 0.456, 0.406) and std (0.229, 0.224, 0.225)"
+ASSUMED = "size and normalization are assumed"
+
+
+@pytest.fixture
+def said(caplog):
+    """Function that returns the lines about images so far."""
+    say_once.cache_clear()
+    return lambda: [record.message for record in caplog.records if "pixels" in record.message]
+
+
+@pytest.fixture(scope="module")
+def resnet_weights(tmp_path_factory):
+    from torchvision.models import resnet18
+
+    path = tmp_path_factory.mktemp("weights") / "my64.pth"
+    torch.save(resnet18(num_classes=3).state_dict(), path)
+    return path
+
+
+def test_what_is_known_of_own_weights_is_said_once_and_what_the_user_leaves_out_is_assumed(
+    resnet_weights, said
+):
+    half = ((0.5, 0.5, 0.5), (0.25, 0.25, 0.25))
+    for options in ({}, {}, {"size": 64}, {"size": 64, "normalization": half}):
+        nb.load_classifier("torchvision:resnet18", resnet_weights, **options)
+    first, second, third = said()
+    for part in ("torchvision:resnet18", "224 × 224", IMAGENET, ASSUMED):
+        assert part in first
+    assert "64 × 64" in second
+    assert "normalization is assumed" in second
+    assert "size" not in second
+    assert "mean (0.5, 0.5, 0.5) and std (0.25, 0.25, 0.25)" in third
+    assert "assumed" not in third
+
+
+@pytest.mark.parametrize("source", [pytest.param("torchvision", marks=pytest.mark.slow), "timm"])
+def test_position_embeddings_tell_the_size(source, said, tmp_path):
+    path = tmp_path / "vit.pth"
+    if source == "torchvision":
+        from torchvision.models import vit_b_32
+
+        name, network = "vit_b_32", vit_b_32(num_classes=3, image_size=64)
+    else:
+        timm = pytest.importorskip("timm")
+        name = "vit_tiny_patch16_224"
+        network = timm.create_model(name, num_classes=3, img_size=64)
+    torch.save(network.state_dict(), path)
+    classifier = nb.load_classifier(f"{source}:{name}", path)
+    assert classifier.size == 64
+    assert classifier(torch.rand(2, 3, 64, 64)).shape == (2, 3)
+    (line,) = said()
+    assert "64 × 64" in line
+    assert "normalization is assumed" in line
+
+
+def test_onnx_gives_the_scores_of_its_graph_and_the_size_that_it_tells_is_not_assumed(
+    said, tmp_path
+):
+    """The graph takes the mean of each channel, which is written without a library of networks."""
+    pytest.importorskip("onnxruntime")
+    onnx = pytest.importorskip("onnx")
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    for size, path in ((64, tmp_path / "fixed.onnx"), ("size", tmp_path / "free.onnx")):
+        graph = helper.make_graph(
+            [helper.make_node("ReduceMean", ["x"], ["y"], axes=[2, 3], keepdims=0)],
+            "graph",
+            [helper.make_tensor_value_info("x", kind, ["n", 3, size, size])],
+            [helper.make_tensor_value_info("y", kind, ["n", 3])],
+        )
+        opsets = [helper.make_opsetid("", 13)]
+        onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
+        classifier = nb.load_classifier(str(path))
+        images = torch.rand(4, 3, classifier.size, classifier.size)
+        torch.testing.assert_close(classifier(images), images.mean((2, 3)), rtol=1e-5, atol=1e-6)
+    fixed, free = said()
+    for part in ("64 × 64", "not normalized", "normalization is assumed"):
+        assert part in fixed
+    assert "size" not in fixed
+    assert "224 × 224" in free
+    assert ASSUMED in free
+
+
+def test_a_plain_network_is_mentioned_only_if_its_size_is_assumed(said):
+    network = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()
+    as_classifier(network, 8)
+    assert said() == []
+    as_classifier(network)
+    timm = pytest.importorskip("timm")
+    # timm records the size of the images in the configuration of a network.
+    network = timm.create_model("test_efficientnet", num_classes=3).eval()
+    assert as_classifier(network).size == 160
+    for line, size in zip(said(), (224, 160), strict=True):
+        assert f"{size} × {size}" in line
+        assert ASSUMED in line

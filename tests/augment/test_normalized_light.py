@@ -5,9 +5,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.classifier import Classifier
+from augment.classifier import Classifier, as_classifier
 from augment.network import LightNormalization, normalize_light
-from augment.plain_networks import as_classifier
 from augment.settings import NormalizedLightSettings
 from renderer import InputError
 

@@ -158,7 +158,7 @@ def test_a_function_without_gradients_is_attacked_by_random_search(photographs):
 
 
 def test_photographs_of_another_size_are_an_error(photographs):
-    from augment.plain_networks import as_classifier
+    from augment.classifier import as_classifier
 
     classifier = as_classifier(HueNetwork().eval(), SIZE, None)
     with pytest.raises(InputError, match="16 pixels"):

@@ -178,26 +178,22 @@ class Harmful:
         return os.mkdir, ("harm",)
 
 
-def write_code(state: dict, path: Path) -> None:
-    """Write an object whose reading would run code."""
-    torch.save(Harmful(), path)
-
-
-def write_ten_classes(state: dict, path: Path) -> None:
-    """Write weights whose last bias has ten values."""
-    torch.save(state | {"classifier.1.bias": torch.zeros(10)}, path)
-
-
 @pytest.mark.parametrize(
-    ("write", "message"),
-    [(write_code, "cannot be read"), (write_ten_classes, "torchvision:squeezenet1_1")],
+    ("content", "message"),
+    [
+        (Harmful(), "cannot be read"),
+        # Weights whose last bias has ten values.
+        ({"classifier.1.bias": torch.zeros(10)}, "torchvision:squeezenet1_1"),
+    ],
 )
 def test_a_file_of_other_weights_is_refused_by_name_and_runs_no_code(
-    tmp_path, monkeypatch, write, message
+    tmp_path, monkeypatch, content, message
 ):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "squeezenet.pth"
-    write(squeezenet1_1().state_dict(), path)
+    if isinstance(content, dict):
+        content = squeezenet1_1().state_dict() | content
+    torch.save(content, path)
     with pytest.raises(InputError, match=message) as caught:
         load_classifier("torchvision:squeezenet1_1", path)
     assert str(caught.value).startswith(f"weights={path}")

@@ -186,8 +186,9 @@ def test_the_gpus_questions_are_refused_without_one(capsys):
     assert capsys.readouterr().err.count("error: torch finds no GPU here") == 1
 
 
-def test_optimizers_are_compared_at_equal_forward_passes(capsys):
+def test_optimizers_are_compared_at_equal_forward_passes(capsys, monkeypatch):
     pytest.importorskip("cma")
+    monkeypatch.setattr(gradient_free, "FRUIT", ("orange",))
     arguments = ["--network", "none", "--views", "1", "--seeds", "1", "--budgets", "2", "20"]
     gradient_free.main(arguments)
     header, _, *rows = capsys.readouterr().out.splitlines()

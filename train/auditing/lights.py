@@ -25,9 +25,8 @@ from augment.attack_settings import (
     SkylightSettings,
     StepSettings,
 )
-from augment.attacks.attack import attack
+from augment.attacks.attack import EXPOSURES, attack
 from augment.attacks.checks import success_by_radius
-from augment.attacks.find_scene import EXPOSURES
 from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult, predictions

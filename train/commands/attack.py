@@ -17,10 +17,9 @@ from torch import Tensor
 
 from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.attacks.adversary import Adversary, reload
-from augment.attacks.attack import attack
+from augment.attacks.attack import attack, find_scene
 from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
 from augment.attacks.files import require_renderers, save
-from augment.attacks.find_scene import find_scene
 from augment.attacks.objective import NO_CLASS, Criterion, Objective, preprocessed_model
 from augment.attacks.result import ZERO_GRADIENT, AttackResult, predictions, warnings
 from augment.classifier import Classifier

@@ -6,14 +6,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from augment.classifier import Classifier
-from augment.plain_networks import (
-    UNIT_RANGE,
-    Normalization,
-    as_classifier,
-    device_of,
-    gradient_flags_kept,
-)
+from augment.classifier import UNIT_RANGE, Classifier, Normalization, as_classifier
+from augment.network import device_of, gradient_flags_kept
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, as_list
 from train.auditing.audit import run_audit

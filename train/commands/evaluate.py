@@ -7,16 +7,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from augment.classifier import Classifier
-from augment.plain_networks import (
-    UNIT_RANGE,
-    Normalization,
-    as_classifier,
-    as_facts,
-    device_of,
-    gradient_flags_kept,
-    require_no_facts,
-)
+from augment.classifier import UNIT_RANGE, Classifier, Normalization, as_classifier
+from augment.files import as_facts, require_no_facts
+from augment.network import device_of, gradient_flags_kept
 from augment.settings import NormalizeLight
 from renderer.errors import as_folder, keyed
 from train.checkpoints import load_chosen, load_run

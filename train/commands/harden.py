@@ -11,10 +11,15 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from augment import plain_networks
 from augment.augmentation_settings import AugmentationSettings
-from augment.classifier import Classifier
-from augment.network import unwrapped
+from augment.classifier import (
+    UNIT_RANGE,
+    Classifier,
+    Normalization,
+    as_classifier,
+    require_evaluation_mode,
+)
+from augment.network import device_of, unwrapped
 from augment.settings import NormalizeLight, RendererSettings
 from renderer.errors import InputError, as_path, describe, require_kind
 from renderer.settings import Settings
@@ -48,8 +53,8 @@ def harden(
     hard_negatives: Sequence[class_names.MeshItem] | None = None,
     classes: Sequence[str] | None = None,
     size: int | None = None,
-    normalization: plain_networks.Normalization = None,
-    value_range: tuple[float, float] = plain_networks.UNIT_RANGE,
+    normalization: Normalization = None,
+    value_range: tuple[float, float] = UNIT_RANGE,
     normalize_light: NormalizeLight = None,
     train: TrainSettings | Section = None,
     augment: AugmentationSettings | Section = None,
@@ -124,11 +129,11 @@ def harden(
         >>> torch.save(hardened.state_dict(), "hardened.pth")  # doctest: +SKIP
     """
     require_kind("network", network, nn.Module, "a torch.nn.Module, whose weights are trained")
-    device = plain_networks.device_of(network) if device is None else device
+    device = device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with folder_or_temporary(out) as folder:
         require_new_run(folder, "out", overwrite, resume=False)
-        classifier = plain_networks.as_classifier(
+        classifier = as_classifier(
             _trainable_copy(network), *options, normalize_light=normalize_light
         )
         if next(classifier.parameters(), None) is None:
@@ -178,7 +183,7 @@ def harden(
 def _trainable_copy(network: nn.Module) -> nn.Module:
     """Copy a network, and check that the weights of the copy can be trained."""
     if not isinstance(network, Classifier):
-        plain_networks.require_evaluation_mode(network, "network")
+        require_evaluation_mode(network, "network")
     copy = deepcopy(network)
     # An optimizer can change a parameter only if it is a leaf of the autograd graph.
     if not all(weight.is_leaf for weight in copy.parameters()):

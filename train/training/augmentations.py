@@ -17,9 +17,8 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.attack_settings import AttackSettings, RelightingSettings, StepSettings
 from augment.attacks.loop import minimize_from
-from augment.attacks.norm_ball import NormBalls
 from augment.attacks.objective import Criterion, Objective, label_loss
-from augment.attacks.optimizers import Gradient
+from augment.attacks.optimizers import Gradient, NormBalls
 from augment.photographs import RelitPhotographs, draw_projected_light
 from augment.random_streams import generator, stream_seed
 from renderer.errors import MAX_SCALE

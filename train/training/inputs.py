@@ -11,9 +11,8 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.attacks.objective import complementary_label
 from augment.classifier import Classifier, class_index
-from augment.files import is_network_file
+from augment.files import as_facts, is_network_file, require_no_facts
 from augment.network import without_normalized_light
-from augment.plain_networks import as_facts, require_no_facts
 from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene

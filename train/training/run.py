@@ -14,7 +14,7 @@ from torch import Tensor
 
 from augment import distributed
 from augment import network as wrappers
-from augment.plain_networks import say_inputs
+from augment.network import say_inputs
 from augment.random_streams import stream_seed
 from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit

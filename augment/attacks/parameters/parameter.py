@@ -6,7 +6,7 @@ from typing import ClassVar
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from augment.attacks.norm_ball import NormBalls
+from augment.attacks.optimizers import NormBalls
 from augment.scene.objects import Conditions
 
 

@@ -219,7 +219,10 @@ CAMERA = {"polar": 0, "azimuth": 0}
         ({"cameras": [CAMERA | {"width": 0}]}, "width=0"),
         ({"own_faces": 0}, "own_faces=0"),
         ({"background": [1]}, r"adversary\.json: background=\[1\]"),
-        ({"cameras": [CAMERA | {"width": 2, "distance": 0.5}]}, r"adversary\.json.*distance 0\.5"),
+        (
+            {"cameras": [CAMERA | {"width": 2, "distance": 0.5}]},
+            r"adversary\.json: the mesh reaches",
+        ),
     ],
     ids=["another size", "a flat camera", "no own faces", "a list", "a camera in the mesh"],
 )
@@ -232,19 +235,11 @@ def test_an_impossible_description_is_refused(undamaged, tmp_path, changes, mess
         reload(folder)
 
 
-def remove_description(folder: Path) -> None:
-    """Remove the description."""
-    (folder / DESCRIPTION).unlink()
-
-
-def cut_description(folder: Path) -> None:
-    """Leave the first character of the description."""
-    (folder / DESCRIPTION).write_text("{")
-
-
-def remove_mesh(folder: Path) -> None:
-    """Remove the mesh."""
-    (folder / "mesh.glb").unlink()
+def announce_10_terabytes(folder: Path) -> None:
+    """Write the header of an image of 10 TB, and nothing more."""
+    header = {"descr": "<f4", "fortran_order": False, "shape": (10**6, 10**6, 3)}
+    with open(folder / "after.npy", "wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
 
 
 def put_pipe(folder: Path) -> None:
@@ -253,29 +248,20 @@ def put_pipe(folder: Path) -> None:
     os.mkfifo(folder / "after.npy")
 
 
-def announce_10_terabytes(folder: Path) -> None:
-    """Write the header of an image of 10 TB, and nothing more."""
-    header = {"descr": "<f4", "fortran_order": False, "shape": (10**6, 10**6, 3)}
-    with open(folder / "after.npy", "wb") as file:
-        np.lib.format.write_array_header_1_0(file, header)
+DAMAGES = {
+    "no description": (lambda folder: (folder / DESCRIPTION).unlink(), "does not exist"),
+    "cut": (lambda folder: (folder / DESCRIPTION).write_text("{"), "does not describe"),
+    "no mesh": (lambda folder: (folder / "mesh.glb").unlink(), "mesh.glb does not exist"),
+    "pipe": (put_pipe, "after.npy"),
+    "10 TB": (announce_10_terabytes, "after.npy"),
+    "beyond float32": (
+        lambda folder: np.save(folder / "after.npy", np.full((1, 3, 8, 8), 1e300)),
+        "after.npy",
+    ),
+}
 
 
-def write_large_numbers(folder: Path) -> None:
-    """Write an image whose numbers are beyond float32."""
-    np.save(folder / "after.npy", np.full((1, 3, 8, 8), 1e300))
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (remove_description, "does not exist"),
-        (cut_description, "does not describe"),
-        (remove_mesh, "mesh.glb does not exist"),
-        (put_pipe, "after.npy"),
-        (announce_10_terabytes, "after.npy"),
-        (write_large_numbers, "after.npy"),
-    ],
-)
+@pytest.mark.parametrize(("damage", "message"), DAMAGES.values(), ids=DAMAGES)
 def test_a_damaged_file_is_refused_by_name(undamaged, tmp_path, damage, message):
     folder = shutil.copytree(undamaged, tmp_path / "damaged")
     damage(folder)

@@ -22,7 +22,8 @@ def slow_attack(attacked) -> AttackResult:
     return attacked(SMALL_STEPS, {"backgrounds": [0.3, 0.5, 0.7]}, max_steps=3)
 
 
-def test_checks_tell_that_the_cost_falls(slow_attack):
+def test_checks_tell_that_the_cost_falls_and_that_more_steps_succeed_more_often(slow_attack):
+    """Nothing is drawn, so that a longer descent repeats the shorter one."""
     checks = augment.check(slow_attack)
     descent = slow_attack.minimum
     assert checks["cost_before"] == pytest.approx(float(descent.cost_before.mean()))
@@ -31,11 +32,6 @@ def test_checks_tell_that_the_cost_falls(slow_attack):
     assert checks["cost_fell"] == 1
     assert checks["zero_gradient"] == 0
     assert 0 <= checks["random_search"] <= 1
-
-
-def test_more_steps_succeed_more_often(slow_attack):
-    """Nothing is drawn, so that a longer descent repeats the shorter one."""
-    checks = augment.check(slow_attack)
     assert list(checks["success_by_steps"]) == [3, 9, 30]
     rates = list(checks["success_by_steps"].values())
     assert rates == sorted(rates)
@@ -233,27 +229,23 @@ def test_a_network_without_the_target_class_is_refused(sky_attack):
         augment.transfer(sky_attack, [network(("orange", "lime"))])
 
 
-def test_a_transfer_to_other_azimuths_is_to_a_scene_with_turned_cameras(result):
-    (row,) = augment.transfer(result, azimuths=[-30.0])
-    assert row["azimuth"] == "-30°"
-    scene = result.problem.scene
-    examples = []
-    for example in scene.examples:
-        [camera] = example.cameras
-        turned = replace(camera, azimuth=camera.azimuth - 30)
-        examples.append(replace(example, cameras=(turned,)))
-    images = scene.changed(examples=examples).render(result.conditions, BOTH)
-    assert row["confidence"] == confidence(network()(images[:, 0])[:, None])
-
-
-def test_a_transfer_to_another_mesh_is_to_a_scene_with_it(result):
+def test_a_transfer_is_to_a_scene_with_turned_cameras_or_with_another_mesh(result):
     """The apple has the label lime, but not its color."""
     objects = augment.build_scene([("solid:apple", "lime")], 12).objects
-    (row,) = augment.transfer(result, objects=objects)
+    turned_row, row = augment.transfer(result, azimuths=[-30.0], objects=objects)
+    assert turned_row["azimuth"] == "-30°"
     assert row["mesh"] == "solid:apple"
-    images = result.problem.scene.changed(objects=objects).render(result.conditions, BOTH)
-    assert row["confidence"] == confidence(network()(images[:, 0])[:, None])
     assert not any(row["clean_correct"])
+    scene = result.problem.scene
+    turned = []
+    for example in scene.examples:
+        [camera] = example.cameras
+        camera = replace(camera, azimuth=camera.azimuth - 30)
+        turned.append(replace(example, cameras=(camera,)))
+    scenes = scene.changed(examples=turned), scene.changed(objects=objects)
+    for shown, found in zip(scenes, (turned_row, row), strict=True):
+        images = shown.render(result.conditions, BOTH)
+        assert found["confidence"] == confidence(network()(images[:, 0])[:, None])
 
 
 def test_only_clean_correct_examples_are_transferred(result):
@@ -261,10 +253,6 @@ def test_only_clean_correct_examples_are_transferred(result):
     logits_before[0] *= -1  # The first example becomes misclassified.
     (row,) = augment.transfer(replace(result, logits_in_views_before=logits_before), [network()])
     assert row["confidence"] == confidence(result.logits_in_views[1:])
-
-
-def test_nothing_is_transferred_if_every_example_was_misclassified(result):
-    misclassified = replace(result, logits_in_views_before=-result.logits_in_views_before)
-    (row,) = augment.transfer(misclassified, [network()])
-    assert row["confidence"] == []
-    assert row["success"] == []
+    nothing = replace(result, logits_in_views_before=-result.logits_in_views_before)
+    (row,) = augment.transfer(nothing, [network()])
+    assert row["confidence"] == row["success"] == []

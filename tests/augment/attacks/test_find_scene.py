@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attacks.find_scene import LIGHT_GRAY, _candidates, find_scene
+from augment.attacks.attack import LIGHT_GRAY, _candidates, find_scene
 from augment.random_streams import generator
 from augment.settings import SceneSettings
 
@@ -72,11 +72,6 @@ def test_a_camera_and_a_light_are_found_in_which_all_views_are_classified_correc
     assert result.clean_correct.all()
 
 
-def test_the_same_draws_find_the_same_scene():
-    settings = SceneSettings(fov=40.0)
-    assert found(bright_and_small, settings) == found(bright_and_small, settings)
-
-
 def test_cameras_of_a_wide_lens_are_drawn_from_where_all_of_the_mesh_lies_before_them():
     settings = SceneSettings(fov=90.0, backgrounds=["behind.png"])
     _, *drawn = _candidates(settings, 50, torch.Generator().manual_seed(0))
@@ -95,5 +90,4 @@ def test_an_object_that_is_classified_correctly_before_light_gray_alone_is_found
 
 def test_settings_stay_as_they_are_if_no_scene_is_found():
     settings = SceneSettings()
-    never = found(lambda images: 0 * images.sum((1, 2, 3)) - 1, settings, cameras=2)
-    assert never == settings
+    assert found(lambda images: 0 * images.sum((1, 2, 3)) - 1, settings, cameras=2) == settings

@@ -7,6 +7,7 @@ from scipy.special import softmax
 from torch import nn
 
 import augment
+from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.problem import SceneProblem
 from renderer.light.files import load_light
 from renderer.light.nonnegative import project_nonnegative
@@ -40,12 +41,9 @@ def test_no_candidate_leaves_the_ball_or_has_negative_light(attacked, monkeypatc
     torch.testing.assert_close(project_nonnegative(lights), lights, rtol=0, atol=1e-5)
 
 
-PARAMETERS = ["lighting", "skylight", "geometry", "pose", "material", "albedo", "pixels", "lamps"]
-
-
-@pytest.mark.parametrize("parameter", PARAMETERS)
+@pytest.mark.parametrize("parameter", PARAMETER_NAMES)
 def test_search_lowers_the_cost_of_every_parameter(attacked, parameter):
-    result = attacked(parameter, optimizer="random_search", max_queries=30, margin=100.0)
+    result = attacked(parameter, optimizer="random_search", max_queries=20, margin=100.0)
     assert result.minimum.cost < result.minimum.cost_before
     assert not result.minimum.zero_gradient.any()
 
@@ -56,24 +54,18 @@ def logits_of_means(images: np.ndarray) -> np.ndarray:
     return 30 * np.stack([images[:, 0].mean((1, 2)), images[:, 2].mean((1, 2))], axis=1)
 
 
-class Counting:
-    """A NumPy function that keeps the images that it was given."""
-
-    def __init__(self):
-        self.images = []
-
-    def __call__(self, images: np.ndarray) -> np.ndarray:
-        scores = logits_of_means(images)
-        self.images += [image.tobytes() for image in images]
-        return scores
-
-
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 @pytest.mark.filterwarnings("ignore:the light is negative")
 def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, noise):
     pytest.importorskip("cma")
-    function = Counting()
+    seen = []
+
+    def function(images: np.ndarray) -> np.ndarray:
+        scores = logits_of_means(images)
+        seen.extend(image.tobytes() for image in images)
+        return scores
+
     scene = augment.build_scene([("solid:orange", 0)], 8, views=2, rasterizer="numpy")
     lighting = augment.StepSettings("linf", 0.2)
     settings = augment.AttackSettings(
@@ -88,8 +80,8 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
     gray = 2  # images with which the network is checked
     result = augment.attack(function, scene, settings=settings, force=True)
     probes = 1
-    assert len(function.images) == int(result.queries.sum()) + gray + probes
-    assert len(set(function.images)) >= int(result.queries.sum())
+    assert len(seen) == int(result.queries.sum()) + gray + probes
+    assert len(set(seen)) >= int(result.queries.sum())
     assert result.backward_passes.tolist() == [0] * len(scene)
     assert (result.minimum.queries <= 40).all()
 

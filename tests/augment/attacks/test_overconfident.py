@@ -5,7 +5,7 @@ import torch
 
 import norm_balls as nb
 
-VIEWS = 8
+VIEWS = 5
 # Radius at which attacks with each optimizer succeed in some views and fail in others.
 RADIUS = 0.08
 
@@ -17,13 +17,14 @@ def network() -> nb.Classifier:
 
 @pytest.fixture(scope="module")
 def scene(network) -> nb.Scene:
-    return nb.build_scene([("solid:orange:7", "orange")], network.size, views=VIEWS)
+    options = {"views": VIEWS, "samples": 1}
+    return nb.build_scene([("solid:orange:7", "orange")], network.size, **options)
 
 
 def attack(
     network: nb.Classifier, scene: nb.Scene, factor: float, optimizer: str
 ) -> nb.AttackResult:
-    """Attack a network, whose logits are multiplied by a factor, in eight views."""
+    """Attack a network, whose logits are multiplied by a factor, in a few views."""
 
     def logits(images: torch.Tensor) -> torch.Tensor:
         return factor * network.network(images)
@@ -31,7 +32,7 @@ def attack(
     classifier = nb.Classifier(logits, network.size, network.classes)
     settings = nb.AttackSettings(
         optimizer=optimizer,
-        max_steps=12,
+        max_steps=6,
         max_queries=None if optimizer == "gradient" else 60,
         allow_negative=True,  # Without the projection, the test takes less time.
         lighting=nb.StepSettings(radius=RADIUS),
@@ -56,7 +57,7 @@ def test_an_attack_succeeds_in_the_same_views_if_the_logits_are_multiplied(
     expected = result.success
     # All views can be attacked, and the radius separates them.
     assert result.clean_correct.all()
-    assert 3 <= int(expected.sum()) <= VIEWS - 2
+    assert 2 <= int(expected.sum()) <= VIEWS - 1
     found = attack(network, scene, 1e4, optimizer).success
     assert int((found ^ expected).sum()) <= 1
 

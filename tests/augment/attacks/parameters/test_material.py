@@ -4,6 +4,7 @@ import colorsys
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,6 +120,7 @@ def three_eggs(varied) -> Scene:
 
 
 def test_a_material_starts_as_the_scene_shows_it_and_a_matte_object_is_varnished(three_eggs):
+    """Values are roughness, metallic, strength and hue in their units."""
     problem = problem_of(three_eggs)
     rows = torch.arange(3)
     varnished_egg = add_table(SceneObject("egg", Gloss().on(egg(None))), TABLE)
@@ -126,13 +128,9 @@ def test_a_material_starts_as_the_scene_shows_it_and_a_matte_object_is_varnished
     expected = varnished.render(three_eggs.conditions(rows), rows)
     rendered = problem.render(problem.start, rows)
     torch.testing.assert_close(rendered, expected, rtol=0, atol=2e-6)
-
-
-def test_values_are_roughness_metallic_strength_and_hue_in_their_units(three_eggs):
     units = torch.tensor([0.3, 0.2, 0.5, math.radians(40.0)], dtype=torch.float64)
-    start = problem_of(three_eggs).start * units
     expected = torch.tensor([[0.5, 0, 1, 0], [0.4, 0, 1, 0], [0.5, 0.2, 0.5, 0]]).double()
-    torch.testing.assert_close(start, expected, rtol=0, atol=2e-6)
+    torch.testing.assert_close(problem.start * units, expected, rtol=0, atol=2e-6)
 
 
 def test_all_faces_of_the_object_change_alike_and_the_table_stays(three_eggs, varied):
@@ -187,6 +185,18 @@ def test_the_hue_turns_by_the_angle_and_keeps_the_mean(angle):
 # --------------------------------------------------------------- files
 
 
+def write(problem: SceneProblem, values: torch.Tensor, folder: Path) -> Adversary:
+    """Write the only example of a problem with some attack values."""
+    before, after = (
+        final_images(problem, each, FIRST, problem.images(each))[0]
+        for each in (problem.start, values)
+    )
+    conditions = problem.conditions(values, FIRST)
+    adversary = Adversary.of(problem.scene, 0, conditions, before, after)
+    write_adversary(adversary, folder)
+    return adversary
+
+
 @pytest.fixture(params=[egg, textured_egg], ids=["plain", "textured"])
 def written(request, tmp_path) -> tuple[Adversary, float]:
     """Write an adversary beside a table that casts the shadows of highlights.
@@ -196,21 +206,15 @@ def written(request, tmp_path) -> tuple[Adversary, float]:
     scene = scene_of(request.param(Gloss(0.5, 0.3, 0.4)), ground=TABLE, shadows=True)
     problem = problem_of(scene)
     values = problem.start + torch.tensor([[-0.5, 0.6, 0.8, 0.7]])
-    before = problem.images(problem.start)[0]
-    after = final_images(problem, values, FIRST, problem.images(values))[0]
-    adversary = Adversary.of(scene, 0, problem.conditions(values, FIRST), before, after)
-    write_adversary(adversary, tmp_path)
+    adversary = write(problem, values, tmp_path)
     return adversary, 1 / 255 if request.param is textured_egg else 1e-5
 
 
-def test_a_material_is_read_back_to_its_image(written, tmp_path):
+def test_a_material_is_read_back_to_its_image_and_written_as_gltfs_factors(written, tmp_path):
     adversary, rounding = written
     assert (adversary.images - adversary.images_before).abs().max() > 0.03
     image = reload(tmp_path).render()
     torch.testing.assert_close(image.double(), adversary.images.double(), rtol=0, atol=rounding)
-
-
-def test_a_material_is_written_as_gltfs_factors(written, tmp_path):
     glb = (tmp_path / "mesh.glb").read_bytes()
     json_length = int.from_bytes(glb[12:16], "little")
     material = json.loads(glb[20 : 20 + json_length])["materials"][0]
@@ -269,10 +273,8 @@ def test_mitsuba_shows_the_material_that_an_attack_leaves(tmp_path, change):
     problem = problem_of(scene)
     start = problem.start
     values = problem.project(start + torch.tensor([change]), FIRST)
-    before = final_images(problem, start, FIRST, problem.images(start))[0]
-    after = final_images(problem, values, FIRST, problem.images(values))[0]
-    adversary = Adversary.of(scene, 0, problem.conditions(values, FIRST), before, after)
-    write_adversary(adversary, tmp_path)
+    adversary = write(problem, values, tmp_path)
+    before, after = adversary.images_before, adversary.images
     expected = render_again(tmp_path, ["mitsuba"], scene.rasterizer)["mitsuba"].double()
 
     def relative_error(image: torch.Tensor) -> float:

@@ -32,25 +32,13 @@ def problem_of(scene: Scene, **units) -> SceneProblem:
     return SceneProblem(scene, [Pose(scene, settings)])
 
 
-def random_poses(problem: SceneProblem, count: int) -> torch.Tensor:
-    """Draw poses (count, D) in the ball of a problem with one example."""
-    draws = [problem.sample(torch.Generator().manual_seed(seed)) for seed in range(count)]
-    return torch.cat(draws)
-
-
 def costs(
     result: augment.AttackResult, classifier: augment.Classifier, values: torch.Tensor
 ) -> torch.Tensor:
     """Return the log-probability (N,) of the right class for poses (N, D)."""
     rows = torch.zeros(len(values), dtype=torch.int64)
     logits = classifier(result.problem.render(values, rows)[:, 0])
-    label = result.criterion.source[0, 0]
-    return logits.log_softmax(1)[:, label]
-
-
-def put_on_ground(vertices: np.ndarray, before: np.ndarray, is_own: np.ndarray) -> None:
-    """Lift vertices (V, 3), so that the object's lowest one is as high as before."""
-    vertices[:, 2] += before[is_own, 2].min() - vertices[is_own, 2].min()
+    return logits.log_softmax(1)[:, result.criterion.source[0, 0]]
 
 
 # --------------------------------------------------------------- what the values mean
@@ -69,7 +57,8 @@ def test_values_are_a_rotation_vector_a_shift_and_a_scale(ground):
     turn = Rotation.from_rotvec([10.0, -5.0, 20.0], degrees=True)
     expected = 1.1**0.7 * turn.apply(before) + [0.03, -0.02, 0]
     if ground:
-        put_on_ground(expected, before, is_own)
+        # The lowest vertex is as high as before.
+        expected[:, 2] += before[is_own, 2].min() - expected[is_own, 2].min()
     np.testing.assert_allclose(moved[is_own], expected[is_own], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(moved[~is_own], before[~is_own])
 
@@ -140,7 +129,8 @@ def test_descent_finds_a_view_as_good_as_those_of_a_grid_and_at_random(result, b
     steps = torch.linspace(-3, 3, 9)
     grid = torch.zeros(81, 9)
     grid[:, 6:8] = torch.cartesian_prod(steps, steps)
-    others = torch.cat([grid, random_poses(result.problem, 20)])
+    draws = [torch.Generator().manual_seed(seed) for seed in range(20)]
+    others = torch.cat([grid, *map(result.problem.sample, draws)])
     lowest = float(costs(result, by_color, others).min())
     before = float(result.minimum.cost_before[0])
     reached = float(result.minimum.cost[0])
@@ -161,6 +151,3 @@ def test_an_adversarial_pose_is_read_back_to_its_image_and_camera(result, tmp_pa
 def test_a_pose_without_outlines_is_refused():
     with pytest.raises(InputError, match="silhouettes=True"):
         problem_of(scene_of(silhouettes=False))
-
-
-# --------------------------------------------------------------- an ImageNet network

@@ -1,8 +1,6 @@
 """Projections reach the nearest point of a norm-ball, draws are uniform, steps have their size."""
 
 import math
-from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import pytest
@@ -14,9 +12,9 @@ from scipy import optimize, stats
 from torch import Tensor
 
 from augment.attack_settings import NORMS, StepSettings
-from augment.attacks.norm_ball import project, sample, scale_gradient
+from augment.attacks.optimizers import NormBalls, sample
 from renderer.errors import InputError
-from renderer.vectors import nearest_in_box
+from renderer.vectors import Ball, nearest_in_box
 
 EPS = torch.finfo(torch.float32).eps
 DTYPES = [torch.float32, torch.float64]
@@ -38,6 +36,13 @@ def dual_norms(offsets: Tensor, name: str) -> Tensor:
 
 # --------------------------------------------------------------- projections
 
+
+def project(name: str, radius: float | None, values: Tensor, center: Tensor) -> Tensor:
+    """Project values (N, D) onto norm-balls around centers (N, D)."""
+    balls = NormBalls(StepSettings(name, radius), center)
+    return balls.project(values, torch.arange(len(values)))
+
+
 PAIRS = arrays(np.float64, (2, 4, 6), elements=COORDINATES)  # values and centers
 
 
@@ -50,7 +55,7 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
     The largest of these products is (v - p)·(c - p) + radius × the dual norm of v - p.
     """
     values, center = torch.from_numpy(pair).to(dtype)
-    nearest = project(StepSettings(name, radius), values, center)
+    nearest = project(name, radius, values, center)
     assert nearest.dtype == dtype
     moved = (values - nearest).double()
     inward = (center - nearest).double()
@@ -59,56 +64,31 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
     dual = dual_norms(moved, name)
     largest_products = (moved * inward).sum(1) + radius * dual
     assert (largest_products <= rounding * (1 + dual)).all()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("name", NORMS)
-@given(pair=PAIRS, radius=RADII)
-def test_points_of_the_ball_stay_to_the_bit(name, dtype, pair, radius):
-    values, center = torch.from_numpy(pair).to(dtype)
-    nearest = project(StepSettings(name, radius), values, center)
-    # Points at the surface may round.
+    # Points of the ball stay to the bit, but those at the surface may round.
     is_inside = norms((values - center).double(), name) <= radius * (1 - 1e-6)
     assert torch.equal(nearest[is_inside], values[is_inside])
-    assert torch.equal(project(StepSettings(name, 0.0), values, center), center)
-    assert torch.equal(project(StepSettings(name, None), values, center), values)
+    assert torch.equal(project(name, 0.0, values, center), center)
+    assert torch.equal(project(name, None, values, center), values)
 
 
-@dataclass
-class BoxAndBall:
-    """The set that a box and a norm-ball about a center share."""
-
-    name: str
-    center: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    radius: float
-
-    def nearest_distance(self, point: np.ndarray) -> float:
-        """Return the distance (a number) of a point (D,) to the set, by scipy."""
-        constraints = []
-        if self.name == "l2":
-            constraints.append({"type": "ineq", "fun": self.slack, "jac": self.slack_gradient})
-        lowest = np.maximum(self.low, self.center - self.radius)
-        highest = np.minimum(self.high, self.center + self.radius)
-        found = optimize.minimize(
-            lambda x: ((x - point) ** 2).sum(),
-            self.center,
-            jac=lambda x: 2 * (x - point),
-            bounds=list(zip(lowest, highest, strict=True)),
-            constraints=constraints,
-            method="SLSQP",
-            options={"ftol": 1e-12},
-        )
-        return math.sqrt(found.fun)
-
-    def slack(self, x: np.ndarray) -> float:
-        """Return radius² - distance², which is positive in the ball."""
-        return self.radius**2 - ((x - self.center) ** 2).sum()
-
-    def slack_gradient(self, x: np.ndarray) -> np.ndarray:
-        """Return the gradient of `slack`."""
-        return 2 * (self.center - x)
+def nearest_distance(name: str, radius: float, *points: np.ndarray) -> float:
+    """Return the distance of a point (D,) to what a box and a norm-ball share, by scipy."""
+    point, center, low, high = points
+    ball = {
+        "type": "ineq",
+        "fun": lambda x: radius**2 - ((x - center) ** 2).sum(),
+        "jac": lambda x: 2 * (center - x),
+    }
+    found = optimize.minimize(
+        lambda x: ((x - point) ** 2).sum(),
+        center,
+        jac=lambda x: 2 * (x - point),
+        bounds=optimize.Bounds(low.clip(center - radius), high.clip(max=center + radius)),
+        constraints=[ball] if name == "l2" else [],
+        method="SLSQP",
+        options={"ftol": 1e-12},
+    )
+    return math.sqrt(found.fun)
 
 
 SMALL_PAIRS = arrays(np.float64, (2, 3), elements=st.floats(-3, 3))
@@ -126,19 +106,17 @@ def test_within_a_box_no_descent_by_scipy_gets_nearer_than_the_projection(
     down, up = torch.from_numpy(reaches).to(dtype)
     low = center - down
     high = center + up
-    box = partial(nearest_in_box, low=low, high=high)
-    nearest = project(StepSettings(name, radius), values[None], center[None], box)[0]
+    nearest = nearest_in_box(values[None], low, high, Ball(center[None], radius, name))[0]
     assert nearest.dtype == dtype
     assert (low <= nearest).all()
     assert (nearest <= high).all()
     rounding = 64 * torch.finfo(dtype).eps
     assert norms((nearest - center).double()[None], name) <= radius + rounding
 
-    corners = [each.double().numpy() for each in (center, low, high)]
-    shared = BoxAndBall(name, *corners, radius)
+    arrays_of = [each.double().numpy() for each in (values, center, low, high)]
     distance = np.linalg.norm((nearest - values).double().numpy())
     # SLSQP may leave the ball by a little.
-    assert distance <= shared.nearest_distance(values.double().numpy()) + 1e-5
+    assert distance <= nearest_distance(name, radius, *arrays_of) + 1e-5
 
 
 # --------------------------------------------------------------- draws
@@ -194,7 +172,7 @@ def test_a_ball_without_a_radius_has_no_uniform_draw():
 def test_a_unit_step_has_unit_length_whatever_the_gradients_size(scale, tolerance):
     gradient = torch.randn(20, 50, generator=torch.Generator().manual_seed(0))
     expected = gradient.double() / gradient.double().norm(dim=1, keepdim=True)
-    step = scale_gradient(StepSettings(step_size=1.0), gradient * scale)
+    step = NormBalls(StepSettings(step_size=1.0), gradient).scale_gradient(gradient * scale)
     torch.testing.assert_close(step.double(), expected, rtol=0, atol=4 * tolerance)
 
 
@@ -211,5 +189,6 @@ GRADIENT = [[3.0, -4.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]]
 )
 def test_every_example_steps_by_its_own_gradient_and_a_zero_one_stays(step, expected):
     settings = StepSettings(step=step, step_size=1.0)
-    steps = scale_gradient(settings, torch.tensor(GRADIENT))
+    gradient = torch.tensor(GRADIENT)
+    steps = NormBalls(settings, gradient).scale_gradient(gradient)
     torch.testing.assert_close(steps, torch.tensor(expected), rtol=0, atol=EPS)

@@ -10,7 +10,7 @@ from PIL import Image, ImageSequence
 
 import augment
 import renderer
-from augment.attacks.figures import SIDE
+from augment.attacks.result import SIDE
 from renderer.io.images import MARGIN
 from tests.helpers import bright_or_dark
 
@@ -29,28 +29,20 @@ def test_a_plot_shows_the_images_and_the_light_of_its_example(result):
     figure = result.plot(example=1)
     before, light, after, _ = (axes for axes in figure.axes)
     ball = renderer.light_sphere(result.conditions.light[1], 96)
-    for axes, expected in (
-        (before, result.images_before[1]),
-        (light, ball),
-        (after, result.images[1]),
-    ):
+    expected = (result.images_before[1], ball, result.images[1])
+    for axes, image in zip((before, light, after), expected, strict=True):
         shown = axes.images[0].get_array()
-        np.testing.assert_allclose(shown, expected.permute(1, 2, 0).clamp(0, 1), atol=1e-6)
+        np.testing.assert_allclose(shown, image.permute(1, 2, 0).clamp(0, 1), atol=1e-6)
 
 
 def test_the_bars_are_the_probabilities_before_and_after(result):
     bars = result.plot(example=0).axes[3]
-    names = [label.get_text() for label in bars.get_yticklabels()]
+    rows = [result.classifier.label(name.get_text()) for name in bars.get_yticklabels()]
     expected = [result.logits_before[0].softmax(0), result.logits[0].softmax(0)]
     for container, probabilities in zip(bars.containers, expected, strict=True):
         widths = [bar.get_width() for bar in container]
-        rows = [result.classifier.label(name) for name in names]
         np.testing.assert_allclose(widths, probabilities[rows], atol=1e-6)
-
-
-def test_a_notebook_shows_a_result_as_a_picture(result):
-    picture = Image.open(io.BytesIO(result._repr_png_()))
-    assert picture.format == "PNG" and picture.width > picture.height
+    assert Image.open(io.BytesIO(result._repr_png_())).format == "PNG"  # for notebooks
 
 
 @pytest.mark.parametrize("suffix", ["gif", "webp"])
