@@ -39,7 +39,7 @@ from augment.photographs import relight_photographs
 from benchmarks.splits import Method, adapt_texture_or_material, load, log_evaluations
 from renderer.io.images import read_square
 from train.command_settings import LabSettings
-from train.data.photographs import TABLE
+from train.data.photo import TABLE
 from train.laboratory.laboratory import write_laboratory
 from train.results.intervals import Jackknife, Units, average, change, leave_out, weighted_means
 from train.results.tables import Estimate, Table, format_fraction, format_interval, fraction

@@ -43,7 +43,7 @@ from benchmarks.common import write_csv
 from renderer.light.environment import read_map
 from train.checkpoints import is_classifier, load_network, load_run
 from train.command_settings import LabSettings
-from train.data.photographs import TABLE
+from train.data.photo import TABLE
 from train.data.sets import Split, content_hash, held_out_rows, load_npz
 from train.device import MixedPrecision, choose_precision
 from train.laboratory.laboratory import write_laboratory

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, as_tensor, require_bounded, require_choice
-from renderer.settings import ENCODINGS
+from renderer.settings import ENCODINGS, REC_709
 
 # Linear value at which the sRGB curve changes
 # from a straight line to a power function.
@@ -177,8 +177,6 @@ def to_unit(images: UInt8[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:
     return images.float() / 255
 
 
-# CIE 1931 chromaticities x and y of red, green, blue and white (ITU-R BT.709).
-REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 # Chromaticities that differ by at most this are those of Rec. 709, rounded.
 ROUNDING = 1e-3
 # Primaries of cameras are at most 1.5. Larger numbers may be percentages.

@@ -38,6 +38,8 @@ REQUIRED = MISSING
 
 # Allowed encodings of image values.
 ENCODINGS = ("linear", "srgb")
+# CIE 1931 chromaticities x and y of red, green, blue and white (ITU-R BT.709).
+REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 # Allowed kinds of normals.
 NORMALS = ("flat", "smooth")
 # Allowed names of rasterizers.

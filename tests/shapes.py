@@ -13,6 +13,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 from typing import Any, Union, get_args, get_origin
 
 from jaxtyping import AbstractArray, jaxtyped
+from torch import Tensor
 
 PACKAGES = ("renderer", "augment", "train")
 
@@ -66,7 +67,7 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
     def hints() -> dict[str, Any]:
         namespace = inspect.unwrap(function).__globals__
         return {
-            name: eval(hint, namespace) if isinstance(hint, str) else hint
+            name: eval(hint, {"Tensor": Tensor} | namespace) if isinstance(hint, str) else hint
             for name, hint in function.__annotations__.items()
             if _names_shape(hint)
         }

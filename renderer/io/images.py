@@ -9,6 +9,8 @@ and cHRM, or the mark of Adobe RGB in the EXIF data of a camera (DCF 2.0). Witho
 them, pixels are sRGB.
 """
 
+from __future__ import annotations
+
 import io
 import math
 import re
@@ -20,18 +22,19 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import accumulate, repeat, zip_longest
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont, ImageOps, features
 from PIL.TiffImagePlugin import BITSPERSAMPLE, PHOTOMETRIC_INTERPRETATION, TiffImageFile
-from torch import Tensor
 
 from renderer.errors import InputError, require_file
-from renderer.image import REC_709, decode, encode, to_bytes, to_rec709
 from renderer.io.files import atomic_write
+from renderer.settings import REC_709
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 # Suffixes of the files in a folder that count as images.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
@@ -60,6 +63,9 @@ def read_image(path: str | Path, size: int) -> Float[Tensor, "3 size size"]:
         raise InputError(
             f"{path} cannot be read as an image ({error}): give an image file"
         ) from error
+    # Pages of results need no tensors, and do not wait for this import.
+    import torch
+
     return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
 
 
@@ -82,6 +88,8 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Float[Ten
             raise InputError(f"{name}: {error} or a gray value") from error
     if not 0 <= gray <= 1:
         raise InputError(f"{name}={reprlib.repr(choice)} is no image: {advice}")
+    import torch
+
     return torch.full((1, size, size), gray)
 
 
@@ -265,6 +273,8 @@ def tiles_of(
     that a classifier saw. Images have values in [0, 1]. They are enlarged by the smallest whole
     factor that makes them `side` pixels wide.
     """
+    from renderer.image import to_bytes
+
     tiles = []
     for image, caption in zip(images, captions, strict=False):
         pixels = to_bytes(image.detach().cpu()).permute(1, 2, 0).numpy()
@@ -394,6 +404,9 @@ def _coded_colors(path: Path) -> tuple[int, int] | None:
 
 def _conversion(gamma: float | None, primaries: Sequence[float]) -> Conversion | None:
     """Return the conversion from a gamma, or the curve of sRGB (None), and from primaries."""
+    # Most images need neither this import nor torch.
+    from renderer.image import decode, encode, to_bytes, to_rec709
+
     try:
         matrix = to_rec709(primaries, adapt=True)
     except ValueError as error:
@@ -403,6 +416,8 @@ def _conversion(gamma: float | None, primaries: Sequence[float]) -> Conversion |
         return None
 
     def convert(image: Image.Image) -> Image.Image:
+        import torch
+
         levels = torch.arange(256) / 255
         curve = decode(levels, "srgb") if gamma is None else levels**gamma
         linear = curve.numpy()[np.asarray(image.convert("RGB"))]

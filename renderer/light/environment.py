@@ -25,9 +25,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer.errors import MAX_MAGNITUDE, InputError, require_file
-from renderer.image import REC_709, to_rec709
+from renderer.image import to_rec709
 from renderer.io.files import read_numbers, replacing, write_numbers
 from renderer.light.harmonics import basis, equirectangular
+from renderer.settings import REC_709
 
 # Suffixes of the files that `write_map` writes.
 SUFFIXES = (".npy", ".hdr", ".exr")

@@ -14,7 +14,7 @@ from torch import nn
 from augment.classifier import Classifier
 from augment.scene import patterns
 from benchmarks import many_objects, splits
-from train.data.photographs import TABLE
+from train.data.photo import TABLE
 from train.results.tables import Estimate, fraction
 
 CLASSES = ["orange", "lemon", "packet"]

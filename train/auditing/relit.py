@@ -1,32 +1,59 @@
-"""Audit of networks on photographs in the light of a projector, without meshes or labels.
+"""Attacks on networks by the light of a projector on photographs, without meshes or labels.
 
-The projector shows a slide, which is a random picture. A photograph keeps its class
-if no slide changes the predicted class. `train.auditing.audit` runs this test on
-each network. If an audit has no meshes, it is the only test.
+The projector shows a slide, which is a random picture. A network loses a photograph
+if the light of the slide changes the predicted class. The photographs need no labels,
+because the prediction for the unchanged photograph counts as right. If an audit has no meshes,
+this is its only test.
 """
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
+
+import torch
+from PIL import Image
 
 from augment.attack_settings import RelightingSettings
 from augment.classifier import Classifier
-from augment.photographs import ADVERSARIAL, RANDOM, SLIDE
+from augment.photographs import (
+    ADVERSARIAL,
+    RANDOM,
+    SLIDE,
+    UNCHANGED,
+    PhotographAttackResult,
+    attack_photographs,
+)
+from renderer.io.files import atomic_write
+from renderer.io.images import write_image
+from renderer.short_repr import ShortRepr
 from train.command_settings import AuditSettings
+from train.data.photographs import find_unlabeled, load_photographs
 from train.results.first_screen import FirstScreen, ShownMetric
 from train.results.page import write_page
-from train.results.pictures import Picture, read_pictures
-from train.results.relit import (
-    MODELED,
-    TITLES,
-    RelitPhotograph,
-    RelitScores,
-    attack_folder,
-    read_relit,
-)
-from train.results.tables import Table, join_words
+from train.results.pictures import Picture, evenly_spaced, read_pictures
+from train.results.predictions import RELIT
+from train.results.tables import Proportion, Table, format_fraction, fraction, join_words
 from train.run_config import CONFIG, read_config
+from train.run_folder import read_json
 from train.settings import published
+
+# Pictures are written for this many photographs.
+PICTURE_COUNT = 8
+# Titles of the columns of tables, by the kind of light.
+TITLES = {
+    SLIDE: "random slide",
+    RANDOM: "random search",
+    ADVERSARIAL: "gradient",
+}
+# Sentences of reports about what the simulation of the light leaves out.
+MODELED = (
+    "A slide is the picture that a projector shows. "
+    "This models a flat print of each photograph in the light of a projector, with the shading of "
+    "a random smooth surface. There are no cast shadows, highlights or changes of the shape."
+)
+
 
 # Name of the subfolder for these results in the folder of results of a network.
 RELIT_FOLDER = "relit"
@@ -55,21 +82,183 @@ IN_LIGHT = {
 
 
 @dataclass(frozen=True)
-class RelitSection:
-    """Section of a report about one network and photographs in the light of a projector.
+class RelitPhotograph:
+    """Predictions of a network for one photograph in the light of several slides.
+
+    A slide is a random picture that a projector shows on the photograph. There
+    are up to three kinds of light: "slide" is the slide itself, "random" is the
+    slide after a random search, and "adversarial" is the slide after a gradient
+    attack.
 
     Attributes:
-        name: Name of the network.
-        tables: Table with a row for each kind of light, and table with a row
-            for each class.
-        pictures: Pictures that show a photograph in each kind of light.
-        sentences: Sentences about the results and the test.
+        path: Path of the photograph, relative to its folder.
+        predicted: Predicted class of the unchanged photograph.
+        kept: For each kind of light, the number of slides under which the
+            predicted class stays the same.
+        becomes: For each kind of light, the predicted class under each slide.
     """
 
-    name: str
-    tables: Sequence[Table]
-    pictures: Sequence[Picture]
-    sentences: Sequence[str]
+    path: str
+    predicted: str
+    kept: Mapping[str, int]
+    becomes: Mapping[str, Sequence[str]]
+
+
+@dataclass(frozen=True, repr=False)
+class RelitScores(ShortRepr):
+    """Predictions of a network for photographs in the light of a projector.
+
+    Attributes:
+        folder: Folder of the photographs.
+        slides: Number of slides for each photograph.
+        gain: Largest factor by which an attack multiplies a color channel of a
+            slide.
+        passes: Number of passes through the network in each attack.
+        photographs: Predictions for each photograph.
+        pictures: For the indices of some photographs, the file name of a
+            picture that shows the photograph in each kind of light.
+        found: Number of photographs in the folder.
+        unreadable: Paths of the photographs that could not be read.
+    """
+
+    folder: str
+    slides: int
+    gain: float
+    passes: int
+    photographs: Sequence[RelitPhotograph]
+    pictures: Mapping[int, str]
+    found: int
+    unreadable: Sequence[str]
+
+    @property
+    def lights(self) -> list[str]:
+        """Kinds of light that were tested: "slide", "random" and perhaps "adversarial".
+
+        A network without gradients is not tested in adversarial light.
+        """
+        return list(self.photographs[0].kept)
+
+    def kept(self, light: str) -> Proportion:
+        """Compute the fraction of photographs whose predicted class no slide changes."""
+        is_kept = [photograph.kept[light] == self.slides for photograph in self.photographs]
+        return fraction(sum(is_kept), len(is_kept))
+
+    def tables(self) -> list[Table]:
+        """Make a table of the photographs that keep their class, and one with a row for each class.
+
+        A row has the number of photographs with the predicted class and, for each kind of light,
+        the number that keep it. The classes that lose most photographs come first.
+        """
+        kept = [[TITLES[light], format_fraction(self.kept(light))] for light in self.lights]
+        rows: list[Any] = []
+        for name in sorted({item.predicted for item in self.photographs}):
+            group = [item for item in self.photographs if item.predicted == name]
+            counts = [
+                sum(item.kept[light] == self.slides for item in group) for light in self.lights
+            ]
+            rows.append([name, len(group), *counts])
+        rows.sort(key=lambda row: sum(row[2:]) / row[1])
+        titles = [f"kept: {TITLES[light]}" for light in self.lights]
+        return [
+            Table("photographs that keep their class", ["light", "kept"], kept),
+            Table("by predicted class", ["class", "photographs", *titles], rows),
+        ]
+
+
+def attack_folder(
+    classifier: Classifier,
+    folder: Path,
+    settings: RelightingSettings,
+    out: Path,
+    *,
+    sensor_noise: float = 1.0,
+    batch_size: int = 32,
+    seed: int = 0,
+    limit: int | None = None,
+) -> RelitScores:
+    """Attack a network by the light of a projector on photographs, and write the results.
+
+    `sensor_noise` is a standard deviation in units of 1/255. `limit` photographs at equal distances
+    in the list are attacked, or all if it is None.
+    """
+    found = find_unlabeled(folder)
+    chosen = evenly_spaced(found, limit or len(found))
+    readable, images, unreadable = load_photographs(
+        folder, chosen, classifier.size, skip_unreadable=True
+    )
+    result = attack_photographs(
+        classifier,
+        images,
+        settings,
+        sensor_noise=sensor_noise,
+        batch_size=batch_size,
+        seed=seed,
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    classes = result.classifier.classes
+    photographs = []
+    for index, photograph in enumerate(readable):
+        becomes = {
+            light: [classes[label] for label in result.predicted[light][index].tolist()]
+            for light in result.changed
+        }
+        photographs.append(
+            RelitPhotograph(
+                path=str(photograph.path),
+                predicted=classes[int(result.source[index])],
+                kept={light: int((~item[index]).sum()) for light, item in result.changed.items()},
+                becomes=becomes,
+            )
+        )
+    scores = RelitScores(
+        folder=str(folder),
+        slides=settings.slides,
+        gain=settings.gain,
+        passes=settings.passes,
+        photographs=photographs,
+        pictures=_write_pictures(result, out),
+        found=len(found),
+        unreadable=unreadable,
+    )
+    atomic_write(out / RELIT, json.dumps(asdict(scores), indent=1) + "\n", durable=True)
+    return scores
+
+
+def read_relit(folder: Path) -> RelitScores:
+    """Read the predictions that `attack_folder` wrote to relit.json."""
+    content = read_json(folder / RELIT)
+    photographs = [RelitPhotograph(**item) for item in content["photographs"]]
+    pictures = {int(index): name for index, name in content["pictures"].items()}
+    return RelitScores(**content | {"photographs": photographs, "pictures": pictures})
+
+
+def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]:
+    """Write pictures that show photographs in each kind of light, side by side.
+
+    Up to PICTURE_COUNT photographs are chosen. Photographs whose class changes in only one kind of
+    light come first, which is usually the gradient attack. Photographs whose class changes in more
+    kinds of light follow. Photographs whose class never changes come last. Return the file name of
+    each picture by the index of its photograph.
+    """
+    # Each entry is about one kind of light: whether any slide changes the class of each
+    # photograph, shape (N,).
+    is_changed = [changed.any(dim=1) for changed in result.changed.values()]
+    change_count = torch.stack(is_changed).sum(dim=0)
+    # A rank above all counts puts photographs that never change at the end.
+    rank = torch.where(change_count > 0, change_count, len(is_changed) + 1)
+    order = torch.argsort(rank, stable=True)
+    # The kinds of light are in the order of their strength.
+    *_, changed_in_strongest = result.changed.values()
+    names = {}
+    for photograph in order[:PICTURE_COUNT].tolist():
+        # The first slide that changes the class in the strongest light, or 0.
+        slide = int(changed_in_strongest[photograph].int().argmax())
+        images = [result.image(photograph, light, slide) for light in result.changed]
+        side_by_side = torch.cat([result.image(photograph, UNCHANGED), *images], dim=2)
+        names[photograph] = f"relit_{photograph:04d}.png"
+        pixels = side_by_side.permute(1, 2, 0).cpu().numpy()
+        write_image(out / names[photograph], Image.fromarray(pixels))
+    return names
 
 
 def measure_photographs(classifier: Classifier, settings: AuditSettings, out: Path) -> None:
@@ -86,37 +275,29 @@ def measure_photographs(classifier: Classifier, settings: AuditSettings, out: Pa
     )
 
 
-def relit_sections(results: Mapping[str, Path]) -> list[RelitSection]:
+def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
     """Make a section about photographs in the light of a projector for each network."""
-    sections = []
-    for name, path in results.items():
-        folder = path / RELIT_FOLDER
-        if folder.exists():
-            sections.append(_section(name, folder))
-    return sections
+    folders = {name: path / RELIT_FOLDER for name, path in results.items()}
+    return [_section(name, folder) for name, folder in folders.items() if folder.exists()]
 
 
 def photographs_screen(results: Mapping[str, Path]) -> FirstScreen:
     """Make the top of the report of an audit without meshes."""
     scores = [read_relit(path / RELIT_FOLDER) for path in results.values()]
-    first = scores[0]
-    last = scores[-1]
+    first, last = scores[0], scores[-1]
     numbers = []
     for light in first.lights:
         if light in last.lights:
             title = NUMBER_TITLES[light]
             before = first.kept(light) if len(scores) > 1 else None
             numbers.append(ShownMetric(title, "higher is better", before, last.kept(light)))
+    answer = "Random slides seldom change its predictions."
+    kept = last.kept(SLIDE).value
+    if kept is not None and kept < PASS_THRESHOLD:
+        answer = "Its predictions depend on the light."
     sentences = [_sentence(name, item) for name, item in zip(results, scores, strict=True)]
     place = f"{len(first.photographs)} photographs of {first.folder}"
-    return FirstScreen(
-        answer=_answer(last),
-        sentences=[*sentences, MODELED],
-        numbers=numbers,
-        rows={},
-        names=[*results],
-        images=place,
-    )
+    return FirstScreen(answer, [*sentences, MODELED], numbers, [*results], place)
 
 
 def write_photographs_page(
@@ -135,14 +316,6 @@ def write_photographs_page(
     )
 
 
-def _answer(scores: RelitScores) -> str:
-    """Write whether fewer than PASS_THRESHOLD of the photographs keep their class."""
-    kept = scores.kept(SLIDE)
-    if kept.value is not None and kept.value < PASS_THRESHOLD:
-        return "Its predictions depend on the light."
-    return "Random slides seldom change its predictions."
-
-
 def _sentence(name: str, scores: RelitScores) -> str:
     """Write how many photographs keep their class in each kind of light."""
     counts = [f"{scores.kept(light).hits} {IN_LIGHT[light]}" for light in scores.lights]
@@ -150,8 +323,8 @@ def _sentence(name: str, scores: RelitScores) -> str:
     return f"Of {len(scores.photographs)} photographs, {name} keeps the class of {kept}."
 
 
-def _section(name: str, folder: Path) -> RelitSection:
-    """Make the section of a report about one network."""
+def _section(name: str, folder: Path) -> dict[str, Any]:
+    """Make the section of a report about one network: its sentences, tables and pictures."""
     scores = read_relit(folder)
     sentences = [
         _sentence(name, scores),
@@ -159,23 +332,19 @@ def _section(name: str, folder: Path) -> RelitSection:
         f"1/{scores.gain:g} and {scores.gain:g}, in {scores.passes} passes through the network. "
         "A change counts only if it remains in three draws of the noise of a sensor.",
     ]
-    attacked_count = len(scores.photographs)
     unreadable_count = len(scores.unreadable)
-    if attacked_count + unreadable_count < scores.found:
+    if len(scores.photographs) + unreadable_count < scores.found:
         sentences.append(f"The folder holds {scores.found} photographs, of which these are some.")
-    if scores.unreadable:
+    if unreadable_count:
         sentences.append(f"{unreadable_count} photographs cannot be read.")
     pictures: list[Picture] = []
     for index, file in scores.pictures.items():
-        caption = _caption(scores.photographs[index])
+        photograph = scores.photographs[index]
+        # The predicted class in each light, from left to right.
+        predictions = [
+            f"{TITLES[light]}: {names[0]}" for light, names in photograph.becomes.items()
+        ]
+        predictions.insert(0, f"unchanged: {photograph.predicted}")
+        caption = f"{photograph.path}. {'; '.join(predictions)}"
         pictures += read_pictures(folder / file, caption, MAX_PICTURE_WIDTH, caption)
-    tables = [scores.summary_table(), scores.class_table()]
-    return RelitSection(name, tables, pictures, sentences)
-
-
-def _caption(photograph: RelitPhotograph) -> str:
-    """Write the caption of a picture: the predicted class in each light, from left to right."""
-    predictions = [f"unchanged: {photograph.predicted}"]
-    for light, predicted in photograph.becomes.items():
-        predictions.append(f"{TITLES[light]}: {predicted[0]}")
-    return f"{photograph.path}. {'; '.join(predictions)}"
+    return {"name": name, "sentences": sentences, "tables": scores.tables(), "pictures": pictures}

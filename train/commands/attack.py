@@ -31,13 +31,14 @@ from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError, keyed, keys_of
 from renderer.visibility import Rasterizer
+from train.auditing.relit import MODELED, attack_folder
 from train.checkpoints import load_chosen, load_network
 from train.class_names import class_of_meshes
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.device import choose_device, choose_rasterizer
 from train.results import attack_tables
 from train.results.overwrite import remove_attack, require_replaceable
-from train.results.relit import MODELED, RELIT, attack_folder
+from train.results.predictions import RELIT, SWEEP_FIGURE, SWEEP_TABLE, TRANSFERS
 from train.results.tables import Table
 from train.run_config import write_config
 from train.run_folder import sole_writer, writable_folder
@@ -113,8 +114,7 @@ def run(settings: AttackExperimentSettings) -> None:
             norms = {name: steps.norm for name, steps in settings.attack.parameters.items()}
             attack_tables.write_sweeps(sweeps, norms, out)
             if is_verbose():
-                files = out / attack_tables.TABLE, out / attack_tables.FIGURE
-                print("success against radius: {} and {}".format(*files))
+                print(f"success against radius: {out / SWEEP_TABLE} and {out / SWEEP_FIGURE}")
         write_config(out, settings, command=command_line("attack"))
     print(f"images, adversaries and numbers: {out}")
 
@@ -152,9 +152,7 @@ def _write_attack(
     elif checks:
         details += [f"warning about {name}: {text}" for text in warnings(checks)]
     if any(targets.values()):
-        table = attack_tables.write_transfers(
-            transfer(result, **targets), folder / attack_tables.TRANSFERS
-        )
+        table = attack_tables.write_transfers(transfer(result, **targets), folder / TRANSFERS)
         details += table.splitlines()
     return heading, details
 
@@ -348,7 +346,7 @@ def _attack_photographs(
                 seed=settings.seed,
             )
         write_config(out, settings, command=command_line("attack"))
-    print(f"{scores.summary_table()}\n")
+    print(f"{scores.tables()[0]}\n")
     print(f"{MODELED}\n")
     unreadable = [f"warning: {path} cannot be read" for path in scores.unreadable]
     for line in shortened(unreadable, MAX_UNREADABLE):

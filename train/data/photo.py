@@ -7,6 +7,8 @@ from pathlib import PurePosixPath
 SEPARATOR = ";"
 # pnb-lab writes a file of this name to its folder of renders.
 DESCRIPTION = "lab.json"
+# Table with the source and the object of each photograph of a folder.
+TABLE = "photos.csv"
 
 
 @dataclass(frozen=True)

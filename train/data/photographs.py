@@ -20,7 +20,7 @@ from augment.progress import progress
 from renderer.errors import InputError, composed, require_memory, single_line
 from renderer.io.images import read_square
 from train import console
-from train.data.photo import DESCRIPTION, Photograph, split_sources
+from train.data.photo import DESCRIPTION, TABLE, Photograph, split_sources
 from train.settings import OTHER_PREFIX, label_names
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
@@ -29,8 +29,6 @@ MACOS_FOLDER = "__MACOSX"
 # Largest number of classes that are positive because they have a sub-folder. The scores of each
 # class take as much time and memory as all photographs.
 MAX_LABELS = 50
-# Table with the source and the object of each photograph of a folder.
-TABLE = "photos.csv"
 # Source, sources of hard negatives and mesh of a photograph that photos.csv does not name.
 NO_ROW = (None, (), None)
 # What `Photograph` has after its path and label.

@@ -35,8 +35,7 @@ from renderer.mesh import Mesh
 from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
 from renderer.solids import HARD_NEGATIVES, SOLIDS
 from train.command_settings import OTHER_PATTERNS, LabSettings
-from train.data.photo import DESCRIPTION
-from train.data.photographs import TABLE
+from train.data.photo import DESCRIPTION, TABLE
 from train.laboratory.shots import FOV, Shot, draw_shots
 from train.run_folder import LOCK, read_json, sole_writer, writable_folder
 from train.settings import (

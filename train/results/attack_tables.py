@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -15,14 +15,9 @@ from torch import Tensor
 from augment.attacks.result import AttackResult, warnings
 from renderer.io.files import atomic_write
 from train.results.pictures import COLORS
+from train.results.predictions import SWEEP_FIGURE, SWEEP_TABLE
 from train.results.tables import Proportion, Table, format_fraction, fraction
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-TRANSFERS = "transfer.jsonl"
-TABLE = "sweep.csv"
-FIGURE = "sweep.png"
 # Versions of the images of an adversary: the words say how they were made. attack.jsonl
 # has results for each version.
 VERSIONS = {
@@ -51,7 +46,16 @@ def format_attack(
 ) -> list[str]:
     """Describe the attack on one mesh in lines of text for the console. The first is a summary."""
     has_noise = bool(result.settings.sensor_noise)
-    text = [_heading(name, result)]
+    parameters = "+".join(parameter.name for parameter in result.problem.parameters)
+    heading = f"{name}: {parameters} against {result.classifier.name}: {_success(result)}"
+    steps = result.steps[result.success & ~result.success_before].double()
+    if len(steps):
+        heading += f"; median of {steps.median():.0f} steps"
+    heading += f"; {int(result.queries.sum())} queries"
+    backward_count = int(result.backward_passes.sum())
+    if backward_count:
+        heading += f", {backward_count} backward passes"
+    text = [f"{heading} ({result.seconds['attack']:.1f} s)"]
     if checks is not None:
         text += _check_lines(checks, has_noise, result.settings.uses_gradients)
     adversaries = [line for line in lines if line["success"] and line["clean_correct"]]
@@ -61,33 +65,13 @@ def format_attack(
     return text
 
 
-def _heading(name: str, result: AttackResult) -> str:
-    """Write the line that sums up an attack."""
-    parameters = "+".join(parameter.name for parameter in result.problem.parameters)
-    heading = f"{name}: {parameters} against {result.classifier.name}: {_success(result)}"
-    steps = result.steps[result.success & ~result.success_before].double()
-    if len(steps):
-        heading += f"; median of {steps.median():.0f} steps"
-    return f"{heading}; {_passes(result)} ({result.seconds['attack']:.1f} s)"
-
-
-def _passes(result: AttackResult) -> str:
-    """Write the numbers of queries (forward passes) and of backward passes of an attack.
-
-    Backward passes are left out if there are none.
-    """
-    text = f"{int(result.queries.sum())} queries"
-    backward_count = int(result.backward_passes.sum())
-    return f"{text}, {backward_count} backward passes" if backward_count else text
-
-
 def _success(result: AttackResult) -> str:
     """Write on how many examples an attack succeeds.
 
     Only examples that are classified correctly before the attack count.
     """
     clean = result.clean_correct
-    rate = fraction(int(result.success[clean].sum()), int(clean.sum()))
+    rate = _success_rate(result.success[clean])
     if rate.n == 0:
         return f"none of {len(clean)} examples was correct before: there is nothing to count"
     text = f"success on {format_fraction(rate)} examples"
@@ -101,23 +85,21 @@ def _success(result: AttackResult) -> str:
     if views.shape[1] > 1:
         text += f", {int(views.sum())} of {views.numel()} views"
     wrong = int((~clean).sum())
-    if wrong:
-        text += f"; {wrong} wrong before, which do not count"
-    return text
+    return f"{text}; {wrong} wrong before, which do not count" if wrong else text
 
 
 def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: bool) -> list[str]:
     """Describe the results of the checks of an attack in lines of text."""
-    unit = "step" if uses_gradients else "query"
-    units = "steps" if uses_gradients else "queries"
-    rates_without_noise = checks[f"success_by_steps{WITHOUT_NOISE}"]
-    longer_attacks = []
-    for steps, rate in checks["success_by_steps"].items():
-        rates = _format_rates(rate, rates_without_noise[steps], has_noise)
-        longer_attacks.append(f"{rates} in {steps}")
-    random_search = _format_rates(
-        checks["random_search"], checks[f"random_search{WITHOUT_NOISE}"], has_noise
-    )
+
+    def rate(name: str, steps: str | None = None) -> str:
+        values = [checks[name + end] for end in ("", WITHOUT_NOISE)]
+        with_noise, without = values if steps is None else [value[steps] for value in values]
+        return (
+            f"{with_noise:.0%} ({without:.0%} without noise)" if has_noise else f"{with_noise:.0%}"
+        )
+
+    unit, units = ("step", "steps") if uses_gradients else ("query", "queries")
+    attacks = [f"{rate('success_by_steps', n)} in {n}" for n in checks["success_by_steps"]]
     zero_gradient = ""
     if uses_gradients:
         zero_gradient = f", without a gradient at the start in {checks['zero_gradient']:.0%}"
@@ -125,36 +107,27 @@ def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: boo
         "log-probability of the right class over all views (less a target's): "
         f"{checks['cost_before']:.2f} before, {checks['cost']:.2f} after; "
         f"lower in {checks['cost_fell']:.0%}{zero_gradient}",
-        f"random changes of the same size, one for each {unit}, succeed on {random_search}; "
-        f"attacks of more {units}: {', '.join(longer_attacks)}",
+        f"random changes of the same size, one for each {unit}, succeed on "
+        f"{rate('random_search')}; attacks of more {units}: {', '.join(attacks)}",
         *(f"warning: {warning}" for warning in warnings(checks)),
     ]
-
-
-def _format_rates(rate: float, without_noise: float, has_noise: bool) -> str:
-    """Write a rate in [0, 1] as "62%", or "62% (70% without noise)" if success needs noise."""
-    if not has_noise:
-        return f"{rate:.0%}"
-    return f"{rate:.0%} ({without_noise:.0%} without noise)"
 
 
 def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_noise: bool) -> str:
     """Write how often adversaries still succeed if their images are made in another way."""
     results = [line["versions"][version] for line in adversaries]
-    success = sum(result["success"] for result in results)
-    without_noise = ""
-    if has_noise:
-        count = sum(result[f"success{WITHOUT_NOISE}"] for result in results)
-        without_noise = f" ({count} without noise)"
     # Adversaries that fooled the classifier by the margin that the settings ask for.
-    with_margin = [line for line in adversaries if line["success_with_margin"]]
-    success_with_margin = sum(line["versions"][version]["success"] for line in with_margin)
-    largest = 255 * max(result["largest_difference"] for result in results)
-    mean = 255 * sum(result["mean_difference"] for result in results) / len(results)
+    with_margin = [line["versions"][version] for line in adversaries if line["success_with_margin"]]
+    counts = [sum(item["success"] for item in group) for group in (results, with_margin)]
+    noise = ""
+    if has_noise:
+        noise = f" ({sum(item[f'success{WITHOUT_NOISE}'] for item in results)} without noise)"
+    largest = 255 * max(item["largest_difference"] for item in results)
+    mean = 255 * sum(item["mean_difference"] for item in results) / len(results)
     return (
         f"images as {VERSIONS.get(version, version)}: "
-        f"{success} of {len(results)} still succeed{without_noise}, "
-        f"{success_with_margin} of the {len(with_margin)} with the margin; "
+        f"{counts[0]} of {len(results)} still succeed{noise}, "
+        f"{counts[1]} of the {len(with_margin)} with the margin; "
         f"pixels differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
     )
 
@@ -167,47 +140,29 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
     lines = []
     rows = []
     for result in transfers:
-        is_correct = result["clean_correct"]
-        success_count = _count_both(result["success"], is_correct)
-        count_without_noise = _count_both(result[f"success{WITHOUT_NOISE}"], is_correct)
-        rate = fraction(success_count, sum(is_correct))
-        kind = next(iter(result))
-        name = result[kind]
-        entry = {kind: name, **asdict(rate), **result}
-        lines.append(json.dumps(entry) + "\n")
-        rows.append(
-            [
-                f"{kind} {name}",
-                f"{rate.n} of {len(is_correct)}",
-                format_fraction(rate),
-                str(count_without_noise),
-            ]
-        )
+        kind, name = next(iter(result.items()))
+        is_correct = torch.tensor(result["clean_correct"])
+        rate = _success_rate(torch.tensor(result["success"])[is_correct])
+        without_noise = torch.tensor(result[f"success{WITHOUT_NOISE}"])[is_correct].sum()
+        lines.append(json.dumps({kind: name, **asdict(rate), **result}) + "\n")
+        correct = f"{rate.n} of {len(is_correct)}"
+        rows.append([f"{kind} {name}", correct, format_fraction(rate), int(without_noise)])
     atomic_write(path, "".join(lines))
     header = ["adversaries shown to", "correct before", "success", "without noise"]
     return str(Table("", header, rows))
-
-
-def _count_both(is_success: Sequence[bool], is_correct: Sequence[bool]) -> int:
-    """Count the examples that are correct before an attack and on which the attack succeeds."""
-    pairs = zip(is_success, is_correct, strict=True)
-    return sum(success and correct for success, correct in pairs)
 
 
 def format_sweep(sweep: Sweep) -> str:
     """Write the success of an attack and of a random search at each radius as a table."""
     rows = []
     for row in sweep:
-        radii = [f"{name} {radius:g}" for name, radius in row["radii"].items()]
-        cells = [" + ".join(radii)]
+        cells = [" + ".join(f"{name} {radius:g}" for name, radius in row["radii"].items())]
         for method in METHODS:
             cells.append(format_fraction(_success_rate(row[method])))
             cells.append(str(int(row[method + WITHOUT_NOISE].sum())))
         rows.append(cells)
-    header = ["radius"]
-    for title in METHODS.values():
-        header += [title, "without noise"]
-    return str(Table("", header, rows))
+    titles = [title for method in METHODS.values() for title in (method, "without noise")]
+    return str(Table("", ["radius", *titles], rows))
 
 
 def _success_rate(is_success: Bool[Tensor, " examples"]) -> Proportion:
@@ -226,7 +181,12 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
     """
     methods = [method + end for end in ("", WITHOUT_NOISE) for method in METHODS]
     if len(sweeps) > 1:
-        sweeps = {**sweeps, "all": _pool_meshes(sweeps, methods)}
+        pooled = []
+        # All meshes have the same radii.
+        for rows in zip(*sweeps.values(), strict=True):
+            success = {method: torch.cat([row[method] for row in rows]) for method in methods}
+            pooled.append({"radii": rows[0]["radii"], **success})
+        sweeps = {**sweeps, "all": pooled}
     records = []
     for mesh, sweep in sweeps.items():
         for method in methods:
@@ -237,31 +197,27 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
     table = csv.DictWriter(text, list(records[0]))
     table.writeheader()
     table.writerows(records)
-    atomic_write(out / TABLE, text.getvalue())
+    atomic_write(out / SWEEP_TABLE, text.getvalue())
     last_mesh = records[-1]["mesh"]
     shown = [record for record in records if record["mesh"] == last_mesh and record["n"]]
-    _draw_sweep(shown, norms, out / FIGURE)
-
-
-def _pool_meshes(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Sweep:
-    """Concatenate the examples of all meshes, which have the same radii, at each radius."""
-    pooled = []
-    for rows in zip(*sweeps.values(), strict=True):
-        success = {method: torch.cat([row[method] for row in rows]) for method in methods}
-        pooled.append({"radii": rows[0]["radii"], **success})
-    return pooled
+    _draw_sweep(shown, norms, out / SWEEP_FIGURE)
 
 
 def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: Path) -> None:
-    """Draw the success rate of each method against the radius."""
+    """Draw the success rate of each method against the radius, in a band that is its interval."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 3.8), layout="constrained")
     axes = figure.subplots()
     first, *others = norms
-    for method in METHODS:
+    for method, title in METHODS.items():
         rows = [record for record in records if record["method"] == method]
-        _draw_method(axes, method, rows, first)
+        radii, values, low, high = (
+            [row[name] for row in rows] for name in (first, "value", "low", "high")
+        )
+        color, line, marker = STYLES[method]
+        axes.plot(radii, values, color=color, linestyle=line, marker=marker, label=title)
+        axes.fill_between(radii, low, high, color=color, alpha=0.15)
     proportional = f"; {' and '.join(others)} in proportion" if others else ""
     axes.set(xscale="log", ylim=(-0.03, 1.03), ylabel="success rate")
     axes.set_xlabel(f"{norms[first]} radius of {first}{proportional}")
@@ -276,17 +232,3 @@ def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], 
     image = io.BytesIO()
     figure.savefig(image, dpi=150)
     atomic_write(path, image.getbuffer())
-
-
-def _draw_method(
-    axes: "Axes", method: str, rows: Sequence[Mapping[str, Any]], parameter: str
-) -> None:
-    """Draw the success rate of one method as a line, in a band that is the 95% interval."""
-    radii = [row[parameter] for row in rows]
-    values = [row["value"] for row in rows]
-    color, line, marker = STYLES[method]
-    title = METHODS[method]
-    axes.plot(radii, values, color=color, linestyle=line, marker=marker, label=title)
-    low = [row["low"] for row in rows]
-    high = [row["high"] for row in rows]
-    axes.fill_between(radii, low, high, color=color, alpha=0.15)

@@ -6,32 +6,30 @@ from contextlib import suppress
 from pathlib import Path
 
 from augment.attack_settings import LINES
-from augment.attacks import adversary
 from renderer.errors import InputError
-from train import checkpoints, run_folder
-from train.data import photographs
-from train.data.photo import DESCRIPTION
-from train.results.attack_tables import FIGURE, TABLE, TRANSFERS
+from train import run_folder
+from train.data import photo
+from train.results import predictions
 from train.results.page import PAGE
-from train.results.predictions import CONTACT_SHEET, PREDICTIONS, ROC_FIGURE, ROC_TABLE, SUMMARY
-from train.results.relit import RELIT
+from train.results.predictions import RELIT, SUMMARY, SWEEP_FIGURE, SWEEP_TABLE, TRANSFERS
 from train.results.store import is_finished
 from train.run_config import CONFIG, read_config
-from train.run_folder import BEFORE, FAILURE, METRICS, PUBLISHED, RENDERS, WEIGHTS
+from train.run_folder import BEFORE, METRICS
 from train.settings import KEPT_ASIDE, PHOTOGRAPHS_FIRST
 
 # Files of an audit, as patterns of `Path.glob`.
 OF_AUDIT = ("*/recognized.json", f"*/*/{RELIT}")
 # Files of a training run. `remove_run` removes them in this order.
-OF_RUN = (METRICS, run_folder.LAST, run_folder.PREVIOUS, run_folder.BEST, WEIGHTS)
+OF_RUN = (METRICS, run_folder.LAST, run_folder.PREVIOUS, run_folder.BEST, run_folder.WEIGHTS)
 # Files that commands write to their output folders. A command refuses a folder with one of them.
 RESULTS = (
     *OF_RUN,
-    *(RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, TABLE, FIGURE),
+    *(RELIT, f"*/{LINES}", LINES, "adversary.json", SWEEP_TABLE, SWEEP_FIGURE),
     *OF_AUDIT,
-    *(SUMMARY, PREDICTIONS, CONTACT_SHEET, ROC_TABLE, ROC_FIGURE),
-    *(DESCRIPTION, photographs.TABLE),
-    PUBLISHED,
+    *(SUMMARY, predictions.PREDICTIONS, predictions.CONTACT_SHEET),
+    *(predictions.ROC_TABLE, predictions.ROC_FIGURE),
+    *(photo.DESCRIPTION, photo.TABLE),
+    run_folder.PUBLISHED,
     *("light.json", "background.png", "comparison.png"),
     *(CONFIG, PAGE),
 )
@@ -69,22 +67,15 @@ def require_new_run(folder: Path, key: str, overwrite: bool, resume: bool) -> No
     such a folder. The files of a run that ended before its first checkpoint may
     be replaced, because they are not results.
     """
-    if checkpoints.exists(folder):
+    if any((folder / name).exists() for name in (run_folder.LAST, run_folder.PREVIOUS)):
         return
     # Names of the files that an unfinished run without a checkpoint has written.
     own: tuple[str, ...] = ()
-    if _is_of_training(folder) and not is_finished(folder):
-        own = (CONFIG, METRICS)
-        if resume:
-            own += (run_folder.BEST,)
-    require_replaceable(folder, key, overwrite, own)
-
-
-def _is_of_training(folder: Path) -> bool:
-    """Return whether the config.yaml in a folder is the configuration of a training run."""
     with suppress(InputError):
-        return isinstance(read_config(folder / CONFIG).get("train"), Mapping)
-    return False
+        is_of_training = isinstance(read_config(folder / CONFIG).get("train"), Mapping)
+        if is_of_training and not is_finished(folder):
+            own = (CONFIG, METRICS, run_folder.BEST) if resume else (CONFIG, METRICS)
+    require_replaceable(folder, key, overwrite, own)
 
 
 def remove_run(folder: Path, *, with_others: bool = True) -> None:
@@ -94,11 +85,11 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
     removal is stopped, what is left belongs to the run that config.yaml describes. The log stays.
     `with_others=False` keeps the first training and the baselines, which may be resumed.
     """
-    files = [folder / name for name in (*OF_RUN, FAILURE, PAGE)]
+    files = [folder / name for name in (*OF_RUN, run_folder.FAILURE, PAGE)]
     files += [*folder.glob("events.out.tfevents.*"), *folder.glob(f"*/{SUMMARY}")]
     for file in files:
         file.unlink(missing_ok=True)
-    for name in (RENDERS, BEFORE, KEPT_ASIDE):
+    for name in (run_folder.RENDERS, BEFORE, KEPT_ASIDE):
         shutil.rmtree(folder / name, ignore_errors=True)
     with suppress(InputError):
         for name in (PHOTOGRAPHS_FIRST, *read_config(folder / CONFIG).get("compare", ())):
@@ -109,7 +100,7 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
 
 def remove_attack(out: Path) -> None:
     """Remove the results of an earlier pnb-attack, so that no report shows them with new ones."""
-    for name in (PAGE, CONFIG, RELIT, TABLE, FIGURE):
+    for name in (PAGE, CONFIG, RELIT, SWEEP_TABLE, SWEEP_FIGURE):
         (out / name).unlink(missing_ok=True)
     for lines in out.glob(f"*/{LINES}"):
         for example in lines.parent.glob("example_*"):

@@ -26,6 +26,12 @@ SUMMARY = "summary.json"
 CONTACT_SHEET = "contact_sheet.png"
 ROC_TABLE = "roc.csv"
 ROC_FIGURE = "roc.png"
+# Files of an attack: predictions for photographs in the light of a projector, transferred
+# adversaries, and the success at each radius.
+RELIT = "relit.json"
+TRANSFERS = "transfer.jsonl"
+SWEEP_TABLE = "sweep.csv"
+SWEEP_FIGURE = "sweep.png"
 # Columns about the class that a photograph shows. The columns of a positive class begin with its
 # name, and no name can make them equal to these.
 TRUE_PROBABILITY = "probability_of_true"

@@ -27,9 +27,8 @@ from renderer.errors import InputError, require_choice
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
 from renderer.short_repr import ShortRepr
-from train.data.photo import Photograph
+from train.data.photo import TABLE, Photograph
 from train.data.photographs import (
-    TABLE,
     find_photographs,
     load_photographs,
     require_outside,

@@ -11,9 +11,9 @@ import augment
 from renderer.errors import InputError
 from tests.helpers import bright_or_dark
 from train.auditing.audit import run_audit
-from train.auditing.relit import RELIT_FOLDER
+from train.auditing.relit import RELIT_FOLDER, read_relit
 from train.command_settings import AuditSettings
-from train.results.relit import RELIT, read_relit
+from train.results.predictions import RELIT
 
 NETWORKS = {
     "classifier": augment.Classifier(bright_or_dark, 16, ["bright", "dark"], "first"),
@@ -59,7 +59,7 @@ def test_the_page_counts_the_photographs_that_keep_their_class(page, settings):
 
 def test_the_page_names_every_class_and_shows_pictures(page, settings):
     scores = read_relit(Path(settings.out) / "classifier" / RELIT_FOLDER)
-    for row in scores.class_table().rows:
+    for row in scores.tables()[1].rows:
         assert f"<td>{row[0]}</td><td>{row[1]}</td>" in page
     for index in scores.pictures:
         assert f'alt="{scores.photographs[index].path}.' in page

@@ -10,8 +10,9 @@ from PIL import Image
 from renderer.errors import InputError
 from scripts import attack, list_parameters
 from tests.helpers import bright_or_dark
+from train.auditing.relit import PICTURE_COUNT, read_relit
 from train.commands.attack import run
-from train.results.relit import PICTURE_COUNT, RELIT, read_relit
+from train.results.predictions import RELIT
 
 
 def load_bright_or_dark():
@@ -59,7 +60,7 @@ def test_every_photograph_has_predictions_and_counts(out, photographs):
 def test_the_tables_count_the_photographs_that_keep_their_class_under_all_slides(out):
     scores = read_relit(out)
     content = json.loads((out / RELIT).read_text())
-    rows = {row[0]: row for row in scores.class_table().rows}
+    rows = {row[0]: row for row in scores.tables()[1].rows}
     for place, light in enumerate(scores.lights):
         kept = [item for item in content["photographs"] if item["kept"][light] == 2]
         assert scores.kept(light).hits == len(kept)
