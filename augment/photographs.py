@@ -20,7 +20,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
-from torch import Tensor
+from torch import Generator, Tensor
 
 from augment.attack_settings import (
     GRADIENT,
@@ -37,16 +37,9 @@ from augment.network import Network, Quantization, device_of, frozen_eval_mode, 
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.patterns import draw_slides, interpolate_smoothly, luminance
-from renderer.errors import (
-    MAX_MAGNITUDE,
-    MAX_SCALE,
-    InputError,
-    require_choice,
-    require_kind,
-    require_whole,
-)
+from renderer import errors
+from renderer.errors import InputError
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
-from renderer.short_repr import ShortRepr
 
 # Names of three lights: the slide as it is, the slide multiplied by the best of several random
 # factors, and the slide multiplied by factors that gradient descent finds.
@@ -130,9 +123,7 @@ class ProjectedLight(NamedTuple):
         return encode(clamp(exposure * radiance), "srgb")
 
 
-def draw_shading(
-    count: int, size: int, draws: torch.Generator
-) -> Float[Tensor, "count 1 size size"]:
+def draw_shading(count: int, size: int, draws: Generator) -> Float[Tensor, "count 1 size size"]:
     """Draw the shading of random smooth surfaces in light from random directions.
 
     It is the cosine between normal and light, or 0 if the surface faces away.
@@ -156,10 +147,7 @@ def draw_shading(
 
 
 def draw_projected_light(
-    count: int,
-    size: int,
-    draws: torch.Generator,
-    photographs: UInt8[Tensor, "N 3 H W"] | None = None,
+    count: int, size: int, draws: Generator, photographs: UInt8[Tensor, "N 3 H W"] | None = None
 ) -> ProjectedLight:
     """Draw the random light of a projector: slide, shading, ambient light and exposure.
 
@@ -178,10 +166,7 @@ def draw_projected_light(
 
 
 def relight_photographs(
-    photographs: Tensor,
-    seed: int = 0,
-    *,
-    slides: Tensor | None = None,
+    photographs: Tensor, seed: int = 0, *, slides: Tensor | None = None
 ) -> Tensor:
     """Show photographs in the light of a projector with random slides.
 
@@ -212,7 +197,7 @@ def relight_photographs(
     require_photographs("photographs", photographs)
     if slides is not None:
         require_photographs("slides", slides)
-    require_whole("seed", seed)
+    errors.require_whole("seed", seed)
     count, _, size, _ = photographs.shape
     light = draw_projected_light(count, size, generator(seed, "relight"), slides)
     return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
@@ -220,13 +205,13 @@ def relight_photographs(
 
 def require_photographs(name: str, photographs: Tensor) -> None:
     """Check that a value is a tensor of square photographs of 8 bits."""
-    require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
+    errors.require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
     shape = tuple(photographs.shape)
     is_square = len(shape) == 4 and shape[1] == 3 and shape[2] == shape[3]
     if photographs.dtype != torch.uint8 or not is_square or not shape[0]:
         raise InputError(
             f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}: "
-            "give uint8 of shape (N, 3, size, size)",
+            "give uint8 of shape (N, 3, size, size)"
         )
 
 
@@ -252,9 +237,9 @@ class RelitPhotographs(NormBalls):
         cells: int,
         radius: float,
         steps: int,
-        generators: Sequence[torch.Generator] = (),
+        generators: Sequence[Generator] = (),
     ):
-        step_size = max(TRAVELED_RADII * radius / max(steps, 1), 1 / MAX_MAGNITUDE)
+        step_size = max(TRAVELED_RADII * radius / max(steps, 1), 1 / errors.MAX_MAGNITUDE)
         settings = StepSettings("linf", radius, "sign", step_size)
         super().__init__(settings, albedo.new_zeros(len(albedo), 3 * cells**2))
         self.group_size = len(albedo)
@@ -302,7 +287,7 @@ OPTIMIZERS: dict[str, type[Optimizer]] = {
 
 
 @dataclass(frozen=True, repr=False)
-class PhotographAttackResult(ShortRepr):
+class PhotographAttackResult(errors.ShortRepr):
     """Predictions of a network for N photographs in the light of a projector.
 
     The projector shows S random pictures (slides) on each photograph, each in
@@ -356,7 +341,7 @@ class PhotographAttackResult(ShortRepr):
         """
         # The last light is the strongest.
         light = [*self.changed][-1] if light is None else light
-        require_choice("light", light, self.changed)
+        errors.require_choice("light", light, self.changed)
         return ~self.changed[light].any(1)
 
     def image(self, photograph: int, light: str, slide: int = 0) -> Tensor:
@@ -437,19 +422,20 @@ def attack_photographs(
         tensor(0.4100)
     """
     require_photographs("photographs", photographs)
-    require_kind("settings", settings, RelightingSettings | None, "RelightingSettings(...) or None")
-    require_whole("seed", seed)
+    errors.require_kind(
+        "settings", settings, RelightingSettings | None, "RelightingSettings(...) or None"
+    )
+    errors.require_whole("seed", seed)
     settings = settings or RelightingSettings()
     success_settings = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
     size = photographs.shape[-1]
     with gradient_flags_kept(network):
-        classifier = as_classifier(
-            network, size, classes, normalization, value_range, device_of(network)
-        )
+        device = device_of(network)
+        classifier = as_classifier(network, size, classes, normalization, value_range, device)
         if classifier.size != size:
             raise InputError(
                 f"photographs have {size} pixels per side, "
-                f"but the network takes {classifier.size}: resize them",
+                f"but the network takes {classifier.size}: resize them"
             )
         return _attack(classifier, photographs, settings, success_settings, seed)
 
@@ -523,7 +509,7 @@ def _attack_slide(
             optimizer=RANDOM_SEARCH if light == RANDOM else GRADIENT,
             max_steps=0 if light == SLIDE else settings.steps,
             max_queries=settings.passes,
-            margin=MAX_SCALE,
+            margin=errors.MAX_SCALE,
             sensor_noise=0.0,
         )
         objective = Objective(result.classifier, criterion, search)

@@ -14,6 +14,7 @@ import reprlib
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -374,6 +375,21 @@ def require_kind(name: str, value: object, kind: Any, expected: str) -> None:
         raise InputError(f"{name} is {describe(value)}: give {expected}", name)
 
 
+def require_shape(name: str, values: Any, *expected: int | str) -> None:
+    """Check the shape of a tensor.
+
+    A name stands for a dimension of any size, and a first "..." for any number of dimensions.
+    """
+    shape = tuple(values.shape)
+    sizes = expected[1:] if expected[0] == "..." else expected
+    checked = shape[-len(sizes) :] if expected[0] == "..." else shape
+    if len(checked) != len(sizes) or any(
+        isinstance(size, int) and size != given for size, given in zip(sizes, checked, strict=True)
+    ):
+        wanted = f"({', '.join(map(str, expected))}{',' if len(expected) == 1 else ''})"
+        raise InputError(f"{name} has shape {shape}: give {wanted}", name)
+
+
 def require_flag(name: str, value: object) -> None:
     """Check that an argument is True or False. The numbers 1 and 0 are accepted, too.
 
@@ -429,6 +445,33 @@ def _short_text(value: object) -> str:
 def _short_repr(value: object) -> str:
     """Convert a value to its `repr` in one line, shortened if it is long."""
     return " ".join(reprlib.repr(value).split())
+
+
+class ShortRepr:
+    """Base of a dataclass with `repr=False`, whose `repr` has the sizes of large fields."""
+
+    def __repr__(self) -> str:
+        kind = cast(Any, type(self))
+        values = [f"{item.name}={_SIZES.repr(getattr(self, item.name))}" for item in fields(kind)]
+        return f"{kind.__name__}({', '.join(values)})"
+
+
+class _Sizes(reprlib.Repr):
+    """Short `repr` in one line, in which arrays and dataclasses are shown without their values."""
+
+    def repr_ndarray(self, value: Any, level: int) -> str:
+        return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
+
+    repr_Tensor = repr_ndarray
+
+    def repr_instance(self, value: Any, level: int) -> str:
+        if is_dataclass(value):
+            return f"{type(value).__name__}(...)"
+        return " ".join(super().repr_instance(value, level).split())
+
+
+_SIZES = _Sizes()
+_SIZES.maxother = 60
 
 
 def _largest_magnitude(tensor: Tensor) -> float:

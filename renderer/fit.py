@@ -18,7 +18,7 @@ color channel (degree 6).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
@@ -33,7 +33,7 @@ from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
 from renderer.camera import Camera, PerspectiveCamera, orbit_cameras
-from renderer.errors import InputError, as_tensor
+from renderer.errors import InputError, as_tensor, require_shape
 from renderer.image import decode
 from renderer.light.basis import COEFFICIENTS, DEGREE
 from renderer.light.harmonics import bands, basis
@@ -179,46 +179,29 @@ def fit_scene(
         if not (values.min() >= 0 and values.max() <= 1):
             raise InputError(f"{name} has values outside [0, 1]: divide bytes by 255")
     size = photograph.shape[-1]
-    if photograph.shape != (CHANNELS, size, size) or mask.shape != (size, size):
-        given = f"{tuple(photograph.shape)} and {tuple(mask.shape)}"
+    require_shape("photograph", photograph, CHANNELS, size, size)
+    require_shape("mask", mask, size, size)
+    if mask.sum() < MIN_COVERED_PIXELS or mask.max() <= HALF_PIXEL:
         raise InputError(
-            f"photograph and mask have the shapes {given}: "
-            "give a photograph (3, size, size) and a mask (size, size)"
-        )
-    covered_pixels = float(mask.sum())
-    if covered_pixels < MIN_COVERED_PIXELS:
-        raise InputError(
-            f"the mask covers {covered_pixels:.0f} pixels of {size} × {size}, but at least "
-            f"{MIN_COVERED_PIXELS} are needed: give a mask that shows the object"
-        )
-    if mask.max() <= HALF_PIXEL:
-        raise InputError(
-            f"the mask covers no pixel by more than {HALF_PIXEL}: give a mask with values in "
-            "[0, 1], 1 where the object is"
+            f"the mask covers {float(mask.sum()):.0f} pixels of {size} × {size}, and the largest "
+            f"share of a pixel is {float(mask.max()):.2g}: give a mask that is 1 where the object "
+            f"is, in at least {MIN_COVERED_PIXELS} pixels"
         )
     # Arguments of `render` and `precompute_transfer` for all images that are compared.
-    options: dict[str, Any] = {
-        "albedo_scale": albedo_scale,
-        "encoding": encoding,
-        "normals": normals,
-        "rasterizer": rasterizer,
-        "samples": SAMPLES,
-    }
+    surface = {"albedo_scale": albedo_scale, "encoding": encoding, "normals": normals}
+    options: dict[str, Any] = {**surface, "rasterizer": rasterizer, "samples": SAMPLES}
     photograph = photograph.double()
     mask = mask.double()
     target = _Target.from_photograph(photograph, mask, mesh, size, options)
+    starts = [start] if start else []
     if start is None:
         # A search in a small copy of the photograph is faster.
         coarse_size = min(COARSE_SIZE, size)
         coarse_target = _Target.from_photograph(photograph, mask, mesh, coarse_size, options)
-        start_cameras = _plausible_cameras(coarse_target, mask, fov)
-    else:
-        start_cameras = [start]
-    refined_cameras = [target.refine_camera(camera) for camera in start_cameras]
-    _, best_camera = target.rank_cameras(refined_cameras)[0]
+        starts = _plausible_cameras(coarse_target, mask, fov)
+    _, camera = target.rank_cameras(target.refine_camera(camera) for camera in starts)[0]
     # Bounces are slow to compute, so only the returned light is fitted with bounces.
-    target_with_bounces = target._replace(options={**options, "bounces": bounces})
-    return target_with_bounces.fit_final_light(best_camera)
+    return target._replace(options={**options, "bounces": bounces}).fit_final_light(camera)
 
 
 def _plausible_cameras(
@@ -231,10 +214,11 @@ def _plausible_cameras(
     """
     mesh = target.mesh
     radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
-    first_cameras = []
-    for polar in FIRST_POLAR_ANGLES:
-        for camera in orbit_cameras(FIRST_AZIMUTH_COUNT, FIRST_WIDTH, polar, fov=fov):
-            first_cameras.append(_framed(camera.with_clip_range(radius), mesh, mask))
+    first_cameras = [
+        _framed(camera.with_clip_range(radius), mesh, mask)
+        for polar in FIRST_POLAR_ANGLES
+        for camera in orbit_cameras(FIRST_AZIMUTH_COUNT, FIRST_WIDTH, polar, fov=fov)
+    ]
     ranked_cameras = [camera for _, camera in target.rank_cameras(first_cameras)]
     # All azimuths fit a round object equally well, so the best cameras may all have the same polar
     # angle. The best camera of each polar angle is therefore refined, too.
@@ -244,22 +228,15 @@ def _plausible_cameras(
     # dict.fromkeys removes duplicates, and keeps the order.
     start_cameras = dict.fromkeys([*ranked_cameras[:KEPT_CAMERAS], *best_of_polar.values()])
     refined = target.rank_cameras(target.refine_camera(camera) for camera in start_cameras)
-    smallest_error, _ = refined[0]
-    largest_error = MAX_ERROR_RATIO * smallest_error
-    plausible_cameras = [camera for error, camera in refined if error <= largest_error]
-    return _distinct(plausible_cameras)[:KEPT_CAMERAS]
-
-
-def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
-    """Remove cameras whose axes all lie within `MIN_CAMERA_ANGLE` degrees of an earlier one's."""
-    kept: list[Camera] = []
+    largest_error = MAX_ERROR_RATIO * refined[0][0]
     max_cosine = math.cos(math.radians(MIN_CAMERA_ANGLE))
-    for camera in cameras:
+    kept: list[Camera] = []
+    for error, camera in refined:
         # Smallest cosine of the angles between the axes right, up and back of both cameras.
         cosines = [(camera.axes() * other.axes()).sum(axis=1).min() for other in kept]
-        if max(cosines, default=-1.0) < max_cosine:
+        if error <= largest_error and max(cosines, default=-1.0) < max_cosine:
             kept.append(camera)
-    return kept
+    return kept[:KEPT_CAMERAS]
 
 
 class _LightFit(NamedTuple):
@@ -317,8 +294,7 @@ class _Target(NamedTuple):
         mask = F.interpolate(mask[None][None], (size, size), mode="area")[0]
         # The background becomes black behind a bright object, and white behind a dark one, so that
         # the silhouette stands out.
-        is_bright = float(object_image.sum()) > 0.5 * CHANNELS * float(mask.sum())
-        gray = 0.0 if is_bright else 1.0
+        gray = 0.0 if float(object_image.sum()) > 0.5 * CHANNELS * float(mask.sum()) else 1.0
         image = object_image + gray * (1 - mask)
         return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, options)
 
@@ -332,8 +308,7 @@ class _Target(NamedTuple):
         """
         operator = precompute_transfer(self.mesh, camera, self.size, **self.options)
         # 49 lights, of which light k has only coefficient k, shape (49, 49, 3).
-        unit_lights = torch.eye(COEFFICIENTS, dtype=torch.float64)
-        unit_lights = unit_lights[..., None].expand(-1, -1, CHANNELS)
+        unit_lights = torch.eye(COEFFICIENTS, dtype=torch.float64)[..., None].expand(-1, -1, 3)
         # Radiance of the P covered pixels under each of the 49 lights, shape (3, 49, P).
         transfer = operator.radiance(unit_lights).permute(1, 0, 2)
         pixels = operator.pixels
@@ -385,10 +360,9 @@ class _Target(NamedTuple):
 
     def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
         """Sort cameras by the squared error of a render with their best light, smallest first."""
-        pairs = []
-        for camera in cameras:
-            residuals = self.fit_light(camera).residuals
-            pairs.append((float(residuals.square().sum()), camera))
+        pairs = [
+            (float(self.fit_light(camera).residuals.square().sum()), camera) for camera in cameras
+        ]
         return sorted(pairs, key=lambda pair: pair[0])
 
     def penalty(self, normal_matrix: Float[Tensor, "3 49 49"]) -> Float[Tensor, " 49"]:
@@ -468,11 +442,9 @@ class _Target(NamedTuple):
         image = render(self.mesh, camera, fit.light, self.size, self.gray, **self.options)
         rendered = decode(image, self.options["encoding"]).flatten(1)
         is_inside = self.mask > WHOLE_PIXEL
-        inside_image = self.image[:, is_inside]
-        error = (rendered - self.image)[:, is_inside].norm() / inside_image.norm()
-        intersection = torch.minimum(fit.coverage, self.mask).sum()
+        error = (rendered - self.image)[:, is_inside].norm() / self.image[:, is_inside].norm()
         union = torch.maximum(fit.coverage, self.mask).sum()
-        overlap = intersection / union
+        overlap = torch.minimum(fit.coverage, self.mask).sum() / union
         return FittedScene(camera, fit.light, float(error), float(overlap))
 
 
@@ -543,10 +515,9 @@ def _nearest_in_cone(point: NDArray[Any], constraints: NDArray[Any]) -> NDArray[
     nearest = point
     is_negative = point @ constraints < 0
     while is_negative.any():
-        used_constraints = constraints[:, is_used]
-        max_iterations = MAX_NNLS_ITERATIONS * constraint_count
-        multipliers, _ = nnls(used_constraints, -point, maxiter=max_iterations)
-        nearest = point + used_constraints @ multipliers
+        used = constraints[:, is_used]
+        multipliers, _ = nnls(used, -point, maxiter=MAX_NNLS_ITERATIONS * constraint_count)
+        nearest = point + used @ multipliers
         is_negative = (nearest @ constraints < 0) & ~is_used
         is_used |= is_negative
     return nearest
@@ -577,14 +548,11 @@ def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Cam
     mesh_low = points.min(0)
     mesh_high = points.max(0)
     size = len(mask)
-    rows = np.flatnonzero((mask > HALF_PIXEL).any(1).numpy())
-    columns = np.flatnonzero((mask > HALF_PIXEL).any(0).numpy())
-    mask_low = np.array([2 * columns[0] / size - 1, 1 - 2 * (rows[-1] + 1) / size])
-    mask_high = np.array([2 * (columns[-1] + 1) / size - 1, 1 - 2 * rows[0] / size])
-    mesh_area = float(np.prod(mesh_high - mesh_low))
-    mask_area = float(np.prod(mask_high - mask_low))
+    rows, columns = np.nonzero((mask > HALF_PIXEL).numpy())
+    mask_low = np.array([2 * columns.min() / size - 1, 1 - 2 * (rows.max() + 1) / size])
+    mask_high = np.array([2 * (columns.max() + 1) / size - 1, 1 - 2 * rows.min() / size])
     # A camera that is wider by this factor shows the mesh smaller by this factor.
-    factor = math.sqrt(mesh_area / mask_area)
+    factor = math.sqrt(np.prod(mesh_high - mesh_low) / np.prod(mask_high - mask_low))
     width = camera.width * factor
     mask_center = (mask_low + mask_high) / 2
     shift = mask_center - (mesh_low + mesh_high) / 2 / factor

@@ -88,9 +88,7 @@ def as_background(
 
 
 def background_term(
-    coverage: Float[Tensor, " ..."],
-    background: Float[Tensor, "... _ _"],
-    encoding: str = "linear",
+    coverage: Float[Tensor, " ..."], background: Float[Tensor, "... _ _"], encoding: str = "linear"
 ) -> Float[Tensor, "... _ P"]:
     """Compute the linear values that the background adds to pixels that a mesh partly covers."""
     require_bounded(coverage=coverage, background=background)

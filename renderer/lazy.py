@@ -24,7 +24,10 @@ def attach(
     are values for `__getattr__`, `__dir__` and `__all__`, and `file` is the package's
     `__file__`.
     """
-    modules = _read_stub(f"{file}i")
+    with open(f"{file}i", encoding="utf-8") as stub:
+        statements = ast.parse(stub.read()).body
+    imports = [statement for statement in statements if isinstance(statement, ast.ImportFrom)]
+    modules = {alias.name: str(item.module) for item in imports for alias in item.names}
     names = sorted(modules)
 
     def get_attribute(name: str) -> object:
@@ -39,20 +42,4 @@ def attach(
         module = __import__(modules[name], fromlist=[name])
         return getattr(module, name)
 
-    def list_names() -> list[str]:
-        """Return the public names of the package."""
-        return names
-
-    return get_attribute, list_names, names
-
-
-def _read_stub(path: str) -> dict[str, str]:
-    """Find out from which module a stub file imports each name."""
-    with open(path, encoding="utf-8") as stub:
-        tree = ast.parse(stub.read())
-    modules = {}
-    for statement in tree.body:
-        if isinstance(statement, ast.ImportFrom):
-            for alias in statement.names:
-                modules[alias.name] = str(statement.module)
-    return modules
+    return get_attribute, lambda: names, names

@@ -32,7 +32,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
-from PIL import Image
 
 from renderer.camera import Camera
 from renderer.errors import InputError
@@ -60,31 +59,19 @@ VARIANT = "scalar_rgb"
 DIFFERENTIABLE = "llvm_ad_rgb"
 # XML tag in a Mitsuba scene file for a value of each Python type.
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}
-# XML tag in a Mitsuba scene file for an object
-# of each type, such as an emitter for "envmap".
-PLUGIN_TAGS = {
-    "path": "integrator",
-    "direct": "integrator",
-    "area": "emitter",
-    "constant": "emitter",
-    "directional": "emitter",
-    "envmap": "emitter",
-    "point": "emitter",
-    "projector": "emitter",
-    "spot": "emitter",
-    "ply": "shape",
-    "disk": "shape",
-    "perspective": "sensor",
-    "orthographic": "sensor",
-    "twosided": "bsdf",
-    "diffuse": "bsdf",
-    "principled": "bsdf",
-    "bitmap": "texture",
-    "mesh_attribute": "texture",
-    "hdrfilm": "film",
-    "box": "rfilter",
-    "multijitter": "sampler",
+# Types of objects in a Mitsuba scene file, such as an envmap, by their XML tag.
+PLUGINS = {
+    "integrator": ("path", "direct"),
+    "emitter": ("area", "constant", "directional", "envmap", "point", "projector", "spot"),
+    "shape": ("ply", "disk"),
+    "sensor": ("perspective", "orthographic"),
+    "bsdf": ("twosided", "diffuse", "principled"),
+    "texture": ("bitmap", "mesh_attribute"),
+    "film": ("hdrfilm",),
+    "rfilter": ("box",),
+    "sampler": ("multijitter",),
 }
+PLUGIN_TAGS = {plugin: tag for tag, plugins in PLUGINS.items() for plugin in plugins}
 # Smallest number by which specular factors are divided.
 # They are divided by the albedo scale, which can be 0.
 MIN_DIVISOR = 1e-6
@@ -144,23 +131,20 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
     with mitsuba() as module:
         try:
             scene = module.load_file(str(path))
-            images = []
-            for view in range(views):
-                image = np.array(module.render(scene, sensor=view))
-                images.append(_as_square(image))
+            rendered = [np.array(module.render(scene, sensor=view)) for view in range(views)]
         except RuntimeError as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"Mitsuba cannot render {path}: {reason}") from error
+    images = []
+    for image in rendered:
+        channels = torch.from_numpy(image).permute(2, 0, 1)
+        height, width = channels.shape[1:]
+        if height != width:
+            # Mitsuba's pixels are square. Stretch the image to a square of its width.
+            square = (width, width)
+            [channels] = F.interpolate(channels[None], square, mode="bilinear", antialias=True)
+        images.append(channels)
     return torch.stack(images)
-
-
-def _as_square(image: Float[np.ndarray, "H W C"]) -> torch.Tensor:
-    """Move the channels of an image to the first axis, and stretch it to a square of its width."""
-    channels = torch.from_numpy(image).permute(2, 0, 1)
-    height, width = channels.shape[1:]
-    if height == width:
-        return channels
-    return F.interpolate(channels[None], (width, width), mode="bilinear", antialias=True)[0]
 
 
 def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
@@ -214,10 +198,8 @@ def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) 
     texture are not white, the colors are first multiplied into new textures. Parts ascend by the
     index of the texture and of the gloss.
     """
-    textured_colors = mesh.corner_colors[mesh.texture_ids >= 0]
-    if (textured_colors != 1).any():
-        no_added_albedo = np.zeros((len(mesh.faces), 3))
-        mesh, _ = with_added_albedo(mesh, no_added_albedo, encoding)
+    if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
+        mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
     # Faces with the same key become one part. The key is the index of the
     # texture and, if the mesh has gloss, the three values of the gloss.
@@ -228,19 +210,16 @@ def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) 
     for key in np.unique(keys, axis=0):
         is_in_part = (keys == key).all(axis=1)
         texture_id = int(key[0])
-        texture = None
-        factors = None
-        if texture_id >= 0:
-            texture = mesh.textures[texture_id]
-            factors = mesh.gloss_textures[texture_id] if mesh.gloss_textures else None
+        has_texture = texture_id >= 0
+        has_factors = has_texture and mesh.gloss_textures
         part = Part(
             positions=mesh.vertices[mesh.faces[is_in_part]],
             normals=normals[is_in_part],
             uvs=mesh.corner_uvs[is_in_part],
             colors=colors[is_in_part],
-            texture=texture,
+            texture=mesh.textures[texture_id] if has_texture else None,
             gloss=None if mesh.gloss is None else key[1:],
-            factors=factors,
+            factors=mesh.gloss_textures[texture_id] if has_factors else None,
         )
         parts.append(part)
     return parts
@@ -307,18 +286,16 @@ def write_mitsuba_scene(
     # with little noise. The rays that are aimed at emitters are
     # therefore all aimed at local lights, if there are any.
     sky["sampling_weight"] = 0.0 if local_emitters else 1.0
-    emitter_samples = 1 if local_emitters else 0
-    sensors = []
-    for camera in cameras:
-        sampler = {"type": "multijitter", "sample_count": SAMPLES}
-        sensors.append({**sensor_of(camera, settings.size), "sampler": sampler})
-    objects = [integrator(settings.bounces, emitter_samples), sky, *local_emitters, *sensors]
+    sampler = {"type": "multijitter", "sample_count": SAMPLES}
+    sensors = [{**sensor_of(camera, settings.size), "sampler": sampler} for camera in cameras]
     normals = mesh.written_normals(settings.normals)
-    for number, part in enumerate(split_parts(mesh, normals, settings.encoding)):
-        writer = _PartWriter(folder, number, part, settings.encoding, albedo_scale)
-        objects.append(writer.write())
+    shapes = [
+        _write_part(folder, number, part, settings.encoding, albedo_scale)
+        for number, part in enumerate(split_parts(mesh, normals, settings.encoding))
+    ]
+    method = integrator(settings.bounces, emitter_samples=1 if local_emitters else 0)
     scene = xml.Element("scene", version="3.0.0")
-    for entry in objects:
+    for entry in (method, sky, *local_emitters, *sensors, *shapes):
         _append(scene, "", entry)
     xml.indent(scene, "    ")
     atomic_write(folder / SCENE, xml.tostring(scene, "unicode") + "\n")
@@ -366,109 +343,62 @@ def _local_emitters(
     return emitters
 
 
-class _PartWriter:
-    """Writer of one part of a mesh as files for Mitsuba, such as part_0.ply and texture_0.png.
+def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_scale: float) -> Scene:
+    """Write a part of a mesh as files for Mitsuba, such as part_0.ply and texture_0.png.
 
-    All faces of the part have the same texture and the same specular reflection.
+    Return its entry for a Mitsuba scene.
     """
+    import trimesh
 
-    def __init__(
-        self, folder: Path, number: int, part: Part, encoding: str, albedo_scale: float
-    ) -> None:
-        """Store the arguments, and compute the fraction of light that passes a glossy coat."""
-        self._folder = folder
-        self._number = number
-        self._part = part
-        self._encoding = encoding
-        self._albedo_scale = albedo_scale
-        # A surface whose metallic value and specular factor are 0 is matte.
-        is_glossy = part.gloss is not None and bool(part.gloss[1:].any())
-        self._gloss = part.gloss if is_glossy else None
-        # Factor for the albedo, because less light is reflected below a coat.
-        self._albedo_factor = 1.0 if self._gloss is None else _reflected_albedo(self._gloss)
+    # A surface whose metallic value and specular factor are 0 is matte.
+    gloss = part.gloss if part.gloss is not None and part.gloss[1:].any() else None
+    # Factor for the albedo, because less light is reflected below a coat.
+    albedo_factor = 1.0 if gloss is None else _reflected_albedo(gloss)
+    corner_values = np.concatenate([part.uvs, albedo_factor * part.colors], axis=-1)
+    corner_values = corner_values.reshape(-1, 5).astype(np.float32)
+    # Each corner of each face is a vertex of its own.
+    surface = trimesh.Trimesh(
+        part.positions.reshape(-1, 3),
+        np.arange(len(corner_values)).reshape(-1, 3),
+        vertex_normals=part.normals.reshape(-1, 3),
+        # Mitsuba reads the attributes u, v, r, g and b of the vertices of a .ply file.
+        vertex_attributes=dict(zip("uvrgb", corner_values.T, strict=True)),
+        process=False,
+    )
+    mesh_file = f"part_{number}.ply"
+    atomic_write(folder / mesh_file, surface.export(file_type="ply", vertex_normal=True))
 
-    def write(self) -> Scene:
-        """Write the mesh and the textures of the part, and return its entry for a Mitsuba scene."""
-        mesh_file = self._write_mesh()
-        albedo = self._albedo()
-        material = {"type": "diffuse", "reflectance": albedo}
-        if self._gloss is not None:
-            material = self._glossy_material(self._gloss, albedo)
-        bsdf = {"type": "twosided", "material": material}
-        return {"type": "ply", "filename": mesh_file, "flip_tex_coords": True, "bsdf": bsdf}
+    def bitmap(name: str, image: UInt8[np.ndarray, "..."], raw: bool) -> Scene:
+        """Write a texture of the part, and return its entry."""
+        file = f"{name}_{number}.png"
+        write_image(folder / file, image)
+        return {"type": "bitmap", "filename": file, "raw": raw}
 
-    def _write_mesh(self) -> str:
-        """Write a .ply file in which each corner of each face is a vertex of its own."""
-        import trimesh
-
-        part = self._part
-        colors = self._albedo_factor * part.colors
-        # Texture coordinates u and v, red, green
-        # and blue of each corner, shape (3 F, 5).
-        corner_values = np.concatenate([part.uvs, colors], axis=-1)
-        corner_values = corner_values.reshape(-1, 5).astype(np.float32)
-        surface = trimesh.Trimesh(
-            part.positions.reshape(-1, 3),
-            np.arange(len(corner_values)).reshape(-1, 3),
-            vertex_normals=part.normals.reshape(-1, 3),
-            # Mitsuba reads the attributes u, v, r, g
-            # and b of the vertices of a .ply file.
-            vertex_attributes=dict(zip("uvrgb", corner_values.T, strict=True)),
-            process=False,
-        )
-        name = f"part_{self._number}.ply"
-        atomic_write(self._folder / name, surface.export(file_type="ply", vertex_normal=True))
-        return name
-
-    def _albedo(self) -> Scene:
-        """Write the texture, if any, and return the albedo: the image file or the vertex colors."""
-        texture = self._part.texture
-        if texture is None:
-            return {"type": "mesh_attribute", "name": "vertex_color"}
-        albedo = self._albedo_factor * decode(torch.from_numpy(texture) / 255, self._encoding)
-        image = to_bytes(encode(albedo, self._encoding))
-        name = f"texture_{self._number}.png"
-        write_image(self._folder / name, Image.fromarray(image.numpy()))
-        return {"type": "bitmap", "filename": name, "raw": self._encoding == "linear"}
-
-    def _glossy_material(self, gloss: Float[np.ndarray, " 3"], albedo: Scene) -> Scene:
-        """Describe a material with specular reflection for Mitsuba.
-
-        If the part has a texture of roughness and metallic, it is written as image
-        files. The values of `gloss` are roughness, metallic and specular factor.
-        """
+    albedo: Scene = {"type": "mesh_attribute", "name": "vertex_color"}
+    if part.texture is not None:
+        linear = albedo_factor * decode(torch.from_numpy(part.texture) / 255, encoding)
+        texture = to_bytes(encode(linear, encoding)).numpy()
+        albedo = bitmap("texture", texture, raw=encoding == "linear")
+    material: Scene = {"type": "diffuse", "reflectance": albedo}
+    if gloss is not None:
         roughness, metallic, specular_factor = gloss.tolist()
-        # A metal has no coat and needs the full albedo, but
-        # the albedo was multiplied by `_albedo_factor`. A
-        # larger value for metallic compensates for this.
-        metallic /= self._albedo_factor
-        # Mitsuba's reflectance at normal incidence is 0.08 · specular.
-        # It must be 0.04 times the specular factor, for a refractive
-        # index of 1.5. The lights of the scene are multiplied by the
-        # albedo scale, so the reflectance is divided by it.
-        specular = specular_factor / 2 / max(self._albedo_scale, MIN_DIVISOR)
-        return {
-            "type": "principled",
-            "base_color": albedo,
-            "specular": min(max(specular, MIN_SPECULAR), 1.0),
-            "roughness": self._gloss_value("roughness", roughness, minimum=MIN_ROUGHNESS),
-            "metallic": self._gloss_value("metallic", metallic, minimum=0.0),
-        }
-
-    def _gloss_value(self, name: str, factor: float, minimum: float) -> Scene | float:
-        """Describe the roughness or the metallic value of a material for Mitsuba.
-
-        If the part has a texture of roughness and metallic, one channel of the
-        texture is written as an image file.
-        """
-        factors = self._part.factors
-        if factors is None:
-            return max(factor, minimum)
-        channel = factors[..., 0 if name == "roughness" else 1]
-        image = np.maximum(channel * factor, 255 * minimum).round().astype(np.uint8)
-        file_name = f"{name}_{self._number}.png"
-        write_image(self._folder / file_name, Image.fromarray(image))
-        return {"type": "bitmap", "filename": file_name, "raw": True}
+        # Mitsuba's reflectance at normal incidence is 0.08 · specular. It must be 0.04 times the
+        # specular factor, for a refractive index of 1.5. The lights of the scene are multiplied by
+        # the albedo scale, so the reflectance is divided by it.
+        specular = specular_factor / 2 / max(albedo_scale, MIN_DIVISOR)
+        specular = min(max(specular, MIN_SPECULAR), 1.0)
+        material = {"type": "principled", "base_color": albedo, "specular": specular}
+        # A metal has no coat and needs the full albedo, but the albedo was multiplied by a factor.
+        # A larger value for metallic compensates for this.
+        factors = {"roughness": roughness, "metallic": metallic / albedo_factor}
+        minimums = {"roughness": MIN_ROUGHNESS, "metallic": 0.0}
+        for channel, (name, factor) in enumerate(factors.items()):
+            material[name] = max(factor, minimums[name])
+            if part.factors is not None:
+                values = np.maximum(part.factors[..., channel] * factor, 255 * minimums[name])
+                material[name] = bitmap(name, values.round().astype(np.uint8), raw=True)
+    bsdf = {"type": "twosided", "material": material}
+    return {"type": "ply", "filename": mesh_file, "flip_tex_coords": True, "bsdf": bsdf}
 
 
 def _reflected_albedo(gloss: Float[np.ndarray, " 3"]) -> float:

@@ -91,13 +91,8 @@ class Photograph:
         # Matrix from a direction (x, y, z) in the axes of the camera
         # to the homogeneous position (column, row, 1) · (-z) in the
         # photograph. The column is width / 2 - focal_length · x / z.
-        to_pixels = np.array(
-            [
-                [focal_length, 0, -width / 2],
-                [0, -focal_length, -height / 2],
-                [0.0, 0.0, -1.0],
-            ]
-        )
+        to_pixels = np.diag([focal_length, -focal_length, -1.0])
+        to_pixels[:2, 2] = -width / 2, -height / 2
         # Direction in which the camera sees the point.
         forward = np.linalg.solve(to_pixels, np.array([*center, 1.0]))
         # Axes of the turned camera. Its axis to the right is horizontal.
@@ -144,8 +139,20 @@ class Window:
         """
         is_enlarged = self.side < size
         samples = 1 if is_enlarged else max(MIN_SAMPLES, math.ceil(self.side / size))
-        rectangle = self._needed_rectangle()
-        pixels = rectangle.read(photograph, beyond)
+        # Rectangle of pixels of the photograph that the window shows, with a border. A homography
+        # maps lines to lines, so the outermost points of the window are its corners.
+        half = self.side / 2
+        corners = self.pixels(*np.meshgrid([-half, half], [-half, half]))
+        low = np.floor(corners.min(axis=(0, 1))).astype(int) - BORDER
+        high = np.ceil(corners.max(axis=(0, 1))).astype(int) + BORDER
+        columns = np.arange(low[0], high[0])
+        rows = np.arange(low[1], high[1])
+        last_row, last_column = np.array(photograph.shape[:2]) - 1
+        pixels = photograph[rows.clip(0, last_row)[:, None], columns.clip(0, last_column)]
+        if beyond is not None:
+            is_row_outside = (rows < 0) | (rows > last_row)
+            is_column_outside = (columns < 0) | (columns > last_column)
+            pixels[is_row_outside[:, None] | is_column_outside] = beyond
         linear = decode(torch.from_numpy(pixels).permute(2, 0, 1) / 255, encoding)[None]
         # If pixels become larger, their values are means over
         # many samples, as with the box filter of the renderer.
@@ -156,82 +163,24 @@ class Window:
         # Positions of all samples along one side,
         # in pixels from the window center.
         offsets = ((np.arange(resolution) + 0.5) / resolution - 0.5) * self.side
-        # Heights of samples above the window center, with one row for
-        # each row of pixels. The first row of pixels is at the top.
-        heights = -offsets.reshape(size, samples)
-        rows = []
-        # Resampling one row of pixels at a time needs less memory.
-        for row_heights in heights:
-            x, y = np.meshgrid(offsets, row_heights)
-            points = np.stack(self.pixels(x, y), axis=-1)
-            grid = torch.from_numpy(rectangle.normalized(points)).to(linear)[None]
+        resampled = []
+        # Resampling one row of pixels at a time needs less memory. The first one is at the top.
+        for heights in -offsets.reshape(size, samples):
+            points = self.pixels(*np.meshgrid(offsets, heights))
+            # `grid_sample` takes coordinates from -1 to 1 in the rectangle.
+            grid = torch.from_numpy(2 * (points - low) / (high - low) - 1).to(linear)[None]
             at_samples = F.grid_sample(linear, grid, mode, align_corners=False)
-            rows.append(F.avg_pool2d(at_samples, samples)[0])
-        return torch.cat(rows, dim=1).clamp(0, 1)
+            resampled.append(F.avg_pool2d(at_samples, samples)[0])
+        return torch.cat(resampled, dim=1).clamp(0, 1)
 
-    def pixels(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Map points of the window to positions in the photograph.
+    def pixels(self, x: Array, y: Array) -> Array:
+        """Map points of the window to positions (column, row) in the photograph, shape (..., 2).
 
-        Points are distances right of and above the window center in pixels. The results are
-        columns and rows.
+        Points are distances right of and above the window center in pixels.
         """
         points = np.stack([x, y, np.ones_like(x)])
         columns, rows, weights = np.tensordot(self.homography, points, 1)
-        return columns / weights, rows / weights
-
-    def _needed_rectangle(self) -> _Rectangle:
-        """Find the rectangle of pixels of the photograph that the window shows, with a border.
-
-        A homography maps lines to lines. The outermost points of the window in the
-        photograph are therefore its corners.
-        """
-        half = self.side / 2
-        x = np.array([-half, half, half, -half])
-        y = np.array([-half, -half, half, half])
-        columns, rows = self.pixels(x, y)
-        return _Rectangle(
-            left=math.floor(columns.min()) - BORDER,
-            top=math.floor(rows.min()) - BORDER,
-            right=math.ceil(columns.max()) + BORDER,
-            bottom=math.ceil(rows.max()) + BORDER,
-        )
-
-
-@dataclass(frozen=True)
-class _Rectangle:
-    """Rectangle of pixels of a photograph, which may extend beyond the photograph.
-
-    Attributes:
-        left: First column of pixels.
-        top: First row of pixels.
-        right: Column after the last column.
-        bottom: Row after the last row.
-    """
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    def read(self, photograph: Array, beyond: int | None) -> Array:
-        """Read the pixels of the rectangle."""
-        height, width = photograph.shape[:2]
-        columns = np.arange(self.left, self.right)
-        rows = np.arange(self.top, self.bottom)
-        pixels = photograph[rows.clip(0, height - 1)[:, None], columns.clip(0, width - 1)]
-        if beyond is not None:
-            is_row_outside = (rows < 0) | (rows >= height)
-            is_column_outside = (columns < 0) | (columns >= width)
-            pixels[is_row_outside[:, None] | is_column_outside] = beyond
-        return pixels
-
-    def normalized(self, points: Array) -> Array:
-        """Convert positions in the photograph to coordinates for torch's `grid_sample`.
-
-        Points are columns and rows. Coordinates (x, y) go from -1 to 1 in the rectangle.
-        """
-        extent = [self.right - self.left, self.bottom - self.top]
-        return 2 * (points - [self.left, self.top]) / extent - 1
+        return np.stack([columns / weights, rows / weights], axis=-1)
 
 
 def fit_photograph(
@@ -255,16 +204,14 @@ def fit_photograph(
     center of the photograph. The mask is white where the object is. `fov` is the field of view of
     the window in degrees, or None for no perspective.
     """
-    is_object = mask > MASK_THRESHOLD
-    rows = np.flatnonzero(is_object.any(axis=1))
-    columns = np.flatnonzero(is_object.any(axis=0))
+    rows, columns = np.nonzero(mask > MASK_THRESHOLD)
     if not len(rows):
         raise InputError(
             "the mask has no white pixels: give a mask that is white where the object is, "
             "or a box around the object"
         )
     # Center (column, row) of the object's bounding box in the photograph, in pixels.
-    center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
+    center = np.array([columns.min() + columns.max() + 1, rows.min() + rows.max() + 1]) / 2
     # Side of the window in pixels.
     side = WINDOW_SCALE * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
     focal_length = None if fov is None else side / 2 / math.tan(math.radians(fov) / 2)
@@ -280,9 +227,8 @@ def fit_photograph(
 
     # The window needs the direction of the world's z-axis in the axes of the photograph's camera:
     # right, up and back. For the first fit, this direction is guessed.
-    guessed_polar = math.radians(GUESSED_POLAR)
-    guessed_up = np.array([0.0, math.sin(guessed_polar), math.cos(guessed_polar)])
-    window = camera_image.window(center, side, guessed_up)
+    polar = math.radians(GUESSED_POLAR)
+    window = camera_image.window(center, side, np.array([0.0, math.sin(polar), math.cos(polar)]))
     scene = fit(window, None)
     # The first fit gives a better direction of the z-axis for the second fit.
     up = _up_direction(scene.camera, window)
@@ -292,28 +238,19 @@ def fit_photograph(
     if np.abs(upright_window.axes - window.axes).max() > MAX_AXIS_CHANGE:
         window = upright_window
         scene = fit(window, scene.camera)
-    return _centered_on_mesh(scene, window, camera_image)
-
-
-def _centered_on_mesh(
-    scene: FittedScene, window: Window, camera_image: Photograph
-) -> FittedPhotograph:
-    """Turn a fitted camera and its window so that the mesh center is in their center."""
+    # Turn the camera and the window so that the mesh center is in their center.
     camera = scene.camera
     # Offset (right, up) of the mesh center from the window center, in pixels.
     offset = np.array([camera.right, camera.up]) * window.side / camera.width
-    mesh_center = np.array(window.pixels(*offset))
     up = _up_direction(camera, window)
-    centered_scene = scene._replace(camera=_turned_to_mesh(camera))
-    return FittedPhotograph(centered_scene, camera_image.window(mesh_center, window.side, up))
+    centered_window = camera_image.window(window.pixels(*offset), window.side, up)
+    return FittedPhotograph(scene._replace(camera=_turned_to_mesh(camera)), centered_window)
 
 
 def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
     """Return the world's z-axis, a unit vector, in the photograph's axes right, up and back."""
-    # The z-components of the axes right, up and back of the fitted camera. These axes are also the
-    # axes of the window.
-    z_axis_in_window = camera.axes()[:, 2]
-    return window.axes.T @ z_axis_in_window
+    # The axes right, up and back of the fitted camera are also the axes of the window.
+    return window.axes.T @ camera.axes()[:, 2]
 
 
 def _turned_to_mesh(camera: Camera) -> Camera:

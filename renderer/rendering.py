@@ -10,32 +10,23 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import overload
+from typing import TypedDict, Unpack, overload
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from renderer import errors
 from renderer.camera import Camera, OrthographicCamera
-from renderer.errors import (
-    MAX_SCALE,
-    InputError,
-    as_list,
-    as_tensor,
-    describe,
-    require_bounded,
-    require_choice,
-    require_kind,
-    require_number,
-)
+from renderer.errors import InputError
 from renderer.image import as_background, composite, encode
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
 from renderer.mesh import NO_TEXTURE, Mesh, require_mesh
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
-from renderer.operators.rays import Rays, Surface
+from renderer.operators.rays import LocalLightView, Rays, Surface
 from renderer.operators.shadows import build_transport
 from renderer.operators.stack import TransferOperators
 from renderer.settings import RASTERIZERS, ImageSettings, samples_per_side
@@ -59,6 +50,8 @@ _OBLIQUE = OrthographicCamera(60.0, 0.0, 2.0)
 # Choosing the rasterizer "opengl" tests the graphics driver, which takes longer than rendering an
 # image. The choice is therefore cached.
 _choose = cache(choose)
+# A white ball of radius 1 around the origin.
+_white_ball = cache(lambda: Mesh.plain(*sphere(5)))
 
 
 def render(
@@ -143,28 +136,20 @@ def render(
         >>> image.shape, torch.autograd.grad(image.mean(), light)[0].shape
         (torch.Size([2, 3, 16, 16]), torch.Size([49, 3]))
     """
-    require_mesh("mesh", mesh)
     per_side = samples_per_side(samples, silhouettes)
     settings = ImageSettings(size, per_side, encoding, normals, shadows, bounces, silhouettes)
-    all_cameras = _listed(cameras)
-    _require_scale(albedo_scale)
-    _require_gloss(gloss)
-    require_choice("rasterizer", rasterizer, RASTERIZERS)
+    all_cameras = _checked_cameras(mesh, cameras, albedo_scale, gloss, rasterizer)
     light = None if light is None else _as_light(light)
     albedo = None if albedo is None else _as_albedo(albedo, mesh)
-    vertices = None if vertices is None else as_tensor("vertices", vertices)
-    if vertices is not None and vertices.shape != mesh.vertices.shape:
-        shape = tuple(vertices.shape)
-        raise InputError(
-            f"vertices of shape {shape} does not fit the mesh: give {mesh.vertices.shape}"
-        )
-    given_lights = as_list("lights", lights, LocalBasis | tuple, _LOCAL_LIGHTS)
+    vertices = None if vertices is None else errors.as_tensor("vertices", vertices)
+    if vertices is not None:
+        errors.require_shape("vertices", vertices, *mesh.vertices.shape)
+    given_lights = errors.as_list("lights", lights, LocalBasis | tuple, _LOCAL_LIGHTS)
     # Each local light becomes a pair of a basis and its coefficients.
     local_lights = [_with_coefficients(local_light) for local_light in given_lights]
     # The images have the dtype and the device of the first light.
-    like = torch.zeros(0) if light is None else light
-    if light is None and local_lights:
-        like = local_lights[0][1]
+    given = [light] if light is not None else [values for _, values in local_lights]
+    like = given[0] if given else torch.zeros(0)
     image_dtype = like.dtype
     # Rounded to half precision, vertices would move by pixels.
     like = like.to(torch.promote_types(image_dtype, torch.float32))
@@ -176,11 +161,10 @@ def render(
     # Rasterizing and ray tracing have no gradients, so they take a mesh and cameras with plain
     # numbers instead of tensors.
     moved_mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
-    fixed_cameras = [camera.fixed() for camera in all_cameras]
     views = build_fragments(
         moved_mesh.vertices,
         mesh.faces,
-        fixed_cameras,
+        [camera.fixed() for camera in all_cameras],
         settings,
         _choose(rasterizer),
         closed=moved_mesh.closed if is_moved else mesh.closed,
@@ -204,6 +188,9 @@ def render(
             # Function of the albedo and the environment light. It returns the radiance that shadows
             # and bounces add to the pixels.
             indirect = partial(transport.radiance, surface)
+        lamp_view = None
+        if local_lights:
+            lamp_view = LocalLightView(rays, mesh, fragments, settings, vertices, gloss)
         shaded_view = ShadedView(
             mesh=mesh,
             fragments=fragments,
@@ -211,7 +198,7 @@ def render(
             vertices=vertices,
             albedo=_sample_albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale,
             light=split,
-            rays=rays,
+            lamp_view=lamp_view,
             gloss=gloss,
             indirect=indirect,
         )
@@ -221,12 +208,6 @@ def render(
     return images[0] if isinstance(cameras, Camera) else torch.stack(images)
 
 
-@cache
-def _white_ball() -> Mesh:
-    """Create a white ball of radius 1 around the origin."""
-    return Mesh.plain(*sphere(5))
-
-
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
     """Split a local light for `render` into its basis and its coefficients.
 
@@ -234,53 +215,39 @@ def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
     """
     pair = light if isinstance(light, tuple) else (light, None)
     if len(pair) != 2:
-        raise InputError(f"lights has the entry {describe(pair)}: give {_LOCAL_LIGHTS}")
+        raise InputError(f"lights has the entry {errors.describe(pair)}: give {_LOCAL_LIGHTS}")
     basis, given = pair
-    require_kind("lights: a basis", basis, LocalBasis, _LOCAL_LIGHTS)
+    errors.require_kind("lights: a basis", basis, LocalBasis, _LOCAL_LIGHTS)
     if given is None:
         return basis, torch.full((basis.size, 3), basis.power)
-    values = as_tensor("lights: coefficients", given)
-    if values.shape != (basis.size, 3):
-        shape = tuple(values.shape)
-        expected = (basis.size, 3)
-        raise InputError(
-            f"lights: the coefficients of {basis} have shape {shape}: give the shape {expected}"
-        )
-    require_bounded(lights=values)
+    values = errors.as_tensor("lights: coefficients", given)
+    errors.require_shape(f"lights: the coefficients of {basis}", values, basis.size, 3)
+    errors.require_bounded(lights=values)
     return basis, values
+
+
+class TransferOptions(TypedDict, total=False):
+    """Types of the keyword arguments of `precompute_transfer`."""
+
+    albedo_scale: float
+    gloss: Gloss | None
+    samples: int
+    encoding: str
+    normals: str
+    shadows: bool
+    bounces: int
+    rasterizer: str
 
 
 @overload
 def precompute_transfer(
-    mesh: Mesh,
-    cameras: Camera,
-    size: int = ...,
-    *,
-    albedo_scale: float = ...,
-    gloss: Gloss | None = ...,
-    samples: int = ...,
-    encoding: str = ...,
-    normals: str = ...,
-    shadows: bool = ...,
-    bounces: int = ...,
-    rasterizer: str = ...,
+    mesh: Mesh, cameras: Camera, size: int = ..., **options: Unpack[TransferOptions]
 ) -> TransferOperator: ...
 
 
 @overload
 def precompute_transfer(
-    mesh: Mesh,
-    cameras: Sequence[Camera],
-    size: int = ...,
-    *,
-    albedo_scale: float = ...,
-    gloss: Gloss | None = ...,
-    samples: int = ...,
-    encoding: str = ...,
-    normals: str = ...,
-    shadows: bool = ...,
-    bounces: int = ...,
-    rasterizer: str = ...,
+    mesh: Mesh, cameras: Sequence[Camera], size: int = ..., **options: Unpack[TransferOptions]
 ) -> TransferOperators: ...
 
 
@@ -337,13 +304,10 @@ def precompute_transfer(
         >>> operators[0].image(lights).shape, operators.image(lights).shape
         (torch.Size([2, 3, 16, 16]), torch.Size([2, 2, 3, 16, 16]))
     """
-    require_mesh("mesh", mesh)
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
-    _require_scale(albedo_scale)
-    _require_gloss(gloss)
-    require_choice("rasterizer", rasterizer, RASTERIZERS)
+    all_cameras = _checked_cameras(mesh, cameras, albedo_scale, gloss, rasterizer)
     operators = build_operators(
-        mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale, gloss=gloss
+        mesh, all_cameras, settings, _choose(rasterizer), albedo_scale, gloss=gloss
     )
     return operators[0] if isinstance(cameras, Camera) else TransferOperators(operators)
 
@@ -376,54 +340,44 @@ def light_sphere(
         >>> image.shape
         torch.Size([3, 16, 16])
     """
-    light = as_tensor("light", light)
-    if light.ndim != 2 or light.shape[1] != 3:
-        shape = tuple(light.shape)
-        raise InputError(f"light has shape {shape}: give coefficients {(basis.size, 3)}")
-    sky, local_lights = split_light(basis, light.detach().cpu().float())
+    light = errors.as_tensor("light", light)
+    errors.require_shape("light", light, basis.size, 3)
+    sky, local = split_light(basis, light.detach().cpu().float())
     # Uniform light of radiance 1 has the irradiance π.
     sky = None if sky is None else sky / math.pi
     camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)
     return render(
-        _white_ball(),
-        camera,
-        sky,
-        size,
-        background=1.0,
-        lights=local_lights,
-        encoding="srgb",
-        rasterizer="numpy",
+        _white_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy"
     )
 
 
-def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:
-    """Convert one camera or a sequence of cameras to a list."""
+def _checked_cameras(
+    mesh: Mesh,
+    cameras: Camera | Sequence[Camera],
+    albedo_scale: float,
+    gloss: Gloss | None,
+    rasterizer: str,
+) -> list[Camera]:
+    """Check arguments of `render` and `precompute_transfer`, and return the cameras as a list."""
+    require_mesh("mesh", mesh)
+    errors.require_number("albedo_scale", albedo_scale, 0, errors.MAX_SCALE)
+    expected = "nb.Gloss(roughness, metallic, specular_factor) or None"
+    errors.require_kind("gloss", gloss, Gloss | None, expected)
+    errors.require_choice("rasterizer", rasterizer, RASTERIZERS)
     if isinstance(cameras, Camera):
         return [cameras]
     expected = "a camera or a list of cameras, such as nb.orbit_cameras(10, width=2.0)"
-    listed_cameras = as_list("cameras", cameras, Camera, expected)
-    if not listed_cameras:
+    all_cameras = errors.as_list("cameras", cameras, Camera, expected)
+    if not all_cameras:
         raise InputError(f"cameras is empty: give {expected}")
-    return listed_cameras
-
-
-def _require_scale(albedo_scale: float) -> None:
-    """Raise `InputError` if `albedo_scale` is no number from 0 to `MAX_SCALE`."""
-    require_number("albedo_scale", albedo_scale, 0, MAX_SCALE)
-
-
-def _require_gloss(gloss: Gloss | None) -> None:
-    """Raise `InputError` if `gloss` is neither a `Gloss` nor None."""
-    require_kind(
-        "gloss", gloss, Gloss | None, "nb.Gloss(roughness, metallic, specular_factor) or None"
-    )
+    return all_cameras
 
 
 def _as_light(light: object) -> Tensor:
     """Convert the argument `light` to a tensor, and check its shape."""
     if isinstance(light, str):
         raise InputError(f"light is {light!r}: give coefficients, such as nb.load_light({light!r})")
-    coefficients = as_tensor("light", light)
+    coefficients = errors.as_tensor("light", light)
     # `degree_of` raises an error if the shape is wrong.
     degree_of(coefficients)
     return coefficients
@@ -431,13 +385,12 @@ def _as_light(light: object) -> Tensor:
 
 def _as_albedo(albedo: object, mesh: Mesh) -> Tensor:
     """Convert the argument `albedo` to a tensor, and check its shape and its values."""
-    values = as_tensor("albedo", albedo)
-    require_bounded(albedo=values)
+    values = errors.as_tensor("albedo", albedo)
+    errors.require_bounded(albedo=values)
     if values.numel() and not (values.min() >= 0 and values.max() <= MAX_ALBEDO):
-        extremes = f"{values.min().item():g} to {values.max().item():g}"
         raise InputError(
-            f"albedo has values from {extremes}: give values from 0 to 1, and set albedo_scale "
-            "for brighter surfaces"
+            f"albedo has values from {values.min().item():g} to {values.max().item():g}: "
+            "give values from 0 to 1, and set albedo_scale for brighter surfaces"
         )
     is_texture = values.ndim == 3 and values.shape[2] == 3 and len(mesh.textures) == 1
     if values.shape != mesh.faces.shape and not is_texture:
@@ -456,19 +409,12 @@ def _recolored(mesh: Mesh, albedo: Float[Tensor, " ..."], encoding: str) -> Mesh
     to 8 bits, which the mean over the patches of a surface evens out.
     """
     colors = encode(albedo.detach().cpu().double(), encoding).numpy()
+    mesh = replace(mesh, gloss=None, gloss_textures=())
     if albedo.ndim == 3:
-        texture = np.rint(255 * colors).astype(np.uint8)
-        return replace(mesh, textures=(texture,), gloss=None, gloss_textures=())
+        return replace(mesh, textures=(np.rint(255 * colors).astype(np.uint8),))
     corner_colors = colors[:, None].repeat(3, axis=1).astype(np.float32)
     untextured = np.full_like(mesh.texture_ids, NO_TEXTURE)
-    return replace(
-        mesh,
-        corner_colors=corner_colors,
-        texture_ids=untextured,
-        textures=(),
-        gloss=None,
-        gloss_textures=(),
-    )
+    return replace(mesh, corner_colors=corner_colors, texture_ids=untextured, textures=())
 
 
 def _sample_albedo(
@@ -479,8 +425,6 @@ def _sample_albedo(
     `albedo` is linear, with one row per face, or the only texture. None uses the colors of
     the mesh.
     """
-    if albedo is None:
-        return surface_albedo(mesh, view, encoding)
-    if albedo.shape == mesh.faces.shape:
+    if albedo is not None and albedo.shape == mesh.faces.shape:
         return face_albedo(albedo, view)
-    return surface_albedo(mesh, view, encoding, [albedo])
+    return surface_albedo(mesh, view, encoding, None if albedo is None else [albedo])

@@ -6,7 +6,7 @@ sample is covered if it shows the shape.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from renderer.camera import Camera
 from renderer.image import decode
 from renderer.light.basis import SplitLight
 from renderer.mesh import Mesh
-from renderer.operators.rays import LocalLightView, Rays
+from renderer.operators.rays import LocalLightView
 from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss, SampleGloss, sample_gloss
 from renderer.surface.shading import glossy_radiance, normals_in_sight, radiance
@@ -65,8 +65,7 @@ class ShadedView:
         vertices: Vertex positions of the shape in world axes, shape (V, 3).
         albedo: Linear albedo at the samples, shape (S, 3).
         light: Environment light and local lights with their coefficients.
-        rays: Ray tracer for the faces of the shape. It is needed if there are
-            local lights and `lamp_view` is None.
+        lamp_view: The shape in local light. It is not needed without local lights.
         is_moved: True if `vertices` are not those of the mesh. If
             `settings.silhouettes` is also True, gradients with respect to the
             vertices include the movement of silhouettes.
@@ -75,8 +74,6 @@ class ShadedView:
         corner_normals: Unit normals of the corners of the F faces (see
             `Mesh.corner_normals`), shape (F, 3, 3). None computes the normals if
             they are needed.
-        lamp_view: Local light of an earlier render of the same shape, which is
-            reused. None computes it.
         indirect: Function that takes the albedo at the samples and the SH
             coefficients of environment light, and returns the radiance that
             shadows and bounces add to the covered pixels, shape (3, P). None
@@ -91,24 +88,12 @@ class ShadedView:
     vertices: Float[Tensor, "V 3"]
     albedo: Float[Tensor, "S 3"]
     light: SplitLight
-    rays: Rays | None = None
+    lamp_view: LocalLightView | None = None
     is_moved: bool = True
     gloss: Gloss | None = None
     corner_normals: Float[Tensor, "F 3 3"] | None = None
-    lamp_view: LocalLightView | None = None
     indirect: Callable[[Tensor, Tensor], Tensor] | None = None
     lamp_positions: Float[Tensor, "L 3"] | None = None
-
-    def radiance(self) -> Float[Tensor, "3 P"]:
-        """Compute the linear radiance of the P covered pixels, times their coverage."""
-        # Autograd adds up gradients in the reverse of this order, so another order would change the
-        # last bits of gradients.
-        summands = [
-            self._environment_radiance(self.fragments),
-            self._indirect_radiance(),
-            *self._lamp_radiances(self.fragments),
-        ]
-        return self._sum(summands, self.fragments)
 
     def pixel_radiance(self, camera: Camera, background: Tensor) -> PixelRadiance:
         """Compute the radiance of the pixels that the shape covers.
@@ -125,18 +110,9 @@ class ShadedView:
         coverage = self.fragments.coverage.to(pixel_radiance)
         return PixelRadiance(self.fragments.pixels, coverage, pixel_radiance)
 
-    def _environment_radiance(self, fragments: Fragments) -> Float[Tensor, "3 P"] | None:
-        """Compute the radiance of pixels under environment light, without shadows and bounces.
-
-        It is None without environment light.
-        """
-        environment = self.light.environment
-        if environment is None:
-            return None
-        arguments = fragments, self.vertices, environment, self.albedo, self._normals
-        if self._sample_gloss is None:
-            return radiance(*arguments)
-        return glossy_radiance(*arguments, self._sample_gloss)
+    def radiance(self) -> Float[Tensor, "3 P"]:
+        """Compute the linear radiance of the P covered pixels, times their coverage."""
+        return self._sum(self.fragments, has_indirect=True)
 
     def _indirect_radiance(self) -> Float[Tensor, "3 P"] | None:
         """Compute the radiance that shadows and bounces add to the P covered pixels.
@@ -148,18 +124,30 @@ class ShadedView:
             return None
         return self.indirect(self.albedo, environment)
 
-    def _lamp_radiances(self, fragments: Fragments) -> list[Tensor]:
-        """Compute the radiance of pixels under each local light (lamps or a projector)."""
-        radiances = []
-        for basis, coefficients in self.light.local_lights:
-            lamp_radiance = self._lamp_view.radiance(
-                basis, self.albedo, coefficients, self.lamp_positions, fragments
-            )
-            radiances.append(lamp_radiance)
-        return radiances
+    def _sum(self, fragments: Fragments, has_indirect: bool) -> Float[Tensor, "3 P"]:
+        """Add up the radiance from all lights, with that of shadows and bounces or without.
 
-    def _sum(self, summands: Sequence[Tensor | None], fragments: Fragments) -> Float[Tensor, "3 P"]:
-        """Add up radiances, without those that are None."""
+        `fragments` may assign the samples to other pixels.
+        """
+        # Autograd adds up gradients in the reverse of this order, so another order would change the
+        # last bits of gradients.
+        summands: list[Tensor | None] = []
+        if self.light.environment is not None:
+            arguments = (fragments, self.vertices, self.light.environment, self.albedo)
+            gloss = self._sample_gloss
+            if gloss is None:
+                summands.append(radiance(*arguments, self._normals))
+            else:
+                summands.append(glossy_radiance(*arguments, self._normals, gloss))
+        if has_indirect:
+            summands.append(self._indirect_radiance())
+        for basis, coefficients in self.light.local_lights:
+            assert self.lamp_view is not None
+            summands.append(
+                self.lamp_view.radiance(
+                    basis, self.albedo, coefficients, self.lamp_positions, fragments
+                )
+            )
         given_summands = [summand for summand in summands if summand is not None]
         if not given_summands:
             return torch.zeros(3, len(fragments.pixels)).to(self.albedo)
@@ -176,11 +164,7 @@ class ShadedView:
         fragments = self.fragments
         # Each sample becomes a pixel of a finer image, so that it is shaded alone.
         finer_fragments = replace(fragments.by_sample(), camera=camera)
-        summands = [
-            self._environment_radiance(finer_fragments),
-            *self._lamp_radiances(finer_fragments),
-        ]
-        at_samples = self._sum(summands, finer_fragments)
+        at_samples = self._sum(finer_fragments, has_indirect=False)
         zeros = at_samples.new_zeros(3, len(fragments.pixels))
         at_pixels = zeros.index_add(1, fragments.sample_to_pixel, at_samples)
         at_pixels = at_pixels / fragments.samples**2
@@ -235,14 +219,3 @@ class ShadedView:
     def _sample_gloss(self) -> SampleGloss | None:
         """Gloss at the samples, or None for a matte shape."""
         return sample_gloss(self.mesh, self.fragments, self.gloss)
-
-    @cached_property
-    def _lamp_view(self) -> LocalLightView:
-        """Local light on the shape: `lamp_view` if it was given, and otherwise a new object."""
-        if self.lamp_view is not None:
-            return self.lamp_view
-        assert self.rays is not None
-        vertices = self.vertices if self.is_moved else None
-        return LocalLightView(
-            self.rays, self.mesh, self.fragments, self.settings, vertices, self.gloss
-        )

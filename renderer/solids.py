@@ -14,7 +14,7 @@ consists of sections, each of which has its own color (see `paint`).
 """
 
 import colorsys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -149,11 +149,10 @@ def sweet_pepper(rng: np.random.Generator) -> Mesh:
     furrows = 0.2 * bump(np.sin(lobe_count / 2 * azimuth) / 0.5) * away_from_axis**2
     vertices[:, :2] *= (1.08 - furrows)[:, None]
     vertices[:, 2] *= rng.uniform(0.9, 1.05)
-    red = (0.78, 0.07, 0.07)
-    yellow = (0.95, 0.75, 0.08)
-    green = (0.22, 0.48, 0.12)
-    orange_red = (0.93, 0.42, 0.05)
-    color = choose(rng, red, yellow, green, orange_red)
+    # Red, yellow, green or orange red.
+    color = choose(
+        rng, (0.78, 0.07, 0.07), (0.95, 0.75, 0.08), (0.22, 0.48, 0.12), (0.93, 0.42, 0.05)
+    )
     skin = mix(color, LEAF_GREEN, 0.1 * ripples(rng, vertices, wavelength=1.0))
     return paint(vertices, faces, section, skin, LEAF_GREEN)
 
@@ -169,9 +168,7 @@ def mushroom(rng: np.random.Generator) -> Mesh:
     vertices, faces, section = revolve(stalk, gills, cap)
     brown = choose(rng, (0.55, 0.34, 0.18), (0.78, 0.62, 0.44))
     white_weight = 4 * ripples(rng, vertices, wavelength=0.5) - 3
-    red = choose(rng, (0.80, 0.10, 0.06))
-    white = (0.95, 0.93, 0.88)
-    red_with_flecks = mix(red, white, white_weight)
+    red_with_flecks = mix(choose(rng, (0.80, 0.10, 0.06)), (0.95, 0.93, 0.88), white_weight)
     cap_color = red_with_flecks if rng.random() < 0.4 else brown
     stalk_color = (0.90, 0.86, 0.76)
     gill_color = (0.72, 0.60, 0.46)
@@ -193,8 +190,7 @@ def bottle(rng: np.random.Generator) -> Mesh:
     )
     paper = choose(rng, (0.93, 0.90, 0.80), (0.85, 0.20, 0.15), (0.92, 0.78, 0.25))
     metal = choose(rng, (0.75, 0.62, 0.25), (0.70, 0.12, 0.12), (0.80, 0.80, 0.82))
-    vertices, faces, section = revolve(base, label, neck, cap)
-    return paint(vertices, faces, section, glass, paper, glass, metal)
+    return paint(*revolve(base, label, neck, cap), glass, paper, glass, metal)
 
 
 def cup(rng: np.random.Generator) -> Mesh:
@@ -211,8 +207,7 @@ def cup(rng: np.random.Generator) -> Mesh:
     )
     white = (0.95, 0.94, 0.90)
     coffee = (0.28, 0.16, 0.08)
-    vertices, faces, section = revolve(outside, inside, drink)
-    body = paint(vertices, faces, section, glaze, white, coffee)
+    body = paint(*revolve(outside, inside, drink), glaze, white, coffee)
     # The handle ends in the middle of the wall of thickness 0.07, at the heights -0.4 and 0.4.
     outer_radii = np.interp([-0.4, 0.4], [-0.7, 0.7], [foot_radius, rim_radius])
     handle_vertices, handle_faces, _ = loft(_handle(outer_radii - 0.035))
@@ -221,9 +216,7 @@ def cup(rng: np.random.Generator) -> Mesh:
 
 def _handle(end_radii: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "19 12 3"]:
     """Create the rings of the handle of a cup, whose ends have these distances from the axis."""
-    x_axis = [1, 0, 0]
-    y_axis = [0, 1, 0]
-    z_axis = [0, 0, 1]
+    x_axis, y_axis, z_axis = np.eye(3)
     open_ring_count = 17
     points_per_ring = 12
     tube_radius = 0.07
@@ -254,8 +247,7 @@ def plate(rng: np.random.Generator) -> Mesh:
     stripe = choose(
         rng, (0.15, 0.25, 0.60), (0.70, 0.15, 0.12), (0.20, 0.50, 0.45), (0.80, 0.65, 0.25)
     )
-    vertices, faces, section = revolve(underside, band, inside)
-    return paint(vertices, faces, section, china, stripe, china)
+    return paint(*revolve(underside, band, inside), china, stripe, china)
 
 
 def lamp(rng: np.random.Generator) -> Mesh:
@@ -277,8 +269,7 @@ def lamp(rng: np.random.Generator) -> Mesh:
     )
     brass = (0.70, 0.60, 0.35)
     cream = (0.98, 0.93, 0.75)
-    vertices, faces, section = revolve(foot, rod, lining, shade)
-    return paint(vertices, faces, section, foot_color, brass, cream, shade_color)
+    return paint(*revolve(foot, rod, lining, shade), foot_color, brass, cream, shade_color)
 
 
 def table(rng: np.random.Generator) -> Mesh:
@@ -346,14 +337,12 @@ def ball(rng: np.random.Generator) -> Mesh:
         # = 0: the magnitude of f, divided by the length of its gradient.
         seam_distance = np.abs(z - 1.2 * (x**2 - y**2)) / np.sqrt(1 + 5.76 * (x**2 + y**2))
         felt = choose(rng, (0.80, 0.88, 0.22), (0.72, 0.84, 0.30))
-        white = (0.92, 0.92, 0.88)
-        skin = mix(felt, white, (0.07 - seam_distance) / 0.02)
+        skin = mix(felt, (0.92, 0.92, 0.88), (0.07 - seam_distance) / 0.02)
     else:
-        red = (0.80, 0.12, 0.12)
-        orange_red = (0.93, 0.40, 0.10)
-        blue = (0.15, 0.35, 0.75)
-        white = (0.93, 0.90, 0.85)
-        skin = choose(rng, red, orange_red, blue, white)
+        # Red, orange red, blue or white.
+        skin = choose(
+            rng, (0.80, 0.12, 0.12), (0.93, 0.40, 0.10), (0.15, 0.35, 0.75), (0.93, 0.90, 0.85)
+        )
     return Mesh.plain(0.95 * directions, faces, skin)
 
 
@@ -376,9 +365,8 @@ def fruit(rng: np.random.Generator) -> Mesh:
     vertices[:, 2] += np.sign(directions[:, 2]) * end_height * bump(angle_from_end / 0.3)
     vertices = 0.95 * vertices / np.abs(vertices).max()
     hue = rng.uniform(LOWEST_HUE, HIGHEST_HUE)
-    hue_difference = rng.uniform(-0.1, 0.1)
-    first_shade = _random_shade(rng, hue)
-    second_shade = _random_shade(rng, hue + hue_difference)
+    hues = (hue, hue + rng.uniform(-0.1, 0.1))
+    first_shade, second_shade = (_random_shade(rng, of_shade) for of_shade in hues)
     patches = ripples(rng, directions, rng.uniform(0.3, 2.0))
     colors = mix(first_shade, second_shade, 0.5 + 0.3 * patches + 0.1 * pores)
     return Mesh.plain(vertices, faces, colors)
@@ -388,33 +376,17 @@ def _random_shade(rng: np.random.Generator, hue: float) -> Float[np.ndarray, " 3
     """Draw a color (HSV) of a hue, a fraction of the circle, clipped to exclude oranges."""
     clipped_hue = np.clip(hue, LOWEST_HUE, HIGHEST_HUE) % 1
     saturation = rng.uniform(0.1, 0.95)
-    value = rng.uniform(0.3, 0.95)
-    return np.array(colorsys.hsv_to_rgb(clipped_hue, saturation, value))
+    return np.array(colorsys.hsv_to_rgb(clipped_hue, saturation, rng.uniform(0.3, 0.95)))
 
 
-# Type of a function that creates a random instance of a solid.
-Maker = Callable[[np.random.Generator], Mesh]
-# Solids whose names are classes of CIFAR-100.
-SOLIDS: dict[str, Maker] = {
-    "orange": orange,
-    "apple": apple,
-    "pear": pear,
-    "sweet_pepper": sweet_pepper,
-    "mushroom": mushroom,
-    "bottle": bottle,
-    "cup": cup,
-    "plate": plate,
-    "lamp": lamp,
-    "table": table,
+# Solids whose names are classes of CIFAR-100, by their names.
+SOLIDS = {
+    maker.__name__: maker
+    for maker in (orange, apple, pear, sweet_pepper, mushroom, bottle, cup, plate, lamp, table)
 }
 # Solids that resemble an orange. The training run `experiment=best` shows the network the solid
 # `fruit` in training, and the other three solids in its evaluation.
-HARD_NEGATIVES: dict[str, Maker] = {
-    "lemon": lemon,
-    "peach": peach,
-    "ball": ball,
-    "fruit": fruit,
-}
+HARD_NEGATIVES = {maker.__name__: maker for maker in (lemon, peach, ball, fruit)}
 
 
 @cache
@@ -437,37 +409,27 @@ def revolve(
     list of points (radius, height) and begins where the previous one ends. The result is
     vertices, faces, and the section of each face.
     """
-    profile, section_of_piece = _divided_profile(sections)
-    azimuth = np.linspace(0, 2 * np.pi, SEGMENTS, endpoint=False)
-    # Each of the P points of the profile becomes a ring of points.
-    radius = profile[:, :1]
-    x = radius * np.cos(azimuth)
-    y = radius * np.sin(azimuth)
-    # All points of a ring have the same height.
-    z = np.broadcast_to(profile[:, 1:], x.shape)
-    vertices, faces, piece_of_face = loft(np.stack([x, y, z], axis=-1))
-    return vertices, faces, section_of_piece[piece_of_face]
-
-
-def _divided_profile(
-    sections: Sequence[np.ndarray | Sequence[tuple[float, float]]],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the P points of a profile with divided edges, and the section of its P - 1 pieces."""
     corners = np.concatenate(sections)
-    point_counts = [len(section) for section in sections]
-    section_of_corner = np.repeat(np.arange(len(sections)), point_counts)
+    section_of_corner = np.repeat(np.arange(len(sections)), list(map(len, sections)))
     edges = np.diff(corners, axis=0)
-    lengths = np.linalg.norm(edges, axis=1)
     # An edge between two equal points has 0 pieces. Subtracting 1e-9
     # prevents an additional piece because of a rounding error of the length.
+    lengths = np.linalg.norm(edges, axis=1)
     piece_counts = np.ceil(lengths / MAX_EDGE_LENGTH - 1e-9).astype(int)
     edge_of_piece = np.repeat(np.arange(len(edges)), piece_counts)
     # Position of the start of each piece on its edge, as a fraction of the edge.
     fraction = np.concatenate([np.arange(count) / count for count in piece_counts if count])
     starts = corners[edge_of_piece] + fraction[:, None] * edges[edge_of_piece]
     profile = np.concatenate([starts, corners[-1:]])
+    azimuth = np.linspace(0, 2 * np.pi, SEGMENTS, endpoint=False)
+    # Each point of the profile becomes a ring of points of the same height.
+    radius = profile[:, :1]
+    x = radius * np.cos(azimuth)
+    y = radius * np.sin(azimuth)
+    z = np.broadcast_to(profile[:, 1:], x.shape)
+    vertices, faces, piece_of_face = loft(np.stack([x, y, z], axis=-1))
     # An edge between two sections belongs to the section of its last corner.
-    return profile, section_of_corner[edge_of_piece + 1]
+    return vertices, faces, section_of_corner[edge_of_piece[piece_of_face] + 1]
 
 
 def loft(rings: Float[np.ndarray, "R P 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -478,15 +440,12 @@ def loft(rings: Float[np.ndarray, "R P 3"]) -> tuple[np.ndarray, np.ndarray, np.
     and for each face the first of its two rings.
     """
     ring_count, point_count = rings.shape[:2]
-    first_point = rings[0, :1]
-    last_point = rings[-1, :1]
-    vertices = np.concatenate([first_point, rings[1:-1].reshape(-1, 3), last_point])
+    vertices = np.concatenate([rings[0, :1], rings[1:-1].reshape(-1, 3), rings[-1, :1]])
     # Vertex of each point of each ring, shape (R, P). The points of the second ring have the
     # vertices 1 to P, and so on. The clipping gives all points of the first ring the vertex 0, and
     # all points of the last ring the last vertex.
     consecutive = np.arange(1 - point_count, (ring_count - 1) * point_count + 1)
-    last_vertex = (ring_count - 2) * point_count + 1
-    vertex = np.clip(consecutive.reshape(ring_count, point_count), 0, last_vertex)
+    vertex = consecutive.clip(0, len(vertices) - 1).reshape(ring_count, point_count)
     # Four corners of each quadrilateral between two rings: a and b are
     # neighbors on the first ring, and d and c are neighbors on the next ring.
     a = vertex[:-1]
@@ -550,9 +509,8 @@ def arc(
     Points and radii are (radius, height). Angles are in degrees: 0 is away from the axis of
     revolution, 90 is up.
     """
-    angle = np.radians(np.linspace(start, stop, ARC_POINTS))[:, None]
-    on_unit_circle = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
-    return np.array(center) + radii * on_unit_circle
+    angle = np.radians(np.linspace(start, stop, ARC_POINTS))
+    return np.array(center) + radii * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def bump(x: Float[np.ndarray, " ..."]) -> np.ndarray:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
 from augment.attacks.objective import Examples, Images, Values
@@ -20,8 +19,7 @@ from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.scene import Scene
 from renderer import errors
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.errors import MAX_SCALE, InputError
-from renderer.image import to_bytes
+from renderer.errors import MAX_SCALE, InputError, ShortRepr
 from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.io.images import gray_or_image, write_image
 from renderer.io.meshes import export_mesh
@@ -32,7 +30,6 @@ from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
-from renderer.short_repr import ShortRepr
 from renderer.surface.albedo import with_added_albedo
 from renderer.surface.gloss import Gloss
 from renderer.visibility import Rasterizer, choose
@@ -264,7 +261,7 @@ def _as_numpy(values: Tensor) -> np.ndarray:
 
 def _write_png(path: Path, image: Float[Tensor, "3 size size"]) -> None:
     """Write an image with 8 bits per channel."""
-    write_image(path, Image.fromarray(to_bytes(image).permute(1, 2, 0).numpy()))
+    write_image(path, image)
 
 
 def save_lights(

@@ -23,7 +23,7 @@ from augment.attacks.objective import NOISE_DRAWS, Examples, Images, Objective, 
 from augment.attacks.optimizers import CMAES, Evaluation, Gradient, Optimizer, Problem, RandomSearch
 from augment.network import frozen_eval_mode
 from augment.progress import progress
-from renderer.short_repr import ShortRepr
+from renderer.errors import ShortRepr
 
 # Fields of a `Minimum` that belong to the returned candidate.
 FOUND = ("values", "images", "success", "cost", "predicted")

@@ -21,11 +21,10 @@ from augment.attacks.objective import Criterion, Objective
 from augment.attacks.problem import SceneProblem
 from augment.classifier import Classifier
 from augment.scene.objects import Conditions
-from renderer.errors import as_path, require_choice, require_kind, require_whole
+from renderer.errors import ShortRepr, as_path, require_choice, require_kind, require_whole
 from renderer.io.images import PAPER, draw_grid, tiles_of, write_image
 from renderer.light.basis import Basis
 from renderer.rendering import light_sphere
-from renderer.short_repr import ShortRepr
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -24,27 +24,16 @@ from augment.progress import progress
 from augment.scene.objects import ROUGHNESS, SceneObject, add_table, initial_materials, load_object
 from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
+from renderer import errors
 from renderer.camera import Camera, orbit_cameras
-from renderer.errors import (
-    InputError,
-    as_device,
-    as_list,
-    as_tensor,
-    describe,
-    has_memory,
-    is_whole,
-    require_bounded,
-    require_flag,
-    require_kind,
-    require_whole,
-)
+from renderer.errors import InputError
 from renderer.io.images import gray_or_image
 from renderer.light.basis import DEGREE, Basis, LocalBasis, harmonics_of, with_local_lights
 from renderer.light.files import load_light
 from renderer.light.harmonics import degree_of, irradiance_error
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.ringing import highlight_error, required_degree
-from renderer.mesh import Mesh, require_mesh, select_faces, subdivide
+from renderer.mesh import Mesh, require_mesh, subdivide
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.surface.gloss import Gloss, smallest_roughness
 from renderer.visibility import choose
@@ -137,11 +126,13 @@ def build_scene(
         >>> round(scene.objects[0].center[0])
         10
     """
-    require_kind("scene", scene, SceneSettings | None, "SceneSettings(...) or None")
-    require_kind("renderer", renderer, RendererSettings | None, "RendererSettings(...) or None")
-    require_flag("shared", shared)
-    require_whole("views", views)
-    require_flag("normalize", normalize)
+    errors.require_kind("scene", scene, SceneSettings | None, "SceneSettings(...) or None")
+    errors.require_kind(
+        "renderer", renderer, RendererSettings | None, "RendererSettings(...) or None"
+    )
+    errors.require_flag("shared", shared)
+    errors.require_whole("views", views)
+    errors.require_flag("normalize", normalize)
     given_cameras = _as_cameras(cameras, views, normalize)
     views = len(given_cameras) or views
     ImageSettings(size)
@@ -168,10 +159,10 @@ def build_scene(
         if settings.degree is None:
             lights_of_degree = partial(_build_lights, settings, settings.light)
     else:
-        environment = as_tensor("light", environment)
+        environment = errors.as_tensor("light", environment)
         # `degree_of` raises InputError if the shape is not that of coefficients.
         degree_of(environment)
-        require_bounded(light=environment)
+        errors.require_bounded(light=environment)
     basis, lights = _build_lights(settings, environment, degree)
     rasterizer = renderer_settings.rasterizer
     return Scene.grid(
@@ -179,7 +170,7 @@ def build_scene(
         given_cameras
         or orbit_cameras(views, settings.width, settings.polar, settings.azimuth, settings.fov),
         load_backgrounds(settings.backgrounds, size),
-        lights.to(as_device(device)),
+        lights.to(errors.as_device(device)),
         renderer_settings.image(size),
         choose(rasterizer) if isinstance(rasterizer, str) else rasterizer,
         shared=shared,
@@ -193,7 +184,7 @@ def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
     """Load the objects of the argument `meshes` of `build_scene`, and put a table under each."""
     example = "such as ('solid:orange', 'orange')"
     expected = f"a list of pairs {example}, or of nb.ObjectSettings"
-    members = as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
+    members = errors.as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
     if not members:
         raise InputError(f"meshes is empty: give pairs {example}")
     for index, member in enumerate(members):
@@ -201,15 +192,15 @@ def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
             continue
         if len(member) != 2:
             raise InputError(
-                f"meshes[{index}] is {describe(member)}: give a pair of a mesh and a label, "
+                f"meshes[{index}] is {errors.describe(member)}: give a pair of a mesh and a label, "
                 f"{example}"
             )
         mesh, label = member
         if not isinstance(mesh, str | Path):
             require_mesh(f"meshes[{index}]", mesh)
-        if not is_whole(label):
+        if not errors.is_whole(label):
             label_name = f"meshes[{index}]: its label"
-            require_kind(label_name, label, str, "the name of a class, or its index")
+            errors.require_kind(label_name, label, str, "the name of a class, or its index")
     objects = []
     for member in progress(members, "reading meshes"):
         if isinstance(member, ObjectSettings):
@@ -238,7 +229,7 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
             )
         return []
     expected = "a list of cameras, such as list(nb.load_cameras(path).values())"
-    given = as_list("cameras", cameras, Camera, expected)
+    given = errors.as_list("cameras", cameras, Camera, expected)
     if not given:
         raise InputError("cameras is empty: give one camera for each view, or leave it out")
     if views not in (1, len(given)):
@@ -281,7 +272,7 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor
     The shape is (B, 3, size, size), or (B, 1, size, size) if all backgrounds are gray.
     """
     expected = "gray values in [0, 1] or image files"
-    choices = as_list("backgrounds", choices, object, f"a list of {expected}")
+    choices = errors.as_list("backgrounds", choices, object, f"a list of {expected}")
     if not choices:
         raise InputError(f"backgrounds is empty: give {expected}")
     images = [gray_or_image("backgrounds", choice, size) for choice in choices]
@@ -330,7 +321,9 @@ class Smoothest(NamedTuple):
         """Return the degree of lighting that the surface needs, as far as memory permits."""
         degree = max(DEGREE, self.degree)
         cpu = torch.device("cpu")
-        while degree > DEGREE and not has_memory(OPERATOR_BYTES * (degree + 1) ** 2 * pixels, cpu):
+        while degree > DEGREE and not errors.has_memory(
+            OPERATOR_BYTES * (degree + 1) ** 2 * pixels, cpu
+        ):
             degree -= 1
         return degree
 
@@ -391,7 +384,7 @@ def _reached_roughness(
         roughness = (roughness + min(lowest_mean - mean, 0.0)).clamp(min=0)
     # `Gloss` gets its default specular factor of 1, because attacks and variations can reach 1.
     gloss = Gloss(roughness, textured=layer is None)
-    return smallest_roughness(gloss.on(select_faces(item.mesh, slice(item.own))))
+    return smallest_roughness(gloss.on(item.own_mesh))
 
 
 def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int:

@@ -20,9 +20,8 @@ from torch import Tensor
 
 from augment.settings import MeshSettings, ObjectSettings, PropSettings
 from renderer.camera import Camera
-from renderer.errors import InputError, as_tensor
+from renderer.errors import InputError, ShortRepr, as_tensor
 from renderer.mesh import Mesh, center_and_extent, concatenate, normalize, select_faces, subdivide
-from renderer.short_repr import ShortRepr
 from renderer.solids import solid
 from renderer.surface.gloss import Gloss
 
@@ -103,19 +102,22 @@ class SceneObject:
         corners_of_others = self.mesh.faces[~self.own_faces]
         return ~np.isin(np.arange(len(self.mesh.vertices)), corners_of_others)
 
+    @property
+    def own_mesh(self) -> Mesh:
+        """Return the mesh of the object itself, whose faces come first, without props and table."""
+        return select_faces(self.mesh, slice(self.own))
+
     @cached_property
     def radius(self) -> float:
         """Return the largest distance of a vertex from the origin, including props and table."""
-        distances = np.linalg.norm(self.mesh.vertices, axis=1)
         # Index by faces, to ignore vertices that no face uses.
-        return float(distances[self.mesh.faces].max())
+        return float(np.linalg.norm(self.mesh.vertices, axis=1)[self.mesh.faces].max())
 
     @property
     def lowest(self) -> float:
         """Return the height z of the lowest vertex, at which a table is placed."""
-        heights = self.mesh.vertices[:, 2]
         # Index by faces, to ignore vertices that no face uses.
-        return float(heights[self.mesh.faces].min())
+        return float(self.mesh.vertices[self.mesh.faces, 2].min())
 
     def move_cameras(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """Move and scale cameras in the same way as the mesh was normalized.
@@ -179,12 +181,13 @@ def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
     Props stand on the plane z = 0 and are moved to the height of the lowest vertex of the object.
     """
     offset = np.array([0, 0, item.lowest])
-    raised = []
-    for prop in props:
-        # Round the vertices to float32, as `normalize` does with those of the object.
-        vertices = (prop.vertices + offset).astype(np.float32)
-        raised.append(replace(prop, vertices=vertices.astype(np.float64)))
+    raised = [replace(prop, vertices=_rounded(prop.vertices + offset)) for prop in props]
     return replace(item.joined(raised), props=props)
+
+
+def _rounded(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+    """Round vertices to float32, as `normalize` does."""
+    return vertices.astype(np.float32).astype(np.float64)
 
 
 def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
@@ -194,17 +197,12 @@ def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
     """
     if color is None:
         return item
-    used_vertices = np.unique(item.mesh.faces)
     # Horizontal coordinates x and y of the vertices that a face uses.
-    horizontal = item.mesh.vertices[used_vertices, :2]
+    horizontal = item.mesh.vertices[np.unique(item.mesh.faces), :2]
     left, near = np.minimum(horizontal.min(0) - TABLE_MARGIN, -MIN_TABLE_REACH)
     right, far = np.maximum(horizontal.max(0) + TABLE_MARGIN, MIN_TABLE_REACH)
-    corners = [
-        [left, near, item.lowest],
-        [right, near, item.lowest],
-        [right, far, item.lowest],
-        [left, far, item.lowest],
-    ]
+    square = ((left, near), (right, near), (right, far), (left, far))
+    corners = [[x, y, item.lowest] for x, y in square]
     table = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.array(color))
     return replace(item.joined([table]), ground=color)
 
@@ -230,18 +228,13 @@ def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObjec
 
     They stand at the height of its new lowest vertex.
     """
-    # Select the faces of the object itself, which come first, without those of props and table.
-    mesh = select_faces(item.mesh, slice(item.own))
-    # Round the vertices to float32, as `normalize` does.
-    vertices = (mesh.vertices @ rotation.T).astype(np.float32)
-    return _with_mesh(item, replace(mesh, vertices=vertices.astype(np.float64)))
+    mesh = item.own_mesh
+    return _with_mesh(item, replace(mesh, vertices=_rounded(mesh.vertices @ rotation.T)))
 
 
 def add_specular_layer(item: SceneObject, gloss: Gloss) -> SceneObject:
     """Return a copy of an object with another specular material. Props and table keep their own."""
-    # Select the faces of the object itself, which come first, without those of props and table.
-    own_mesh = select_faces(item.mesh, slice(item.own))
-    return _with_mesh(item, gloss.on(own_mesh))
+    return _with_mesh(item, gloss.on(item.own_mesh))
 
 
 def _with_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
@@ -258,70 +251,47 @@ def _load_prop(item: PropSettings) -> Mesh:
     sine = math.sin(angle)
     rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     turned = item.scale * mesh.vertices @ rotation.T
-    used_vertices = np.unique(mesh.faces)
-    lowest = turned[used_vertices, 2].min()
+    lowest = turned[mesh.faces, 2].min()
     return replace(mesh, vertices=turned + np.array([*item.at, -lowest]))
 
 
 def _load(item: MeshSettings) -> Mesh:
-    """Load a mesh with the color and the gloss of its settings."""
-    mesh = _load_with_color(item)
-    if item.gloss is None:
-        return mesh
-    # If the setting is "file", `_load_with_color` has loaded the gloss of the file.
-    if item.gloss != "file":
-        # The order of the values is roughness, metallic, specular factor.
-        mesh = Gloss(*(float(value) for value in item.gloss)).on(mesh)
-    # Column 1 of the gloss is the metallic factor of each face.
-    is_metal = mesh.gloss is not None and mesh.gloss[:, 1].any()
-    if is_metal and item.color is None and not _has_colors(mesh):
-        raise InputError(
-            f"{item.mesh} is a metal without a color: "
-            "give color=[red,green,blue], or a metallic of 0",
-        )
-    return mesh
-
-
-def _load_with_color(item: MeshSettings) -> Mesh:
-    """Load a mesh file or generate a solid, and give it the color of its settings, if any."""
+    """Load a mesh file or generate a solid, and give it the color and the gloss of its settings."""
     kind, _, name = item.mesh.partition(":")
     if item.mesh in MESHES_IN_MEMORY:
         mesh = MESHES_IN_MEMORY[item.mesh]
     elif kind == "solid":
-        mesh = _build_solid(item.mesh, name)
+        name, _, seed = name.partition(":")
+        if seed and not seed.isdecimal():
+            raise InputError(f"{item.mesh} has the seed {seed!r}: give a whole number")
+        try:
+            mesh = solid(name, int(seed or 0))
+        except ValueError as error:
+            raise InputError(f"{item.mesh}: {error}") from error
     else:
         # Importing trimesh takes half a second.
         from renderer.io.meshes import load_mesh
 
         mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
-    if item.color is None:
-        return mesh
-    if _has_colors(mesh):
+    has_colors = bool(mesh.textures) or bool((mesh.corner_colors != 1).any())
+    if item.color is not None and has_colors:
         raise InputError(
             f"color is set, but {item.mesh} has its own colors: "
             "remove color, and set albedo_scale to make them brighter or darker",
         )
-    colored = Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
-    return replace(colored, gloss=mesh.gloss)
-
-
-def _build_solid(mesh_name: str, name_and_seed: str) -> Mesh:
-    """Generate the mesh of a solid, such as an orange.
-
-    The name may end with a seed, as in "orange:3", which is 0 by default.
-    """
-    name, _, seed = name_and_seed.partition(":")
-    if seed and not seed.isdecimal():
-        raise InputError(f"{mesh_name} has the seed {seed!r}: give a whole number")
-    try:
-        return solid(name, int(seed or 0))
-    except ValueError as error:
-        raise InputError(f"{mesh_name}: {error}") from error
-
-
-def _has_colors(mesh: Mesh) -> bool:
-    """Return whether a mesh has textures, or vertex colors other than white."""
-    return bool(mesh.textures) or bool((mesh.corner_colors != 1).any())
+    if item.color is not None:
+        colored = Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
+        mesh = replace(colored, gloss=mesh.gloss)
+    if item.gloss not in (None, "file"):
+        # The order of the values is roughness, metallic, specular factor.
+        mesh = Gloss(*(float(value) for value in item.gloss)).on(mesh)
+    is_metal = mesh.gloss is not None and mesh.gloss[:, METALLIC].any()
+    if item.gloss is not None and is_metal and item.color is None and not has_colors:
+        raise InputError(
+            f"{item.mesh} is a metal without a color: "
+            "give color=[red,green,blue], or a metallic of 0",
+        )
+    return mesh
 
 
 # Each face has three numbers: roughness, metallic and specular factor. These are the positions of
@@ -370,21 +340,15 @@ def initial_materials(item: SceneObject) -> FaceMaterials:
     `SPECULAR_LAYER`. Props and table keep their materials.
     """
     object_mask = torch.from_numpy(item.own_faces)
-    if item.mesh.gloss is None:
-        face_gloss = torch.tensor([MATTE]).expand(len(object_mask), 3)
-    else:
+    face_gloss = torch.tensor([MATTE]).expand(len(object_mask), 3)
+    if item.mesh.gloss is not None:
         face_gloss = torch.from_numpy(item.mesh.gloss)
-    metallic_and_specular = face_gloss[object_mask, METALLIC:]
-    is_matte = not metallic_and_specular.any()
-    if is_matte:
+    if not face_gloss[object_mask, METALLIC:].any():
         specular_layer = face_gloss.new_tensor(SPECULAR_LAYER)
         face_gloss = torch.where(object_mask[:, None], specular_layer, face_gloss)
     return FaceMaterials(face_gloss=face_gloss, object_mask=object_mask)
 
 
-# Fields of `Conditions` whose second axis is the vertices of a mesh. `Conditions.row` cuts it to
-# the number of vertices of a mesh.
-OF_VERTICES = ("vertices",)
 # Fields of `Conditions` whose second axis is the faces of a mesh.
 OF_FACES = ("albedo", "gloss", "hue")
 
@@ -451,14 +415,10 @@ class Conditions(ShortRepr):
             mesh: Mesh of the example. Entries of vertices and faces are cut to the numbers of
                 its vertices and faces.
         """
-        rows = {}
-        for name, values in vars(self).items():
-            if values is None:
-                continue
-            row = values[index]
-            if name in OF_VERTICES:
-                row = row[: len(mesh.vertices)]
-            elif name in OF_FACES:
-                row = row[: len(mesh.faces)]
-            rows[name] = row
+        counts = {"vertices": len(mesh.vertices)} | dict.fromkeys(OF_FACES, len(mesh.faces))
+        rows = {
+            name: values[index][: counts[name]] if name in counts else values[index]
+            for name, values in vars(self).items()
+            if values is not None
+        }
         return Conditions(**rows)

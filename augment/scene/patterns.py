@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Shaped, UInt8
-from torch import Tensor
+from torch import Generator, Tensor
 
 from renderer.image import LUMINANCE, decode, to_unit
 
@@ -106,7 +106,7 @@ def random_colors(draws: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3 1 1"]:
 def draw_patterns(
     count: int,
     size: int,
-    draws: torch.Generator,
+    draws: Generator,
     points: Float[Tensor, "2 count size size"] | None = None,
 ) -> Float[Tensor, "count 3 size size"]:
     """Draw random patterns in two colors: stripes, squares, discs, halves or one color.
@@ -147,9 +147,7 @@ def draw_patterns(
 
 
 def draw_photograph_patterns(
-    photographs: Float[Tensor, "N 3 H W"],
-    points: Float[Tensor, "2 _ size size"],
-    draws: torch.Generator,
+    photographs: Float[Tensor, "N 3 H W"], points: Float[Tensor, "2 _ size size"], draws: Generator
 ) -> Float[Tensor, "N 3 size size"]:
     """Draw random patterns that are photographs, rotated, scaled and saturated at random.
 
@@ -193,17 +191,14 @@ FAR = 100.0
 
 
 def draw_slides(
-    count: int,
-    size: int,
-    draws: torch.Generator,
-    photographs: UInt8[Tensor, "N 3 H W"] | None = None,
+    count: int, size: int, draws: Generator, photographs: UInt8[Tensor, "N 3 H W"] | None = None
 ) -> Float[Tensor, "count 3 size size"]:
     """Draw random slides, which are pictures that a projector shows.
 
     A slide has a two-color pattern, Voronoi cells, a smooth field or a photograph. Slides are
     linear light on the CPU.
     """
-    families: list[Callable[[int, int, torch.Generator], Tensor]]
+    families: list[Callable[[int, int, Generator], Tensor]]
     families = [draw_patterns, draw_cells, draw_fields]
     if photographs is not None:
         families.append(partial(draw_projected, photographs))
@@ -219,7 +214,7 @@ def draw_slides(
     return slides
 
 
-def draw_cells(count: int, size: int, draws: torch.Generator) -> Float[Tensor, "count 3 size size"]:
+def draw_cells(count: int, size: int, draws: Generator) -> Float[Tensor, "count 3 size size"]:
     """Draw pictures of Voronoi cells, each cell in a random color.
 
     The centers of the cells are random points. A pixel belongs to the cell whose center is nearest.
@@ -243,9 +238,7 @@ def draw_cells(count: int, size: int, draws: torch.Generator) -> Float[Tensor, "
     return shown.transpose(1, 2).unflatten(2, (size, size))
 
 
-def draw_fields(
-    count: int, size: int, draws: torch.Generator
-) -> Float[Tensor, "count 3 size size"]:
+def draw_fields(count: int, size: int, draws: Generator) -> Float[Tensor, "count 3 size size"]:
     """Draw pictures of smooth random light, which differs between the three channels.
 
     Pictures are linear light.
@@ -269,7 +262,7 @@ def interpolate_smoothly(
 
 
 def draw_projected(
-    photographs: UInt8[Tensor, "N 3 H W"], count: int, size: int, draws: torch.Generator
+    photographs: UInt8[Tensor, "N 3 H W"], count: int, size: int, draws: Generator
 ) -> Float[Tensor, "count 3 size size"]:
     """Choose photographs, and rotate, scale and saturate them at random.
 
@@ -445,9 +438,7 @@ TWO_COLORED = ("gradient", "stripes", "checkers")
 
 
 def draw_lab_pattern(
-    name: str,
-    rng: np.random.Generator,
-    slides: Sequence[np.ndarray] = (),
+    name: str, rng: np.random.Generator, slides: Sequence[np.ndarray] = ()
 ) -> Float[np.ndarray, "H W 3"]:
     """Draw an image for a projector: a pattern with random colors, angle, scale and position.
 

@@ -141,7 +141,12 @@ class OperatorRenderer:
         for index in needed_stacks:
             built = self._built[index]
             row_indices = torch.nonzero(row_to_stack == index).squeeze(1)
-            rows = _as_rows(row_indices, light.device)
+            rows: Rows = row_indices.to(light.device, non_blocking=True)
+            first = int(row_indices[0])
+            end = int(row_indices[-1]) + 1
+            if end - first == len(row_indices):
+                # Consecutive rows are a slice, which is faster.
+                rows = slice(first, end)
             # Indices of these images of the batch among the images of the stack.
             stack_images = built.image_to_stack_image[images[row_indices]]
             stack_images_on_device = stack_images.to(light.device, non_blocking=True)
@@ -155,31 +160,25 @@ class OperatorRenderer:
         if not missing:
             return
         for index in progress(missing, "rendering views"):
-            self._built[index] = self._build_stack(index)
-            # The first stack tells how much memory all stacks will need.
+            built = self._build_stack(index)
+            self._built[index] = built
             if len(self._built) == 1:
-                self._require_memory_for_others(self._built[index])
-
-    def _require_memory_for_others(self, first: _BuiltStack) -> None:
-        """Check that all other stacks fit in memory, if each is as large as the first one."""
-        operators = first.operators
-        stack_bytes = (
-            operators.transfer.nbytes + operators.albedo.nbytes + first.background_terms.nbytes
-        )
-        needed = (self._stack_count - 1) * stack_bytes + self.attack_bytes
-        view_count = len(self._views_of_operators)
-        name = f"{view_count} views of {self.settings.size} pixels per side (views)"
-        require_memory(name, needed, self.backgrounds.device)
+                # All other stacks must fit in memory, if each is as large as the first one.
+                tensors = (built.operators.transfer, built.operators.albedo, built.background_terms)
+                stack_bytes = sum(tensor.nbytes for tensor in tensors)
+                needed = (self._stack_count - 1) * stack_bytes + self.attack_bytes
+                view_count = len(self._views_of_operators)
+                name = f"{view_count} views of {self.settings.size} pixels per side (views)"
+                require_memory(name, needed, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> _BuiltStack:
         """Build a stack of transfer operators, and the backgrounds of its images."""
         first_operator = index * self._operators_per_stack
-        end = first_operator + self._operators_per_stack
-        views = self._views_of_operators[first_operator:end]
+        views = self._views_of_operators[first_operator:][: self._operators_per_stack]
         operators: list[TransferOperator] = []
-        for object_index, views_of_object in groupby(views, key=itemgetter(0)):
+        for object_index, pairs in groupby(views, key=itemgetter(0)):
             item = self.objects[object_index]
-            cameras = [camera for _, camera in views_of_object]
+            cameras = [camera for _, camera in pairs]
             operators += self.build(item.mesh, cameras, albedo_scale=item.albedo_scale)
         # Mask of the images whose operators are in this stack, shape (N,). M of them are True.
         is_in_stack = self._stack_of_image == index
@@ -196,15 +195,6 @@ class OperatorRenderer:
         # on.
         image_to_stack_image = is_in_stack.cumsum(0) - 1
         return _BuiltStack(stack, image_to_stack_image, background_terms)
-
-
-def _as_rows(indices: Int[Tensor, " B"], device: torch.device) -> Rows:
-    """Convert row indices to a slice if they are consecutive, because a slice is faster."""
-    first = int(indices[0])
-    end = int(indices[-1]) + 1
-    if end - first == len(indices):
-        return slice(first, end)
-    return indices.to(device, non_blocking=True)
 
 
 # Shadows and bounces are computed again if a coordinate of a vertex has changed by more than this
@@ -348,9 +338,9 @@ class DirectRenderer:
         Return the S samples that the camera sees, and the albedo at the samples, shape (S, 3).
         """
         key = (object_index, camera)
-        view = self._views.get(key)
-        if view is None:
-            view = self._rasterize(object_index, camera, self.objects[object_index].mesh.vertices)
+        if key in self._views:
+            return self._views[key]
+        view = self._rasterize(object_index, camera, self.objects[object_index].mesh.vertices)
         if self.cached:
             self._views[key] = view
         return view
@@ -410,28 +400,23 @@ class DirectRenderer:
         split = split_light(self.basis, light)
         # Projector and lamps need rays for their shadows. For an unmoved object with its own
         # gloss, the view is prepared once.
-        rays = None
         lamp_view = None
-        if split.local_lights:
+        if split.local_lights and not is_moved and gloss is None:
+            lamp_view = self.local_view(object_index, fixed_camera)
+        elif split.local_lights:
             moved_mesh = replace(item.mesh, vertices=positions)
             rays = Rays(moved_mesh) if is_moved else self._rays_among(object_index)
-            if not is_moved and gloss is None:
-                lamp_view = self.local_view(object_index, fixed_camera)
+            moved = vertices if is_moved else None
+            lamp_view = LocalLightView(rays, item.mesh, fragments, self.settings, moved, gloss)
         indirect = None
         if self.settings.global_illumination:
+            view = (example, object_index, fixed_camera, fragments, positions)
             # A camera whose fields are tensors is attacked, so it differs in each call. Its views
             # are not kept. `fixed` returns the same camera if no field is a tensor.
-            is_kept = camera is fixed_camera
-            indirect = partial(
-                self._indirect_radiance,
-                example,
-                object_index,
-                fixed_camera,
-                fragments,
-                positions,
-                is_kept,
-            )
-        shares_normals = not is_moved and self.settings.normals == "smooth"
+            indirect = partial(self._indirect_radiance, *view, camera is fixed_camera)
+        corner_normals = None
+        if not is_moved and self.settings.normals == "smooth":
+            corner_normals = torch.from_numpy(item.mesh.corner_normals).to(self.like.device)
         shown = ShadedView(
             mesh=item.mesh,
             fragments=fragments,
@@ -439,10 +424,9 @@ class DirectRenderer:
             vertices=vertices,
             albedo=albedo,
             light=split,
-            rays=rays,
             is_moved=is_moved,
             gloss=gloss,
-            corner_normals=self._corner_normals(object_index) if shares_normals else None,
+            corner_normals=corner_normals,
             lamp_view=lamp_view,
             indirect=indirect,
             lamp_positions=changed.positions,
@@ -454,10 +438,6 @@ class DirectRenderer:
         if object_index not in self._rays:
             self._rays[object_index] = Rays(self.objects[object_index].mesh)
         return self._rays[object_index]
-
-    def _corner_normals(self, object_index: int) -> Tensor:
-        """Return the normals at the corners of an unmoved object, shape (F, 3, 3)."""
-        return torch.from_numpy(self.objects[object_index].mesh.corner_normals).to(self.like.device)
 
     def _indirect_radiance(
         self,
@@ -475,40 +455,27 @@ class DirectRenderer:
         The S samples in P pixels are those of a shape with the given positions of its vertices.
         Unless `is_kept`, the view is not needed again, and is removed to save memory.
         """
-        frozen = self._transport_near(example, object_index, camera, positions)
+        item = self.objects[object_index]
+
+        def trace(mesh: Mesh) -> FrozenTransport:
+            return FrozenTransport(mesh, self.settings, item.albedo_scale, self.basis)
+
+        # One shape is kept for each example, in addition to the unmoved objects. If the unmoved
+        # mesh is not close to the shape, try the shape that was kept for the example. If that is
+        # not close either, compute shadows and bounces of the new shape.
+        frozen = self._transport_of_object.get(object_index) or trace(item.mesh)
+        self._transport_of_object[object_index] = frozen
+        if not frozen.is_near(positions):
+            frozen = self._transport_of_example.get(example, frozen)
+            if not frozen.is_near(positions):
+                frozen = trace(replace(item.mesh, vertices=positions))
+            self._transport_of_example[example] = frozen
+        if camera not in frozen.views:
+            frozen.add(camera, *self._rasterize(object_index, camera, frozen.mesh.vertices))
         added = frozen.radiance(camera, fragments, albedo, light)
         if not is_kept:
             del frozen.views[camera]
         return added
-
-    def _transport_near(
-        self, example: int, object_index: int, camera: Camera, vertices: Float[np.ndarray, "V 3"]
-    ) -> FrozenTransport:
-        """Return the shadows and bounces of a shape, or of a kept shape that is close to it.
-
-        One shape is kept for each example, in addition to the unmoved objects.
-        """
-        frozen = self._transport_of_object.get(object_index)
-        if frozen is None:
-            frozen = self._freeze(object_index, self.objects[object_index].mesh)
-            self._transport_of_object[object_index] = frozen
-        # If the unmoved mesh is not close to the shape, try the shape that was kept for the
-        # example. If that is not close either, compute shadows and bounces of the new shape.
-        if not frozen.is_near(vertices):
-            frozen = self._transport_of_example.get(example, frozen)
-            if not frozen.is_near(vertices):
-                moved = replace(self.objects[object_index].mesh, vertices=vertices)
-                frozen = self._freeze(object_index, moved)
-            self._transport_of_example[example] = frozen
-        if camera not in frozen.views:
-            frozen.add(camera, *self._rasterize(object_index, camera, frozen.mesh.vertices))
-        return frozen
-
-    def _freeze(self, object_index: int, mesh: Mesh) -> FrozenTransport:
-        """Trace the shadows and bounces of light on an object."""
-        return FrozenTransport(
-            mesh, self.settings, self.objects[object_index].albedo_scale, self.basis
-        )
 
     def _rasterize(
         self, object_index: int, camera: Camera, vertices: Float[np.ndarray, "V 3"]

@@ -16,17 +16,9 @@ from torch import Tensor
 from augment.progress import progress
 from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.render import DirectRenderer, Layer, OperatorRenderer
+from renderer import errors
 from renderer.camera import Camera
-from renderer.errors import (
-    InputError,
-    as_integers,
-    as_list,
-    as_tensor,
-    describe,
-    require_bounded,
-    require_kind,
-    require_memory,
-)
+from renderer.errors import InputError
 from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
 from renderer.mesh import Mesh
@@ -113,30 +105,30 @@ class Scene:
         one_light: bool = False,
         lights_of_degree: Callable[[int, float | None], tuple[Basis, Tensor]] | None = None,
     ):
-        require_kind("settings", settings, ImageSettings, "nb.ImageSettings(size)")
-        require_kind("basis", basis, Basis, "a basis of light, such as Harmonics(degree)")
+        self.objects = errors.as_list("objects", objects, SceneObject, "a list of scene objects")
+        examples = errors.as_list("examples", examples, Example, "a list of examples")
+        lights = errors.as_tensor("lights", lights)
+        backgrounds = errors.as_tensor("backgrounds", backgrounds)
         effects = "a function of images and examples"
-        require_kind("camera_effects", camera_effects, Callable | None, effects)
-        if not hasattr(rasterizer, "rasterize"):
-            raise InputError(
-                f"rasterizer is {describe(rasterizer)}: give renderer.visibility.choose(name)",
-            )
-        self.objects = as_list("objects", objects, SceneObject, "a list of scene objects")
-        examples = as_list("examples", examples, Example, "a list of examples")
-        lights = as_tensor("lights", lights)
-        backgrounds = as_tensor("backgrounds", backgrounds)
-        _require_examples(examples, self.objects)
-        _require_lights(lights, basis)
-        _require_backgrounds(backgrounds, settings.size)
-
+        errors.require_kind("settings", settings, ImageSettings, "nb.ImageSettings(size)")
+        errors.require_kind("basis", basis, Basis, "a basis of light, such as Harmonics(degree)")
+        errors.require_kind("camera_effects", camera_effects, Callable | None, effects)
+        errors.require_kind(
+            "rasterizer", rasterizer, Rasterizer, "renderer.visibility.choose(name)"
+        )
         self.settings = settings
         self.rasterizer = rasterizer
         self.basis = basis
         self.camera_effects = camera_effects
         self.one_light = one_light
         self.lights_of_degree = lights_of_degree
+        self._require_fitting(examples, lights, backgrounds)
         # The depth range of each camera must contain the whole object.
-        self.examples = [self._with_clip_ranges(example) for example in examples]
+        self.examples = []
+        for example in examples:
+            radius = self.objects[example.object].radius
+            cameras = tuple(camera.with_clip_range(radius) for camera in example.cameras)
+            self.examples.append(replace(example, cameras=cameras))
         self.backgrounds = backgrounds.to(lights)
         self.lights = lights.expand(len(examples), *lights.shape[-2:])
         self.views = len(examples[0].cameras)
@@ -150,52 +142,58 @@ class Scene:
 
         pixels_per_example = self.views * settings.size**2
         self.group_size = max(1, AT_ONCE // pixels_per_example)
-        self.attack_bytes = _attack_bytes(
-            pixels=len(self) * pixels_per_example,
-            pixels_at_once=min(len(self), self.group_size) * pixels_per_example,
-            lights=self.lights,
-            camera_effects=camera_effects is not None,
-        )
+        per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL
+        if camera_effects:
+            per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA
+        numbers = NUMBERS_PER_PIXEL * len(self) * pixels_per_example
+        numbers += per_rendered_pixel * min(len(self), self.group_size) * pixels_per_example
+        numbers += NUMBERS_PER_LIGHT_VALUE * self.lights.numel()
+        self.attack_bytes = lights.element_size() * numbers
         count = f"{len(self) * self.views} renders of {settings.size} pixels per side"
-        require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
-        self._operator_renderer = self._build_operator_renderer()
+        errors.require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
+        self._operator_renderer = OperatorRenderer(
+            self.objects,
+            [(item.object, camera) for item in self.examples for camera in item.cameras],
+            self._background.repeat_interleave(self.views),
+            self.backgrounds.flatten(2),
+            settings,
+            # `build` must not refer to `self`. Python frees objects with circular references late.
+            build=partial(
+                build_operators,
+                settings=settings,
+                rasterizer=rasterizer,
+                basis=basis,
+                dtype=lights.dtype,
+            ),
+            attack_bytes=self.attack_bytes,
+        )
         self._direct_renderer = DirectRenderer(
             self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light
         )
 
-    def _with_clip_ranges(self, example: Example) -> Example:
-        """Return a copy of an example whose cameras have a depth range with the whole object."""
-        radius = self.objects[example.object].radius
-        cameras = tuple(camera.with_clip_range(radius) for camera in example.cameras)
-        return replace(example, cameras=cameras)
-
-    def _build_operator_renderer(self) -> OperatorRenderer:
-        """Prepare rendering with transfer operators, which are matrices from light to image.
-
-        The operators are built when an image first needs them.
-        """
-        views = []
-        for example in self.examples:
-            views += [(example.object, camera) for camera in example.cameras]
-        # `build` must not refer to `self`. Python frees objects with circular references late.
-        build = partial(
-            build_operators,
-            settings=self.settings,
-            rasterizer=self.rasterizer,
-            basis=self.basis,
-            dtype=self.lights.dtype,
-        )
-        # Index of the background of each image, shape (E · V,).
-        image_to_background = self._background.repeat_interleave(self.views)
-        return OperatorRenderer(
-            self.objects,
-            views,
-            image_to_background,
-            self.backgrounds.flatten(2),
-            self.settings,
-            build,
-            self.attack_bytes,
-        )
+    def _require_fitting(
+        self, examples: Sequence[Example], lights: Tensor, backgrounds: Tensor
+    ) -> None:
+        """Check that examples, lights and backgrounds fit the objects, the basis and the size."""
+        if not examples:
+            raise InputError(
+                "examples is empty: give at least one mesh, one view and one background"
+            )
+        highest = max(example.object for example in examples)
+        if highest >= len(self.objects):
+            raise InputError(
+                f"objects has {len(self.objects)} objects, but an example refers to index "
+                f"{highest}: give an object for each index"
+            )
+        errors.require_bounded(lights=lights)
+        errors.require_shape("lights", lights, "...", self.basis.size, 3)
+        size = self.settings.size
+        is_image = backgrounds.shape[1:] in ((1, size, size), (3, size, size))
+        if not (is_image and backgrounds.min() >= 0 and backgrounds.max() <= 1):
+            raise InputError(
+                f"backgrounds has shape {tuple(backgrounds.shape)}, or values outside of [0, 1]: "
+                f"give images of shape (count, 3, {size}, {size}) with values in [0, 1]"
+            )
 
     @classmethod
     def grid(
@@ -225,14 +223,12 @@ class Scene:
         """
         # Cameras of the examples of an object in front of a background: one tuple per example.
         camera_groups = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
-        examples = []
-        for object_index, given_cameras, background_index in product(
-            range(len(objects)), camera_groups, range(len(backgrounds))
-        ):
-            cameras_of_example = given_cameras
-            if placed:
-                cameras_of_example = objects[object_index].move_cameras(given_cameras)
-            examples.append(Example(object_index, cameras_of_example, background_index))
+        examples = [
+            Example(index, item.move_cameras(group) if placed else group, background)
+            for index, item in enumerate(objects)
+            for group in camera_groups
+            for background in range(len(backgrounds))
+        ]
         return cls(objects, examples, backgrounds, *of_scene, **options)
 
     def changed(self, **arguments: Any) -> Scene:
@@ -241,8 +237,8 @@ class Scene:
         Args:
             arguments: Arguments of `Scene` that differ in the copy, by name.
         """
-        arguments_of_self = {name: getattr(self, name) for name in _ARGUMENTS}
-        return Scene(**arguments_of_self | arguments)
+        own = {name: getattr(self, name) for name in signature(Scene).parameters}
+        return Scene(**own | arguments)
 
     def __len__(self) -> int:
         return len(self.examples)
@@ -339,14 +335,11 @@ class Scene:
                 each example, or if they contain NaN.
         """
         expected = "conditions, such as scene.conditions(examples)"
-        require_kind("conditions", conditions, Conditions, expected)
-        if conditions.light.shape[1:] != (self.basis.size, 3):
-            raise InputError(
-                f"conditions.light has shape {tuple(conditions.light.shape)}: "
-                f"give a light for each example, shape (examples, {self.basis.size}, 3)",
-            )
+        errors.require_kind("conditions", conditions, Conditions, expected)
+        errors.require_shape("conditions.light", conditions.light, "examples", self.basis.size, 3)
         examples = self._as_examples(examples, len(conditions.light))
         layers = list(self._layers(conditions, examples))
+        size = self.settings.size
         # Start with the background of each image, shape (A · V, 3 or 1, size²). Then overwrite
         # the pixels that objects cover.
         image_to_background = self._background[examples].repeat_interleave(self.views)
@@ -354,7 +347,6 @@ class Scene:
         new_values = [encode(clamp(layer.composite), self.settings.encoding) for layer in layers]
         targets = [(layer.rows, layer.pixels) for layer in layers]
         images = ScatterLayers.apply(canvas.expand(-1, 3, -1).contiguous(), targets, *new_values)
-        size = self.settings.size
         images = images.view(len(examples), self.views, 3, size, size)
         if self.camera_effects:
             images = self.camera_effects(images, examples)
@@ -368,19 +360,14 @@ class Scene:
         The range of indices on a GPU is not checked, because the CPU would wait for the GPU. A
         count of None allows any number.
         """
-        indices = as_integers("examples", examples)
-        if indices.ndim != 1 or count not in (None, len(indices)):
-            number = "a list of" if count is None else str(count)
-            raise InputError(
-                f"examples has shape {tuple(indices.shape)}: "
-                f"give {number} indices, one for each light",
-            )
+        indices = errors.as_integers("examples", examples)
+        errors.require_shape("examples", indices, "count" if count is None else count)
         if indices.device.type != "cpu" or not len(indices):
             return indices.to(self.lights.device)
         if int(indices.min()) < 0 or int(indices.max()) >= len(self):
             raise InputError(
                 f"examples has indices from {int(indices.min())} to {int(indices.max())}: "
-                f"give indices from 0 to {len(self) - 1}",
+                f"give indices from 0 to {len(self) - 1}"
             )
         return indices.to(self.lights.device)
 
@@ -395,11 +382,10 @@ class Scene:
 
         Image a · V + v of a layer is view v of the example with the index `examples[a]`.
         """
-        require_bounded(light=conditions.light)
+        errors.require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
-        surface_changes = (conditions.vertices, conditions.albedo, conditions.gloss)
-        is_surface_changed = any(values is not None for values in surface_changes)
-        if self.one_light or is_surface_changed:
+        changes = (conditions.vertices, conditions.albedo, conditions.gloss)
+        if self.one_light or any(values is not None for values in changes):
             return self._render_directly(light, conditions, examples)
         if conditions.positions is not None:
             return self._render_with_moved_lamps(light, conditions.positions, examples)
@@ -428,10 +414,9 @@ class Scene:
         examples: Int[Tensor, " A"],
     ) -> Iterator[Layer]:
         """Render views with transfer operators, and add the light of moved lamps to each view."""
-        movable_light = self.basis.movable_light
-        assert movable_light is not None
+        assert self.basis.movable_light is not None
         # Rows of the lamps in the K coefficients, and the basis of the lamps.
-        lamp_rows, lamps = movable_light
+        lamp_rows, lamps = self.basis.movable_light
         other_light = light.clone()
         other_light[:, lamp_rows] = 0
         batch_images = torch.arange(len(light) * self.views, device=light.device)
@@ -440,10 +425,9 @@ class Scene:
             for image in batch_images[rows].tolist():
                 row, view = divmod(image, self.views)
                 example = self.examples[int(examples[row])]
-                camera = example.cameras[view]
-                view_in_lamps = self._direct_renderer.local_view(example.object, camera)
-                fragments, albedo = self._direct_renderer.view(example.object, camera)
-                radiance = view_in_lamps.radiance(
+                view_key = (example.object, example.cameras[view])
+                fragments, albedo = self._direct_renderer.view(*view_key)
+                radiance = self._direct_renderer.local_view(*view_key).radiance(
                     lamps, albedo, light[row, lamp_rows], positions[row]
                 )
                 # Positions of the pixels that the object covers in the sorted list `pixels`.
@@ -479,59 +463,3 @@ class Scene:
             background_pixels = background.index_select(1, pixels)
             term = background_term(coverage[None], background_pixels, self.settings.encoding)
             yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])
-
-
-# Names of the arguments of `Scene`. A scene has an attribute of the same name for each of them.
-_ARGUMENTS = tuple(name for name in signature(Scene).parameters)
-
-
-def _require_examples(examples: Sequence[Example], objects: Sequence[SceneObject]) -> None:
-    """Check that there are examples, and that each refers to one of the objects."""
-    if not examples:
-        raise InputError("examples is empty: give at least one mesh, one view and one background")
-    highest = max(example.object for example in examples)
-    if highest >= len(objects):
-        raise InputError(
-            f"objects has {len(objects)} objects, but an example refers to index {highest}: "
-            "give an object for each index"
-        )
-
-
-def _require_lights(lights: Float[Tensor, "... coefficients 3"], basis: Basis) -> None:
-    """Check that lights are finite and have one RGB coefficient for each function of the basis."""
-    require_bounded(lights=lights)
-    if lights.shape[-2:] != (basis.size, 3):
-        raise InputError(
-            f"lights has shape {tuple(lights.shape)}: give (examples, {basis.size}, 3), "
-            "three channels for each coefficient of the basis"
-        )
-
-
-def _require_backgrounds(backgrounds: Tensor, size: int) -> None:
-    """Check the shape and the range of backgrounds."""
-    is_image = backgrounds.shape[1:] in ((1, size, size), (3, size, size))
-    if not (is_image and backgrounds.min() >= 0 and backgrounds.max() <= 1):
-        raise InputError(
-            f"backgrounds has shape {tuple(backgrounds.shape)}, or values outside of [0, 1]: "
-            f"give images of shape (count, 3, {size}, {size}) with values in [0, 1]"
-        )
-
-
-def _attack_bytes(
-    pixels: int,
-    pixels_at_once: int,
-    lights: Tensor,
-    camera_effects: bool,
-) -> int:
-    """Estimate the memory that an attack on the light of a scene takes.
-
-    The linear operators from light to image are not counted. `pixels_at_once` counts the pixels of
-    images that are rendered at the same time.
-    """
-    per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL
-    if camera_effects:
-        per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA
-    numbers = NUMBERS_PER_PIXEL * pixels
-    numbers += per_rendered_pixel * pixels_at_once
-    numbers += NUMBERS_PER_LIGHT_VALUE * lights.numel()
-    return lights.element_size() * numbers

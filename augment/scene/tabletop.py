@@ -17,6 +17,7 @@ In arrays with a pair of surfaces, index 0 is the table, and index 1 is the wall
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -25,7 +26,7 @@ from torch import Tensor
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.light.basis import Harmonics, LocalBasis
-from renderer.light.harmonics import bands, cache_tensors, degree_of
+from renderer.light.harmonics import cache_tensors, degree_of
 from renderer.mesh import Mesh
 from renderer.operators.rays import NO_FACE, Rays, sphere, unoccluded
 from renderer.settings import ImageSettings
@@ -66,16 +67,17 @@ class Room:
     wall: float
 
 
-@dataclass(frozen=True)
-class _SeenPoints:
+class _SeenPoints(NamedTuple):
     """The points of table and wall that a camera sees, S points in each of P pixels.
 
     Attributes:
         points: Positions in world units.
+        normals: Unit normals of the surfaces.
         is_on_wall: Mask of the points on the wall. The others are on the table.
     """
 
     points: Float[Tensor, "S P 3"]
+    normals: Float[Tensor, "S P 3"]
     is_on_wall: Bool[Tensor, "S P"]
 
 
@@ -137,82 +139,62 @@ def irradiance(
     The object itself is invisible. `lamp` is the unit direction towards a white lamp of irradiance
     1, or zero for no lamp. `lights` are local lights with their RGB coefficients.
     """
-    room_axes = _room_axes(camera)
-    # Unit normals of the table and the wall in world axes.
-    normals = torch.stack([room_axes[2], room_axes[0]])
-    # Directions of the sky, the values of the harmonics in them, and the irradiance by each
-    # harmonic, in the axes of the room.
-    directions, harmonic_values, irradiance_per_harmonic = _directions(degree_of(sky))
-    sky = _sky_in_room_axes(sky, camera.azimuth)
-
+    harmonics = Harmonics(degree_of(sky))
+    normals = _normals(camera)
     # Shadows of lamps have sharp edges, which need several samples per pixel.
     fine = image if lamp.any() or lights else replace(image, samples=1)
-    fine_points = _find_seen_points(camera, fine, room, normals)
-    # Irradiance from the whole sky of the table, in row 0, and of the wall, in row 1.
-    from_table_sky, from_wall_sky = (irradiance_per_harmonic @ sky).clamp(min=0)
+    fine_points = _find_seen_points(camera, fine, room)
+    # Irradiance from the whole sky of the table, in row 0, and of the wall, in row 1. Only the
+    # harmonics with the indices `nonzero` contribute irradiance.
+    from_whole_sky = harmonics.irradiance(normals) @ sky[harmonics.nonzero]
+    from_table_sky, from_wall_sky = from_whole_sky.clamp(min=0)
     # The following values are averages over the samples of each of the P pixels.
     fraction_on_wall = fine_points.is_on_wall.double().mean(0)[:, None]
     open_sky = from_table_sky + fraction_on_wall * (from_wall_sky - from_table_sky)
-    from_lamp = _from_lamp(room, fine_points, normals, lamp).mean(0)[:, None]
-    from_lights = _from_local_lights(room, fine_points, normals, lights).mean(0)
+    from_lamp = _from_lamp(room, fine_points, lamp).mean(0)[:, None]
+    from_lights = _from_local_lights(room, fine_points, lights).mean(0)
     lit = open_sky + (from_lamp + from_lights)
 
     # Irradiance from the part of the sky that the object blocks, in an image of fewer pixels.
-    coarse_size = math.ceil(image.size / COARSE)
-    coarse = replace(image, size=coarse_size, samples=1)
-    coarse_points = _find_seen_points(camera, coarse, room, normals)
+    coarse = replace(image, size=math.ceil(image.size / COARSE), samples=1)
+    coarse_points = _find_seen_points(camera, coarse, room)
     # The irradiance is the integral of radiance times cosine. The density of the directions is
     # proportional to the cosine, so each direction has the same share of π, the integral of the
     # cosine.
-    weighted_radiance = harmonic_values @ sky * (math.pi / DIRECTIONS)
-    world_directions = directions @ room_axes
-    blocked = _blocked_sky(room, coarse_points, normals, world_directions, weighted_radiance)
+    directions = _directions(normals)
+    radiance = harmonics.radiance(directions.flatten(0, 1)) @ sky * (math.pi / DIRECTIONS)
+    blocked = _blocked_sky(room, coarse_points, directions, radiance.unflatten(0, (2, -1)))
     blocked_image = F.interpolate(
         blocked.T.unflatten(1, (coarse.size, -1))[None], image.size, mode="bilinear"
     )[0]
     return (lit.T.unflatten(1, (image.size, -1)) - blocked_image).clamp(min=0)
 
 
-def _room_axes(camera: Camera) -> Float[Tensor, "3 3"]:
-    """Return the axes of a room, which is a table and a wall that faces the camera.
-
-    Row 0 is the normal of the wall, which is horizontal and points to the side of the camera. Row
-    2 is the normal of the table, which is vertical. Row 1 is perpendicular to both.
-    """
+def _normals(camera: Camera) -> Float[Tensor, "2 3"]:
+    """Return the normals of a table, which points up, and of a wall that faces the camera."""
     azimuth = math.radians(camera.azimuth)
-    sine = math.sin(azimuth)
-    cosine = math.cos(azimuth)
-    rows = [[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]
+    rows = [[0.0, 0.0, 1.0], [math.cos(azimuth), math.sin(azimuth), 0.0]]
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def _from_lamp(
-    room: Room, seen: _SeenPoints, normals: Float[Tensor, "2 3"], lamp: Float[Tensor, " 3"]
-) -> Float[Tensor, "S P"]:
+def _from_lamp(room: Room, seen: _SeenPoints, lamp: Float[Tensor, " 3"]) -> Float[Tensor, "S P"]:
     """Compute the irradiance of points on a table and a wall from a white distant lamp.
 
-    Row 0 of the normals is that of the table, row 1 that of the wall. The result is 0 in the shadow
-    of the object.
+    The result is 0 in the shadow of the object.
     """
-    # Surface of each point as a row of `normals`: 0 for the table, 1 for the wall, shape (S, P).
-    point_to_surface = seen.is_on_wall.long()
-    lit = (normals @ lamp).clamp(min=0)[point_to_surface]
-    may_be_shaded = (lit > 0) & _passes_near_origin(seen.points, lamp, room.radius)
-    # Positions of these points in (S, P): indices of samples, and indices of pixels.
-    candidates = torch.nonzero(may_be_shaded, as_tuple=True)
+    lit = (seen.normals @ lamp).clamp(min=0)
+    # Indices of the samples, and of the pixels, of the points that may be shaded.
+    candidates = torch.nonzero(
+        (lit > 0) & _passes_near_origin(seen.points, lamp, room.radius), as_tuple=True
+    )
     # Rays start slightly above the surface, so that rounding cannot move their starts below it.
-    offset = room.rays.offset * normals[point_to_surface[candidates]]
-    starts = seen.points[candidates] + offset
-    is_lit = room.rays.first_hit(starts, lamp.expand(len(starts), 3)) == NO_FACE
-    lit[candidates] *= is_lit
+    starts = seen.points[candidates] + room.rays.offset * seen.normals[candidates]
+    lit[candidates] *= room.rays.first_hit(starts, lamp.expand(len(starts), 3)) == NO_FACE
     return lit
 
 
 def _from_local_lights(
-    room: Room,
-    seen: _SeenPoints,
-    normals: Float[Tensor, "2 3"],
-    lights: Sequence[tuple[LocalBasis, Tensor]],
+    room: Room, seen: _SeenPoints, lights: Sequence[tuple[LocalBasis, Tensor]]
 ) -> Float[Tensor, "S P 3"]:
     """Compute the irradiance of points on a table and a wall from projector and lamps.
 
@@ -220,12 +202,12 @@ def _from_local_lights(
     """
     # One list of all points, shape (S · P, 3).
     points = seen.points.flatten(0, 1)
-    point_normals = normals[seen.is_on_wall.long()].flatten(0, 1)
+    normals = seen.normals.flatten(0, 1)
     arriving = torch.zeros(len(points), 3, dtype=torch.float64)
     for basis, coefficients in lights:
         # `unoccluded` needs the normals of faces and those for shading. On flat surfaces, both
         # are the same.
-        paths = unoccluded(room.rays, basis, points, point_normals, point_normals)
+        paths = unoccluded(room.rays, basis, points, normals, normals)
         # A path goes from one function of the basis, such as a pixel of the projector, to one
         # point.
         irradiance_of_path = paths.irradiance[:, None] * coefficients[paths.function]
@@ -236,7 +218,6 @@ def _from_local_lights(
 def _blocked_sky(
     room: Room,
     seen: _SeenPoints,
-    normals: Float[Tensor, "2 3"],
     directions: Float[Tensor, "2 D 3"],
     radiance: Float[Tensor, "2 D 3"],
 ) -> Float[Tensor, "P 3"]:
@@ -246,21 +227,18 @@ def _blocked_sky(
     hits the object is summed. Directions are in world axes, D for points of the table (row 0) and D
     for points of the wall. `radiance` is the irradiance that each contributes if it is not blocked.
     """
-    points = seen.points[0]
-    is_on_wall = seen.is_on_wall[0]
+    # Rays start slightly above the surface.
+    points = seen.points[0] + room.rays.offset * seen.normals[0]
     blocked = torch.zeros(len(points), 3, dtype=torch.float64)
     for surface in (TABLE, WALL):
         # Indices of the pixels that show this surface, the table or the wall.
-        pixels = torch.nonzero(is_on_wall == surface).squeeze(1)
-        # Rays start slightly above the surface.
-        starts = points[pixels] + room.rays.offset * normals[surface]
+        pixels = torch.nonzero(seen.is_on_wall[0] == surface).squeeze(1)
+        starts = points[pixels]
         may_hit = _passes_near_origin(starts, directions[surface].T, room.radius)
         # Each traced ray has an index of its start and an index of its direction.
         ray_to_start, ray_to_direction = torch.nonzero(may_hit, as_tuple=True)
-        face_of_ray = room.rays.first_hit(
-            starts[ray_to_start], directions[surface, ray_to_direction]
-        )
-        is_blocked = face_of_ray != NO_FACE
+        ray_directions = directions[surface, ray_to_direction]
+        is_blocked = room.rays.first_hit(starts[ray_to_start], ray_directions) != NO_FACE
         blocked_pixels = pixels[ray_to_start[is_blocked]]
         blocked.index_add_(0, blocked_pixels, radiance[surface, ray_to_direction[is_blocked]])
     return blocked
@@ -290,14 +268,9 @@ def _find_shown_points(
     room: Room, mesh: Mesh, camera: Camera, image: ImageSettings
 ) -> Float[Tensor, "P 3"]:
     """Find the points of an object, a table or a wall that the centers of the pixels show."""
-    room_axes = _room_axes(camera)
-    # Unit normals of the table (row 0) and the wall (row 1).
-    normals = torch.stack([room_axes[2], room_axes[0]])
     # Points of table or wall that the pixels would show without the object, shape (P, 3).
-    points = _find_seen_points(camera, replace(image, samples=1), room, normals).points[0]
-    starts = points + FAR * torch.from_numpy(camera.axes()[2])
-    if isinstance(camera, PerspectiveCamera):
-        starts = torch.from_numpy(camera.pose()[:3, 3]).expand_as(points)
+    points = _find_seen_points(camera, replace(image, samples=1), room).points[0]
+    starts = _ray_starts(camera, points)
     forward = F.normalize(points - starts, dim=1)
     face_of_pixel = room.rays.first_hit(starts, forward)
     # M of the pixels show the object. Replace the point of each by the point of the face of the
@@ -324,87 +297,62 @@ def _passes_near_origin(
     """
     # A ray comes nearest to the origin after the distance -along from its start.
     along = points @ directions
-    squared = points.square().sum(-1)
-    if directions.ndim > 1:
-        squared = squared[..., None]
-    is_ahead = along < 0
+    squared = points.square().sum(-1, keepdim=directions.ndim > 1)
     # Pythagoras gives the squared distance between the ray and the origin.
-    squared_distance = squared - along**2
-    return is_ahead & (squared_distance < radius**2)
+    return (along < 0) & (squared - along**2 < radius**2)
 
 
-@cache_tensors
-def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Choose directions above a table (normal +z) and in front of a wall (normal +x).
+def _directions(normals: Float[Tensor, "2 3"]) -> Float[Tensor, "2 D 3"]:
+    """Choose unit directions in front of a table and of a wall, with these normals.
 
     The density of the D = `DIRECTIONS` directions is proportional to the cosine of the angle to the
-    normal (Malley's method). Return unit directions (2, D, 3), the K harmonics in them (2, D, K),
-    and the irradiance for a coefficient of 1 of each harmonic (2, K). Index 0 is the table, index 1
-    the wall.
+    normal (Malley's method).
     """
     index = torch.arange(DIRECTIONS, dtype=torch.float64)
-    # Distribute points evenly over the unit disk, along a spiral (Fibonacci lattice). Malley's
-    # method then projects them onto the hemisphere.
+    # Distribute points evenly over the unit disk, along a spiral of the golden angle (Fibonacci
+    # lattice). Malley's method then projects them onto the hemisphere.
     squared_radius = (index + 0.5) / DIRECTIONS
-    golden_angle = math.pi * (3 - math.sqrt(5))
-    angle = golden_angle * index
+    angle = math.pi * (3 - math.sqrt(5)) * index
     radius = squared_radius.sqrt()
-    x = radius * angle.cos()
-    y = radius * angle.sin()
-    above_table = torch.stack([x, y, (1 - squared_radius).sqrt()], dim=1)
-    # Permute the coordinates (x, y, z) to (z, x, y), which turns the normal +z of the table to
-    # the normal +x of the wall.
-    in_front_of_wall = above_table.roll(1, 1)
-    directions = torch.stack([above_table, in_front_of_wall])
-    harmonics = Harmonics(degree)
-    normals = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
-    irradiance = torch.zeros(2, harmonics.size, dtype=torch.float64)
-    # Only the harmonics with the indices `nonzero` contribute irradiance.
-    irradiance[:, harmonics.nonzero] = harmonics.irradiance(normals)
-    radiance = harmonics.radiance(directions.flatten(0, 1)).unflatten(0, (2, -1))
-    return directions, radiance, irradiance
+    on_hemisphere = torch.stack(
+        [radius * angle.cos(), radius * angle.sin(), (1 - squared_radius).sqrt()], dim=1
+    )
+    # Axes of both hemispheres, whose third axis is the normal, in world axes.
+    up, forward = normals
+    right = torch.linalg.cross(up, forward)
+    return on_hemisphere @ torch.stack(
+        [torch.stack([forward, right, up]), torch.stack([right, up, forward])]
+    )
 
 
-def _sky_in_room_axes(sky: Float[Tensor, "K 3"], azimuth: float) -> Float[Tensor, "K 3"]:
-    """Rotate an environment light about the vertical, so that the normal of a wall becomes +x.
-
-    The light is in world axes, and the azimuth of that normal in degrees.
-    """
-    # The harmonic of band l and order m (from -l to l) has the index l (l + 1) + m. For m > 0,
-    # the harmonics of orders m and -m depend on the azimuth φ as cos mφ and sin mφ. A rotation
-    # about the vertical mixes only these two.
-    l = bands(degree_of(sky))
-    order = torch.arange(len(l)) - l * (l + 1)
-    angle = (order * math.radians(azimuth)).double()[:, None]
-    # Index of the harmonic with the same band l and the order -m.
-    opposite_order = l * (l + 1) - order
-    return angle.cos() * sky + angle.sin() * sky[opposite_order]
-
-
-def _find_seen_points(
-    camera: Camera, image: ImageSettings, room: Room, normals: Float[Tensor, "2 3"]
-) -> _SeenPoints:
+def _find_seen_points(camera: Camera, image: ImageSettings, room: Room) -> _SeenPoints:
     """Find where the rays of a camera meet a table or a wall, if no object is in the way.
 
     Each of the P = size² pixels has S = samples² rays.
     """
-    right, up = _sample_positions(camera, image)
     # Each ray passes through a point of the plane through the origin that faces the camera. The
     # rows of `axes` point right, up and towards the camera.
     axes = torch.from_numpy(camera.axes())
+    right, up = _sample_positions(camera, image)
     ends = right * axes[0] + up * axes[1]
-    starts = ends + FAR * axes[2]
-    if isinstance(camera, PerspectiveCamera):
-        starts = torch.from_numpy(camera.pose()[:3, 3]).expand_as(ends)
+    starts = _ray_starts(camera, ends)
     forward = ends - starts
     # Table and wall are the planes normal · p = level.
+    normals = _normals(camera)
     levels = torch.tensor([room.height, -room.wall], dtype=torch.float64)
     falling = (forward @ normals.T).clamp(max=FALLING)
     # Length at which a ray p = starts + length · forward meets each plane, shape (S, P, 2).
     lengths = (levels - starts @ normals.T) / falling
     points = starts + lengths.amin(2, keepdim=True) * forward
     is_on_wall = lengths[..., WALL] < lengths[..., TABLE]
-    return _SeenPoints(points, is_on_wall)
+    return _SeenPoints(points, normals[is_on_wall.long()], is_on_wall)
+
+
+def _ray_starts(camera: Camera, points: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
+    """Return the points at which the rays of a camera through some points start."""
+    if isinstance(camera, PerspectiveCamera):
+        return torch.from_numpy(camera.pose()[:3, 3]).expand_as(points)
+    return points + FAR * torch.from_numpy(camera.axes()[2])
 
 
 def _sample_positions(camera: Camera, image: ImageSettings) -> tuple[Tensor, Tensor]:
@@ -423,10 +371,9 @@ def _sample_positions(camera: Camera, image: ImageSettings) -> tuple[Tensor, Ten
     up, right = torch.meshgrid(
         up_of_rows - camera.up, right_of_columns - camera.right, indexing="ij"
     )
-    size = image.size
-    samples = image.samples
     # Split rows and columns of samples: (2, pixel row, sample row, pixel column, sample column).
-    by_pixel = torch.stack([right, up]).view(2, size, samples, size, samples)
+    split = 2 * (image.size, image.samples)
+    by_pixel = torch.stack([right, up]).view(2, *split)
     # Bring the two axes of samples to the front, and join each pair of axes.
-    right, up = by_pixel.permute(0, 2, 4, 1, 3).reshape(2, samples**2, -1, 1)
+    right, up = by_pixel.permute(0, 2, 4, 1, 3).reshape(2, image.samples**2, -1, 1)
     return right, up

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Generator, Tensor
 
 from augment.augmentation_settings import CameraEffectSettings, VariationSettings
 from augment.progress import progress
@@ -53,9 +53,7 @@ MIN_BLUR = 1e-3
 PHOTOGRAPH_PROBABILITY = 0.5
 
 
-def vary(
-    scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False
-) -> Scene:
+def vary(scene: Scene, settings: VariationSettings, draws: Generator, once: bool = False) -> Scene:
     """Change objects, cameras, lighting and backgrounds of a scene at random.
 
     All views of one example change in the same way. With `once`, the examples are rendered in one
@@ -66,7 +64,7 @@ def vary(
         if scene.views > 1 or any(item.ground is not None for item in scene.objects):
             raise InputError(
                 "tables require one view per example and objects without a table of their own: "
-                "set views=1 and remove ground, or set tables=0",
+                "set views=1 and remove ground, or set tables=0"
             )
         is_on_table = torch.rand(len(scene), generator=draws) < settings.tables
     if settings.moves or settings.backgrounds is not None:
@@ -85,7 +83,7 @@ class _Variation:
 
     scene: Scene
     settings: VariationSettings
-    draws: torch.Generator
+    draws: Generator
     is_on_table: Bool[Tensor, " E"]
 
     def change_geometry(self, once: bool) -> Scene:
@@ -405,7 +403,7 @@ def draw_camera_effects(
     settings: CameraEffectSettings,
     count: int,
     image: ImageSettings,
-    draws: torch.Generator,
+    draws: Generator,
     device: torch.device | str = "cpu",
     points: Float[Tensor, "2 count size size"] | None = None,
 ) -> Callable[[Tensor, Tensor], Tensor]:
@@ -480,7 +478,7 @@ def _blur(
 
 
 def _draw_image_files(
-    folder: str | Path, key: str, count: int, size: int, draws: torch.Generator
+    folder: str | Path, key: str, count: int, size: int, draws: Generator
 ) -> Float[Tensor, "count 3 size size"]:
     """Read randomly chosen images of a folder, with replacement."""
     files = sorted(path for path in Path(folder).rglob("*") if path.suffix.lower() in SUFFIXES)

@@ -18,11 +18,10 @@ import reprlib
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import accumulate, repeat, zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -202,11 +201,21 @@ def eight_bits(image: Image.Image) -> Image.Image:
     return image
 
 
-def write_image(path: Path, image: Image.Image, **options: object) -> None:
+def write_image(
+    path: Path, image: Image.Image | Tensor | UInt8[np.ndarray, " ..."], **options: object
+) -> None:
     """Write an image file in the format that its suffix names.
 
-    A reader never sees a part of the new file: see `atomic_write`.
+    A tensor has channels first, and 8 bits or values in [0, 1]. An array has channels last. A
+    reader never sees a part of the new file: see `atomic_write`.
     """
+    if not isinstance(image, Image.Image | np.ndarray):
+        from renderer.image import to_bytes
+
+        pixels = image.detach().cpu().permute(1, 2, 0)
+        image = (to_bytes(pixels) if pixels.is_floating_point() else pixels).numpy()
+    if isinstance(image, np.ndarray):
+        image = Image.fromarray(image)
     content = io.BytesIO()
     image_format = Image.registered_extensions()[path.suffix.lower()]
     image.save(content, image_format, **options)
@@ -234,12 +243,11 @@ INK = "#1a1a1a"
 FAINT = "#6b6b6b"
 
 
-@dataclass(frozen=True)
-class Tile:
+class Tile(NamedTuple):
     """Image with a caption below it.
 
     Attributes:
-        image: RGB values, uint8, shape (H, W, 3).
+        image: RGB values.
         caption: Lines of text. The first line is nearly black, and the other lines
             are gray.
     """
@@ -247,21 +255,16 @@ class Tile:
     image: UInt8[np.ndarray, "H W 3"]
     caption: tuple[str, ...]
 
-    def captioned(self) -> Image.Image:
-        """Draw the image with its caption below. It is as wide as the image or the longest line."""
-        image = Image.fromarray(self.image)
+    @property
+    def width(self) -> int:
+        """Width of the image, or of the longest line of the caption, in pixels."""
         line_widths = [_text_width(line, CAPTION_SIZE) for line in self.caption]
-        width = max([image.width, *line_widths])
-        caption_top = image.height + CAPTION_GAP
-        height = caption_top + LINE_HEIGHT * len(self.caption)
-        captioned = Image.new("RGB", (width, height), PAPER)
-        captioned.paste(image)
-        draw = ImageDraw.Draw(captioned)
-        font = ImageFont.load_default(CAPTION_SIZE)
-        for number, line in enumerate(self.caption):
-            color = INK if number == 0 else FAINT
-            draw.text((0, caption_top + number * LINE_HEIGHT), line, color, font)
-        return captioned
+        return max([self.image.shape[1], *line_widths])
+
+    @property
+    def height(self) -> int:
+        """Height of the image with its caption in pixels."""
+        return len(self.image) + CAPTION_GAP + LINE_HEIGHT * len(self.caption)
 
 
 def tiles_of(
@@ -279,8 +282,7 @@ def tiles_of(
     for image, caption in zip(images, captions, strict=False):
         pixels = to_bytes(image.detach().cpu()).permute(1, 2, 0).numpy()
         factor = math.ceil(side / image.shape[2])
-        enlarged = pixels.repeat(factor, 0).repeat(factor, 1)
-        tiles.append(Tile(enlarged, caption))
+        tiles.append(Tile(pixels.repeat(factor, 0).repeat(factor, 1), caption))
     return tiles
 
 
@@ -292,11 +294,13 @@ def draw_grid(
     Each column is as wide as its widest tile or title. Each row is as high as its
     highest tile. The last row may be shorter.
     """
-    images = [[tile.captioned() for tile in row] for row in rows]
-    row_heights = [max(image.height for image in row) for row in images]
-    column_widths = _column_widths(images, titles)
-    title_lines = bool(heading) + bool(titles)
-    first_top = MARGIN + TITLE_HEIGHT * title_lines
+    row_heights = [max(tile.height for tile in row) for row in rows]
+    column_widths = []
+    # zip_longest fills up with None: a tile, a column or a title may be missing.
+    for column, title in zip_longest(zip_longest(*rows), titles):
+        tile_widths = [tile.width for tile in column or () if tile]
+        column_widths.append(max([_text_width(title or "", TITLE_SIZE), *tile_widths]))
+    first_top = MARGIN + TITLE_HEIGHT * (bool(heading) + bool(titles))
     # Left edges of the columns and top edges of the rows. Each list has one
     # more entry: the position at which another column or row would begin.
     lefts = list(accumulate((width + GAP for width in column_widths), initial=MARGIN))
@@ -312,30 +316,20 @@ def draw_grid(
     draw.text((MARGIN, MARGIN), heading, INK, font)
     for title, left in zip(titles, lefts, strict=False):
         draw.text((left, first_top - TITLE_HEIGHT), title, INK, font)
-    for row, top in zip(images, tops, strict=False):
-        for image, left in zip(row, lefts, strict=False):
-            sheet.paste(image, (left, top))
+    font = ImageFont.load_default(CAPTION_SIZE)
+    for row, top in zip(rows, tops, strict=False):
+        for tile, left in zip(row, lefts, strict=False):
+            sheet.paste(Image.fromarray(tile.image), (left, top))
+            caption_top = top + len(tile.image) + CAPTION_GAP
+            for number, line in enumerate(tile.caption):
+                line_top = caption_top + number * LINE_HEIGHT
+                draw.text((left, line_top), line, FAINT if number else INK, font)
     return sheet
 
 
-def _column_widths(images: Sequence[Sequence[Image.Image]], titles: Sequence[str]) -> list[int]:
-    """Compute the width of each column of a sheet of images in pixels."""
-    columns = zip_longest(*images)
-    widths = []
-    # zip_longest fills up with None: an image,
-    # a column or a title may be missing.
-    for column, title in zip_longest(columns, titles):
-        title_width = _text_width(title or "", TITLE_SIZE)
-        image_widths = [image.width for image in column or () if image]
-        widths.append(max([title_width, *image_widths]))
-    return widths
-
-
 def _text_width(text: str, size: int) -> int:
-    """Compute the width of a line of text in pixels, rounded up."""
-    if not text:
-        return 0
-    return round(ImageFont.load_default(size).getlength(text) + 0.5)
+    """Compute the width of a line of text in pixels, rounded up. It is 0 without text."""
+    return round(ImageFont.load_default(size).getlength(text) + 0.5) if text else 0
 
 
 # Gamma and primaries of Adobe RGB (1998).

@@ -87,12 +87,7 @@ def save_light(
     errors.require_kind("basis", basis, Harmonics | LocalBasis, expected)
     coefficients = errors.as_tensor("coefficients", coefficients)
     errors.require_bounded(coefficients=coefficients)
-    if coefficients.shape != (basis.size, 3):
-        shape = tuple(coefficients.shape)
-        raise InputError(
-            f"coefficients has shape {shape}, but {basis} needs the shape {(basis.size, 3)}: "
-            "give coefficients of this shape"
-        )
+    errors.require_shape("coefficients", coefficients, basis.size, 3)
     if isinstance(basis, Harmonics) and is_map:
         errors.require_whole("height", height, 1, MAX_MAP_HEIGHT)
         physical = basis.project_nonnegative(coefficients)

@@ -24,30 +24,19 @@ from renderer.light.harmonics import basis
 from renderer.light.skylight import coefficients
 from renderer.settings import TURBIDITY
 
-# Preetham et al., appendix A.2: the parameters A to E of Perez's formula, as
-# slope and offset in turbidity. The rows are the luminance Y, x and y.
+# Preetham et al., appendix A.2: the parameters A to E of Perez's formula. The rows are the
+# luminance Y, x and y. The first table is the slope in turbidity, the second the offset.
 PEREZ = np.array(
     [
         [
-            (0.1787, -1.4630),
-            (-0.3554, 0.4275),
-            (-0.0227, 5.3251),
-            (0.1206, -2.5771),
-            (-0.0670, 0.3703),
+            [0.1787, -0.3554, -0.0227, 0.1206, -0.0670],
+            [-0.0193, -0.0665, -0.0004, -0.0641, -0.0033],
+            [-0.0167, -0.0950, -0.0079, -0.0441, -0.0109],
         ],
         [
-            (-0.0193, -0.2592),
-            (-0.0665, 0.0008),
-            (-0.0004, 0.2125),
-            (-0.0641, -0.8989),
-            (-0.0033, 0.0452),
-        ],
-        [
-            (-0.0167, -0.2608),
-            (-0.0950, 0.0092),
-            (-0.0079, 0.2102),
-            (-0.0441, -1.6537),
-            (-0.0109, 0.0529),
+            [-1.4630, 0.4275, 5.3251, -2.5771, 0.3703],
+            [-0.2592, 0.0008, 0.2125, -0.8989, 0.0452],
+            [-0.2608, 0.0092, 0.2102, -1.6537, 0.0529],
         ],
     ]
 )
@@ -102,12 +91,8 @@ def fit_polynomials(zenith_degree: int, turbidity_degree: int, nodes: int = 32) 
     # by the inverse of these formulas.
     zeniths = math.pi / 4 * (x + 1)
     turbidities = 5 / (y + 1.5)
-    skies = np.stack(
-        [
-            coefficients_by_quadrature(zenith, 0.0, turbidity, nodes)[UPRIGHT]
-            for zenith, turbidity in zip(zeniths, turbidities, strict=True)
-        ]
-    )
+    suns = zip(zeniths, turbidities, strict=True)
+    skies = np.stack([coefficients_by_quadrature(z, 0.0, t, nodes)[UPRIGHT] for z, t in suns])
     polynomials = chebvander2d(x, y, (zenith_degree, turbidity_degree))
     [fit, *_] = np.linalg.lstsq(polynomials, skies.reshape(len(skies), -1))
     shape = (zenith_degree + 1, turbidity_degree + 1, len(UPRIGHT), 3)
@@ -194,7 +179,7 @@ def radiance(cosine: np.ndarray, angle: np.ndarray, zenith: float, turbidity: fl
     # The last direction is straight up.
     cosine = np.append(cosine.clip(MIN_COSINE), 1)
     angle = np.append(angle, zenith)
-    a, b, c, d, e = (PEREZ @ [turbidity, 1]).T[:, :, None]
+    a, b, c, d, e = (turbidity * PEREZ[0] + PEREZ[1]).T[:, :, None]
     gradation = 1 + a * np.exp(b / cosine)
     indicatrix = 1 + c * np.exp(d * angle) + e * np.cos(angle) ** 2
     perez = gradation * indicatrix

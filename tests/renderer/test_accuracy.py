@@ -533,42 +533,22 @@ def test_the_references_harmonics_are_scipys_without_the_condon_shortley_sign(li
 # ---------------------------------------------------------------------------- the tables
 
 
-def markdown_row(cells: Iterable[str]) -> str:
-    """Join the cells of a row of a table."""
-    return f"|{'|'.join(cells)}|"
-
-
-def print_table(title: str, cases: Sequence[Case[Any]]) -> bool:
-    """Print a table, and return whether all errors are within their bounds. Others are bold."""
-    errors_of_cases = [case.errors() for case in cases]
-    # A dictionary keeps the order.
-    quantities = list(dict.fromkeys(name for errors in errors_of_cases for name in errors))
-    print(markdown_row([title, *quantities]))
-    print(markdown_row(["-"] * (1 + len(quantities))))
-    is_within = True
-    for case, errors in zip(cases, errors_of_cases, strict=True):
-        cells = [case.name]
-        for name in quantities:
-            if name not in errors:
-                cells.append("–")
-            elif errors[name] <= case.bound:
-                cells.append(f"{errors[name]:.3g}")
-            else:
-                cells.append(f"**{errors[name]:.3g}**")
-                is_within = False
-        print(markdown_row(cells), flush=True)
-    print()
-    return is_within
-
-
 def main() -> int:
-    """Print the tables, and return the exit status: 1 if an error is beyond its bound."""
+    """Print the tables, and return 1 if an error, which is then bold, is beyond its bound."""
     torch.set_num_threads(1)
-    sizes = QUICK if "--quick" in sys.argv else FULL
     status = 0
-    for title, cases in tables(**sizes).items():
-        if not print_table(title, list(cases)):
-            status = 1
+    for title, cases in tables(**(QUICK if "--quick" in sys.argv else FULL)).items():
+        measured = {case.name: (case.bound, case.errors()) for case in cases}
+        # A dictionary keeps the order.
+        quantities = dict.fromkeys(name for _, errors in measured.values() for name in errors)
+        rows = [[title, *quantities], ["-"] * (1 + len(quantities))]
+        for case, (bound, errors) in measured.items():
+            is_beyond = {name: not error <= bound for name, error in errors.items()}
+            status |= any(is_beyond.values())
+            cells = [f"{errors[name]:.3g}" if name in errors else "–" for name in quantities]
+            marks = ["**" if is_beyond.get(name) else "" for name in quantities]
+            rows.append([case, *(m + cell + m for m, cell in zip(marks, cells, strict=True))])
+        print("\n".join(f"|{'|'.join(cells)}|" for cells in rows), end="\n\n", flush=True)
     return status
 
 

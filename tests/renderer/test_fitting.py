@@ -84,7 +84,9 @@ def test_a_renders_camera_and_light_are_found_from_a_camera_nearby():
     assert fit.error < 0.05
 
 
-@pytest.mark.parametrize(("brightness", "bound"), [(9.0, 0.055), (13.0, 0.17)])
+@pytest.mark.parametrize(
+    ("brightness", "bound"), [(9.0, 0.055), pytest.param(13.0, 0.17, marks=pytest.mark.slow)]
+)
 def test_light_is_found_from_an_image_with_overexposed_parts(brightness, bound):
     """A sixth and a third of the object's values are 1, and tell no more than that it is bright."""
     assert nearby_fit(brightness).error < bound

@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from augment.classifier import Classifier
-from renderer.errors import as_path
+from renderer.errors import ShortRepr, as_path
 from renderer.io.files import atomic_write
-from renderer.short_repr import ShortRepr
 from train.auditing.lights import KINDS, RANDOM, PlainViews
 from train.results.compare import ALL, Difference, Evaluations, difference, mean_metric
 from train.results.first_screen import EQUAL_RATE, gain_sentence

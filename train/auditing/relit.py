@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from PIL import Image
 
 from augment.attack_settings import RelightingSettings
 from augment.classifier import Classifier
@@ -25,9 +24,9 @@ from augment.photographs import (
     PhotographAttackResult,
     attack_photographs,
 )
+from renderer.errors import ShortRepr
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
-from renderer.short_repr import ShortRepr
 from train.command_settings import AuditSettings
 from train.data.photographs import find_unlabeled, load_photographs
 from train.results.first_screen import FirstScreen, ShownMetric
@@ -256,8 +255,7 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
         images = [result.image(photograph, light, slide) for light in result.changed]
         side_by_side = torch.cat([result.image(photograph, UNCHANGED), *images], dim=2)
         names[photograph] = f"relit_{photograph:04d}.png"
-        pixels = side_by_side.permute(1, 2, 0).cpu().numpy()
-        write_image(out / names[photograph], Image.fromarray(pixels))
+        write_image(out / names[photograph], side_by_side)
     return names
 
 

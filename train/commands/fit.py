@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy.lib.stride_tricks import sliding_window_view
-from PIL import Image, ImageOps
+from PIL import ImageOps
 
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings, RendererSettings
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, require_file, single_line
-from renderer.image import decode, encode, to_bytes
+from renderer.image import decode, encode
 from renderer.io.images import eight_bits, open_image, read_image, read_rgb, write_image
 from renderer.light.files import save_light
 from renderer.photograph import fit_photograph
@@ -69,13 +69,13 @@ def fit(settings: FitSettings) -> None:
     out.mkdir(parents=True, exist_ok=True)
     # The window is the square of the photograph that the found camera shows.
     background = found.window.cut(image, BACKGROUND_SIZE, settings.encoding)
-    write_values(out / "background.png", encode(background, settings.encoding))
+    write_image(out / "background.png", encode(background, settings.encoding))
     coverage = found.window.cut(mask[..., None], BACKGROUND_SIZE, beyond=0)
-    write_values(out / "mask.png", coverage.expand(3, -1, -1))
+    write_image(out / "mask.png", coverage.expand(3, -1, -1))
     save_light(out / "light.json", found.scene.light)
     scene, renderer = attacked_scene(settings, found.scene.camera, out)
     photograph, rendered = render_attacked(settings, scene, renderer)
-    write_values(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
+    write_image(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
     # The three channels of the mask are equal, so the first one is enough.
     is_object = read_image(out / "mask.png", ATTACKED_SIZE)[0] > MIN_COVERAGE
     error = relative_error(rendered[:, is_object], photograph[:, is_object], settings.encoding)
@@ -262,9 +262,3 @@ def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndar
     cv2.grabCut(bgr, labels, rectangle, *models, GRAB_CUT_STEPS, cv2.GC_INIT_WITH_RECT)
     is_object = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
     return np.where(is_object, 255, 0).astype(np.uint8)
-
-
-def write_values(path: Path, image: Float[torch.Tensor, "3 H W"]) -> None:
-    """Write an image with values in [0, 1] to a file with 8 bits per channel."""
-    pixels = to_bytes(image.permute(1, 2, 0)).numpy()
-    write_image(path, Image.fromarray(pixels))

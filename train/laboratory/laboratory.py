@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 
 from augment.progress import progress
 from augment.random_streams import stream_seed
@@ -273,10 +272,10 @@ def _write_render(
     seed = stream_seed(settings.seed, "samples", number) % SEED_COUNT
     radiance = path_traced(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)
     exposed = torch.from_numpy(settings.exposure * radiance).clamp(0, 1)
-    pixels = (encode(exposed, "srgb") * 255).round().byte()
+    pixels = encode(exposed, "srgb").permute(2, 0, 1)
     path = Path(subject.label) / f"{number:04d}_{shot.lighting}.png"
     (out / path).parent.mkdir(parents=True, exist_ok=True)
-    write_image(out / path, Image.fromarray(pixels.numpy()))
+    write_image(out / path, pixels)
     return path.as_posix()
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from renderer.short_repr import ShortRepr
+from renderer.errors import ShortRepr
 from train.results.intervals import (
     RATES,
     Jackknife,

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from renderer.errors import InputError, single_line
+from renderer.errors import InputError, ShortRepr, single_line
 from renderer.io.files import atomic_write
-from renderer.short_repr import ShortRepr
 from train.data.photo import SEPARATOR, Photograph, split_sources
 from train.settings import label_names
 

@@ -23,10 +23,9 @@ import torch
 
 from augment.classifier import Label, LogitNetwork, OperatingPoint, log_odds
 from augment.network import compute_outputs
-from renderer.errors import InputError, require_choice
+from renderer.errors import InputError, ShortRepr, require_choice
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
-from renderer.short_repr import ShortRepr
 from train.data.photo import TABLE, Photograph
 from train.data.photographs import (
     find_photographs,

@@ -6,7 +6,6 @@ from pathlib import Path
 from statistics import fmean
 
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 from tqdm import tqdm
@@ -80,7 +79,7 @@ class RunLog:
         grid = make_grid(tiles, nrow=GRID_COLUMNS, padding=1, pad_value=255)
         self._renders.mkdir(exist_ok=True)
         path = self._renders / f"epoch_{epoch:03d}.png"
-        write_image(path, Image.fromarray(grid.permute(1, 2, 0).numpy()), compress_level=1)
+        write_image(path, grid, compress_level=1)
         self._board.add_image("renders", grid, epoch)
 
     def attack_examples(

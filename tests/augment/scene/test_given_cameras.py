@@ -49,9 +49,10 @@ def test_a_scene_shows_a_mesh_in_its_world_as_a_render_does():
     """Vertices are rounded to float32 in the scene, which moves few samples at outlines."""
     light = renderer.load_light("grace")
     mesh = placed()
-    scene = augment.build_scene(
-        [(mesh, "cup")], SIZE, cameras=cameras(), normalize=False, light=light, samples=4
-    )
+    scene = placed_scene(3, light=light, samples=4)
+    [item] = scene.objects
+    vertices = np.array(item.center) + item.extent * item.mesh.vertices
+    np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-5)
     expected = renderer.render(
         mesh, cameras(), light, SIZE, samples=4, encoding=scene.settings.encoding
     )
@@ -63,27 +64,22 @@ def test_a_scene_shows_a_mesh_in_its_world_as_a_render_does():
         assert difference.max() < 0.1
 
 
-def test_an_object_knows_where_its_mesh_was():
-    mesh = placed()
-    scene = augment.build_scene([(mesh, "cup")], SIZE, cameras=cameras(), normalize=False)
-    [item] = scene.objects
-    vertices = np.array(item.center) + item.extent * item.mesh.vertices
-    np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-5)
+def placed_scene(count: int = 1, **options) -> augment.Scene:
+    """Build a scene of a cup where it is, seen by the first cameras."""
+    return augment.build_scene(
+        [(placed(), "cup")], SIZE, cameras=cameras()[:count], normalize=False, **options
+    )
 
 
 def test_given_cameras_replace_the_circle():
-    circle = augment.build_scene([("solid:cup", "cup")], SIZE, 3)
-    given = augment.build_scene(
-        [("solid:cup", "cup")], SIZE, cameras=renderer.orbit_cameras(3, 2.0)
-    )
-    assert torch.equal(images_of(given), images_of(circle))
+    cup = [("solid:cup", "cup")]
+    given = augment.build_scene(cup, SIZE, cameras=renderer.orbit_cameras(3, 2.0))
+    assert torch.equal(images_of(given), images_of(augment.build_scene(cup, SIZE, 3)))
 
 
 def test_a_pose_attack_turns_cameras_about_the_object():
     """The object's center only comes nearer to the principal point, by the larger distance."""
-    [camera] = augment.build_scene(
-        [(placed(), "cup")], SIZE, cameras=cameras()[:1], normalize=False
-    ).cameras[0]
+    [camera] = placed_scene().cameras[0]
     turns = [torch.tensor(value, dtype=torch.float64) for value in (10.0, -20.0, 0.1)]
     turned = camera.moved(*turns).fixed()
     origin = np.zeros((1, 3))
@@ -100,12 +96,10 @@ def test_an_attack_and_its_files_keep_pinhole_cameras(tmp_path):
         return torch.stack([mean, 0.3 + 0 * mean], dim=1)
 
     classifier = augment.Classifier(logits, size=SIZE, classes=["cup", "other"])
-    scene = augment.build_scene(
-        [(placed(), "cup")], SIZE, cameras=cameras()[:1], normalize=False, silhouettes=True
-    )
+    scene = placed_scene(silhouettes=True, samples=2)
     pose = augment.PoseSettings(radius=1.0)
     light = augment.StepSettings(step_size=0.5)
-    settings = augment.AttackSettings(pose=pose, lighting=light, max_steps=3, allow_negative=True)
+    settings = augment.AttackSettings(pose=pose, lighting=light, max_steps=1, allow_negative=True)
     result = augment.attack(classifier, scene, settings=settings, force=True)
     augment.save(result, tmp_path)
     adversary = augment.reload(tmp_path / "example_000")
@@ -114,7 +108,7 @@ def test_an_attack_and_its_files_keep_pinhole_cameras(tmp_path):
 
 
 def test_variations_keep_pinhole_cameras():
-    scene = augment.build_scene([(placed(), "cup")], SIZE, cameras=cameras()[:1], normalize=False)
+    scene = placed_scene()
     settings = VariationSettings(shift=0.1, scale=[0.8, 1.2], azimuth=20.0, fov=[20.0, 40.0])
     varied = vary(scene, settings, torch.Generator().manual_seed(0))
     [camera] = varied.cameras[0]

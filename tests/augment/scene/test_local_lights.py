@@ -130,14 +130,10 @@ def joint_attack(request, tmp_path_factory) -> tuple[augment.AttackResult, Adver
     return done, written, folder
 
 
-def test_a_joint_attack_lowers_the_cost(joint_attack):
-    done, _, _ = joint_attack
+def test_a_joint_attack_lowers_the_cost_and_is_read_back_to_its_image(joint_attack):
+    done, written, folder = joint_attack
     assert (done.images - done.images_before).abs().max() > 0.05
     assert (done.minimum.cost < done.minimum.cost_before).all()
-
-
-def test_a_joint_attack_is_read_back_to_its_image(joint_attack):
-    done, written, folder = joint_attack
     found = reload(folder)
     assert torch.equal(found.light, written.light)
     assert found.basis == written.basis
@@ -163,32 +159,20 @@ def test_mitsuba_renders_a_joint_attack_alike(joint_attack):
     assert (image - done.images[0]).abs().median() < 2 / 255
 
 
-@pytest.fixture(scope="module")
-def moved_lamps(tmp_path_factory) -> tuple[augment.AttackResult, Adversary, Path]:
-    """Attack the positions of the lamps, and write the second example."""
+def test_moved_lamps_are_read_back_where_they_ended(tmp_path):
     positions = StepSettings("l2", 0.6, "unit", 0.5)
     settings = augment.AttackSettings(positions=positions, max_steps=3)
     done = augment.attack(by_mean_color(), scene(exposure=0.3), settings=settings, force=True)
     before = done.images_in_views_before[1]
     written = Adversary.of(done.problem.scene, 1, done.conditions, before, done.images_in_views[1])
-    folder = tmp_path_factory.mktemp("moved")
-    write_adversary(written, folder)
-    return done, written, folder
-
-
-def test_moved_lamps_are_read_back_where_they_ended(moved_lamps):
-    done, written, folder = moved_lamps
-    image = reload(folder).render(choose("numpy"))
+    write_adversary(written, tmp_path)
+    image = reload(tmp_path).render(choose("numpy"))
     torch.testing.assert_close(image, done.images[1], rtol=0, atol=1e-6)
-    lamps, powers = build_local_light(LampsSettings(start=str(folder / "lamps.json")))
+    lamps, powers = build_local_light(LampsSettings(start=str(tmp_path / "lamps.json")))
     assert torch.equal(torch.tensor(lamps.positions), done.conditions.positions[1])
     assert torch.equal(powers, written.light[-len(powers) :])
-
-
-def test_lamps_do_not_start_from_the_file_of_a_projector(moved_lamps):
-    _, _, folder = moved_lamps
     with pytest.raises(InputError, match=r"projector\.json"):
-        build_local_light(LampsSettings(start=str(folder / "projector.json")))
+        build_local_light(LampsSettings(start=str(tmp_path / "projector.json")))
 
 
 # --------------------------------------------------------------- images
@@ -201,15 +185,8 @@ def test_a_table_receives_the_projection_and_the_shadow():
     the square of the ratio of the distances.
     """
     above = ProjectorSettings(pixels=1, polar=0, pattern=1.0, fov=60)
-    options = {
-        "light": NO_SKY,
-        "projector": above,
-        "lamps": None,
-        "backgrounds": [0.0],
-        "width": 4.0,
-        "polar": 0,
-        "samples": 4,
-    }
+    lights = {"light": NO_SKY, "projector": above, "lamps": None, "backgrounds": [0.0]}
+    options = lights | {"width": 4.0, "polar": 0, "samples": 4}
     color = [0.2, 0.5, 0.7]
     shown = scene(48, ground=color, **options)
     on_table = rendered(shown)[0, 0]
@@ -242,10 +219,8 @@ def test_stacked_sparse_operators_give_the_images_and_gradients_of_each_operator
     )
     assert all(operator.sparse is not None for operator in operators)
     single_light = light.clone().requires_grad_(True)
-    expected = []
-    for row, example in enumerate(examples.tolist()):
-        expected.append(operators[example].image(single_light[row]))
-    expected = torch.stack(expected)
+    pairs = zip(examples.tolist(), single_light, strict=True)
+    expected = torch.stack([operators[example].image(light) for example, light in pairs])
     torch.testing.assert_close(images, expected, rtol=0, atol=1e-6)
     (expected_gradient,) = torch.autograd.grad((expected * weights).sum(), single_light)
     torch.testing.assert_close(gradient, expected_gradient, rtol=1e-5, atol=1e-5)

@@ -26,11 +26,14 @@ def plain_mesh(tmp_path) -> str:
 # --------------------------------------------------------------- colors
 
 
-def test_a_mesh_without_colors_takes_the_given_one(plain_mesh):
+def test_a_mesh_without_colors_takes_the_given_one_which_a_metal_needs(plain_mesh):
     color = [0.9, 0.5, 0.1]
-    mesh = load_object(ObjectSettings(plain_mesh, "orange", color=color)).mesh
+    metal = [0.3, 1, 1]
+    mesh = load_object(ObjectSettings(plain_mesh, "orange", color=color, gloss=metal)).mesh
     expected = np.broadcast_to(np.float32(color), mesh.corner_colors.shape)
     np.testing.assert_array_equal(mesh.corner_colors, expected)
+    with pytest.raises(InputError, match="color="):
+        load_object(ObjectSettings(plain_mesh, "orange", gloss=metal))
 
 
 @pytest.mark.parametrize(
@@ -40,13 +43,6 @@ def test_a_mesh_without_colors_takes_the_given_one(plain_mesh):
 def test_colors_and_seeds_that_a_mesh_cannot_have_are_refused(mesh, color, message):
     with pytest.raises(InputError, match=message):
         load_object(ObjectSettings(mesh, "orange", color=color))
-
-
-def test_a_metal_needs_a_color(plain_mesh):
-    metal = [0.3, 1, 1]
-    load_object(ObjectSettings(plain_mesh, "orange", color=[0.9, 0.5, 0.1], gloss=metal))
-    with pytest.raises(InputError, match="color="):
-        load_object(ObjectSettings(plain_mesh, "orange", gloss=metal))
 
 
 # --------------------------------------------------------------- props and tables

@@ -126,30 +126,21 @@ def test_a_changed_albedo_looks_like_a_mesh_of_that_color(make_scene, stone, enc
         torch.testing.assert_close(images[row], expected, rtol=0, atol=13 * 4 * EPS32)
 
 
-@pytest.fixture
-def black_and_white(make_scene) -> Scene:
-    """Return a scene before one black and two white backgrounds."""
+def test_pixel_changes_are_added_last_and_clamped_and_keep_their_gradient_at_the_bounds(make_scene):
+    """At its bounds `torch.clamp` has none or half of a gradient, and no attack could start."""
     backgrounds = torch.ones(3, 3, 6, 6)
     backgrounds[0] = 0
-    return make_scene(backgrounds=backgrounds)
-
-
-def test_pixel_changes_are_added_last_and_clamped(black_and_white):
+    scene = make_scene(backgrounds=backgrounds)
     draws = torch.Generator().manual_seed(0)
     change = 2 * torch.rand(3, 2, 3, 6, 6, generator=draws).double() - 1
-    lights = black_and_white.lights
-    images = black_and_white.render(Conditions(lights), EVERY)
-    changed = black_and_white.render(Conditions(lights, pixels=change), EVERY)
+    images = scene.render(Conditions(scene.lights), EVERY)
+    changed = scene.render(Conditions(scene.lights, pixels=change), EVERY)
     assert torch.equal(changed, (images + change).clamp(0, 1))
-
-
-def test_pixels_at_their_bounds_keep_their_gradient(black_and_white):
-    """At its bounds `torch.clamp` has none or half of a gradient, and no attack could start."""
-    pixels = torch.zeros(3, 2, 3, 6, 6, dtype=torch.float64, requires_grad=True)
-    images = black_and_white.render(Conditions(black_and_white.lights, pixels=pixels), EVERY)
     assert (images == 0).any()
     assert (images == 1).any()
-    (gradient,) = torch.autograd.grad(images.sum(), pixels)
+    pixels = torch.zeros_like(change).requires_grad_()
+    unchanged = scene.render(Conditions(scene.lights, pixels=pixels), EVERY)
+    (gradient,) = torch.autograd.grad(unchanged.sum(), pixels)
     assert torch.equal(gradient, torch.ones_like(pixels))
 
 
@@ -190,18 +181,8 @@ def cup_image(gray: float, added: float, shadows: bool) -> Tensor:
     """Render a cup, which shades itself inside."""
     cup = solid("cup")
     mesh = Mesh.plain(cup.vertices, cup.faces, (gray, gray, gray))
-    scene = augment.build_scene(
-        [(mesh, "cup")],
-        24,
-        1,
-        encoding="linear",
-        normals="flat",
-        rasterizer="numpy",
-        width=2.4,
-        polar=35.0,
-        shadows=shadows,
-        backgrounds=[0.0],
-    )
+    view = {"width": 2.4, "polar": 35.0, "backgrounds": [0.0], "rasterizer": "numpy"}
+    scene = augment.build_scene([(mesh, "cup")], 24, normals="flat", shadows=shadows, **view)
     albedo = torch.full((1, len(mesh.faces), 3), added)
     return scene.render(Conditions(scene.lights, albedo=albedo), torch.arange(1))
 

@@ -17,13 +17,12 @@ from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.problem import SceneProblem
 from augment.augmentation_settings import count_views
 from augment.scene import render
-from augment.scene.build import build_scene, load_backgrounds
+from augment.scene.build import build_scene
 from augment.scene.objects import Conditions, Example, load_object
 from augment.scene.render import NEAR
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.camera import orbit_cameras
-from renderer.io.images import gray_or_image
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import ambient, probe
 from renderer.mesh import Mesh
@@ -71,33 +70,24 @@ def test_views_follow_from_examples_meshes_and_backgrounds(
     assert count_views(examples, meshes, backgrounds, views) == expected
 
 
-def test_a_scene_takes_paths_as_text_and_as_path(tmp_path):
+def test_a_scene_takes_paths_as_text_and_as_path_and_cuts_the_center_out_of_a_background(tmp_path):
     renderer.export_mesh(renderer.solid("pear"), tmp_path / "pear.glb")
     renderer.save_light(tmp_path / "light.json", probe("grace"))
-    Image.new("RGB", (8, 8), "teal").save(tmp_path / "behind.png")
+    pixels = np.random.default_rng(0).integers(0, 256, (8, 12, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "wide.png")
+    square = torch.from_numpy(pixels[:, 2:10]).permute(2, 0, 1) / 255
     images = []
     for kind in (str, Path):
         mesh = kind(tmp_path / "pear.glb")
-        options = {
-            "light": kind(tmp_path / "light.json"),
-            "backgrounds": [kind(tmp_path / "behind.png")],
-            "rasterizer": "numpy",
-        }
+        behind = kind(tmp_path / "wide.png")
+        options = {"light": kind(tmp_path / "light.json"), "rasterizer": "numpy"}
         for item in ((mesh, "pear"), ObjectSettings(mesh, "pear")):
-            images.append(first_image(build_scene([item], 8, **options)))
+            scene = build_scene([item], 8, backgrounds=[0.5, behind], **options)
+            gray = torch.full((3, 8, 8), 0.5)
+            assert torch.equal(scene.backgrounds, torch.stack([gray, square]))
+            images.append(first_image(scene))
     for image in images[1:]:
         assert torch.equal(image, images[0])
-
-
-@pytest.mark.parametrize("kind", [str, Path])
-def test_a_background_is_the_center_square_of_an_image(tmp_path, kind):
-    path = tmp_path / "wide.png"
-    pixels = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
-    Image.fromarray(pixels).save(path)
-    square = torch.from_numpy(pixels[:, 1:5]).permute(2, 0, 1) / 255
-    assert torch.equal(gray_or_image("backgrounds", kind(path), 4), square)
-    gray = torch.full((3, 4, 4), 0.5)
-    assert torch.equal(load_backgrounds([0.5, path], 4), torch.stack([gray, square]))
 
 
 # --------------------------------------------------------------- the degree of light

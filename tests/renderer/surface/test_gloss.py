@@ -32,7 +32,7 @@ from renderer.microfacets import reflectance
 from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
-from renderer.operators.rays import Rays, path_reflectance
+from renderer.operators.rays import LocalLightView, Rays, path_reflectance
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shaded_view import ShadedView
@@ -769,15 +769,17 @@ class GlossyView:
 
     def total(self, values: dict[str, Tensor]) -> Tensor:
         """Return the weighted sum of the radiance at fixed visibility."""
+        gloss = Gloss(values["roughness"], values["metallic"], values["specular_factor"])
+        vertices = values["vertices"]
         view = ShadedView(
             self.mesh,
             self.view,
             self.settings,
-            values["vertices"],
+            vertices,
             values["albedo"],
             SplitLight(values["environment"], [(self.LAMP, values["lamp"])]),
-            self.rays,
-            gloss=Gloss(values["roughness"], values["metallic"], values["specular_factor"]),
+            LocalLightView(self.rays, self.mesh, self.view, self.settings, vertices, gloss),
+            gloss=gloss,
         )
         return (view.radiance() * self.upstream).sum()
 
