@@ -43,6 +43,8 @@ class StepSettings(Settings):
     """
 
     needs_noise_margin: ClassVar[bool] = False
+    # Names of the fields of which at least one must not be 0, so that an attack changes something.
+    parts: ClassVar[tuple[str, ...]] = ()
 
     norm: str = setting("linf", "Norm of the ball.", choices=NORMS)
     radius: float | None = setting(
@@ -54,6 +56,14 @@ class StepSettings(Settings):
         choices=STEPS,
     )
     step_size: float = setting(0.05, "Factor of each step.", within=(1 / MAX_MAGNITUDE, MAX_SCALE))
+
+    def __post_init__(self) -> None:
+        """Check that the attack can change something."""
+        super().__post_init__()
+        if self.parts and not any(getattr(self, name) for name in self.parts):
+            raise InputError(
+                f"{', '.join(self.parts)} are all 0, so nothing can change: set one of them above 0"
+            )
 
 
 @dataclass
@@ -78,7 +88,7 @@ class SkylightSettings(StepSettings):
     )
     sun: float = setting(
         math.degrees(1),
-        "Change of the zenith angle and the azimuth of the sun for a value of 1.",
+        "Change of the sun's zenith angle and azimuth for a value of 1.",
         "degrees",
         within=(0.1, 360),
     )
@@ -93,6 +103,7 @@ class PoseSettings(StepSettings):
     """
 
     needs_noise_margin = True
+    parts = POSE_PARTS
 
     rotation: float = setting(
         10.0,
@@ -110,7 +121,7 @@ class PoseSettings(StepSettings):
     )
     view: float = setting(
         10.0,
-        "Change of the polar angle and the azimuth of the camera for a value of 1.",
+        "Change of the camera's polar angle and azimuth for a value of 1.",
         "degrees",
         within=(0, 180),
     )
@@ -119,15 +130,6 @@ class PoseSettings(StepSettings):
         "Growth of the distance of the camera for a value of 1. 0.1 is a factor of 1.1.",
         within=(0, 1),
     )
-
-    def __post_init__(self) -> None:
-        """Check that the attack can change something."""
-        super().__post_init__()
-        if not any(getattr(self, name) for name in POSE_PARTS):
-            raise InputError(
-                f"{', '.join(POSE_PARTS)} are all 0, so the pose cannot change: "
-                "set one of them above 0",
-            )
 
 
 @dataclass
@@ -139,6 +141,7 @@ class MaterialSettings(StepSettings):
     """
 
     needs_noise_margin = True
+    parts = MATERIAL_PARTS
 
     roughness: float = setting(
         0.3,
@@ -163,12 +166,6 @@ class MaterialSettings(StepSettings):
         "degrees",
         within=(0, 180),
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not any(getattr(self, name) for name in MATERIAL_PARTS):
-            message = f"{', '.join(MATERIAL_PARTS)} are all 0: nothing of the material would change"
-            raise InputError(message)
 
 
 @dataclass
@@ -393,9 +390,7 @@ class AttackSettings(ParameterSettings):
         An optimizer without gradients has no limit of its own: it takes at most one step for each
         query, which is an image that it shows to the classifier.
         """
-        if self.uses_gradients:
-            return self.max_steps
-        return self.query_limit_of_start or 0
+        return self.max_steps if self.uses_gradients else self.query_limit_of_start or 0
 
     def with_budget(self, factor: int) -> Self:
         """Return settings whose largest numbers of steps and queries are multiplied by a factor."""

@@ -263,15 +263,9 @@ class RendererSettings(Settings):
 
     def image(self, size: int) -> ImageSettings:
         """Return the settings of images with a size in pixels per side."""
-        return ImageSettings(
-            size=size,
-            samples=samples_per_side(self.samples, self.silhouettes),
-            encoding=self.encoding,
-            normals=self.normals,
-            shadows=self.shadows,
-            bounces=self.bounces,
-            silhouettes=self.silhouettes,
-        )
+        names = ("encoding", "normals", "shadows", "bounces", "silhouettes")
+        options = {name: getattr(self, name) for name in names}
+        return ImageSettings(size, samples_per_side(self.samples, self.silhouettes), **options)
 
 
 @dataclass
