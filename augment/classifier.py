@@ -192,7 +192,6 @@ class Classifier(LogitNetwork):
         normalize_light: NormalizeLight = None,
     ):
         """Check the arguments, which the docstring of the class explains. Freeze the network."""
-        errors.require_kind("name", name, str, "a string for messages")
         errors.require_kind(
             "network", network, Callable, "a torch.nn.Module, or a function from images to logits"
         )

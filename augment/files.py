@@ -133,6 +133,11 @@ def name_error(name: str | Path, reason: str) -> InputError:
     return InputError(f"name={name} {reason}", "name")
 
 
+def weights_error(path: str | Path, reason: str) -> InputError:
+    """Return an error about the argument `weights`, a file."""
+    return InputError(f"weights={path} {reason}", "weights")
+
+
 def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
     """Load a classifier from a file that contains its network.
 
@@ -262,11 +267,9 @@ def _require_plain_members(path: Path) -> None:
                 or (file_name.endswith(".json") and _uses_pickle(archive.read(name)))
                 or (file_name.endswith(".pt") and not _is_readable(archive.read(name)))
             ):
-                raise InputError(
-                    f"name={path}: its member {name} could run any code when it is read: "
-                    "export the network with tensors alone as its constants and example inputs",
-                    "name",
-                )
+                advice = "export it with tensors alone as its constants and example inputs"
+                reason = f"has the member {name}, which could run any code when it is read"
+                raise name_error(path, f"{reason}: {advice}")
 
 
 def _uses_pickle(content: bytes) -> bool:
@@ -357,16 +360,12 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
     # torch and safetensors raise many kinds of errors for damaged files.
     except Exception as error:
         if (advice := advice_for_pickles(path)) is not None:
-            raise InputError(
-                f"weights={path} cannot be loaded, because it {advice}", "weights"
-            ) from error
+            raise weights_error(path, f"cannot be loaded, because it {advice}") from error
         reason = textwrap.shorten(str(error), 200)
         if isinstance(error, pickle.UnpicklingError):
             reason = "it is not a file of weights, or contains other objects"
-        raise InputError(
-            f"weights={path} cannot be read ({reason}): save a network's state_dict() alone",
-            "weights",
-        ) from error
+        advice = "save a network's state_dict() alone"
+        raise weights_error(path, f"cannot be read ({reason}): {advice}") from error
 
 
 def _state_dict(content: Any) -> Mapping[str, Tensor]:
@@ -433,9 +432,6 @@ def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path
         unwrapped(classifier).load_state_dict(state)
     except (RuntimeError, ValueError) as error:
         reason = textwrap.shorten(str(error), 300)
-        raise InputError(
-            f"weights={source} do not fit {classifier.name} ({reason}): "
-            "use weights of that network",
-            "weights",
-        ) from error
+        misfit = f"do not fit {classifier.name} ({reason})"
+        raise weights_error(source, f"{misfit}: use weights of that network") from error
     return classifier

@@ -26,6 +26,7 @@ from augment.files import (
     name_error,
     read_weights,
     require_no_facts,
+    weights_error,
 )
 from augment.network import ChannelNormalization, Network, own_size, say_inputs, unwrapped
 from augment.progress import progress_message
@@ -319,27 +320,22 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         module = importlib.import_module(module_name)
         if not hasattr(module, function_name):
             advice = f"did you mean {nearest(function_name, [*vars(module)])}?"
-            raise InputError(
-                f"name={full_name}: {module.__file__} has no function {function_name}: {advice}",
-                "name",
-            )
+            reason = f"is not in {module.__file__}, which has no function {function_name}: {advice}"
+            raise name_error(full_name, reason)
         network, size, classes = getattr(module, function_name)()
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # The user's code may raise any exception.
-        if isinstance(error, ModuleNotFoundError) and error.name == module_name:
-            raise InputError(
-                f"name={full_name}: there is no module {module_name} in {current_folder}: "
-                f"start the command in the folder of {module_name}.py",
-                "name",
-            ) from error
-        last_call = traceback.extract_tb(error.__traceback__)[-1]
+        place = traceback.extract_tb(error.__traceback__)[-1]
         kind = f"{type(error).__name__}: {single_line(error)}"  # type: ignore[arg-type]
-        raise name_error(
-            full_name,
-            f"fails ({kind}, in line {last_call.lineno} of {last_call.filename}): "
-            "use python:package.module:function, which returns (module, size, classes)",
-        ) from error
+        reason = (
+            f"fails ({kind}, in line {place.lineno} of {place.filename}): "
+            "use python:package.module:function, which returns (module, size, classes)"
+        )
+        if isinstance(error, ModuleNotFoundError) and error.name == module_name:
+            advice = f"start the command in the folder of {module_name}.py"
+            reason = f"fails: there is no module {module_name} in {current_folder}: {advice}"
+        raise name_error(full_name, reason) from error
     # A single string is not a list of names, although Python counts it as a sequence of strings.
     is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
     has_names = is_list and all(type(item) is str for item in classes)
@@ -373,11 +369,8 @@ class Source(NamedTuple):
 def _load_python(name: str, weights: Path | None, _: NetworkFacts) -> Classifier:
     """Load a classifier by a Python function that the user wrote."""
     if weights is not None:
-        raise InputError(
-            f"weights={weights} cannot be combined with python:{name}, a function that "
-            "loads the weights itself: leave weights out",
-            "weights",
-        )
+        reason = f"cannot be combined with python:{name}, a function that loads the weights itself"
+        raise weights_error(weights, f"{reason}: leave weights out")
     return Classifier(*call_python(name), f"python:{name}")
 
 
@@ -474,11 +467,8 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
         choices.append(f"a file ({', '.join(SUFFIXES)})")
         raise name_error(name, f"is not known: choose one of {', '.join(choices)}")
     if known is None and path is not None:
-        raise InputError(
-            f"weights={path} cannot be combined with {name}, a file that contains weights: "
-            "leave weights out",
-            "weights",
-        )
+        reason = f"cannot be combined with {name}, a file that contains weights"
+        raise weights_error(path, f"{reason}: leave weights out")
     if known is not None and not known.takes_facts:
         require_no_facts(name, facts)
     with progress_message(f"loading {name}"):

@@ -322,7 +322,6 @@ SCENES = [
     *calls_of("seed", lambda x: scene([(f"solid:orange:{x}", "orange")]), "x"),
     *calls_of(r"[None]", CLASSIFIER, IMAGES[0]),
     *calls_of("permute", CLASSIFIER, IMAGES.permute(0, 2, 3, 1)),
-    *calls_of("inference_mode", torch.inference_mode()(lambda x: attack(force=x)), True),
     *calls_of("alone", attack, lambda x: {"logits": bright_or_dark(x)}),
     *calls_of("conditions", lambda x: small_scene().render(x, torch.arange(2)), None),
     *calls_of(
@@ -377,16 +376,14 @@ ATTACKS = [
     ),
     *calls_of("result", augment.check, None),
     *calls_of("result", lambda x: augment.success_by_radius(x, [1.0]), None),
-    *calls_of(
-        "scales", lambda x: augment.success_by_radius(small_result(), x), 0.5, [], ["x"], [-1]
-    ),
+    *calls_of("scales", lambda x: augment.success_by_radius(small_result(), x), 0.5, ["x"], [-1]),
     *calls_of("result", lambda x: augment.transfer(x, [CLASSIFIER]), None),
     *calls_of("classifiers", lambda x: augment.transfer(small_result(), x), ["squeezenet"], 3),
     *by_name(transferred, azimuths=[30.0, ["x"], [NAN]], objects=[[MESH], MESH]),
     *calls_of("result", lambda x: augment.save(x, "out"), None),
     *calls_of("folder", lambda x: augment.save(small_result(), x), None, 3),
     *calls_of("file.txt", lambda x: augment.save(small_result(), x), "file.txt"),
-    *by_name(saved, checks=[3, {"success": 1.0}], verify=["blender", 3]),
+    *by_name(saved, verify=["blender", 3]),
     *calls_of("folder", augment.reload, None, 3),
     *calls_of("file.txt", augment.reload, "file.txt"),
     *calls_of("missing", augment.reload, "missing"),
@@ -425,7 +422,6 @@ CLASSIFIERS = [
     *calls_of(
         "classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), 3, [], ["a", "a"], [0, 1]
     ),
-    *calls_of("name", lambda x: augment.Classifier(bright_or_dark, SIZE, CLASSES, x), None, 3),
     *calls_of("images", CLASSIFIER, BYTES, BYTES.to(torch.uint8), "x"),
     *calls_of("images", CLASSIFIER, IMAGES[0], [[1], [2, 3]]),
     *calls_of("logits", augment.Classifier(probabilities, SIZE, CLASSES), IMAGES),

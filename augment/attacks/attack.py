@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from numbers import Integral
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -141,11 +141,6 @@ def attack(
     require_kind("settings", settings, AttackSettings | None, "nb.AttackSettings(...) or None")
     require_whole("seed", seed)
     require_flag("force", force)
-    if torch.is_inference_mode_enabled():
-        raise InputError(
-            "torch.inference_mode() computes no gradients: "
-            "call norm_balls.attack outside of this mode"
-        )
     size = scene.settings.size
     lights = scene.lights
     with gradient_flags_kept(classifier):
@@ -277,7 +272,7 @@ def target_labels(
     if isinstance(target, str) and target == LEAST_LIKELY:
         return logits.argmin(2)
     view_count = logits.shape[1]
-    names = [target] * view_count
+    names: list[Any] = [target] * view_count
     if not isinstance(target, str) and not is_whole(target):
         advice = "the name or the index of a class, or one for each view"
         names = as_list("target", target, str | Integral, advice)

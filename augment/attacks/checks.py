@@ -138,8 +138,6 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     """
     require_result(result)
     scales = as_list("scales", scales, object, "a list of factors of the radii")
-    if not scales:
-        raise InputError("scales is empty: give factors of the radii, such as [0.5, 1, 2]")
     for scale in scales:
         require_number("scales", scale, 1 / MAX_SCALE, MAX_SCALE)
     draws = generator(result.seed, "sweep")
@@ -246,14 +244,14 @@ def transfer(
                     f"classifiers[{index}]",
                     dtype=images.dtype,
                 )
-            change = partial(_resized, size=classifier.size)
-            rows.append({"network": classifier.name, **classify(classifier, change)})
+            resized = partial(_resized, size=classifier.size)
+            rows.append({"network": classifier.name, **classify(classifier, resized)})
     for azimuth in azimuths:
-        change = partial(_turned, angle=azimuth)
-        rows.append({"azimuth": f"{azimuth:+g}°", **classify(attacked, change)})
+        turned = partial(_turned, angle=azimuth)
+        rows.append({"azimuth": f"{azimuth:+g}°", **classify(attacked, turned)})
     for item in objects:
-        change = partial(replace, shown=item)
-        rows.append({"mesh": Path(item.name).name, **classify(attacked, change)})
+        exchanged = partial(replace, shown=item)
+        rows.append({"mesh": Path(item.name).name, **classify(attacked, exchanged)})
     return rows
 
 
@@ -279,7 +277,7 @@ def require_transferable(
 
 @dataclass(frozen=True)
 class Successes:
-    """Masks of the examples for which an attack has succeeded. `add` changes them in place.
+    """Masks of the examples for which an attack has succeeded, which the methods change in place.
 
     Attributes:
         with_noise: Whether each of the E examples meets the criterion, also with
@@ -375,13 +373,16 @@ def _adversaries(result: AttackResult) -> tuple[Examples, list[Adversary], list[
     """
     problem = result.problem
     examples = torch.nonzero(result.clean_correct & result.success)[:, 0]
-    states: list[list[Adversary]] = [[], []]
-    for state, values in zip(states, (problem.start, result.minimum.values), strict=True):
+
+    def state(values: Values) -> list[Adversary]:
         conditions = problem.conditions(values, problem.all_examples)
+        adversaries = []
         for example in examples.tolist():
             images = result.images_in_views_before[example], result.images_in_views[example]
-            state.append(Adversary.of(problem.scene, example, conditions, *images))
-    return examples, *states
+            adversaries.append(Adversary.of(problem.scene, example, conditions, *images))
+        return adversaries
+
+    return examples, state(problem.start), state(result.minimum.values)
 
 
 def _classify(

@@ -1,7 +1,7 @@
 """Files of an attack: a figure and a folder for each example, and all numbers as JSON lines."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ from torch import Tensor
 from augment.attack_settings import LINES
 from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
 from augment.attacks.objective import as_jpeg
-from augment.attacks.result import CHECKED, AttackResult, predictions, require_result, warnings
+from augment.attacks.result import AttackResult, predictions, require_result, warnings
 from augment.progress import progress
-from renderer.errors import InputError, as_folder, as_list, require_choice, require_kind
+from renderer.errors import as_folder, as_list, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.files import atomic_write
 from renderer.io.images import Tile, draw_grid, tiles_of, write_image
@@ -87,11 +87,6 @@ def save(
     """
     require_result(result)
     folder = as_folder("folder", folder)
-    if checks is not None:
-        require_kind("checks", checks, Mapping, "the dictionary that norm_balls.check returns")
-        if missing := CHECKED - checks.keys():
-            names = ", ".join(sorted(missing))
-            raise InputError(f"checks lacks the keys {names}: give what norm_balls.check returns")
     verify = [verify] if isinstance(verify, str) else verify
     verify = as_list("verify", verify, str, "a list of renderers")
     require_renderers(verify)

@@ -58,6 +58,7 @@ MIN_GRADIENT = 1e-30
 NOISE_DRAWS = 3
 
 
+@dataclass(frozen=True)
 class Rows:
     """Base of data classes whose tensors have one row for each example."""
 
@@ -65,7 +66,7 @@ class Rows:
         """Return a copy with changed tensors."""
         tensors = {name: item for name, item in vars(self).items() if isinstance(item, Tensor)}
         changed = {name: change(tensor) for name, tensor in tensors.items()}
-        return replace(self, **changed)  # type: ignore[type-var]
+        return replace(self, **changed)
 
     def select(self, rows: Tensor | slice) -> Self:
         """Return some of the rows."""

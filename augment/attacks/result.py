@@ -54,8 +54,6 @@ PAUSE = 1200
 ZERO_GRADIENT = (
     "the first gradient of some examples is exactly zero: optimizer=random_search needs none"
 )
-# Keys of the result of `check` that `warnings` reads. `nb.save` refuses checks without them.
-CHECKED = {"success", "success_without_noise", "random_search", "cost_fell", "zero_gradient"}
 
 
 @dataclass(frozen=True, repr=False)

@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,47 +23,48 @@ CLASSES = ("orange", "lime", "sky", "night")
 # --------------------------------------------------------------- numbers
 
 
-@dataclass
-class Saved:
-    """A saved attack on two examples, with the target lime."""
-
-    result: AttackResult
-    checks: dict
-    margin: float
-    lines: list[dict]
-    """One for each example."""
-    last_line: dict
-
-
-@pytest.fixture(scope="module", params=[0.5, 100.0])
-def saved(request, attacked, tmp_path_factory) -> Saved:
-    """Save an attack with a margin."""
+@pytest.mark.parametrize("margin", [0.5, 100.0])
+def test_the_lines_of_an_attack_have_its_numbers_and_its_checks(
+    attacked, by_color, tmp_path, margin
+):
     scene = {"backgrounds": [0.4, 0.6]}
-    options = {"target": "lime", "max_steps": 4, "margin": request.param}
-    result = attacked("lighting", scene, **options)
+    result = attacked("lighting", scene, target="lime", max_steps=4, margin=margin)
     checks = augment.check(result)
-    folder = tmp_path_factory.mktemp("saved")
-    augment.save(result, folder, checks)
-    *lines, last_line = [json.loads(line) for line in (folder / LINES).read_text().splitlines()]
-    assert len(lines) == 2
-    return Saved(result, checks, request.param, lines, last_line)
-
-
-def test_the_last_line_holds_the_checks(saved):
-    expected = {"checks": saved.checks, "warnings": warnings(saved.checks)}
-    assert saved.last_line == json.loads(json.dumps(expected))
-
-
-def test_each_example_has_a_line_with_the_numbers_of_its_descent(saved):
-    result = saved.result
-    for example, line in enumerate(saved.lines):
-        assert line["example"] == example
+    augment.save(result, tmp_path, checks)
+    *lines, last_line = [json.loads(line) for line in (tmp_path / LINES).read_text().splitlines()]
+    assert last_line == json.loads(json.dumps({"checks": checks, "warnings": warnings(checks)}))
+    assert [line["example"] for line in lines] == [0, 1]
+    for example, line in enumerate(lines):
         assert line["label"] == ["orange"]
         for name in ("success", "success_before", "steps", "cost", "cost_before"):
             assert line[name] == getattr(result.minimum, name)[example].item()
         change = result.minimum.values[example] - result.problem.start[example]
         assert line["largest_change"] == {"lighting": change.abs().max().item()}
         assert line["largest_change"]["lighting"] > 0
+        for suffix, logits in (("_before", result.logits_before), ("", result.logits)):
+            probabilities = logits[example].softmax(0)
+            assert line[f"predicted{suffix}"] == [CLASSES[probabilities.argmax()]]
+            assert line[f"confidence{suffix}"] == [pytest.approx(probabilities.max().item())]
+        assert line["clean_correct"] is (line["predicted_before"] == ["orange"])
+        # A success with margin leads all other classes by the margin.
+        lead = result.logits[example, 1] - result.logits[example, [0, 2, 3]].max()
+        assert line["success_with_margin"] is bool(lead >= margin)
+        assert result.success_with_margin[example].item() is bool(lead >= margin)
+        assert set(line["versions"]) == {"float", "8 bits", "JPEG 90", "reload"}
+        assert line["versions"]["reload"]["largest_difference"] < 1e-5
+        images = result.images_in_views[example]
+        rounded = (images * 255).round() / 255
+        probabilities = by_color(rounded).softmax(1)[0]
+        predicted = CLASSES[probabilities.argmax()]
+        differences = (rounded - images).abs()
+        assert line["versions"]["8 bits"] == {
+            "success": predicted == "lime",
+            "success_without_noise": predicted == "lime",
+            "predicted": [predicted],
+            "confidence": [pytest.approx(probabilities.max().item(), abs=1e-5)],
+            "largest_difference": pytest.approx(differences.max().item(), abs=1e-7),
+            "mean_difference": pytest.approx(differences.mean().item(), abs=1e-7),
+        }
 
 
 @pytest.mark.parametrize("parameter", ["lighting", "pixels"])
@@ -88,46 +89,6 @@ def test_no_version_of_an_example_that_was_wrong_before_is_a_success(by_color, t
         assert counted["predicted"] == ["orange"]
         assert not counted["success"]
         assert not counted["success_without_noise"]
-
-
-def test_each_line_has_the_predictions_before_and_after(saved):
-    for suffix, logits in (("_before", saved.result.logits_before), ("", saved.result.logits)):
-        for line, probabilities in zip(saved.lines, logits.softmax(1), strict=True):
-            assert line[f"predicted{suffix}"] == [CLASSES[probabilities.argmax()]]
-            assert line[f"confidence{suffix}"] == [pytest.approx(probabilities.max().item())]
-    for line in saved.lines:
-        assert line["clean_correct"] is (line["predicted_before"] == ["orange"])
-
-
-def test_a_success_with_margin_leads_all_other_classes_by_the_margin(saved):
-    for example, line in enumerate(saved.lines):
-        logits = saved.result.logits[example]
-        lead = logits[1] - logits[[0, 2, 3]].max()
-        expected = bool(lead >= saved.margin)
-        assert line["success_with_margin"] is expected
-        assert saved.result.success_with_margin[example].item() is expected
-
-
-def test_each_line_tells_how_the_image_of_8_bits_is_classified(saved, by_color):
-    for images, line in zip(saved.result.images_in_views, saved.lines, strict=True):
-        rounded = (images * 255).round() / 255
-        probabilities = by_color(rounded).softmax(1)[0]
-        predicted = CLASSES[probabilities.argmax()]
-        differences = (rounded - images).abs()
-        assert line["versions"]["8 bits"] == {
-            "success": predicted == "lime",
-            "success_without_noise": predicted == "lime",
-            "predicted": [predicted],
-            "confidence": [pytest.approx(probabilities.max().item(), abs=1e-5)],
-            "largest_difference": pytest.approx(differences.max().item(), abs=1e-7),
-            "mean_difference": pytest.approx(differences.mean().item(), abs=1e-7),
-        }
-
-
-def test_each_line_has_the_usual_versions_of_the_image(saved):
-    for line in saved.lines:
-        assert set(line["versions"]) == {"float", "8 bits", "JPEG 90", "reload"}
-        assert line["versions"]["reload"]["largest_difference"] < 1e-5
 
 
 # --------------------------------------------------------------- light and shape

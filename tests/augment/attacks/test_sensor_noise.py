@@ -47,14 +47,15 @@ def nervous(threshold: float) -> augment.Classifier:
     return augment.Classifier(logits, SIZE, ("orange", "other"), "nervous")
 
 
-def counted(images: Tensor, classifier: augment.Classifier, **settings) -> Tensor:
-    """Return which images (A, V, 3, SIZE, SIZE) count as no orange, by the library."""
+def counted(
+    images: Tensor, classifier: augment.Classifier, criterion: Criterion | None = None
+) -> Tensor:
+    """Return which images (A, V, 3, SIZE, SIZE) count, by default as no orange."""
     views = images.shape[:2]
-    criterion = Criterion(torch.zeros(views, dtype=torch.long))
+    criterion = criterion or Criterion(torch.zeros(views, dtype=torch.long))
     predicted = classifier(images.flatten(0, 1)).argmax(1).view(views)
-    rows = torch.arange(len(images))
-    objective = Objective(classifier, criterion, augment.AttackSettings(**settings))
-    return objective.fooled_in_views(images, predicted, rows)
+    objective = Objective(classifier, criterion, augment.AttackSettings(quantized=False))
+    return objective.fooled_in_views(images, predicted, torch.arange(len(images)))
 
 
 def survival(images: Tensor, classifier: augment.Classifier, deviation: float) -> float:
@@ -88,7 +89,7 @@ def test_an_image_counts_with_the_probability_of_gaussian_noise_in_three_draws(w
     lead, images = with_lead
     expected = norm.cdf(lead) ** NOISE_DRAWS
     tolerance = 4 * math.sqrt(expected * (1 - expected) / len(images))
-    rate = counted(images, nervous(0.0), quantized=False).double().mean().item()
+    rate = counted(images, nervous(0.0)).double().mean().item()
     assert rate == pytest.approx(expected, abs=tolerance)
 
 
@@ -129,7 +130,7 @@ def test_each_view_is_counted_by_itself():
     """The first view is far above the threshold, the second hardly, and the third below."""
     views = [GRAY + change * PATTERN for change in (0.1, 1e-4, -0.1)]
     images = torch.stack(views).expand(40, -1, -1, -1, -1)
-    rates = counted(images, nervous(AT_GRAY), quantized=False).double().mean(0)
+    rates = counted(images, nervous(AT_GRAY)).double().mean(0)
     far, close, below = rates.tolist()
     assert far == 1
     assert 0 < close < 0.5
@@ -140,12 +141,8 @@ def test_each_view_is_counted_by_itself():
 def test_a_target_must_be_reached_with_noise(source):
     """Another class is not enough, and the image is close to the threshold."""
     images = (GRAY + 1e-4 * PATTERN)[None, None]
-    predicted = torch.ones(1, 1, dtype=torch.long)
     criterion = Criterion(torch.tensor([[source]]), torch.tensor([[1]]))
-    settings = augment.AttackSettings(quantized=False)
-    rows = torch.zeros(1, dtype=torch.long)
-    objective = Objective(nervous(AT_GRAY), criterion, settings)
-    assert not objective.fooled_in_views(images, predicted, rows).any()
+    assert not counted(images, nervous(AT_GRAY), criterion).any()
 
 
 # --------------------------------------------------------------- attacks
