@@ -283,18 +283,9 @@ def as_integers(name: str, value: object) -> Tensor:
     """
     import torch
 
-    if isinstance(value, torch.Tensor):
-        is_real = not value.is_complex() and value.dtype != torch.bool
-        has_integers = is_real and not value.is_floating_point()
-        if has_integers or not value.numel():
-            return value.long()
-    else:
-        array = _as_numbers(value)
-        if array is not None and (array.dtype.kind in "iu" or not array.size):
-            return torch.as_tensor(array, dtype=torch.int64)
-    raise InputError(
-        f"{name} is {describe(value)}: give a tensor, an array or a list of whole numbers", name
-    )
+    if isinstance(value, torch.Tensor) and value.dtype in (torch.int64, torch.int32, torch.uint8):
+        return value.long()
+    return torch.as_tensor(_as_numbers(as_array(name, value, "iu")), dtype=torch.int64)
 
 
 def _as_numbers(value: object) -> np.ndarray | None:

@@ -13,11 +13,13 @@ from __future__ import annotations
 import math
 import operator
 import os
+import re
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache, partial
+from inspect import formatannotation
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from renderer.errors import (
@@ -234,7 +236,11 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
     if isinstance(value, str) and not value and not facts.may_be_empty:
         raise InputError(f"{name} is empty: give a name", name)
     if facts.is_pair:
-        _check_pair(name, value, facts)
+        lower = -math.inf if facts.minimum is None else facts.minimum
+        upper = math.inf if facts.maximum is None else facts.maximum
+        if len(value) != 2 or not lower <= value[0] <= value[1] <= upper:
+            expected = f"give [minimum, maximum] from {lower:g} to {upper:g}"
+            raise InputError(f"{name}={list(value)}: {expected}", name)
         return
     items = list(value) if _is_list(value) else [value]
     if facts.length not in (None, len(items)):
@@ -251,18 +257,6 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
             raise InputError(f"{name}={item} must be {range_in_words}", name)
 
 
-def _check_pair(name: str, value: Any, facts: Facts) -> None:
-    """Check that a list is a pair [minimum, maximum] of numbers within the range of its field."""
-    lower_limit = -math.inf if facts.minimum is None else facts.minimum
-    upper_limit = math.inf if facts.maximum is None else facts.maximum
-    if len(value) == 2 and lower_limit <= value[0] <= value[1] <= upper_limit:
-        return
-    raise InputError(
-        f"{name}={list(value)}: give [minimum, maximum] from {lower_limit:g} to {upper_limit:g}",
-        name,
-    )
-
-
 def require_field_types(settings: Any, *unchecked: str) -> None:
     """Check that the fields of a dataclass have the types with which they are annotated.
 
@@ -277,7 +271,9 @@ def require_field_types(settings: Any, *unchecked: str) -> None:
 def _check_type(name: str, value: Any, hint: Any) -> None:
     """Check that a value has the annotated type of its field."""
     if not _fits(value, hint):
-        raise InputError(f"{name} is {describe(value)}: give {_expected(hint)}", name)
+        # `formatannotation` puts the module before the name of a class.
+        expected = re.sub(r"\b[\w.]+\.", "", formatannotation(hint))
+        raise InputError(f"{name} is {describe(value)}: give a value of type {expected}", name)
 
 
 # Functions that tell whether a value is accepted for a
@@ -310,29 +306,6 @@ def _is_list(value: object) -> bool:
     """Tell whether a value is a list. An array or a tensor with at least one axis counts as one."""
     is_array = getattr(value, "ndim", 0) > 0
     return not isinstance(value, str) and (is_array or isinstance(value, Sequence))
-
-
-# Words with which errors ask for a value of each type.
-_NOUNS: dict[Any, str] = {
-    int: "a whole number",
-    float: "a number",
-    bool: "True or False",
-    str: "a string",
-    list: "a list",
-    type(None): "None",
-}
-
-
-def _expected(hint: Any) -> str:
-    """Describe the values that a type annotation allows, for an error."""
-    if get_origin(hint) in (Union, types.UnionType):
-        return " or ".join(_expected(option) for option in get_args(hint))
-    if get_origin(hint) is list:
-        (item_hint,) = get_args(hint)
-        plural = {float: " of numbers", int: " of whole numbers", str: " of strings"}
-        return "a list" + plural.get(item_hint, "")
-    kind = get_origin(hint) or hint
-    return _NOUNS.get(kind) or f"{kind.__name__}(...)"
 
 
 @dataclass(frozen=True)

@@ -73,41 +73,33 @@ def _write(state: dict[str, Any], path: Path, previous: Path | None = None) -> N
 def load(path: Path) -> dict[str, Any]:
     """Read a checkpoint that `save` wrote, and check its hash."""
     require_file(path, "give a run folder that holds a checkpoint")
-    try:
+    with _refused_if_damaged(path):
         state = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(state, dict):
-            raise ValueError("it is not a dictionary")
-        stored_hash = state.pop(HASH, None)
-        if stored_hash != content_hash(state):
+        if state.pop(HASH, None) != content_hash(state):
             raise ValueError("its content does not match its hash")
-    except Exception as error:
-        # `torch.load` raises errors of many types for a damaged file.
-        raise InputError(
-            f"checkpoint {path} is damaged or not a checkpoint: use another checkpoint of the run",
-        ) from error
-    return checked(state, path)
+        return _checked(state)
 
 
-def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Check that the content of a checkpoint has an architecture and finite weights.
-
-    The content of a later version of the library raises InputError, too.
-    """
+@contextmanager
+def _refused_if_damaged(path: Path) -> Iterator[None]:
+    """Turn any error of a block that reads a checkpoint into an InputError."""
     try:
-        version = state["architecture"].get("version", 1)
-        is_finite = all(value.isfinite().all() for value in state["model"].values())
-    except (LookupError, AttributeError) as error:
+        yield
+    # torch, safetensors and json raise errors of many types for a damaged file.
+    except Exception as error:
+        reason = textwrap.shorten(single_line(error), LONGEST_REASON)
         raise InputError(
-            f"checkpoint {path} has no architecture or weights: use another checkpoint",
+            f"checkpoint {path} is damaged or not a checkpoint ({reason}): use another one"
         ) from error
+
+
+def _checked(state: dict[str, Any]) -> dict[str, Any]:
+    """Check that a checkpoint has finite weights, and is not of a later version of the library."""
+    version = state["architecture"].get("version", 1)
     if version not in range(VERSION + 1):
-        raise InputError(
-            f"checkpoint {path} has version {version!r}, later than {VERSION}: update the library"
-        )
-    if not is_finite:
-        raise InputError(
-            f"checkpoint {path} has NaN or infinity in its weights: use another checkpoint"
-        )
+        raise ValueError(f"a later version of this library wrote it, with the format {version!r}")
+    if not all(value.isfinite().all() for value in state["model"].values()):
+        raise ValueError("its weights have NaN or infinity")
     return state
 
 
@@ -328,15 +320,9 @@ def write_published(path: Path, state: Mapping[str, Any]) -> None:
 def _load_published(path: Path) -> dict[str, Any]:
     """Read a file of `write_published`. The weights, in single precision, are in "model"."""
     weights: dict[str, Tensor] = {}
-    try:
-        with safe_open(path, "pt") as file:
-            facts = {name: json.loads(text) for name, text in file.metadata().items()}
-            for name in file.keys():  # noqa: SIM118 (The file is no mapping.)
-                value = file.get_tensor(name)
-                weights[name] = value.float() if value.is_floating_point() else value
-    except Exception as error:
-        # safetensors and json raise errors of many types for a damaged file.
-        raise InputError(
-            f"checkpoint {path} is damaged or has no architecture: use another checkpoint",
-        ) from error
-    return checked({**facts, "model": weights}, path)
+    with _refused_if_damaged(path), safe_open(path, "pt") as file:
+        facts = {name: json.loads(text) for name, text in file.metadata().items()}
+        for name in file.keys():  # noqa: SIM118 (The file is no mapping.)
+            value = file.get_tensor(name)
+            weights[name] = value.float() if value.is_floating_point() else value
+        return _checked({**facts, "model": weights})

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from augment.classifier import Classifier, class_index, nearest
-from augment.scene.objects import name_mesh
+from augment.scene.objects import MESHES_IN_MEMORY, name_mesh
 from augment.settings import ObjectSettings
 from renderer.errors import InputError, as_list, describe
 from renderer.mesh import Mesh
@@ -90,6 +90,8 @@ def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) ->
 
 def _unknown_class_error(mesh: str, classes: Sequence[str]) -> InputError:
     """Create the error for a mesh whose class is unknown."""
+    if mesh in MESHES_IN_MEMORY:
+        return InputError(f"an nb.Mesh has no class: give (mesh, {classes[0]!r}) or label")
     solid = solid_name(mesh)
     solids = (*SOLIDS, *HARD_NEGATIVES)
     if not solid and not Path(mesh).exists():
@@ -131,12 +133,10 @@ def require_others(
     """
     for key, item in hard_negatives.items():
         is_labeled = item.label not in ("", OTHER) and not item.label.startswith(OTHER_PREFIX)
+        name = class_of_name(name_of_mesh(item.mesh), classes)
         if is_labeled:
-            name: str | None = class_name(classes, item.label, f"label of {key}")
-        else:
-            name = class_of_name(name_of_mesh(item.mesh), classes)
-        is_permitted = is_labeled and len(labels) > 1
-        if name in labels and not is_permitted:
+            name = class_name(classes, item.label, f"label of {key}")
+        if name in labels and not (is_labeled and len(labels) > 1):
             raise InputError(
                 f"{key} is {item.mesh}, which is of the positive class {name}: remove it", key
             )
@@ -149,10 +149,8 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
     """
     if settings.label is None:
         found = classes_of_meshes(settings.meshes, classes, "meshes")
-        meshes = [
-            {**(item if isinstance(item, dict) else {"mesh": item}), "label": name}
-            for item, name in zip(settings.meshes, found, strict=True)
-        ]
+        mappings = [item if isinstance(item, dict) else {"mesh": item} for item in settings.meshes]
+        meshes = [item | {"label": name} for item, name in zip(mappings, found, strict=True)]
         # A dictionary has each name once, in the order of the meshes.
         names = [*dict.fromkeys(found)]
     else:
@@ -197,27 +195,3 @@ def as_mappings(
             mapping["label"] = classifier.classes[classifier.label(mapping["label"])]
         mappings.append(mapping)
     return mappings
-
-
-def find_positive_classes(
-    label: str | int | None,
-    meshes: Sequence[MeshItem],
-    mappings: Sequence[dict[str, Any]],
-    classifier: Classifier,
-) -> list[str]:
-    """Return the names of the classes that the meshes of a caller show.
-
-    Without a label, each class of the meshes is listed once, in their order. `mappings` come from
-    `as_mappings`.
-    """
-    if label is not None:
-        return [classifier.classes[classifier.label(label)]]
-    for index, item in enumerate(meshes):
-        if isinstance(item, Mesh):
-            name = classifier.classes[0]
-            raise InputError(
-                f"meshes[{index}] is an nb.Mesh without a class: give (mesh, {name!r})"
-            )
-    names = classes_of_meshes(mappings, classifier.classes, "meshes")
-    # A dictionary has each name once, in the order of the meshes.
-    return list(dict.fromkeys(names))

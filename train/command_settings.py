@@ -101,10 +101,7 @@ class AttackSceneSettings(SceneSettings):
 
     views: int = setting_like(SceneSettings, "views", 1)
     search: int = setting(
-        10,
-        "Number of cameras to try for a mesh that is misclassified, in several lightings and in "
-        "front of light gray.",
-        within=(0, MAX_VIEWS),
+        10, "Cameras to try for a misclassified mesh, in several lightings.", within=(0, MAX_VIEWS)
     )
 
     def __post_init__(self) -> None:
@@ -142,14 +139,12 @@ class AttackExperimentSettings(NetworkSettings):
     network: str = setting("efficientnet_lite0", f"The attacked network: {NETWORKS}.")
     label: Any = setting(
         None,
-        "Class of the meshes, by its name or index. null: the class that the name of each mesh's "
-        "file tells. A mapping {mesh, label} names its own class.",
+        "Class of the meshes, by name or index. null: the class that the name of each file tells.",
         is_text=True,
     )
     target: Any = setting(
         None,
-        "Class to reach: null (any misclassification), least_likely, a class, or a list of "
-        "classes, one per view.",
+        "Class to reach: null (any other), least_likely, a class, or a list, one per view.",
         is_text=True,
     )
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
@@ -160,8 +155,7 @@ class AttackExperimentSettings(NetworkSettings):
     )
     reload: str | None = setting(
         None,
-        "Folder of an adversary. Its predictions are printed or, with attack=..., it is attacked "
-        "further.",
+        "Folder of an adversary, to print its predictions or, with attack=..., attack it further.",
     )
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
@@ -226,7 +220,7 @@ class LabSettings(Settings):
     meshes: list[Any] = setting(LAB_MESHES, "The objects: by default, 6 oranges and 10 others.")
     setups: int = setting(
         180,
-        "Number of draws of lighting, camera and pose. With one label, each has two renders.",
+        "Draws of lighting, camera and pose. With one label, each has two renders.",
         within=(1, MAX_IMAGES),
     )
     patterns: list[str] = setting(
@@ -252,17 +246,13 @@ class LabSettings(Settings):
     )
     albedo: list[float] = pair([0.04, 0.16], "albedo of table and wall.", (0, 1))
     walls: float = setting(
-        0.0,
-        "Fraction of the setups with a wall behind the object, if no projector stands behind it.",
-        within=(0, 1),
+        0.0, "Fraction of the setups with a wall behind the object.", within=(0, 1)
     )
     roughness: list[float] = pair(
         [0.5, 0.5], "roughness of the object. 0.1 is glossy, 1 is matte.", (0.05, 1)
     )
     exposure: float = setting(
-        1.0,
-        "Factor of the radiance. With 1, a radiance of 1 is white.",
-        within=(1 / MAX_SCALE, MAX_SCALE),
+        1.0, "Factor of the radiance, of which 1 is white.", within=(1 / MAX_SCALE, MAX_SCALE)
     )
     size: int = setting(64, "Pixels per side.", within=(1, MAX_SIZE))
     spp: int = setting(32, "Paths per pixel and light.", within=(1, 10**5))
@@ -306,8 +296,7 @@ class AuditSettings(NetworkSettings):
     )
     label: Any = setting(
         None,
-        "Class of the meshes, by its name or index. null: the class that the name of the mesh's "
-        "file tells. Each class has an audit of its own.",
+        "Class of the meshes, by name or index. null: the class that the name of each file tells.",
         is_text=True,
     )
     meshes: list[Any] = setting([], "Meshes of the class. []: only `unlabeled` is audited.")
@@ -317,9 +306,7 @@ class AuditSettings(NetworkSettings):
         "light of a projector? At most 100 times `budget` of them are attacked.",
     )
     hard_negatives: list[Any] = setting(
-        [],
-        "Meshes of other classes, in the same lighting. []: generated fruit and balls, but "
-        "none with the name of the class.",
+        [], "Meshes of other classes, in the same lighting. []: generated fruit and balls."
     )
     photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")
     laboratory: str | None = setting(
@@ -328,8 +315,8 @@ class AuditSettings(NetworkSettings):
     environments: list[str] = setting([*ENVIRONMENTS], "Environment lightings, or maps (.hdr ...).")
     budget: float = setting(
         1.0,
-        "Factor of the number of views, lightings and renders. "
-        "With 1, EfficientNet-Lite0 takes 18 minutes on one core.",
+        "Factor of views, lightings and renders. With 1, EfficientNet-Lite0 takes 18 minutes on "
+        "a core.",
         within=(0.01, 100),
     )
     overwrite: bool = setting(False, "Start anew in a folder that holds an audit or other results.")
@@ -363,9 +350,7 @@ class EvaluateSettings(NetworkSettings):
     """Settings of the command pnb-evaluate, which scores a network on photographs."""
 
     photos: str = setting(
-        REQUIRED,
-        "Folder of photographs: a folder per class, or images of `label`. pretrained/laboratory "
-        "is installed.",
+        REQUIRED, "Folder of photographs: a folder per class, or images of `label`."
     )
     run: str | None = setting(
         None,
@@ -382,7 +367,7 @@ class EvaluateSettings(NetworkSettings):
     out: str = setting(f"runs/photographs/{TIME_FOLDER}", "Folder of the scores.")
     false_positive_rate: float | None = setting(
         None,
-        "Rate for which a threshold on the log-odds of `label` is chosen on calibrate.",
+        "Rate for which a threshold of `label` is chosen on calibrate.",
         within=(1e-6, 1 - 1e-6),
     )
     calibrate: str | None = setting(
@@ -439,23 +424,19 @@ class FitSettings(Settings):
     )
     fov: float | None = setting(
         None,
-        "Angle across a square that is 1.6 times as wide as the object. null: orthographic.",
+        "Angle across a square 1.6 times as wide as the object. null: orthographic.",
         "degrees",
         within=(0.1, 120),
     )
     albedo_scale: float = setting(
-        1.0,
-        "Factor of the albedo of the mesh. Twice as much halves the lighting.",
-        within=(1e-3, 1e3),
+        1.0, "Factor of the albedo. Twice as much halves the lighting.", within=(1e-3, 1e3)
     )
     encoding: str = setting(
-        "srgb",
-        "Encoding of the photograph, the colors of the mesh and the images of the printed attack.",
-        choices=ENCODINGS,
+        "srgb", "Encoding of the photograph and of the colors of the mesh.", choices=ENCODINGS
     )
     bounces: int = setting(
         3,
-        "Number of bounces of light between the surfaces of the mesh. 0: also without shadows.",
+        "Bounces of light between the surfaces of the mesh. 0: also no shadows.",
         within=(0, MAX_BOUNCES),
     )
     label: str | None = setting(

@@ -47,7 +47,6 @@ GROUPS = ("source", "mesh", "class")
 # needs this size.
 MIN_SIZE = 5
 MAX_IMAGES = 10**6
-MAX_WORKERS = 1024
 MAX_SEED = 2**63 - 1
 # Explanation of a list of meshes in settings.
 MESHES = (
@@ -79,8 +78,7 @@ class DataSettings(Settings):
     name: str = setting("shapes", "The data set.", choices=DATA_SETS)
     validation: float | None = setting(
         None,
-        "Fraction of the training images of each class to validate on. "
-        "null: what `network` left out, otherwise 0.1.",
+        "Fraction of each class to validate on. null: what `network` left out, or 0.1.",
         above=0,
         below=1,
     )
@@ -93,9 +91,7 @@ class DataSettings(Settings):
         below=1,
     )
     workers: int = setting(
-        2,
-        "Processes that read images larger than 64 pixels per side, which stay on disk.",
-        within=(0, MAX_WORKERS),
+        2, "Processes that read images of more than 64 pixels per side.", within=(0, 1024)
     )
     train_per_class: int = setting(
         300, "Training images per class of shapes.", within=(1, MAX_IMAGES)
@@ -119,7 +115,7 @@ class TrainingSceneSettings(SceneSettings):
     backgrounds: list[Any] = setting_like(SceneSettings, "backgrounds", [0.0, 0.25, 0.5, 0.75, 1.0])
     views: int | None = setting(
         None,
-        "Number of cameras per mesh, at equal azimuths. null: as many as augment.examples needs.",
+        "Cameras per mesh, at equal azimuths. null: as augment.examples needs.",
         within=(1, MAX_VIEWS),
     )
 
@@ -134,9 +130,8 @@ class EvaluationSettings(Settings):
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     laboratory_setups: int = setting(
         0,
-        "If photos is null: number of draws of light and camera of path-traced renders that are "
-        "kept aside, of other instances and patterns than in training. Both networks are scored "
-        "on them. A multiple of 5. 0: none.",
+        "If photos is null: number of path-traced setups (light and camera) of other objects "
+        "and patterns than in training, to score both networks on. A multiple of 5. 0: none.",
         within=(0, MAX_IMAGES),
     )
 
@@ -157,14 +152,11 @@ class NetworkSettings(Settings):
     network: str | None = setting(None, f"The network: {NETWORKS}.")
     size: int | None = setting(
         None,
-        "Pixels per side of the classifier's images. null: that of its source, and 224 if a file "
-        "records none.",
+        "Pixels per side of the network's images. null: those of its source, or 224.",
         within=(1, MAX_SIZE),
     )
     weights: str | None = setting(
-        None,
-        "File of the classifier's weights: a state dict or a checkpoint, with any number of "
-        "classes. null: its own weights, or a download.",
+        None, "File of the network's weights (a state dict or a checkpoint). null: its own."
     )
     classes: Any = setting(
         None,
@@ -214,9 +206,7 @@ class ExperimentSettings(NetworkSettings):
         "python:package.module:function. null: random weights.",
     )
     size: int | None = setting(
-        None,
-        "Pixels per side. null: the size of `network`, otherwise 32.",
-        within=(MIN_SIZE, MAX_SIZE),
+        None, "Pixels per side. null: those of `network`, or 32.", within=(MIN_SIZE, MAX_SIZE)
     )
     meshes: list[Any] = setting(["solid:orange:0", "solid:orange:1"], MESHES)
     hard_negatives: list[Any] = setting(
@@ -251,9 +241,7 @@ class ExperimentSettings(NetworkSettings):
         [], "Other kinds of renders to train first, in sub-folders, and to show in the same table."
     )
     photographs_first: bool = setting(
-        False,
-        "First train with experiment=photographs, in the sub-folder `photographs`, and begin with "
-        "its result instead of `network`.",
+        False, "First train with experiment=photographs in a sub-folder, and begin with its result."
     )
     data: DataSettings = setting(DataSettings, "The data set.")
     augment: AugmentationSettings = setting(

@@ -17,10 +17,6 @@ NEEDS_INITIAL_NETWORK = (
 # Value of train.freeze with which only the last layer is trained, as by Kirichenko
 # et al. (2023).
 ALL_BUT_LAST = "all_but_last"
-# Choices of train.schedule.
-SCHEDULES = ("step", "cosine", "one_cycle")
-# Choices of train.flips.
-FLIPS = ("random", "alternating")
 # Choices of train.augmentation that are transforms of torchvision.
 TRANSFORMS = ("color_jitter", "trivial_augment", "augmix", "color_jitter+augmix")
 # Augmentation by the light of a projector; see `train.training.augmentations`.
@@ -29,8 +25,6 @@ RELIGHT = "relight"
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT)
 # Choices of train.optimizer.
 OPTIMIZERS = ("sgd", "adamw")
-# Choices of train.compile.
-COMPILE = ("auto", "always", "never")
 
 
 @dataclass
@@ -70,9 +64,8 @@ class TrainSettings(Settings):
     learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
     feature_norm: float | None = setting(
         None,
-        "Norm of the features for which learning_rate is meant. If only the last layer learns, "
-        "the rate is multiplied by it and divided by the norm of the features of the network. "
-        "null: the rate does not change.",
+        "Norm of the features for which learning_rate is meant. If only the last layer learns, the "
+        "rate is multiplied by it / the norm of the network's features. null: it is not.",
         above=0,
         maximum=MAX_SCALE,
     )
@@ -88,25 +81,22 @@ class TrainSettings(Settings):
     )
     schedule: str = setting(
         "step",
-        "Schedule of the learning rate. step: times 0.2 at 30%, 60% and 80% of the training.",
-        choices=SCHEDULES,
+        "Schedule of the learning rate. step: times 0.2 at 30%, 60% and 80%.",
+        choices=("step", "cosine", "one_cycle"),
     )
     flips: str = setting(
         "random",
-        "Horizontal flips: half of the images at random, or each image in every other epoch "
-        "(alternating).",
-        choices=FLIPS,
+        "Horizontal flips: of random halves, or of each image in every other epoch.",
+        choices=("random", "alternating"),
     )
     augmentation: str = setting(
         "none",
-        "Augmentation of every training image. relight: the light of a projector with random "
-        "slides.",
+        "Augmentation of every training image. relight: random light of a projector.",
         choices=AUGMENTATIONS,
     )
     relight_gain: float = setting(
         3.0,
-        "Largest factor of a channel of a slide for augmentation=relight. Its inverse is the "
-        "smallest.",
+        "Largest factor of a channel for augmentation=relight. Its inverse is the smallest.",
         within=(1, 100),
     )
     relight_steps: int = setting(
@@ -115,19 +105,17 @@ class TrainSettings(Settings):
     label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
     ranking_weight: float = setting(
         0.0,
-        "Weight of the loss that ranks the images of `label` in a batch above the others.",
+        "Weight of the loss that ranks images of `label` above the others of a batch.",
         within=(0, MAX_SCALE),
     )
     distillation_weight: float = setting(
         0.0,
-        "Weight of the divergence from the predictions of `network`. "
-        "On renders, this counts classes other than `label`.",
+        "Weight of the divergence from `network`, on renders for classes other than `label`.",
         within=(0, MAX_SCALE),
     )
     consistency_weight: float = setting(
         0.0,
-        "Weight of the divergence of the predictions for augmented images from those of "
-        "`network` for the same images without augmentation.",
+        "Weight of the divergence on augmented images from `network` on the plain images.",
         within=(0, MAX_SCALE),
     )
     interpolate: bool = setting(
@@ -137,14 +125,12 @@ class TrainSettings(Settings):
     )
     ema_decay: float = setting(
         0.0,
-        "Decay of the moving average of the weights, which is validated and kept. 0: none.",
+        "Decay of the moving average of the weights, which is kept. 0: none.",
         minimum=0,
         below=1,
     )
     soup: bool = setting(
-        False,
-        "Start each epoch with `network` again, and keep the mean of the networks of all "
-        "epochs (a model soup).",
+        False, "Start each epoch with `network`, and keep the mean of all epochs (a model soup)."
     )
     eval_mode: bool | None = setting(
         None,
@@ -159,21 +145,20 @@ class TrainSettings(Settings):
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
     threads: int | None = setting(
         None,
-        "CPU threads, on which the last bits depend. "
-        "null: all cores that the process may use, or one for small batches.",
+        "CPU threads, on which the last bits depend. null: all cores, or one for small batches.",
         within=(1, 1024),
     )
     compile: str = setting(
-        "auto", "Compile the training step. auto: CUDA graphs on one GPU.", choices=COMPILE
+        "auto",
+        "Compile the training step. auto: CUDA graphs on one GPU.",
+        choices=("auto", "always", "never"),
     )
     deterministic: bool = setting(
-        False,
-        "Compute the same bits every time on a GPU, which is slower. The results of a CPU always "
-        "repeat.",
+        False, "Compute the same bits every time on a GPU, too, which is slower."
     )
     checkpoint_every: int = setting(
         1,
-        "Epochs between two checkpoints. A single process also writes one about every minute.",
+        "Epochs between checkpoints. A single process also writes one every minute.",
         within=(1, 10**6),
     )
     resume: bool = setting(

@@ -8,7 +8,6 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -33,48 +32,33 @@ for argument in sys.argv:
 """
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What a run of the script did.
+def reproduce(
+    folder: Path, *arguments: str, **environment: str
+) -> tuple[int, list[list[str]], str]:
+    """Run the script in a folder with the stub in place of Python.
 
-    Attributes:
-        status: Exit status.
-        calls: Arguments of each call of Python.
-        errors: What the script printed to standard error.
+    Return its exit status, the arguments of each call of Python, and what it printed as errors.
     """
-
-    status: int
-    calls: list[list[str]]
-    errors: str
-
-
-def reproduce(folder: Path, *arguments: str, **environment: str) -> Outcome:
-    """Run the script in a folder with the stub in place of Python."""
     stub = folder / "python"
     stub.write_text(STUB)
     stub.chmod(0o755)
     calls = folder / "calls"
     calls.touch()
     variables = {"PYTHON": str(stub), "RUNS": "runs", "PATH": os.environ["PATH"]}
+    command = [ROOT / "scripts" / "reproduce.sh", *arguments]
     done = subprocess.run(
-        [ROOT / "scripts" / "reproduce.sh", *arguments],
-        cwd=folder,
-        env=variables | environment,
-        capture_output=True,
-        text=True,
+        command, cwd=folder, env=variables | environment, capture_output=True, text=True
     )
-    lines = calls.read_text().splitlines()
-    return Outcome(done.returncode, [json.loads(line) for line in lines], done.stderr)
+    return done.returncode, [*map(json.loads, calls.read_text().splitlines())], done.stderr
 
 
 @pytest.mark.parametrize(
     ("arguments", "environment"), [(["gpu"], {}), ([], INPUTS), (["tpu"], INPUTS)]
 )
 def test_missing_inputs_are_refused_before_anything_runs(tmp_path, arguments, environment):
-    outcome = reproduce(tmp_path, *arguments, **environment)
-    assert outcome.status == 2
-    assert outcome.calls == []
-    assert outcome.errors.startswith("usage: ")
+    status, calls, errors = reproduce(tmp_path, *arguments, **environment)
+    assert (status, calls) == (2, [])
+    assert errors.startswith("usage: ")
 
 
 @pytest.mark.parametrize(
@@ -87,10 +71,9 @@ def test_missing_inputs_are_refused_before_anything_runs(tmp_path, arguments, en
     ],
 )
 def test_every_training_has_valid_settings(tmp_path, command, trainings):
-    outcome = reproduce(tmp_path, command, "train.checkpoint_every=5", **INPUTS)
-    assert outcome.errors == ""
-    assert outcome.status == 0
-    calls = [call for call in outcome.calls if call[:3] == ["-m", "train", "--multirun"]]
+    status, calls, errors = reproduce(tmp_path, command, "train.checkpoint_every=5", **INPUTS)
+    assert (status, errors) == (0, "")
+    calls = [call for call in calls if call[:3] == ["-m", "train", "--multirun"]]
     assert [call[3] for call in calls] == [f"experiment={name}" for name in trainings]
     for call in calls:
         settings = train_command.read([first_of_sweep(word) for word in call[3:]])
@@ -110,7 +93,7 @@ def first_of_sweep(word: str) -> str:
 
 @pytest.mark.parametrize(("command", "device"), [("cpu", "cpu"), ("gpu", "cuda")])
 def test_the_training_speed_is_measured_first(tmp_path, command, device):
-    first_call = reproduce(tmp_path, command, **INPUTS).calls[0]
+    _, [first_call, *_], _ = reproduce(tmp_path, command, **INPUTS)
     assert first_call[:3] == ["-m", "benchmarks.training", "speed"]
     options = dict(zip(first_call[3::2], first_call[4::2], strict=True))
     assert options["--data"] == "cifar100.npz"
@@ -127,8 +110,8 @@ def test_the_training_speed_is_measured_first(tmp_path, command, device):
     ],
 )
 def test_the_tables_compare_all_runs_of_an_experiment(tmp_path, command, tables):
-    outcome = reproduce(tmp_path, command, **INPUTS)
-    calls = [call for call in outcome.calls if call[:3] == ["-m", "scripts", "compare"]]
+    _, calls, _ = reproduce(tmp_path, command, **INPUTS)
+    calls = [call for call in calls if call[:3] == ["-m", "scripts", "compare"]]
     for call, (experiment, images) in zip(calls, tables, strict=True):
         runs = [f"runs/{experiment}/augment-none+seed-{seed}" for seed in (0, 1)]
         assert call[3] == f"runs=[{','.join(runs)}]"

@@ -40,10 +40,10 @@ READER_SECONDS = 60
 # Additional bytes of address space. A reader that asks for more fails, and not the machine.
 MEMORY = 12 * 2**30
 
+LIGHTS = ("light.npy", "light.hdr", "light.exr", "light.json")
 MESHES = ("mesh.obj", "mesh.glb", "mesh.ply", "mesh.stl", "mesh.off")
 
 
-LIGHTS = ("light.npy", "light.hdr", "light.exr", "light.json")
 # Functions of the library by the files that they read.
 READERS: dict[str, Callable[[Path], Any]] = {
     **dict.fromkeys(MESHES, load_mesh),

@@ -47,29 +47,25 @@ def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new
     assert content_hash(load(tmp_path / LAST)) == content_hash(again)
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        pytest.param(Path.unlink, id="missing"),
-        pytest.param(lambda path: path.write_bytes(path.read_bytes()[:2000]), id="truncated"),
-        pytest.param(lambda path: torch.save(Harmful(), path), id="code"),
-        pytest.param(lambda path: save(path, {"model": {}}), id="no architecture"),
-        pytest.param(
-            lambda path: save(path, STATE | {"model": {"weight": torch.tensor(torch.nan)}}),
-            id="NaN",
-        ),
-        pytest.param(
-            lambda path: save(path, STATE | {"architecture": {"version": 99}}), id="later version"
-        ),
-    ],
-)
+NAN = {"model": {"weight": torch.tensor(torch.nan)}}
+SPOILED = {
+    "missing": Path.unlink,
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[:2000]),
+    "code": lambda path: torch.save(Harmful(), path),
+    "no architecture": lambda path: save(path, {"model": {}}),
+    "NaN": lambda path: save(path, STATE | NAN),
+    "later version": lambda path: save(path, STATE | {"architecture": {"version": 99}}),
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILED)
 def test_a_file_without_a_usable_network_is_refused_by_name_and_runs_no_code(
     tmp_path, monkeypatch, spoil
 ):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / BEST
     save(path, STATE)
-    spoil(path)
+    SPOILED[spoil](path)
     with pytest.raises(InputError, match=rf"^(checkpoint )?{re.escape(str(path))} [^\n]+$"):
         load(path)
     assert not Path("harm").exists()

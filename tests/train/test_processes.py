@@ -22,7 +22,7 @@ from augment.scene.scene import Scene
 from tests.runs import completed_run
 from train import checkpoints, run_folder
 from train.cli import read_settings
-from train.processes import Interrupted, SignalHandler, process_group
+from train.device import Interrupted, SignalHandler, process_group
 from train.run_folder import read_metrics
 from train.settings import ExperimentSettings
 
@@ -51,27 +51,25 @@ def run_from_file(config: Path, folder: Path) -> None:
     completed_run(settings, folder)
 
 
+def linear() -> torch.nn.Module:
+    return torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2))
+
+
 def random_mode(file: Path) -> None:
     """Write the images, the diagnostics and the number of renders of this process."""
     meshes = [("solid:table", 0), ("solid:plate", 1)]
     count = []
     with pytest.MonkeyPatch.context() as patch:
         render = Scene.render
-        patch.setattr(
-            Scene,
-            "render",
-            lambda self, *args: (count.append(len(args[1])), render(self, *args))[1],
-        )
+        counted = lambda self, *args: (count.append(len(args[1])), render(self, *args))[1]  # noqa: E731
+        patch.setattr(Scene, "render", counted)
+        options = {"views": 3, "samples": 1, "rasterizer": "numpy"}
         settings = AugmentationSettings(mode="random")
-        service = AugmentationService.from_meshes(
-            meshes, 8, settings, views=3, samples=1, rasterizer="numpy"
-        )
+        service = AugmentationService.from_meshes(meshes, 8, settings, **options)
         service.rank = distributed.rank()
         service.world_size = distributed.world_size()
         torch.manual_seed(0)
-        made = service.regenerate(
-            torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 0
-        )
+        made = service.regenerate(linear(), 0)
     torch.save((made.images, made.diagnostics, count[0]), file)
 
 
@@ -82,7 +80,7 @@ def folder_mode(file: Path) -> None:
     settings = AugmentationSettings(mode="folder", folder="unread", examples=5)
     process = (), distributed.rank(), distributed.world_size()
     service = AugmentationService(settings, None, labels, 0, Phases(), *process, images)
-    made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 1)
+    made = service.regenerate(linear(), 1)
     torch.save((made.images, made.labels, torch.tensor(made.diagnostics["attack_success"])), file)
 
 

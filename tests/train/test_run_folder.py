@@ -197,9 +197,8 @@ def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(
     tmp_path, done, monkeypatch
 ):
     """Later lines and scores are written again. Lines that were cut or lost come back."""
-    monkeypatch.setattr(
-        time, "time", itertools.count(1e9).__next__
-    )  # TensorBoard orders the files by their seconds
+    # TensorBoard orders the files by their seconds.
+    monkeypatch.setattr(time, "time", itertools.count(1e9).__next__)
     write_epochs(tmp_path, range(1, 4))
     epochs = read_metrics(tmp_path)
     (tmp_path / METRICS).write_text('{"epoch": 3, "train/lo')
@@ -213,12 +212,10 @@ def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(
     assert [(event.step, event.value) for event in board.Scalars("test/accuracy")] == [(4, 0.25)]
 
 
-def test_attack_success_is_the_fraction_of_the_clean_correct_examples():
-    """Of ten examples, two were wrong before, and six are wrong after the attack."""
-    diagnostics = {"attack_success_before": 0.2, "attack_success": 0.6}
-    assert attack_success(diagnostics) == pytest.approx(4 / 8)
-
-
-@pytest.mark.parametrize("diagnostics", [{}, {"attack_success_before": 1.0, "attack_success": 1.0}])
-def test_there_is_no_attack_success_without_clean_correct_examples(diagnostics):
-    assert attack_success(diagnostics) is None
+@pytest.mark.parametrize(
+    ("before", "after", "expected"), [(0.2, 0.6, 4 / 8), (1.0, 1.0, None), (None, None, None)]
+)
+def test_attack_success_is_the_fraction_of_the_clean_correct_examples(before, after, expected):
+    """For example, of ten examples, two were wrong before, and six are wrong after the attack."""
+    diagnostics = {"attack_success_before": before, "attack_success": after} if before else {}
+    assert attack_success(diagnostics) == (expected and pytest.approx(expected))

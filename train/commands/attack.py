@@ -6,6 +6,7 @@ be loaded again with reload=FOLDER.
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,8 +48,6 @@ from train.system import command_line, is_verbose, shortened
 
 # Warnings about at most 3 unreadable files are printed if --verbose is not set.
 MAX_UNREADABLE = 3
-# The search for a scene in which a mesh is recognized may change these settings.
-SEARCHED_SETTINGS = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
 
 
 def run(settings: AttackExperimentSettings) -> None:
@@ -79,10 +78,7 @@ def run(settings: AttackExperimentSettings) -> None:
         if not settings.attack.parameters:
             return
     targets = load_targets(settings, classifier, device)
-    out = writable_folder(settings.out, "out")
-    require_replaceable(out, "out", settings.overwrite)
-    with sole_writer("out", out), catch_warnings():
-        remove_attack(out)
+    with _results_of(settings) as out, catch_warnings():
         if settings.attack.checks is not False:
             # The checks say this for each mesh.
             filterwarnings("ignore", ZERO_GRADIENT)
@@ -115,8 +111,18 @@ def run(settings: AttackExperimentSettings) -> None:
             attack_tables.write_sweeps(sweeps, norms, out)
             if is_verbose():
                 print(f"success against radius: {out / SWEEP_TABLE} and {out / SWEEP_FIGURE}")
-        write_config(out, settings, command=command_line("attack"))
     print(f"images, adversaries and numbers: {out}")
+
+
+@contextmanager
+def _results_of(settings: AttackExperimentSettings) -> Iterator[Path]:
+    """Yield the empty folder of the results, and write config.yaml at the end of the block."""
+    out = writable_folder(settings.out, "out")
+    require_replaceable(out, "out", settings.overwrite)
+    with sole_writer("out", out):
+        remove_attack(out)
+        yield out
+        write_config(out, settings, command=command_line("attack"))
 
 
 def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
@@ -280,12 +286,8 @@ def load_targets(
 
 def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
     """Write the settings that the search for a scene changed, such as "scene.polar=80.0"."""
-    words = []
-    for name in SEARCHED_SETTINGS:
-        value = getattr(scene, name)
-        if value != getattr(before, name):
-            words.append(shlex.quote(f"scene.{name}={value}"))
-    return " ".join(words)
+    changed = [item for item in vars(scene).items() if item[1] != getattr(before, item[0])]
+    return shlex.join(f"scene.{name}={value}" for name, value in changed)
 
 
 def format_reloaded(
@@ -331,21 +333,16 @@ def _attack_photographs(
     """Attack a network by the light of a projector on photographs, and print the results."""
     device = choose_device(settings.device)
     classifier = load_chosen(settings).to(device)
-    out = writable_folder(settings.out, "out")
-    require_replaceable(out, "out", settings.overwrite)
-    with sole_writer("out", out):
-        remove_attack(out)
-        with keyed("unlabeled"):
-            scores = attack_folder(
-                classifier,
-                published(Path(folder)),
-                relighting,
-                out,
-                sensor_noise=settings.attack.sensor_noise,
-                batch_size=settings.attack.batch_size,
-                seed=settings.seed,
-            )
-        write_config(out, settings, command=command_line("attack"))
+    with _results_of(settings) as out, keyed("unlabeled"):
+        scores = attack_folder(
+            classifier,
+            published(Path(folder)),
+            relighting,
+            out,
+            sensor_noise=settings.attack.sensor_noise,
+            batch_size=settings.attack.batch_size,
+            seed=settings.seed,
+        )
     print(f"{scores.tables()[0]}\n")
     print(f"{MODELED}\n")
     unreadable = [f"warning: {path} cannot be read" for path in scores.unreadable]

@@ -9,10 +9,10 @@ from torch import Tensor
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, as_classifier
 from augment.network import device_of, gradient_flags_kept
 from augment.settings import NormalizeLight
-from renderer.errors import InputError, as_list
+from renderer.errors import as_list
 from train.auditing.audit import run_audit
 from train.auditing.network import CLASSIFIER, HARDENED, AuditReport
-from train.class_names import MeshItem, as_mappings, find_positive_classes
+from train.class_names import MeshItem, as_mappings
 from train.command_settings import ENVIRONMENTS, AuditSettings
 from train.results.overwrite import require_replaceable
 from train.run_folder import folder_or_temporary
@@ -119,16 +119,10 @@ def audit(
         with folder_or_temporary(out) as folder:
             require_replaceable(folder, "out", overwrite)
             items = as_mappings("meshes", meshes, classifier)
-            positive_classes = find_positive_classes(label, meshes, items, classifier)
-            if len(positive_classes) > 1:
-                raise InputError(
-                    f"meshes are of several classes ({', '.join(positive_classes)}): "
-                    "give meshes of one class"
-                )
             negatives = as_mappings("hard_negatives", hard_negatives, classifier)
             settings = AuditSettings(
                 network=classifier.name,
-                label=positive_classes[0],
+                label=label,
                 meshes=items,
                 hard_negatives=negatives,
                 photos=None if photos is None else str(photos),

@@ -20,17 +20,18 @@ from omegaconf import DictConfig, OmegaConf
 from augment import distributed
 from augment.augmentation_settings import MODES
 from renderer.errors import keyed
+from renderer.settings import field_types
 from train import checkpoints, console
 from train.__main__ import main
 from train.cli import read_settings
-from train.processes import Interrupted, broadcast, process_group
+from train.device import Interrupted, broadcast, process_group
 from train.results.compare import format_short_comparison, format_table
 from train.results.overwrite import remove_run, require_new_run
 from train.results.page import report_of
 from train.results.store import is_finished, summarize
 from train.run_config import CONFIG, format_command, require_same_run, resume_config
 from train.run_folder import sole_writer, writable_folder
-from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings
+from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings, NetworkSettings
 from train.system import is_verbose, program
 from train.training.inputs import with_label
 from train.training.run import make_runs
@@ -41,14 +42,9 @@ CHOICES = ("experiment", "augment", "data", "launcher")
 # Name of the log file in the folder of a training run.
 LOG = "train.log"
 # The first training on photographs takes these settings from the main training.
-SHARED = (
-    *("network", "size", "unlabeled", "seed", "overwrite", "data"),
-    *("weights", "classes", "normalization", "normalize_light"),
-    "trust",
-)
+SHARED = (*field_types(NetworkSettings), "unlabeled", "seed", "overwrite", "data")
 SHARED_IN_TRAIN = (
-    *("precision", "device", "threads", "deterministic", "checkpoint_every"),
-    *("resume", "cache"),
+    *("precision", "device", "threads", "deterministic", "checkpoint_every", "resume", "cache"),
 )
 
 

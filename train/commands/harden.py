@@ -30,11 +30,9 @@ from train.results.overwrite import require_new_run
 from train.results.page import report_of
 from train.run_folder import folder_or_temporary, sole_writer
 from train.settings import (
-    OTHER,
     DataSettings,
     ExperimentSettings,
     TrainingSceneSettings,
-    read_objects,
 )
 from train.train_settings import TrainSettings
 from train.training.inputs import initial_of, load_data
@@ -139,12 +137,11 @@ def harden(
         if next(classifier.parameters(), None) is None:
             raise InputError("network has no parameters: give a network that can be trained")
         items = class_names.as_mappings("meshes", meshes, classifier)
-        labels = class_names.find_positive_classes(label, meshes, items, classifier)
         changes: dict[str, Any] = {
             "out": str(folder.absolute()),
             "seed": seed,
             "overwrite": overwrite,
-            "label": None if label is None else labels[0],
+            "label": None if label is None else classifier.classes[classifier.label(label)],
             "network": classifier.name,
             "meshes": items,
             "unlabeled": str(as_path("unlabeled", unlabeled)),
@@ -153,8 +150,6 @@ def harden(
         }
         if hard_negatives is not None:
             negatives = class_names.as_mappings("hard_negatives", hard_negatives, classifier)
-            named = read_objects(negatives, OTHER, "hard_negatives")
-            class_names.require_others(named, labels, classifier.classes)
             changes["hard_negatives"] = negatives
         if out is None:
             changes["train"]["cache"] = None

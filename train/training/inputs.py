@@ -25,9 +25,8 @@ from train.class_names import class_of_name, name_of_mesh, require_others, with_
 from train.data import sets
 from train.data.photographs import find_photographs, load_photographs
 from train.data.rendered_shapes import cache_folder, load_shapes
-from train.device import choose_rasterizer
+from train.device import choose_rasterizer, main_process_first
 from train.networks import CLASSIFIER, PYTHON, describe
-from train.processes import main_process_first
 from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, label_names
 
 # Default fraction of the training images that validate the network.

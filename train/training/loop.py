@@ -29,8 +29,7 @@ from train import checkpoints, console, run_folder
 from train.checkpoints import random_state, restore_random_state
 from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_batches
 from train.data.sets import Split
-from train.device import MixedPrecision
-from train.processes import SignalHandler, all_reduce_sum
+from train.device import MixedPrecision, SignalHandler, all_reduce_sum
 from train.run_folder import PHASES
 from train.train_settings import TrainSettings
 from train.training.averages import Averages

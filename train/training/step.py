@@ -16,8 +16,7 @@ from augment.service import AugmentationService
 from renderer.errors import InputError, keyed, require_memory
 from train import console
 from train.data.batches import Batch
-from train.device import GraphedNetwork, MixedPrecision, compiles
-from train.processes import wrap_ddp
+from train.device import GraphedNetwork, MixedPrecision, compiles, wrap_ddp
 from train.train_settings import RELIGHT, TrainSettings
 from train.training.augmentations import Baseline, RelitBatches
 from train.training.averages import Averages

@@ -17,9 +17,8 @@ from renderer import errors
 from renderer.errors import InputError
 from train import checkpoints, run_folder
 from train.data.sets import Split
-from train.device import MixedPrecision
+from train.device import Interrupted, MixedPrecision
 from train.networks import WideResNet
-from train.processes import Interrupted
 from train.run_folder import read_metrics
 from train.train_settings import TrainSettings
 from train.training import loop

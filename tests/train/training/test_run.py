@@ -25,7 +25,7 @@ from train.checkpoints import load_run
 from train.command_settings import LabSettings
 from train.data import batches
 from train.data.sets import Split, content_hash
-from train.processes import Interrupted
+from train.device import Interrupted
 from train.results.overwrite import remove_run
 from train.results.store import is_finished, summarize
 from train.run_folder import read_metrics
