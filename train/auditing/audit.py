@@ -12,7 +12,7 @@ the subfolders are CLASSIFIER and HARDENED.
 
 import json
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -23,7 +23,6 @@ import torch
 
 from augment.classifier import Classifier
 from augment.scene.objects import load_object
-from augment.settings import ObjectSettings
 from renderer.errors import InputError, keyed
 from renderer.io.files import atomic_write
 from renderer.light.files import UNIFORM, load_light
@@ -54,8 +53,7 @@ from train.auditing.network import (
 )
 from train.auditing.relit import (
     RELIT_FOLDER,
-    measure_photographs,
-    photographs_screen,
+    attack_some,
     write_photographs_page,
 )
 from train.checkpoints import load_chosen, load_network
@@ -114,104 +112,78 @@ def run_audit(
     again.
     """
     is_named = networks is None
-    if networks is None:
-        networks = load_networks(settings)
-    if not settings.meshes:
-        return _audit_photographs(settings, networks, is_named)
-    # Caveats are sentences at the beginning of the report.
-    caveats = _size_caveats(networks.values())
-    if not (settings.hard_negatives or settings.laboratory):
-        caveats.append(NO_HARD_NEGATIVES)
-    settings = complete(settings, networks[CLASSIFIER])
-    plan = _Plan(settings, networks)
+    networks = load_networks(settings) if networks is None else networks
+    device = choose_device(settings.device)
+    networks = {key: network.to(device) for key, network in networks.items()}
+    caveats = _caveats(settings, networks, device)
+    plan = None
+    if settings.meshes:
+        settings = complete(settings, networks[CLASSIFIER])
+        plan = _Plan(settings, networks, device)
+    else:
+        find_unlabeled(published(Path(str(settings.unlabeled))))
     out = writable_folder(settings.out, "out")
     _require_continuable(out, settings.overwrite, is_named)
     renders = out / "renders"
     has_renders = renders.exists() and not settings.overwrite
-    if LABORATORY not in plan.image_folders:
+    if plan is not None and LABORATORY not in plan.image_folders:
         try:
             # `mitsuba` raises an InputError if Mitsuba, which renders, is not installed.
             with nullcontext() if has_renders else mitsuba():
                 plan.image_folders = {LABORATORY: renders} | plan.image_folders
         except InputError as error:
             caveats.append(f"The laboratory is left out, and hard_negatives with it ({error}).")
-    caveats += _gradient_caveats(networks.values(), plan.device)
     for sentence in caveats:
         console.warning(sentence)
     with sole_writer("out", out):
         _prepare_folder(settings, out, renders)
-        plan.find_views(out / CLASSIFIER)
-        if plan.image_folders.get(LABORATORY) == renders:
-            size = max(network.size for network in plan.networks.values())
-            laboratory = laboratory_settings(settings, renders, size)
-            _write_folder(
-                renders,
-                lambda folder: write_laboratory(replace(laboratory, out=str(folder))),
-            )
-        for key, network in plan.networks.items():
-            plan.measure(key, out / key)
-            if settings.unlabeled:
-                _measure_photographs(network, settings, out / key)
-        plan.score_in_normalized_light(out)
-        remedies = name_remedies(plan.networks)
-        names = _names(plan.networks)
-        return page.write_audit_page(
-            settings.label, names, remedies, plan.image_folders, out, caveats
-        )
+        for key in networks:
+            (out / key).mkdir(exist_ok=True)
+        if plan is not None:
+            if plan.image_folders.get(LABORATORY) == renders:
+                size = max(network.size for network in networks.values())
+                _write_folder(renders, partial(_write_renders, settings, plan, size))
+            plan.measure(networks, out)
+        if settings.unlabeled:
+            for key, network in networks.items():
+                _write_folder(out / key / RELIT_FOLDER, partial(attack_some, network, settings))
+        names = {key: network.name for key, network in networks.items()}
+        if len({*names.values()}) < len(names):
+            names[HARDENED] += " (hardened)"
+        if plan is not None:
+            remedies = name_remedies(networks)
+            folders = plan.image_folders
+            return page.write_audit_page(settings.label, names, remedies, folders, out, caveats)
+        results = {name: out / key for key, name in names.items()}
+        return page.Audited(*write_photographs_page(results, out, caveats), "", {}, None)
 
 
-def _audit_photographs(
-    settings: AuditSettings, networks: Mapping[str, Classifier], is_named: bool
-) -> page.Audited:
-    """Audit networks without meshes, on photographs in the light of a projector.
-
-    Only if the settings name the networks may an audit that was stopped continue.
-    """
-    device = choose_device(settings.device)
-    find_unlabeled(published(Path(str(settings.unlabeled))))
-    out = writable_folder(settings.out, "out")
-    _require_continuable(out, settings.overwrite, is_named)
-    caveats = _size_caveats(networks.values())
+def _caveats(
+    settings: AuditSettings, networks: Mapping[str, Classifier], device: torch.device
+) -> list[str]:
+    """Write sentences for the beginning of the report."""
+    caveats = []
+    sizes = [str(network.size) for network in networks.values()]
+    if len({*sizes}) > 1:
+        listed = " and ".join(sizes)
+        caveats.append(f"The networks take images of {listed} pixels, and differ by that, too.")
+    if settings.meshes and not (settings.hard_negatives or settings.laboratory):
+        caveats.append(NO_HARD_NEGATIVES)
     for network in networks.values():
         if not network.is_differentiable(torch.empty(0, device=device)):
-            caveats.append(f"{network.name} has no gradients: only random search attacks it.")
-    for sentence in caveats:
-        console.warning(sentence)
-    with sole_writer("out", out):
-        _prepare_folder(settings, out, out / "renders")
-        for key, network in networks.items():
-            (out / key).mkdir(exist_ok=True)
-            _measure_photographs(network.to(device), settings, out / key)
-        names = _names(networks)
-        folders = {name: out / key for key, name in names.items()}
-        screen = photographs_screen(folders)
-        path = write_photographs_page(screen, folders, out, caveats)
-        return page.Audited(path, screen, "", {}, None)
-
-
-def _measure_photographs(network: Classifier, settings: AuditSettings, results: Path) -> None:
-    """Attack a network by the light of a projector on photographs, unless the results exist."""
-    _write_folder(results / RELIT_FOLDER, partial(measure_photographs, network, settings))
-
-
-def _names(networks: Mapping[str, Classifier]) -> dict[str, str]:
-    """Choose the names of the networks in the report.
-
-    If both networks have the same name, " (hardened)" is added to the second.
-    """
-    names = {key: network.name for key, network in networks.items()}
-    if len(set(names.values())) < len(names):
-        names[HARDENED] += " (hardened)"
-    return names
+            attack = "only random search attacks it"
+            if settings.meshes:
+                attack = f"random search attacks each view with {QUERIES} queries for each radius"
+            caveats.append(f"{network.name} has no gradients: {attack}.")
+    return caveats
 
 
 class _Plan:
-    """Networks, images and lighting of an audit, checked before anything is written.
+    """Images and lighting of an audit, checked before anything is written.
 
     Attributes:
         label: Class whose objects are tested.
-        device: Device of the networks and the renders.
-        networks: Networks by the name of the subfolder for their results.
+        items: Meshes and hard negatives, which need not be of a class of the networks.
         image_folders: Folders of labeled test images: "laboratory" for
             path-traced renders, and "photographs". Each may be missing.
         environments: Names or files of environment lights.
@@ -220,71 +192,72 @@ class _Plan:
         attacked_views: Views whose lighting is attacked.
     """
 
-    def __init__(self, settings: AuditSettings, networks: Mapping[str, Classifier]):
+    def __init__(
+        self, settings: AuditSettings, networks: Mapping[str, Classifier], device: torch.device
+    ):
         self.label = settings.label
-        self.device = choose_device(settings.device)
-        self.networks = {key: network.to(self.device) for key, network in networks.items()}
-        meshes, hard_negatives = read_meshes(settings)
+        meshes = [*read_objects(settings.meshes, self.label, "meshes").values()]
+        hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
+        for item in hard_negatives:
+            own_name = solid_name(item.mesh) or Path(item.mesh).stem
+            item.label = item.label or OTHER_PREFIX + own_name
+        for item in meshes:
+            if item.label != self.label:
+                raise InputError(
+                    f"meshes has {item.mesh} of the class {item.label}, but label={self.label}: "
+                    "give only meshes of this class, and others as hard_negatives",
+                    "meshes",
+                )
+        self.items = [*meshes, *hard_negatives]
         folders = {LABORATORY: settings.laboratory, PHOTOGRAPHS: settings.photos}
         self.image_folders = {
             name: published(Path(folder)) for name, folder in folders.items() if folder
         }
-        items = [*meshes, *hard_negatives]
-        _require_classes(self.networks.values(), items, self.image_folders, self.label)
+        labels = {item.label for item in self.items if not item.label.startswith(OTHER_PREFIX)}
+        for network in networks.values():
+            for name in labels:
+                network.label(name)
+            for name, folder in self.image_folders.items():
+                with keyed(FOLDER_KEYS[name]):
+                    find_photographs(folder, network.classes, self.label)
         # Hard negatives and lights are loaded only to report a file that cannot be read
         # before the audit begins.
-        objects = [load_object(item) for item in items]
+        objects = [load_object(item) for item in self.items]
         for name in settings.environments:
             load_light(name)
         self.environments = [UNIFORM, *settings.environments]
         self.random_light_count = settings.scale(RANDOM_LIGHT_COUNT)
-        seed = settings.seed
         positives = objects[: len(meshes)]
-        self.views = Views(positives, settings.scale(VIEW_COUNT), seed, self.device)
-        self.attacked_views = Views(positives, settings.scale(ATTACKED_COUNT), seed, self.device)
+        self.views, self.attacked_views = (
+            Views(positives, settings.scale(count), settings.seed, device)
+            for count in (VIEW_COUNT, ATTACKED_COUNT)
+        )
 
-    def find_views(self, results: Path) -> None:
-        """Find the ordinary light and the size at which the audited network recognizes most views.
+    def measure(self, networks: Mapping[str, Classifier], out: Path) -> None:
+        """Test and attack the networks, except for results that exist already.
 
-        The views of all networks then have this light and this size.
+        The views of all networks have the ordinary light and the size at which the audited network
+        recognizes most views.
         """
-        results.mkdir(exist_ok=True)
-        path = results / PLAIN
-        _write_json(path, _search, self.networks[CLASSIFIER], self.attacked_views)
+        path = out / CLASSIFIER / PLAIN
+        _write_json(path, _search, networks[CLASSIFIER], self.attacked_views)
         plain = PlainViews(**read_json(path))
-        self.views = plain.apply_to(self.views)
-        self.attacked_views = plain.apply_to(self.attacked_views)
-
-    def measure(self, key: str, results: Path) -> None:
-        """Test and attack one network, except for results that exist already."""
-        network = self.networks[key]
-        results.mkdir(exist_ok=True)
-        lights = (self.environments, self.random_light_count)
-        path = results / RECOGNIZED
-        _write_json(path, recognize_in_environments, network, self.views, *lights)
-        for kind in KINDS:
-            path = results / f"{kind}.json"
-            _write_json(path, success_by_light, network, self.attacked_views, kind, results)
-        self._score(network, results)
-        others = [other for other in self.networks.values() if other is not network]
-        if others:
-            path = results / TRANSFER
-            _write_json(path, transfer_success, network, *others, self.attacked_views, results)
-
-    def score_in_normalized_light(self, out: Path) -> None:
-        """Score each network with the remedy "normalized light" on the test images.
-
-        This remedy normalizes the colors of an image before the network classifies it.
-        """
-        for key, network in normalizing(self.networks).items():
-            self._score(network, out / key)
-
-    def _score(self, network: Classifier, results: Path) -> None:
-        """Score a network on all test images, and write the scores to subfolders."""
-        for name, images in self.image_folders.items():
-            results.mkdir(exist_ok=True)
-            predictor = Predictor(network, network.classes, network.size, self.device)
-            _write_folder(results / name, partial(_evaluate, predictor, images, self.label))
+        views, attacked_views = map(plain.apply_to, (self.views, self.attacked_views))
+        for key, network in networks.items():
+            results = out / key
+            lights = (self.environments, self.random_light_count)
+            _write_json(results / RECOGNIZED, recognize_in_environments, network, views, *lights)
+            for kind in KINDS:
+                path = results / f"{kind}.json"
+                _write_json(path, success_by_light, network, attacked_views, kind, results)
+            for other in networks.values():
+                if other is not network:
+                    arguments = (network, other, attacked_views, results)
+                    _write_json(results / TRANSFER, transfer_success, *arguments)
+        for key, network in {**networks, **normalizing(networks)}.items():
+            for name, images in self.image_folders.items():
+                predictor = Predictor(network, network.classes, network.size, self.views.device)
+                _write_folder(out / key / name, partial(_evaluate, predictor, images, self.label))
 
 
 def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
@@ -321,41 +294,6 @@ def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
     return networks
 
 
-def _require_classes(
-    networks: Collection[Classifier],
-    items: Sequence[ObjectSettings],
-    folders: Mapping[str, Path],
-    label: str,
-) -> None:
-    """Check that all networks have the classes of the meshes and of the test images."""
-    labels = {item.label for item in items if not item.label.startswith(OTHER_PREFIX)}
-    for network in networks:
-        for name in labels:
-            network.label(name)
-        for name, folder in folders.items():
-            with keyed(FOLDER_KEYS[name]):
-                find_photographs(folder, network.classes, label)
-
-
-def _size_caveats(networks: Collection[Classifier]) -> list[str]:
-    """Return a sentence for the report if the networks take images of different sizes."""
-    sizes = [str(network.size) for network in networks]
-    if len(set(sizes)) == 1:
-        return []
-    listed = " and ".join(sizes)
-    return [f"The networks take images of {listed} pixels, and differ by that, too."]
-
-
-def _gradient_caveats(networks: Collection[Classifier], device: torch.device) -> list[str]:
-    """Return a sentence for the report about each network that has no gradients on a device."""
-    return [
-        f"{network.name} has no gradients: random search attacks each view with {QUERIES} queries "
-        "for each radius."
-        for network in networks
-        if not network.is_differentiable(torch.empty(0, device=device))
-    ]
-
-
 def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
     """Prepare the folder of an audit, and write the settings to its file config.yaml.
 
@@ -373,55 +311,33 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
                 (out / name).rename(removed)
             shutil.rmtree(removed, ignore_errors=True)
     elif (out / CONFIG).exists():
-        require_same(out, settings, "out=", _may_change)
+        # A stopped audit may continue with a change of some settings, but only from None.
+        require_same(
+            out, settings, "out=", lambda key, old, _: old is None and key in SETTABLE_LATER
+        )
     write_config(out, settings, command=command_line("audit"))
 
 
-def _may_change(key: str, old: Any, new: Any) -> bool:
-    """Return whether a stopped audit may continue with a change of a setting: only from None."""
-    return old is None and key in SETTABLE_LATER
-
-
-def laboratory_settings(settings: AuditSettings, out: Path, size: int) -> LabSettings:
-    """Choose the settings of the path-traced renders on which an audit scores networks.
+def _write_renders(settings: AuditSettings, plan: _Plan, size: int, out: Path) -> None:
+    """Render the path-traced test images on which an audit scores networks.
 
     They show the meshes and the hard negatives under each pattern of PATTERNS,
     and in each environment map of the audit.
     """
-    meshes, hard_negatives = read_meshes(settings)
     lighting_count = len(PATTERNS) + len(settings.environments)
-    return LabSettings(
-        out=str(out),
-        label=settings.label,
-        meshes=[asdict(item) for item in (*meshes, *hard_negatives)],
-        setups=settings.scale(SETUPS) * lighting_count,
-        patterns=[*PATTERNS],
-        environments=settings.environments,
-        size=size,
-        spp=SPP,
-        seed=settings.seed,
+    write_laboratory(
+        LabSettings(
+            out=str(out),
+            label=settings.label,
+            meshes=[asdict(item) for item in plan.items],
+            setups=settings.scale(SETUPS) * lighting_count,
+            patterns=[*PATTERNS],
+            environments=settings.environments,
+            size=size,
+            spp=SPP,
+            seed=settings.seed,
+        )
     )
-
-
-def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[ObjectSettings]]:
-    """Read the settings of the meshes and of the hard negatives, with their labels.
-
-    A hard negative without a label gets a label that starts with "other_", which need not be a
-    class of the networks. The first list has the meshes of the class, the second the hard
-    negatives.
-    """
-    meshes = [*read_objects(settings.meshes, settings.label, "meshes").values()]
-    hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
-    for item in hard_negatives:
-        item.label = item.label or OTHER_PREFIX + (solid_name(item.mesh) or Path(item.mesh).stem)
-    for item in meshes:
-        if item.label != settings.label:
-            raise InputError(
-                f"meshes has {item.mesh} of the class {item.label}, but label={settings.label}: "
-                "give only meshes of this class, and others as hard_negatives",
-                "meshes",
-            )
-    return meshes, hard_negatives
 
 
 def _require_continuable(out: Path, overwrite: bool, is_named: bool) -> None:

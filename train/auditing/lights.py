@@ -7,8 +7,9 @@ direction.
 
 import base64
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ from augment.attack_settings import (
 from augment.attacks.attack import EXPOSURES, attack
 from augment.attacks.checks import success_by_radius
 from augment.attacks.objective import Criterion, Objective
-from augment.attacks.problem import SceneProblem, build_problem
+from augment.attacks.problem import build_problem
 from augment.attacks.result import AttackResult, predictions
 from augment.augmentation_settings import VariationSettings
 from augment.classifier import Classifier
@@ -202,16 +203,20 @@ def recognize_in_environments(
     for number, light in enumerate(HARMONICS.project_nonnegative(random_lights), 1):
         lights[f"{RANDOM}{number}"] = light
     scene = views.scene(classifier.size)
-    examples = torch.arange(views.count, device=views.device)
-    recognized_by_light = {}
-    for name, light in progress(lights.items(), "renders in other light"):
-        exposed = views.exposure * light.to(scene.lights)
-        # All examples have the same light.
-        conditions = Conditions(exposed.expand(len(scene), -1, -1))
-        with torch.no_grad():
-            images = scene.render(conditions, examples)
-        recognized_by_light[name] = is_correct(classifier, scene, images).tolist()
-    return recognized_by_light
+    return {
+        name: _recognized(classifier, scene, views.exposure * light.to(scene.lights)).tolist()
+        for name, light in progress(lights.items(), "renders in other light")
+    }
+
+
+def _recognized(
+    classifier: Classifier, scene: Scene, light: Float[Tensor, "C K"]
+) -> Bool[Tensor, " E"]:
+    """Render all examples in the same light, and test which of them a classifier recognizes."""
+    conditions = Conditions(light.expand(len(scene), -1, -1))
+    examples = torch.arange(len(scene), device=light.device)
+    with torch.no_grad():
+        return is_correct(classifier, scene, scene.render(conditions, examples))
 
 
 def is_correct(
@@ -326,58 +331,33 @@ def transfer_success(
 
     There are two sets of attacked lighting. "first" is the lighting that `success_by_light` wrote,
     whose attack ended at its first success. "further" comes from attacks that continue after their
-    success. The views are rendered again at the image size of the other classifier. The three
-    numbers, for each kind of lighting and for "further" and "first", are those of
-    `_TransferTest.count`.
+    success. The views are rendered again at the image size of the other classifier. A view is
+    tested if its attacked lighting fools the first classifier, and if the other classifier
+    recognizes it before the attack. The three numbers, for each kind of lighting and for "further"
+    and "first", are tested views that are misclassified even with the noise of a camera, tested
+    views, and tested views that are misclassified without noise.
     """
     counts: dict[str, dict[str, list[int]]] = {}
     for kind in progress(KINDS, "transfer"):
         result = adversaries(attacked, views, kind, additional=True)
         problem = build_problem(result.settings, views.scene(other.size, kind))
-        test = _TransferTest(result, other, problem)
-        is_wrong = result.clean_correct & result.success
-        further = test.count(is_wrong, result.minimum.values)
-        with np.load(out / f"{kind}.npz") as saved:
-            is_wrong = torch.from_numpy(saved["wrong"])
-            values = torch.from_numpy(saved["values"])
-        first = test.count(is_wrong, values)
-        counts[kind] = {"further": further, "first": first}
-    return counts
-
-
-class _TransferTest:
-    """Test whether attacked lighting of one classifier fools another classifier.
-
-    Args:
-        result: Result of an attack on the first classifier.
-        other: Second classifier, which is tested.
-        problem: Scene with images of the size of the second classifier, and the
-            attacked parameters.
-    """
-
-    def __init__(self, result: AttackResult, other: Classifier, problem: SceneProblem):
         label = other.label(problem.scene.labels[0])
-        self.problem = problem
-        self.is_correct = is_correct(other, problem.scene, problem.images(problem.start))
         criterion = Criterion(torch.full_like(result.criterion.source, label))
-        self.objective = Objective(other, criterion, result.settings, result.seed)
-
-    def count(self, is_wrong: Bool[Tensor, " E"], values: Float[Tensor, "E D"]) -> list[int]:
-        """Count the views whose attacked lighting also fools the second classifier.
-
-        A view is tested if its attacked lighting fools the first classifier, and if the second
-        classifier recognizes it before the attack. The three numbers are tested views that are
-        misclassified even with the noise of a camera, tested views, and tested views that are
-        misclassified without noise.
-        """
-        is_tested = is_wrong.to(self.is_correct) & self.is_correct
-        images = self.problem.images(values.to(self.problem.start))
-        predicted = self.objective.logits(images).argmax(2)
-        examples = self.problem.all_examples
-        is_fooled = self.objective.fooled_in_views(images, predicted, examples).all(1)
-        is_fooled_without_noise = self.objective.criterion.reached(predicted)
-        masks = (is_tested & is_fooled, is_tested, is_tested & is_fooled_without_noise)
-        return [int(mask.sum()) for mask in masks]
+        objective = Objective(other, criterion, result.settings, result.seed)
+        recognized = is_correct(other, problem.scene, problem.images(problem.start))
+        lights = {"further": (result.clean_correct & result.success, result.minimum.values)}
+        with np.load(out / f"{kind}.npz") as saved:
+            lights["first"] = torch.from_numpy(saved["wrong"]), torch.from_numpy(saved["values"])
+        counts[kind] = {}
+        for name, (is_wrong, values) in lights.items():
+            is_tested = is_wrong.to(recognized) & recognized
+            images = problem.images(values.to(problem.start))
+            predicted = objective.logits(images).argmax(2)
+            fooled = objective.fooled_in_views(images, predicted, problem.all_examples).all(1)
+            without_noise = criterion.reached(predicted)
+            masks = (is_tested & fooled, is_tested, is_tested & without_noise)
+            counts[kind][name] = [int(mask.sum()) for mask in masks]
+    return counts
 
 
 def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
@@ -460,14 +440,17 @@ def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
     ENOUGH. If no view is ever recognized, the first combination is returned.
     """
     best: PlainViews | None = None
-    candidates = list(_candidates(views))
-    for candidate in progress(candidates, "search for plain light"):
-        recognized = _count_recognized(classifier, candidate)
+    candidates = [*product(SIZES, EXPOSURES, PLAIN_LIGHTS)]
+    for size, exposure, name in progress(candidates, "search for plain light"):
+        candidate = replace(views, light=name, exposure=exposure, size=size)
+        scene = candidate.scene(classifier.size)
+        light = load_light(name).to(scene.lights) * exposure
+        recognized = int(_recognized(classifier, scene, light).sum())
         if best is None or recognized > best.recognized:
             best = PlainViews(
-                light=candidate.light,
-                exposure=candidate.exposure,
-                size=candidate.size,
+                light=name,
+                exposure=exposure,
+                size=size,
                 recognized=recognized,
                 n=views.count,
                 recognized_as_given=recognized if best is None else best.recognized_as_given,
@@ -476,21 +459,3 @@ def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
             break
     assert best is not None
     return best
-
-
-def _candidates(views: Views) -> Iterator[Views]:
-    """Yield a copy of views for each combination of size, exposure and plain light."""
-    for size in SIZES:
-        for exposure in EXPOSURES:
-            for light in PLAIN_LIGHTS:
-                yield replace(views, light=light, exposure=exposure, size=size)
-
-
-def _count_recognized(classifier: Classifier, views: Views) -> int:
-    """Render views in their own light, and count those that are classified correctly."""
-    scene = views.scene(classifier.size)
-    light = load_light(views.light).to(scene.lights) * views.exposure
-    examples = torch.arange(views.count, device=views.device)
-    with torch.no_grad():
-        images = scene.render(Conditions(light.expand(len(scene), -1, -1)), examples)
-    return int(is_correct(classifier, scene, images).sum())

