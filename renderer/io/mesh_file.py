@@ -1,11 +1,11 @@
 """What readers of mesh files share: the files beside a mesh, numbers in text, polygons, colors."""
 
 import io
-import itertools
 import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
@@ -175,14 +175,12 @@ def parse_numbers(text: bytes, dtype: type) -> np.ndarray:
             raise ValueError("a word is not a number: export the file again") from error
 
 
-def words_of_lines(text: bytes) -> list[list[bytes]]:
-    """Split text into the words of each line, without comments."""
-    return [line.split() for line in without_comments(text).split(b"\n")]
-
-
-def numbers_of(lines: Iterable[list[bytes]]) -> np.ndarray:
-    """Parse the words of all lines as float64, shape (N,)."""
-    return parse_numbers(b" ".join(itertools.chain.from_iterable(lines)), np.float64)
+def words_per_line(text: bytes) -> np.ndarray:
+    """Count the words of each line of a text that ends with a line break."""
+    characters = np.frombuffer(b"\n" + text, dtype=np.uint8)
+    is_blank = characters <= ord(" ")
+    lines = np.cumsum(characters == ord("\n"))[1:][is_blank[:-1] & ~is_blank[1:]] - 1
+    return np.bincount(lines, minlength=text.count(b"\n"))
 
 
 def triangles_of(
@@ -357,7 +355,7 @@ def _clip_ears(points: np.ndarray) -> tuple[np.ndarray, bool]:
     # The ears leave out some corners on straight edges. Each triangle
     # at such an edge is divided, so that it has these corners, too.
     kept = np.unique(triangles)
-    for start, end in itertools.pairwise([*kept, kept[0] + count]):
+    for start, end in pairwise([*kept, kept[0] + count]):
         if end == start + 1:
             continue
         chain = np.arange(start, end + 1) % count

@@ -12,14 +12,13 @@ from renderer.io.mesh_file import (
     Part,
     as_utf8,
     colored_mesh,
-    numbers_of,
     parse_numbers,
     product,
     require_bounded,
     triangles_of,
     unit_colors,
     without_comments,
-    words_of_lines,
+    words_per_line,
 )
 from renderer.mesh import NO_TEXTURE
 
@@ -57,9 +56,10 @@ class _Lines(NamedTuple):
     numbers: list[int]
     texts: list[bytes]
 
-    def words(self) -> list[list[bytes]]:
-        """Return the words of each line after the keyword, without comments."""
-        return words_of_lines(b"\n".join(self.texts)) if self.texts else []
+    def words(self) -> tuple[np.ndarray, bytes]:
+        """Return the number of words of each line, and all lines, without keyword and comment."""
+        text = without_comments(b"".join([text + b"\n" for text in self.texts]))
+        return words_per_line(text), text
 
     def names(self) -> list[str]:
         """Return the text of each line, which is a name."""
@@ -136,8 +136,7 @@ def _cleaned(text: bytes) -> bytes:
 
 def _table(lines: _Lines, lengths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Parse N lines of numbers, filled up with zeros, and return how many each has, shape (N,)."""
-    words = lines.words()
-    counts = np.array([len(line) for line in words], dtype=np.int64)
+    counts, text = lines.words()
     wrong = counts[~np.isin(counts, lengths)]
     if len(wrong):
         raise ValueError(
@@ -145,7 +144,7 @@ def _table(lines: _Lines, lengths: tuple[int, ...]) -> tuple[np.ndarray, np.ndar
         )
     table = np.zeros((len(counts), max(lengths)))
     is_given = np.arange(max(lengths)) < counts[:, None]
-    table[is_given] = numbers_of(words)
+    table[is_given] = parse_numbers(text, np.float64)
     return table, counts
 
 
@@ -173,9 +172,8 @@ def _polygons(lines: dict[str, _Lines]) -> tuple[np.ndarray, np.ndarray]:
     Return the indices (C, 3) of the position, uv and normal of each corner, or -1, and the number
     of corners (P,) of each face.
     """
-    words = lines["f"].words()
-    sizes = np.array([len(line) for line in words], dtype=np.int64)
-    indices = _corners([word for line in words for word in line])
+    sizes, text = lines["f"].words()
+    indices = _corners(text.split())
     for column, keyword in enumerate(("v", "vt", "vn")):
         written = indices[:, column]
         numbers = lines[keyword].numbers

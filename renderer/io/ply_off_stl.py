@@ -11,7 +11,6 @@ from renderer.io.mesh_file import (
     Part,
     as_utf8,
     colored_mesh,
-    numbers_of,
     parse_numbers,
     product,
     require_bounded,
@@ -19,7 +18,6 @@ from renderer.io.mesh_file import (
     triangles_of,
     unit_colors,
     without_comments,
-    words_of_lines,
 )
 from renderer.mesh import NO_TEXTURE
 
@@ -332,7 +330,7 @@ def read_off(file: MeshFile) -> list[Part]:
     if header is None:
         raise ValueError("the file does not begin with OFF")
     has_uvs, has_colors, has_normals, has_weights, has_dimension = map(bool, header.groups())
-    lines = [words for words in words_of_lines(text[header.end() :]) if words]
+    lines = [line.split() for line in text[header.end() :].split(b"\n") if line.strip()]
     counts = lines[0] if lines else []
     is_plain = all(count.isdigit() for count in counts) and len(counts) >= 2
     if has_weights or has_dimension or not is_plain:
@@ -348,14 +346,14 @@ def read_off(file: MeshFile) -> list[Part]:
     is_even = all(len(line) == width for line in vertex_lines)
     if not is_even or color_end - color_start not in ((3, 4) if has_colors else (0,)):
         raise ValueError(f"the vertices have other numbers than {header[0].decode()} announces")
-    table = numbers_of(vertex_lines).reshape(-1, width)
+    table = _numbers(vertex_lines).reshape(-1, width)
     vertices = table[:, :3]
     vertex_colors = _colors([line[color_start:color_end] for line in vertex_lines], file)
-    given_sizes = numbers_of([line[:1] for line in face_lines])
+    given_sizes = _numbers([line[:1] for line in face_lines])
     sizes = given_sizes.astype(np.int64)
     corner_words = [line[1 : 1 + size] for line, size in zip(face_lines, sizes, strict=True)]
     color_words = [line[1 + size :] for line, size in zip(face_lines, sizes, strict=True)]
-    numbers = numbers_of(corner_words)
+    numbers = _numbers(corner_words)
     indices = numbers.astype(np.int64)
     is_complete = len(indices) == sizes.sum() and (sizes == given_sizes).all()
     is_plain = is_complete and (indices == numbers).all()
@@ -371,10 +369,15 @@ def read_off(file: MeshFile) -> list[Part]:
     return [Part(colored_mesh(vertices, faces, colors), normals)]
 
 
+def _numbers(lines: list[list[bytes]]) -> np.ndarray:
+    """Parse the words of all lines, shape (N,)."""
+    return parse_numbers(b" ".join(word for line in lines for word in line), np.float64)
+
+
 def _colors(lines: list[list[bytes]], file: MeshFile) -> np.ndarray:
     """Convert lines of 3 or 4 words to sRGB-encoded colors, which are white for empty lines."""
     widths = np.array([len(line) for line in lines], dtype=np.int64)
-    given = numbers_of(lines)
+    given = _numbers(lines)
     # Bytes are written as whole numbers, and other colors with a point.
     highest = given.max(initial=0)
     is_whole = (given == given.astype(np.uint8)).all()
