@@ -82,6 +82,8 @@ class Camera(ABC):
     clip_range: float = field(default=CLIP_RANGE, kw_only=True)
 
     distance: ClassVar[float]
+    # Only a camera with perspective has a field `distance`.
+    has_perspective: ClassVar[bool] = False
     # Roll, point about which attacks turn the camera, principal point relative to the image
     # center, and aspect ratio of the pixels. Only a `PinholeCamera` has other values.
     roll: ClassVar[float] = 0.0
@@ -133,10 +135,8 @@ class Camera(ABC):
         """
         factor = log_distance.exp()
         moved: dict[str, Any] = {"polar": self.polar + polar, "azimuth": self.azimuth + azimuth}
-        # An orthographic camera has no field `distance`.
-        for name in ("width", "distance"):
-            if name in vars(self):
-                moved[name] = getattr(self, name) * factor
+        for name in ("width", "distance") if self.has_perspective else ("width",):
+            moved[name] = getattr(self, name) * factor
         return replace(self, **moved)
 
     def normalized(self, center: np.ndarray, scale: float) -> Self:
@@ -164,8 +164,7 @@ class Camera(ABC):
             "width": scale * self.width,
             "clip_range": scale * self.clip_range,
         }
-        # An orthographic camera has no field `distance`.
-        if "distance" in vars(self):
+        if self.has_perspective:
             distance = self.distance - back
             if not distance > 0:
                 raise InputError(
@@ -232,16 +231,17 @@ class Camera(ABC):
         Returns:
             Position of the camera (x, y, z, w), float64, shape (4,).
         """
-        axes, _ = self._differentiable_axes()
-        return F.pad(axes[2], (0, 1))
-
-    def _differentiable_axes(self) -> tuple[Tensor, Tensor]:
-        """Compute `axes` differentiably, and the camera coordinates of the origin, shape (3,)."""
         # Camera coordinates of the origin and of the unit vectors give the axes of the camera.
         origin_and_units = torch.eye(4, 3, dtype=torch.float64).roll(1, 0)
         coordinates = self._camera_coordinates(origin_and_units)
         origin = coordinates[:, 0]
-        return coordinates[:, 1:] - origin[:, None], origin
+        axes = coordinates[:, 1:] - origin[:, None]
+        if not self.has_perspective:
+            return F.pad(axes[2], (0, 1))
+        # Camera coordinates relative to the pivot, as in `pose`.
+        offsets = [-self.right, -self.up, self.distance]
+        position = torch.stack([tensor_like(offset, origin) for offset in offsets])
+        return F.pad((position - origin) @ axes, (0, 1), value=1.0)
 
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -279,7 +279,8 @@ class Camera(ABC):
               points. On a plane, it is a linear function of the image position.
         """
         right, up, back = self._camera_coordinates(points)
-        w, nearness = self._w_and_nearness(back)
+        w = 1 - back / self.distance if self.has_perspective else torch.ones_like(back)
+        nearness = 1 / w if self.has_perspective else back
         scale = 2 / self.width
         x = (right + self.right) * scale + self.principal_right * w
         y = (up + self.up) * scale * self.pixel_aspect + self.principal_up * w
@@ -305,14 +306,6 @@ class Camera(ABC):
         right, up, back = torch.stack([torch.stack(axis) for axis in axes]) @ (points - pivot).T
         cosine, sine = roll.cos(), roll.sin()
         return torch.stack([cosine * right + sine * up, cosine * up - sine * right, back])
-
-    @abstractmethod
-    def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
-        """Compute the homogeneous coordinate w and the nearness of points.
-
-        Image coordinates are divided by w. The nearness is larger for nearer points. `back` is
-        the coordinate along the axis from the origin to the camera.
-        """
 
     def depths(self, points: np.ndarray) -> np.ndarray | None:
         """Compute the depths of points, which a perspective projection divides by.
@@ -357,10 +350,6 @@ class OrthographicCamera(Camera):
         coordinates += (shift * scale)[:, None]
         return coordinates.T
 
-    def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
-        """Compute the homogeneous coordinate w, which is 1, and the nearness, which is `back`."""
-        return torch.ones_like(back), back
-
 
 @dataclass(frozen=True)
 class PerspectiveCamera(Camera):
@@ -378,16 +367,8 @@ class PerspectiveCamera(Camera):
     1.0
     """
 
-    # The distance is a field of perspective cameras only.
     distance: float = field(kw_only=True)  # type: ignore[misc]
-
-    def differentiable_eye(self) -> Tensor:
-        """Compute `eye`, (x, y, z, 1), differentiably."""
-        axes, origin = self._differentiable_axes()
-        # Camera coordinates relative to the pivot, as in `pose`.
-        offsets = [-self.right, -self.up, self.distance]
-        position = torch.stack([tensor_like(offset, origin) for offset in offsets])
-        return F.pad((position - origin) @ axes, (0, 1), value=1.0)
+    has_perspective: ClassVar[bool] = True
 
     @property
     def angle(self) -> float:
@@ -406,11 +387,6 @@ class PerspectiveCamera(Camera):
         depth_scale = 2 * far / (far - near)
         normalized_depth = depth_scale * ((self.distance - near - back) / depths) - 1
         return np.stack([x, y, normalized_depth]).T
-
-    def _w_and_nearness(self, back: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
-        """Compute w, the depth divided by the camera's distance, and the nearness 1 / w."""
-        w = 1 - back / self.distance
-        return w, 1 / w
 
     def depths(self, points: np.ndarray) -> np.ndarray:
         """Compute the depths of points, which must lie in front of the camera."""

@@ -270,7 +270,12 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
     for keyword, text in properties:
         match keyword.lower():
             case "kd":
-                material = material._replace(color=_color(text))
+                values = [float(word) for word in without_comments(text.encode()).split()]
+                is_color = all(0 <= value <= 1 + TOLERANCE for value in values)
+                if len(values) not in (1, 3) or not is_color:
+                    raise ValueError(f'"Kd {text}" is no color: give red, green, blue from 0 to 1')
+                color = tuple(min(value, 1.0) for value in values * (3 // len(values)))
+                material = material._replace(color=color)
             case "map_kd":
                 texture, is_clamped = _texture(text)
                 material = material._replace(texture=(texture, folder), is_clamped=is_clamped)
@@ -284,15 +289,6 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
     if not opacities.get("d", 1 - opacities.get("tr", 0)) >= OPAQUE:
         raise ValueError(f"the material {name} is transparent, which is not supported")
     return material
-
-
-def _color(text: str) -> tuple[float, ...]:
-    """Parse a color of one gray value, or of red, green and blue."""
-    values = [float(word) for word in without_comments(text.encode()).split()]
-    # A comparison with NaN is False, so `not` also finds NaN.
-    if len(values) not in (1, 3) or not all(0 <= value <= 1 + TOLERANCE for value in values):
-        raise ValueError(f'"Kd {text}" is not a color: give red, green and blue from 0 to 1')
-    return tuple(min(value, 1.0) for value in values * (3 // len(values)))
 
 
 def _texture(text: str) -> tuple[str, bool]:

@@ -17,7 +17,7 @@ from functools import partial, reduce
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderer.errors import require_bounded
@@ -76,14 +76,22 @@ def surface_albedo(
 def sample_textures(
     textures: Sequence[Texture], mesh: Mesh, fragments: Fragments
 ) -> Float[Tensor, "C S"]:
-    """Look up the textures of a mesh at the samples of a view, with interpolation.
+    """Look up the textures of a mesh at the samples of a view, with bilinear interpolation.
 
-    Samples of faces without a texture have the value 1. `mesh.texture_ids` are
-    indices into `textures`.
+    The texture coordinates are u (to the right) and v (up). The texture covers
+    [0, 1] in both and repeats beyond. The center of column i is at
+    u = (i + 0.5) / width. Samples of faces without a texture have the value 1.
+    `mesh.texture_ids` are indices into `textures`.
     """
     parts = list(_samples_of_textures(textures, mesh, fragments))
+    blocks = [
+        reduce(torch.add, [w * texture.look_up(i) for w, i in _surrounding_texels(texture, block)])
+        for texture, _, uvs in parts
+        # The points are processed in blocks to limit the memory.
+        for block in uvs.split(BLOCK, dim=1)
+    ]
     # One row for each channel.
-    values = torch.cat([interpolate_texture(texture, uvs) for texture, _, uvs in parts], 1)
+    values = torch.cat(blocks, dim=1)
     sample_count = len(fragments.sample_to_seen_face)
     # All faces of most meshes have the same texture.
     if len(parts) == 1 and values.shape[1] == sample_count:
@@ -105,21 +113,6 @@ def _samples_of_textures(
         samples = torch.nonzero(texture_of_sample == texture_id).squeeze(1)
         has_all = len(samples) == len(texture_of_sample)
         yield texture, samples, sample_uvs if has_all else sample_uvs.index_select(1, samples)
-
-
-def interpolate_texture(texture: Texture, uvs: Float[Tensor, "2 N"]) -> Float[Tensor, "C N"]:
-    """Interpolate a texture bilinearly at N points.
-
-    The texture coordinates are u (to the right) and v (up). The texture covers
-    [0, 1] in both and repeats beyond. The center of column i is at
-    u = (i + 0.5) / width.
-    """
-    # The points are processed in blocks to limit the memory.
-    blocks = [
-        reduce(torch.add, [w * texture.look_up(i) for w, i in _surrounding_texels(texture, block)])
-        for block in uvs.split(BLOCK, dim=1)
-    ]
-    return torch.cat(blocks, dim=1)
 
 
 def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tuple[Tensor, Tensor]]:
@@ -164,22 +157,17 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
     # A channel has only 256 possible values. A table with the linear value of each saves
     # decoding every texel.
     linear_values = decode(torch.arange(256, dtype=torch.float64) / 255, encoding).to(like)
+
+    def look_up(all_texels: Tensor, texels: Tensor) -> Tensor:
+        """Look up the linear values (3, N) of N texels (N,) of a texture with 8 bits."""
+        eight_bit_values = all_texels.index_select(0, texels).int().flatten()
+        return linear_values.index_select(0, eight_bit_values).view(-1, 3).T
+
     textures = []
     for texture in mesh.textures:
         all_texels = torch.from_numpy(texture).to(like.device).flatten(0, 1)
-        look_up = partial(_look_up_bytes, all_texels, linear_values)
-        textures.append(Texture(*texture.shape[:2], look_up=look_up))
+        textures.append(Texture(*texture.shape[:2], look_up=partial(look_up, all_texels)))
     return textures
-
-
-def _look_up_bytes(
-    all_texels: UInt8[Tensor, "_ 3"],
-    linear_values: Float[Tensor, " 256"],
-    texels: Int[Tensor, " N"],
-) -> Float[Tensor, "3 N"]:
-    """Look up the linear values of N texels of a texture with 8 bits."""
-    eight_bit_values = all_texels.index_select(0, texels).int().flatten()
-    return linear_values.index_select(0, eight_bit_values).view(-1, 3).T
 
 
 def face_albedo(albedo: Float[Tensor, "F 3"], fragments: Fragments) -> Float[Tensor, "S 3"]:
