@@ -288,8 +288,7 @@ def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
             may_be_points = True
             _, *numbers, camera_id, image_name = line.split(maxsplit=9)
             pose = np.array(numbers, dtype=float)
-            # The real part of the quaternion is first in the file, and last for scipy.
-            rotation = Rotation.from_quat(np.roll(pose[:4], -1)).as_matrix()
+            rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
             view = np.column_stack([rotation, pose[4:]])
             _add(cameras, image_name.strip(), PinholeCamera.from_matrix(view, *lenses[camera_id]))
     return cameras

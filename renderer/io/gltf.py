@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
+from scipy.ndimage import map_coordinates
 
 from renderer.errors import require_memory
 from renderer.image import encode
@@ -47,23 +48,24 @@ SKINNED_VERTEX_BYTES = 1000
 MAX_WEIGHT_ERROR = 0.01
 
 
+# Columns of the values of vertices.
+POSITION = slice(0, 3)
+U, V, ALPHA = 3, 4, 5
+COLOR = slice(6, 9)
+NORMAL = slice(9, 12)
+
+
 class _Surface(NamedTuple):
-    """Faces whose corners have values, in their own axes.
+    """Faces whose vertices have values.
 
     Attributes:
-        positions: Positions of the V vertices, shape (V, 3).
+        values: Position (3), texture coordinates (2), alpha, linear color (3) and normal (3) of
+            the V vertices, shape (V, 12). Normals of 0 if the file has none.
         faces: Vertex indices of the corners of the F faces, shape (F, 3).
-        corners: Texture coordinates (2), alpha, linear color (3) and normal (3)
-            of the corners, shape (F, 3, 9). Normals of 0 if the file has none.
     """
 
-    positions: Float[np.ndarray, "V 3"]
+    values: Float[np.ndarray, "V 12"]
     faces: Int[np.ndarray, "F 3"]
-    corners: Float[np.ndarray, "F 3 9"]
-
-    def select(self, faces: np.ndarray) -> "_Surface":
-        """Keep some of the faces, and all vertices."""
-        return self._replace(faces=self.faces[faces], corners=self.corners[faces])
 
 
 class _Primitive(NamedTuple):
@@ -150,9 +152,9 @@ def _read_part(
     require_bounded(coordinates=positions, colors=colors, **{"texture coordinates": uvs})
     material, uvs = material.placed(uvs)
     normals = attributes.get("NORMAL", np.zeros_like(positions))
-    values = np.concatenate([uvs, colors[:, 3:], colors[:, :3], normals], axis=1)
+    values = np.column_stack([positions, uvs, colors[:, 3], colors[:, :3], normals])
     joints = {key: v for key, v in attributes.items() if key.startswith(SKINNING)}
-    return _Primitive(_Surface(positions, faces, values[faces]), material, joints)
+    return _Primitive(_Surface(values, faces), material, joints)
 
 
 def _attributes(
@@ -234,17 +236,20 @@ def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
         if len(poses) > 1:
             raise ValueError("it shows several copies of a mesh that joints move")
         positions, pose = _posed(file, file.entry("skins", node["skin"]), part)
-        surface = surface._replace(positions=positions)
+        values = np.column_stack([positions, surface.values[:, 3:]])
+        surface = surface._replace(values=values)
         poses = pose[None]
-    vertices, faces, corners = _visible(part.material, surface)
+    values, faces = _visible(part.material, surface)
     if not len(faces):
         return []
+    vertices = values[:, POSITION]
+    corners = values[faces]
     material = part.material
     mesh = colored_mesh(
         vertices,
         faces,
-        encode(torch.from_numpy(corners[..., 3:6]), "srgb").numpy(),
-        corners[..., :2],
+        encode(torch.from_numpy(corners[..., COLOR]), "srgb").numpy(),
+        corners[..., U:ALPHA],
         textures=[] if material.texture is None else [material.texture],
     )
     if material.gloss is not None:
@@ -254,7 +259,7 @@ def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
             gloss=np.tile(material.gloss.astype(np.float32), (len(faces), 1)),
             gloss_textures=(material.gloss_texture,) if has_texture else (),
         )
-    normals = corners[..., 6:] if corners[..., 6:].any() else None
+    normals = corners[..., NORMAL] if corners[..., NORMAL].any() else None
     if "skin" not in node:
         return [Part(mesh, normals, pose) for pose in poses]
     # The values of the normals are only compared, so they need not follow the joints.
@@ -278,7 +283,7 @@ def _posed(
             raise ValueError(f"a skin has {len(bind)} matrices for {len(matrices)} joints")
         matrices = matrices @ bind
     names = [name for name in part.joints if name.startswith("JOINTS")]
-    none = np.zeros((len(part.surface.positions), 0), np.int64)
+    none = np.zeros((len(part.surface.values), 0), np.int64)
     joints = np.hstack([none, *(part.joints[name] for name in names)])
     weights = np.hstack([none, *(part.joints[n.replace("JOINTS", "WEIGHTS")] for n in names)])
     # A joint with the weight 0 may be any number, so it is replaced by joint 0.
@@ -288,7 +293,7 @@ def _posed(
             f"a vertex has the joint {joints.max()}, but its skin has {len(matrices)} joints"
         )
     # Weighted sum of the matrices of the joints, and of the weights, for each vertex.
-    blended = np.zeros((len(part.surface.positions), 4, 4))
+    blended = np.zeros((len(part.surface.values), 4, 4))
     for joint, weight in zip(joints.T, weights.T, strict=True):
         blended += weight[:, None, None] * matrices[joint]
     sums = weights.sum(axis=1)
@@ -299,7 +304,8 @@ def _posed(
         raise ValueError(f"the weights of a vertex add up to {worst:g} instead of 1")
     blended /= sums[:, None, None]
     linear, shift = blended[:, :3, :3], blended[:, :3, 3]
-    return np.einsum("vij,vj->vi", linear, part.surface.positions) + shift, matrices[0]
+    positions = part.surface.values[:, POSITION]
+    return np.einsum("vij,vj->vi", linear, positions) + shift, matrices[0]
 
 
 def _visible(material: Material, surface: _Surface) -> _Surface:
@@ -316,8 +322,6 @@ def _visible(material: Material, surface: _Surface) -> _Surface:
     return visible
 
 
-# Columns of the values at the corners of faces.
-U, V, ALPHA = 0, 1, 2
 # Largest alpha of a texel.
 FULL = 255
 # Largest number of faces before the last division.
@@ -339,22 +343,10 @@ class _AlphaTexture:
                 high = np.maximum(high, np.roll(high, step, axis))
             self._levels.append(np.stack([low, high]))
 
-    def position(self, corners: np.ndarray) -> np.ndarray:
-        """Compute the positions (column, row), in texels, of points with texture coordinates."""
+    def positions(self, values: np.ndarray) -> np.ndarray:
+        """Compute the positions (column, row), in texels, of vertices, shape (V, 2)."""
         height, width = self.texels.shape
-        columns = corners[..., U] * width - 0.5
-        return np.stack([columns, (1 - corners[..., V]) * height - 0.5], axis=-1)
-
-    def at(self, positions: np.ndarray) -> np.ndarray:
-        """Interpolate alpha in [0, 1] bilinearly at positions (N, 2) in texels."""
-        height, width = self.texels.shape
-        first = np.floor(positions)
-        weight = positions - first
-        columns = (first[:, :1].astype(np.int64) + np.arange(2)) % width
-        rows = (first[:, 1:].astype(np.int64) + np.arange(2)) % height
-        values = self.texels[rows[:, :, None], columns[:, None, :]] / FULL
-        values = _interpolate(values[:, 0], values[:, 1], weight[:, 1])
-        return _interpolate(values[:, 0], values[:, 1], weight[:, 0])
+        return np.stack([values[:, U] * width - 0.5, (1 - values[:, V]) * height - 0.5], axis=1)
 
     def ranges(self, positions: np.ndarray) -> np.ndarray:
         """Return bounds (2, F) of alpha within F faces with corners at positions (F, 3, 2)."""
@@ -381,107 +373,86 @@ def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: f
     surface = given
     texture = _AlphaTexture(np.full((1, 1), FULL, np.uint8) if texels is None else texels)
     while True:
-        positions = texture.position(surface.corners)
-        low, high = texture.ranges(positions)
-        alphas = surface.corners[..., ALPHA]
+        values, faces = surface
+        positions = texture.positions(values)
+        corners = positions[faces]
+        low, high = texture.ranges(corners)
+        alphas = values[faces, ALPHA]
         is_shown = high * alphas.max(axis=1) >= cutoff
         is_crossed = is_shown & (low * alphas.min(axis=1) < cutoff)
-        lengths = np.linalg.norm(positions - np.roll(positions, -1, axis=1), axis=2)
+        lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
         is_large = is_crossed & (lengths.max(axis=1) > 1)
         # Without a texture, alpha is linear in each face, so faces need not be divided.
         if texels is None or not is_large.any():
             break
-        if len(surface.faces) > MAX_FACES:
+        if len(faces) > MAX_FACES:
             raise ValueError(
                 f"the border of its alpha needs more than {MAX_FACES} faces: use fewer texels "
                 "or fewer repetitions of the texture"
             )
-        surface = _halve(surface.select(is_shown), lengths[is_shown], is_large[is_shown])
-    flat_alpha = texture.at(positions[is_crossed].reshape(-1, 2)).reshape(-1, 3)
-    excess = flat_alpha * alphas[is_crossed] - cutoff
-    if is_shown.all() and not (excess < 0).any():
+        surface = _halve(values, faces[is_shown], lengths[is_shown], is_large[is_shown])
+    # SciPy has rows first.
+    flat_alpha = map_coordinates(
+        texture.texels, positions.T[::-1], np.float64, order=1, mode="grid-wrap"
+    )
+    excess = flat_alpha / FULL * values[:, ALPHA] - cutoff
+    crossed = faces[is_crossed]
+    if is_shown.all() and not (excess[crossed] < 0).any():
         return given
-    kept = surface.select(is_shown & ~is_crossed)
-    vertices, faces, corners = _cut(surface.select(is_crossed), excess)
-    faces = np.concatenate([kept.faces, faces])
-    return _Surface(vertices, faces, np.concatenate([kept.corners, corners]))
+    values, cut_faces = _cut(values, crossed, excess)
+    return _Surface(values, np.concatenate([faces[is_shown & ~is_crossed], cut_faces]))
 
 
-def _interpolate(values: np.ndarray, others: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Interpolate between two arrays of N rows by the shares (N,) of the second one."""
-    share = share.reshape(-1, *[1] * (values.ndim - 1))
-    return values + share * (others - values)
-
-
-def _halve(surface: _Surface, lengths: np.ndarray, is_large: np.ndarray) -> _Surface:
+def _halve(
+    values: np.ndarray, faces: np.ndarray, lengths: np.ndarray, is_large: np.ndarray
+) -> _Surface:
     """Halve some faces at an edge that is the longest of all faces around it, so no crack opens.
 
     Such an edge is at the end of a path from each large face over the longest edge to the next
     face (Rivara 1984). `lengths` are those of the sides 0-1, 1-2 and 2-0, shape (F, 3).
     """
-    vertices, faces, corners = surface
     ends, edge_of_side = shared_edges(faces)
-    # A seam of the texture has two lengths. Edges of one length are ordered by their numbers.
     edge_length = np.zeros(len(ends))
-    np.maximum.at(edge_length, edge_of_side, lengths)
+    edge_length[edge_of_side] = lengths
+    # Edges of one length are ordered by their numbers.
     rank = np.argsort(np.argsort(edge_length, kind="stable"))
     longest = rank[edge_of_side].argmax(axis=1)
     longest_edge = np.take_along_axis(edge_of_side, longest[:, None], axis=1)[:, 0]
-    is_wanted = np.zeros(len(ends), dtype=bool)
+    is_halved = np.zeros(len(ends), dtype=bool)
     touched = is_large
-    while not is_wanted[longest_edge[touched]].all():
-        is_wanted[longest_edge[touched]] = True
-        touched = is_wanted[edge_of_side].any(axis=1)
-    is_wanted[edge_of_side[edge_of_side != longest_edge[:, None]]] = False
-    halved = is_wanted[longest_edge]
+    while not is_halved[longest_edge[touched]].all():
+        is_halved[longest_edge[touched]] = True
+        touched = is_halved[edge_of_side].any(axis=1)
+    is_halved[edge_of_side[edge_of_side != longest_edge[:, None]]] = False
+    divided = is_halved[longest_edge]
     # Corners 0 and 1 are the ends of the longest side, and point 3 is its middle.
-    order = (longest[halved, None] + np.arange(3)) % 3
-    points = np.take_along_axis(faces[halved], order, axis=1)
-    middle = len(vertices) + (np.cumsum(is_wanted) - 1)[longest_edge[halved]]
-    points = np.column_stack([points, middle])
-    values = np.take_along_axis(corners[halved], order[..., None], axis=1)
-    values = np.concatenate([values, values[:, :2].mean(axis=1, keepdims=True)], axis=1)
-    halves = [[0, 3, 2], [3, 1, 2]]
+    order = (longest[divided, None] + np.arange(3)) % 3
+    middle = len(values) + (np.cumsum(is_halved) - 1)[longest_edge[divided]]
+    points = np.column_stack([np.take_along_axis(faces[divided], order, axis=1), middle])
     return _Surface(
-        np.concatenate([vertices, vertices[ends[is_wanted]].mean(axis=1)]),
-        np.concatenate([faces[~halved], *(points[:, half] for half in halves)]),
-        np.concatenate([corners[~halved], *(values[:, half] for half in halves)]),
+        np.concatenate([values, values[ends[is_halved]].mean(axis=1)]),
+        np.concatenate([faces[~divided], points[:, [0, 3, 2]], points[:, [3, 1, 2]]]),
     )
 
 
-def _cut(surface: _Surface, excess: np.ndarray) -> _Surface:
-    """Keep the parts of faces where a linear function is not negative.
+def _cut(values: np.ndarray, faces: np.ndarray, excess: Float[np.ndarray, " V"]) -> _Surface:
+    """Keep the parts of faces where a function that is linear in each face is not negative.
 
-    Its values at the corners are `excess`, shape (F, 3).
+    Its values at the vertices are `excess`.
     """
-    vertices, faces, corners = surface
-    is_kept = excess >= 0
+    is_kept = excess[faces] >= 0
     count = is_kept.sum(axis=1)
-    whole, crossed = count == 3, (count == 1) | (count == 2)
+    is_whole, is_cut = count == 3, (count == 1) | (count == 2)
     # The corner 0 is the one that differs from both others.
-    odd = np.where(count == 1, is_kept.argmax(axis=1), is_kept.argmin(axis=1))[crossed]
-    order = (odd[:, None] + np.arange(3)) % 3
-    odd_faces = np.take_along_axis(faces[crossed], order, axis=1)
-    odd_corners = np.take_along_axis(corners[crossed], order[..., None], axis=1)
-    excess = np.take_along_axis(excess[crossed], order, axis=1)
+    odd = np.where(count == 1, is_kept.argmax(axis=1), is_kept.argmin(axis=1))[is_cut]
+    turned = np.take_along_axis(faces[is_cut], (odd[:, None] + np.arange(3)) % 3, axis=1)
     # Points 3 and 4 lie on the sides 0-1 and 0-2.
-    shares = excess[:, :1] / (excess[:, :1] - excess[:, 1:])
-    starts, stops = odd_corners[:, [0, 0]], odd_corners[:, 1:]
-    values = np.concatenate([odd_corners, starts + shares[..., None] * (stops - starts)], axis=1)
-    # Both faces at an edge get the same point, at the share of the first of them.
-    sides = np.stack([odd_faces[:, [0, 0]], odd_faces[:, 1:]], axis=-1).reshape(-1, 2)
-    is_forward = sides[:, 0] < sides[:, 1]
-    share = np.where(is_forward, shares.ravel(), 1 - shares.ravel())
-    sides.sort(axis=1)
-    _, first, point_of_side = np.unique(
-        sides @ [len(vertices), 1], return_index=True, return_inverse=True
-    )
-    low, high = vertices[sides[first]].swapaxes(0, 1)
-    ids = np.concatenate([odd_faces, len(vertices) + point_of_side.reshape(-1, 2)], axis=1)
-    one = count[crossed] == 1
-    pieces = [(one, (0, 3, 4)), (~one, (3, 1, 2)), (~one, (3, 2, 4))]
-    return _Surface(
-        np.concatenate([vertices, _interpolate(low, high, share[first])]),
-        np.concatenate([faces[whole], *(ids[rows][:, piece] for rows, piece in pieces)]),
-        np.concatenate([corners[whole], *(values[rows][:, piece] for rows, piece in pieces)]),
-    )
+    sides = np.sort(turned[:, [[0, 1], [0, 2]]].reshape(-1, 2), axis=1)
+    keys, point_of_side = np.unique(sides @ [len(values), 1], return_inverse=True)
+    low, high = np.divmod(keys, len(values))
+    share = excess[low] / (excess[low] - excess[high])
+    points = values[low] + share[:, None] * (values[high] - values[low])
+    ids = np.column_stack([turned, len(values) + point_of_side.reshape(-1, 2)])
+    one = count[is_cut] == 1
+    pieces = [ids[one][:, [0, 3, 4]], ids[~one][:, [3, 1, 2]], ids[~one][:, [3, 2, 4]]]
+    return _Surface(np.concatenate([values, points]), np.concatenate([faces[is_whole], *pieces]))

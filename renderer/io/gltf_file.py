@@ -516,9 +516,9 @@ def _with_color(material: Material, file: GltfFile, model: dict[str, Any], name:
     if f"{name}Texture" not in model:
         return material
     image, placement = _image(file, model[f"{name}Texture"])
-    alpha = np.array(image.convert("RGBA"))[..., 3] if image.has_transparency_data else None
-    alpha = None if alpha is None or alpha.min() == 255 else alpha
-    texture = np.array(image.convert("RGB"))
+    texels = np.array(image.convert("RGBA"))
+    alpha = texels[..., 3] if texels[..., 3].min() < 255 else None
+    texture = np.ascontiguousarray(texels[..., :3])
     return replace(material, placement=placement, texture=texture, alpha=alpha)
 
 
