@@ -182,22 +182,15 @@ class Camera(ABC):
             Unit vectors to the right, up and back (from the origin to the
             camera) as rows, float64, shape (3, 3).
         """
-        polar = math.radians(self.polar)
-        azimuth = math.radians(self.azimuth)
-        sin_polar = math.sin(polar)
-        cos_polar = math.cos(polar)
-        sin_azimuth = math.sin(azimuth)
-        cos_azimuth = math.cos(azimuth)
-        back_x = sin_polar * cos_azimuth
-        back_y = sin_polar * sin_azimuth
-        # The sum equals sin_polar, except for rounding errors. Using sin_polar instead would change
-        # the last bits of images.
-        up_z = back_x * cos_azimuth + back_y * sin_azimuth
-        right = np.array([-sin_azimuth, cos_azimuth, 0.0])
-        up = np.array([-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, up_z])
-        cos_roll, sin_roll = math.cos(math.radians(self.roll)), math.sin(math.radians(self.roll))
-        rolled = [cos_roll * right + sin_roll * up, cos_roll * up - sin_roll * right]
-        return np.array([*rolled, [back_x, back_y, cos_polar]])
+        polar, azimuth, roll = map(math.radians, (self.polar, self.azimuth, self.roll))
+        sine, cosine = math.sin(azimuth), math.cos(azimuth)
+        back = np.array([math.sin(polar) * cosine, math.sin(polar) * sine, math.cos(polar)])
+        right = np.array([-sine, cosine, 0.0])
+        # The last component is sin(polar), except for rounding errors. Using sin(polar) instead
+        # would change the last bits of images.
+        up = np.array([-back[2] * cosine, -back[2] * sine, back[0] * cosine + back[1] * sine])
+        sine, cosine = math.sin(roll), math.cos(roll)
+        return np.array([cosine * right + sine * up, cosine * up - sine * right, back])
 
     def pose(self) -> np.ndarray:
         """Return the matrix that maps camera coordinates to world coordinates.

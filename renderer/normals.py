@@ -322,7 +322,7 @@ def _groups_of_file(
     return _joined(faces, first[agree], second[agree]), is_given
 
 
-def _neighbors(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _neighbors(faces: np.ndarray) -> Int[np.ndarray, "2 N"]:
     """Return the pairs of corners at one vertex whose faces share an edge that ends there.
 
     Corner c of face f has the number 3 f + c.
@@ -334,7 +334,7 @@ def _neighbors(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     edge = np.minimum(start, end) * (start.max() + 1) + np.maximum(start, end)
     sides = np.argsort(edge, kind="stable")
     sorted_edges = edge[sides]
-    firsts, seconds = [], []
+    pairs = [np.zeros((2, 0), np.int64)]
     for distance in range(1, MAX_FACES_AT_EDGE):
         is_shared = sorted_edges[distance:] == sorted_edges[:-distance]
         if not is_shared.any():
@@ -343,13 +343,10 @@ def _neighbors(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         second = sides[distance:][is_shared]
         # The corners of both faces at the start and at the end of the first side.
         is_parallel = start[first] == start[second]
-        firsts += [first, next_corner[first]]
-        seconds += [
-            np.where(is_parallel, second, next_corner[second]),
-            np.where(is_parallel, next_corner[second], second),
-        ]
-    nothing = np.zeros(0, np.int64)
-    return np.concatenate([nothing, *firsts]), np.concatenate([nothing, *seconds])
+        pairs.append(np.stack([first, np.where(is_parallel, second, next_corner[second])]))
+        at_end = np.where(is_parallel, next_corner[second], second)
+        pairs.append(np.stack([next_corner[first], at_end]))
+    return np.concatenate(pairs, axis=1)
 
 
 def _joined(faces: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -229,7 +229,7 @@ def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObjec
     They stand at the height of its new lowest vertex.
     """
     mesh = item.own_mesh
-    return _with_mesh(item, replace(mesh, vertices=_rounded(mesh.vertices @ rotation.T)))
+    return _with_mesh(item, mesh.moved(_rounded(mesh.vertices @ rotation.T)))
 
 
 def add_specular_layer(item: SceneObject, gloss: Gloss) -> SceneObject:

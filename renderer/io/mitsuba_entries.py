@@ -59,45 +59,33 @@ def projector(pose: Float[np.ndarray, "4 4"], fov: float, pattern: Scene, scale:
 def sensor(
     pose: Float[np.ndarray, "4 4"],
     size: int,
-    fov: float | None = None,
+    lens: Scene,
     pixel_format: str = "rgba",
-    film_center: tuple[float, float] = (0.0, 0.0),
     pixel_aspect: float = 1.0,
 ) -> Scene:
     """Describe a camera for Mitsuba, which calls it a sensor.
 
-    The angle `fov` is horizontal, in degrees. None shows x and y from -1 to 1 without
-    perspective. `film_center` is the offset of the image center from the principal point, right
-    and down, as fractions of the image. Mitsuba has square pixels, so the number of rows is size
-    divided by `pixel_aspect`.
+    The lens is {"type": "perspective", "fov": horizontal angle in degrees}, or, for x and y from
+    -1 to 1 without perspective, {"type": "orthographic"}. Mitsuba has square pixels, so the number
+    of rows is size divided by `pixel_aspect`.
     """
-    row_count = max(1, round(size / pixel_aspect))
-    film = {
-        "type": "hdrfilm",
-        "width": size,
-        "height": row_count,
-        "pixel_format": pixel_format,
-        "rfilter": {"type": "box"},
-    }
-    lens: Scene = {"type": "orthographic"}
-    if fov is not None:
-        lens = {"type": "perspective", "fov": fov}
-    if any(film_center):
-        right, below = film_center
-        lens |= {"principal_point_offset_x": right, "principal_point_offset_y": below}
+    film = {"type": "hdrfilm", "width": size, "height": max(1, round(size / pixel_aspect))}
+    film |= {"pixel_format": pixel_format, "rfilter": {"type": "box"}}
     return {**lens, "to_world": pose, "film": film}
 
 
 def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
     """Convert a camera of this renderer to a camera of Mitsuba."""
-    if isinstance(camera, PerspectiveCamera):
-        # The principal point is measured from the image center in halves of the
-        # image, and Mitsuba measures the image center from the principal point.
-        film_center = (-camera.principal_right / 2, camera.principal_up / 2)
-        pose = pose_of(camera)
-        aspect = camera.pixel_aspect
-        return sensor(pose, size, camera.angle, pixel_format, film_center, aspect)
-    return sensor(pose_of(camera, camera.width / 2), size, None, pixel_format)
+    if not isinstance(camera, PerspectiveCamera):
+        pose = pose_of(camera, camera.width / 2)
+        return sensor(pose, size, {"type": "orthographic"}, pixel_format)
+    lens: Scene = {"type": "perspective", "fov": camera.angle}
+    if camera.principal_right or camera.principal_up:
+        # The principal point is measured from the image center in halves of the image, and
+        # Mitsuba measures the image center from the principal point, right and down.
+        lens["principal_point_offset_x"] = -camera.principal_right / 2
+        lens["principal_point_offset_y"] = camera.principal_up / 2
+    return sensor(pose_of(camera), size, lens, pixel_format, camera.pixel_aspect)
 
 
 def pose_of(camera: Camera, scale: float = 1.0) -> Float[np.ndarray, "4 4"]:

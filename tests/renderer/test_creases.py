@@ -204,7 +204,7 @@ def test_a_file_has_the_normals_of_the_mesh(name, normals, tmp_path):
 
 def test_moved_vertices_keep_the_sharp_edges_of_the_mesh():
     """A flattened rim stays sharp, so that images have no jump as the vertices move."""
-    moved = replace(CAN, vertices=CAN.vertices * [1, 1, 0.01])
+    moved = CAN.moved(CAN.vertices * [1, 1, 0.01])
     assert_array_equal(moved.normal_ids, CAN.normal_ids)
     light = nb.load_light("grace").double()
     camera = nb.OrthographicCamera(50.0, 20.0, 1.6)

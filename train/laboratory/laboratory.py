@@ -118,11 +118,12 @@ def path_traced(
     and this choice would cause most of the noise. `spp` is the number of paths for each pixel and
     light source; the result is linear radiance.
     """
+    lens = {"type": "perspective", "fov": FOV}
     with mitsuba() as module:
         scene = {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": bounces + 1},
-            "sensor": sensor(look_at(shot.camera, shot.aim), size, FOV, "rgb"),
+            "sensor": sensor(look_at(shot.camera, shot.aim), size, lens, "rgb"),
             "table": _plane(np.eye(4), shot.table),
         }
         if shot.wall is not None:
