@@ -368,30 +368,27 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
 def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
     """Check and split a view matrix, (4, 4) or (3, 4): rotation (3, 3) and translation (3,)."""
     matrix = as_array("view", view).astype(np.float64)
-    if matrix.shape not in ((4, 4), (3, 4)):
-        raise InputError(f"view has shape {matrix.shape}: give a matrix (4, 4) or (3, 4)")
-    rotation = matrix[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    is_right_handed = np.linalg.det(rotation) > 0
-    is_affine = np.array_equal(matrix[3:], np.eye(4)[3 : len(matrix)])
-    if not (error <= MATRIX_TOLERANCE and is_right_handed and is_affine):
-        raise InputError(
-            f"view={matrix.tolist()} is not a rotation with a translation: give the matrix from "
-            "world to camera coordinates"
-        )
-    return rotation, matrix[:3, 3]
+    if matrix.shape in ((4, 4), (3, 4)):
+        rotation = matrix[:3, :3]
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        is_affine = np.array_equal(matrix[3:], np.eye(4)[3 : len(matrix)])
+        if error <= MATRIX_TOLERANCE and np.linalg.det(rotation) > 0 and is_affine:
+            return rotation, matrix[:3, 3]
+    raise InputError(
+        f"view={matrix.tolist()} is not a rotation with a translation: give the matrix (4, 4) or "
+        "(3, 4) from world to camera coordinates"
+    )
 
 
 def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
     """Check an intrinsic matrix in pixels, and return fx, fy, cx and cy."""
     matrix = as_array("intrinsics", intrinsics).astype(np.float64)
-    if matrix.shape != (3, 3):
-        raise InputError(f"intrinsics has shape {matrix.shape}: give a matrix (3, 3)")
-    (focal_x, skew, center_x), (below_diagonal, focal_y, center_y), last_row = matrix.tolist()
-    has_focal_lengths = focal_x > 0 and focal_y > 0
-    has_zeros = below_diagonal == 0 and abs(skew) <= MATRIX_TOLERANCE * focal_x
-    if not (has_focal_lengths and has_zeros and last_row == [0, 0, 1]):
-        raise InputError(
-            f"intrinsics is {matrix.tolist()}: give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-        )
-    return focal_x, focal_y, center_x, center_y
+    if matrix.shape == (3, 3):
+        focal_x, focal_y, center_x, center_y = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        expected = [[focal_x, 0, center_x], [0, focal_y, center_y], [0, 0, 1]]
+        error = np.abs(matrix - expected).max()
+        if focal_x > 0 and focal_y > 0 and error <= MATRIX_TOLERANCE * focal_x:
+            return focal_x, focal_y, center_x, center_y
+    raise InputError(
+        f"intrinsics is {matrix.tolist()}: give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+    )

@@ -290,12 +290,9 @@ def smallest_roughness(mesh: Mesh) -> float:
     if mesh.gloss is None:
         return 1.0
     # The first channel of a gloss texture is a factor for the roughness.
-    roughness_factors = [
-        np.percentile(texture[..., 0], _IGNORED_PERCENT) / 255 for texture in mesh.gloss_textures
-    ]
-    # Faces without a texture have the texture index -1, which selects this last factor.
-    roughness_factors.append(1.0)
-    factor_of_face = np.take(roughness_factors, mesh.texture_ids if mesh.gloss_textures else -1)
+    smallest = [np.percentile(t[..., 0], _IGNORED_PERCENT) / 255 for t in mesh.gloss_textures]
+    # Faces without a texture have the texture index -1, which selects the last factor.
+    factor_of_face = np.take([*smallest, 1.0], mesh.texture_ids if smallest else -1)
     roughness_of_face = mesh.gloss[:, 0] * factor_of_face
     # Columns 1 and 2 are metallic and specular factor. If both are 0, a face is matte.
     has_gloss = mesh.gloss[:, 1:].any(1)

@@ -133,7 +133,17 @@ class ViewFrame(NamedTuple):
         """
         # There are M = (degree + 1) (degree + 2) / 2 lobe functions.
         degree = (math.isqrt(8 * len(lobes) + 1) - 3) // 2
-        coefficients = self._harmonics_in_sample_axes(lobes, degree)
+        # In sample axes, the coefficients of the orders m ≥ 0 are c_lm s_m cos mφ, and those of
+        # the orders -m < 0 are c_lm s_m sin mφ (see the module).
+        functions, orders = (ids.to(lobes.device) for ids in _functions_and_orders(degree))
+        # The normal is (sin θ cos φ, sin θ sin φ, cos θ). The smallest sine avoids a division
+        # by 0 at θ = 0, where its powers make the factors 0 or 1, and gradients finite.
+        x, y, _ = self.normals
+        sine = (x**2 + y**2).clamp(min=SMALLEST_SINE**2).sqrt()
+        sine_powers = torch.stack([torch.ones_like(sine), sine, sine**2])
+        exponents = _sine_exponents(torch.arange(-degree, degree + 1, device=x.device).abs())
+        factors = _complex_powers(x / sine, y / sine, degree) * sine_powers[exponents]
+        coefficients = lobes.index_select(0, functions) * factors.index_select(0, degree + orders)
         if self.tilt is None:
             return coefficients
         # The tilt R_x(a) R_y(b) rotates about the y-axis and then about the x-axis. But
@@ -146,24 +156,6 @@ class ViewFrame(NamedTuple):
         for angle in (Angle(sine_b, cosine_b), Angle(sine_a, cosine_a)):
             coefficients = _rotate_harmonics(_multiply_bands(permutation, coefficients), angle)
         return coefficients
-
-    def _harmonics_in_sample_axes(self, lobes: Tensor, degree: int) -> Tensor:
-        """Compute the SH coefficients of the lobe of each of S samples in its own sample axes.
-
-        The coefficients of the orders m ≥ 0 are c_lm s_m cos mφ, and those of the
-        orders -m < 0 are c_lm s_m sin mφ (see the module).
-        """
-        function_of_harmonic, order = _functions_and_orders(degree)
-        function_of_harmonic = function_of_harmonic.to(lobes.device)
-        order = order.to(lobes.device)
-        # The normal is (sin θ cos φ, sin θ sin φ, cos θ). The smallest sine avoids a division
-        # by 0 at θ = 0, where its powers make the factors 0 or 1, and gradients finite.
-        x, y, _ = self.normals
-        sine = (x**2 + y**2).clamp(min=SMALLEST_SINE**2).sqrt()
-        sine_powers = torch.stack([torch.ones_like(sine), sine, sine**2])
-        exponents = _sine_exponents(torch.arange(-degree, degree + 1, device=x.device).abs())
-        factors = _complex_powers(x / sine, y / sine, degree) * sine_powers[exponents]
-        return lobes.index_select(0, function_of_harmonic) * factors.index_select(0, degree + order)
 
     def to_world(self, coefficients: Tensor) -> Tensor:
         """Rotate SH coefficients from the intermediate axes of `harmonics` to world axes.
