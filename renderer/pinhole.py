@@ -159,7 +159,7 @@ class PinholeCamera(PerspectiveCamera):
             rotation = rotation * [[1], [-1], [-1]]
             translation = translation * [1, -1, -1]
         focal_x, focal_y, principal_x, principal_y = _split_intrinsics(intrinsics)
-        image_width, image_height = size if np.ndim(size) else (size, size)
+        image_width, image_height = size if isinstance(size, tuple | list) else (size, size)
         for side in (image_width, image_height):
             require_whole("size", side, 1, MAX_MAGNITUDE)
         side = min(image_width, image_height)

@@ -253,12 +253,9 @@ def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
         textures=[] if material.texture is None else [material.texture],
     )
     if material.gloss is not None:
-        has_texture = material.gloss_texture is not None
-        mesh = replace(
-            mesh,
-            gloss=np.tile(material.gloss.astype(np.float32), (len(faces), 1)),
-            gloss_textures=(material.gloss_texture,) if has_texture else (),
-        )
+        gloss = np.tile(material.gloss.astype(np.float32), (len(faces), 1))
+        texture = material.gloss_texture
+        mesh = replace(mesh, gloss=gloss, gloss_textures=() if texture is None else (texture,))
     normals = corners[..., NORMAL] if corners[..., NORMAL].any() else None
     if "skin" not in node:
         return [Part(mesh, normals, pose) for pose in poses]

@@ -350,10 +350,9 @@ def _glb(
     for key in np.unique(keys, axis=0):
         has_key = (keys == key).all(1)
         # Eight values for each corner: color (3), texture coordinates (2) and normal (3).
-        values = [mesh.corner_colors[has_key], mesh.corner_uvs[has_key], normals[has_key]]
-        vertex_ids, values, faces = _split_vertices(
-            mesh.faces[has_key], np.concatenate(values, axis=-1)
-        )
+        parts = [mesh.corner_colors[has_key], mesh.corner_uvs[has_key], normals[has_key]]
+        corner_values = np.concatenate(parts, axis=-1)
+        vertex_ids, values, faces = _split_vertices(mesh.faces[has_key], corner_values)
         attributes = {
             "POSITION": mesh.vertices[vertex_ids] @ rotation,
             # v points down in glTF.

@@ -52,7 +52,8 @@ class Texture:
         require_bounded(texture=values)
         # One row for each channel, with all texels in row-major order.
         channels = values.flatten(0, 1).T
-        return Texture(*values.shape[:2], look_up=partial(torch.index_select, channels, 1))
+        height, width = values.shape[:2]
+        return Texture(height, width, partial(torch.index_select, channels, 1))
 
 
 def surface_albedo(
@@ -165,8 +166,9 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
 
     textures = []
     for texture in mesh.textures:
+        height, width = texture.shape[:2]
         all_texels = torch.from_numpy(texture).to(like.device).flatten(0, 1)
-        textures.append(Texture(*texture.shape[:2], look_up=partial(look_up, all_texels)))
+        textures.append(Texture(height, width, partial(look_up, all_texels)))
     return textures
 
 
