@@ -335,11 +335,13 @@ def compute_outputs(
         for batch in batches:
             moved = batch if device is None else batch.to(device)
             shown = to_unit(moved) if moved.dtype == torch.uint8 else moved
+
+            def compute(rows: slice, shown: Tensor = shown) -> Tensor:
+                # The network may compute in half precision.
+                return network(shown[rows]).to(shown.dtype)
+
             # No images are a batch, too, which gives outputs their shape.
-            count = len(shown) or 1
-            computed = limit.map(lambda rows, images=shown: network(images[rows]), count)
-            # The network may compute in half precision.
-            outputs += [output.to(shown.dtype) for output in computed]
+            outputs += limit.map(compute, len(shown) or 1)
     joined = torch.cat(outputs)
     return joined.unflatten(0, images.shape[:-3]) if isinstance(images, Tensor) else joined
 

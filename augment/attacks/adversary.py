@@ -217,9 +217,9 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     cameras = adversary.cameras
     export_mesh(shown.mesh, folder / MESH, settings.normals, cameras, shown.own)
     (_, light), *local_lights = save_lights(folder, adversary.light, adversary.basis)
-    background: float | str = float(adversary.background.flatten()[0])
-    if (adversary.background != background).any():
-        background = BACKGROUND
+    gray = float(adversary.background.flatten()[0])
+    is_gray = bool((adversary.background == gray).all())
+    if not is_gray:
         _write_png(folder / BACKGROUND, adversary.background.expand(3, -1, -1))
     if adversary.pixels is not None:
         write_numbers(folder / PIXELS, _as_numpy(adversary.pixels))
@@ -236,7 +236,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
         "albedo_scale": shown.albedo_scale,
         "gloss": shown.mesh.gloss is not None,
         "local_lights": [basis.name for basis, _ in local_lights],
-        "background": background,
+        "background": gray if is_gray else BACKGROUND,
         "cameras": [asdict(camera) for camera in cameras],
         "image": asdict(settings),
         "pixels": adversary.pixels is not None,
