@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, w
 from augment.attacks.objective import as_jpeg
 from augment.attacks.result import AttackResult, predictions, require_result, warnings
 from augment.progress import progress
+from augment.scene.objects import Conditions
 from renderer.errors import as_folder, as_list, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.files import atomic_write
@@ -92,7 +94,8 @@ def save(
     require_renderers(verify)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"example_{example:03d}" for example in range(len(result.images_in_views))]
-    lines = [_write_example(result, *pair) for pair in enumerate(progress(paths, "saving"))]
+    write = partial(_write_example, result, result.conditions)
+    lines = [write(example, path) for example, path in enumerate(progress(paths, "saving"))]
 
     images = result.images_in_views.cpu()
     versions = {
@@ -129,8 +132,10 @@ def require_renderers(names: Sequence[str]) -> None:
             pass
 
 
-def _write_example(result: AttackResult, example: int, path: Path) -> dict[str, Any]:
-    """Write the figure and the folder of an example.
+def _write_example(
+    result: AttackResult, after: Conditions, example: int, path: Path
+) -> dict[str, Any]:
+    """Write the figure and the folder of an example. `after` are the conditions of all examples.
 
     Return its numbers for attack.jsonl, where the dictionary "versions" is empty.
     """
@@ -138,7 +143,7 @@ def _write_example(result: AttackResult, example: int, path: Path) -> dict[str, 
     scene = problem.scene
     images = result.images_in_views_before[example], result.images_in_views[example]
     write_image(path.with_suffix(".png"), figure(result, example))
-    adversary = Adversary.of(scene, example, result.conditions, *images)
+    adversary = Adversary.of(scene, example, after, *images)
     light_numbers = write_adversary(adversary, path)
     light_before, basis_before = result.light(problem.start, example)
     exposed = light_before.cpu() * scene.examples[example].exposure
