@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -217,16 +217,15 @@ class Lamps(LocalBasis):
     def __post_init__(self) -> None:
         """Check the fields, and convert the positions to tuples of numbers."""
         positions = as_array("positions", self.positions)
-        if positions.shape[1:] != (3,) or (positions == 0).all(axis=1).any():
+        is_triple = positions.shape[1:] == (3,) and (positions != 0).any(axis=1).all()
+        if not is_triple or not (np.abs(positions) <= MAX_SCALE).all():
             raise InputError(
                 f"lamps.positions={self.positions} are no positions of lamps: give [x, y, z] for "
-                "each lamp, and no lamp at the origin"
+                f"each lamp, with magnitudes up to {MAX_SCALE:g}, and no lamp at the origin"
             )
         # Plain assignment to a field of a frozen dataclass raises an error.
         object.__setattr__(self, "positions", tuple(map(tuple, positions.tolist())))
         require_field_types(self, "positions")
-        for value in chain(*self.positions):
-            require_range("a coordinate of lamps.positions", value, -MAX_SCALE, MAX_SCALE)
         require_range("lamps.power", self.power, 1 / MAX_SCALE, MAX_SCALE)
         require_range("lamps.radius", self.radius, 0, MAX_SCALE)
 

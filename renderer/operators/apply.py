@@ -273,7 +273,7 @@ class TransferOperator:
         canvas = background_images.expand(*batch_shape, -1, -1)
         images = canvas.clone(memory_format=torch.contiguous_format)
         # `scatter_` takes half the time of `index_copy_` on a CPU.
-        images.scatter_(-1, self._pixels_by_color.expand(*batch_shape, -1, -1), encoded)
+        images.scatter_(-1, self.pixels.expand(*batch_shape, COLORS, -1), encoded)
         size = self.settings.size
         return images.view(*batch_shape, COLORS, size, size), is_unclamped, clamped_values
 
@@ -287,7 +287,7 @@ class TransferOperator:
 
         The last two arguments are the last two results of `_images`.
         """
-        pixel_index = self._pixels_by_color.expand(*is_unclamped.shape[:-2], -1, -1)
+        pixel_index = self.pixels.expand(is_unclamped.shape)
         # `gather` is faster than `index_select`, most of all for three axes.
         pixel_gradient = image_gradient.flatten(-2).gather(-1, pixel_index)
         pixel_gradient = encode_gradient(clamped_values, pixel_gradient, self.settings.encoding)
@@ -436,11 +436,6 @@ class TransferOperator:
     def _last_background(self) -> dict[str, tuple[Any, tuple[Tensor, Tensor]]]:
         """Key of the last gray background, and what was prepared for it ("pair")."""
         return {}
-
-    @cached_property
-    def _pixels_by_color(self) -> Tensor:
-        """Indices of the covered pixels, repeated for the three colors, shape (3, P)."""
-        return self.pixels.expand(COLORS, -1)
 
     @cached_property
     def _placement(self) -> Tensor:

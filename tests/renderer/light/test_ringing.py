@@ -81,49 +81,38 @@ def test_the_irradiance_of_a_point_source_has_the_documented_error(degree):
     assert irradiance_error(band_factors(degree)) == pytest.approx(ERRORS[degree], rel=5e-3)
 
 
-class WindowSearch:
+def searched_factors(degree: int) -> np.ndarray:
     """Search for the best window by SciPy, without the window's own quadratic program.
 
     A kernel that is nowhere negative is the square of a polynomial, times
     1 + z if the degree is odd. The search is over the Legendre coefficients of
-    this polynomial.
+    this polynomial. The result is the best of four searches from random polynomials.
     """
+    node, node_weight = legendre.leggauss(64)
+    cosine, weight = legendre.leggauss(400)
+    clamped_cosine = legendre.legvander(cosine, degree).T @ (weight * cosine.clip(min=0)) / 2
+    energies = 2 * np.arange(degree + 1) + 1
 
-    def __init__(self, degree: int) -> None:
-        self.degree = degree
-        self.node, self.weight = legendre.leggauss(64)
-        cosine, weight = legendre.leggauss(400)
-        clamped = weight * cosine.clip(min=0)
-        self.clamped_cosine = legendre.legvander(cosine, degree).T @ clamped / 2
-
-    def factors(self, values: np.ndarray) -> np.ndarray:
-        """Return the factors of the kernel that a polynomial gives."""
-        odd_factor = 1 + self.node * (self.degree % 2)
-        squared = legendre.legval(self.node, values) ** 2 * odd_factor
-        bands = legendre.legvander(self.node, self.degree).T @ (self.weight * squared) / 2
+    def factors(values: np.ndarray) -> np.ndarray:
+        squared = legendre.legval(node, values) ** 2 * (1 + node * (degree % 2))
+        bands = legendre.legvander(node, degree).T @ (node_weight * squared) / 2
         return bands / bands[0]
 
-    def objective(self, values: np.ndarray) -> float:
-        """Return the squared irradiance error up to a factor."""
-        energies = 2 * np.arange(self.degree + 1) + 1
-        changes = self.clamped_cosine * (1 - self.factors(values))
-        return 1e3 * float((energies * changes**2).sum())
+    def squared_error(values: np.ndarray) -> float:
+        return 1e3 * float((energies * (clamped_cosine * (1 - factors(values))) ** 2).sum())
 
-    def best_factors(self) -> np.ndarray:
-        """Return the best of four searches from random polynomials."""
-        count = self.degree // 2 + 1
-        starts = np.random.default_rng(0).uniform(0.2, 1, (4, count)) + np.eye(count)[0]
-        options = {"ftol": 1e-12, "maxiter": 500}
-        results = []
-        for start in starts:
-            result = optimize.minimize(self.objective, start, method="SLSQP", options=options)
-            results.append(result)
-        return self.factors(min(results, key=lambda result: result.fun).x)
+    count = degree // 2 + 1
+    starts = np.random.default_rng(0).uniform(0.2, 1, (4, count)) + np.eye(count)[0]
+    options = {"ftol": 1e-12, "maxiter": 500}
+    results = [
+        optimize.minimize(squared_error, start, method="SLSQP", options=options) for start in starts
+    ]
+    return factors(min(results, key=lambda result: result.fun).x)
 
 
 @pytest.mark.parametrize("degree", [3, 6, 12])
 def test_scipy_finds_no_better_window_that_is_nowhere_negative(degree):
-    best_error = irradiance_error(WindowSearch(degree).best_factors())
+    best_error = irradiance_error(searched_factors(degree))
     assert irradiance_error(band_factors(degree)) <= 1.001 * best_error
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,23 +108,14 @@ def relative_error(approximate: torch.Tensor, exact: np.ndarray) -> float:
     return float(np.linalg.norm(error) / np.linalg.norm(exact))
 
 
-class WeightedSky:
-    """Radiance of the published sky times harmonics, as an integrand in angles."""
-
-    def __init__(self, zenith: float, azimuth: float, turbidity: float) -> None:
-        self.zenith = zenith
-        self.azimuth = azimuth
-        self.turbidity = turbidity
-
-    def __call__(self, angles: np.ndarray) -> np.ndarray:
-        """Return the integrands (N, 49 · 3) at zenith angles and azimuths (N, 2)."""
-        directions = unit_vectors(angles[:, 0], angles[:, 1])
-        xyz = published_sky(directions, self.zenith, self.azimuth, self.turbidity)
-        rgb = xyz @ np.linalg.inv(RGB_TO_XYZ).T
-        harmonics = basis(torch.from_numpy(directions), 6).numpy()
-        solid_angle = np.sin(angles[:, :1])
-        products = (harmonics * solid_angle)[:, :, None] * rgb[:, None, :]
-        return products.reshape(len(angles), -1)
+def weighted_sky(angles: np.ndarray, sky: tuple[float, float, float]) -> np.ndarray:
+    """Return radiance of the published sky times harmonics (N, 49 · 3) by angles (N, 2)."""
+    directions = unit_vectors(angles[:, 0], angles[:, 1])
+    rgb = published_sky(directions, *sky) @ np.linalg.inv(RGB_TO_XYZ).T
+    harmonics = basis(torch.from_numpy(directions), 6).numpy()
+    solid_angle = np.sin(angles[:, :1])
+    products = (harmonics * solid_angle)[:, :, None] * rgb[:, None, :]
+    return products.reshape(len(angles), -1)
 
 
 @pytest.mark.parametrize("sky", SKIES)
@@ -132,7 +124,7 @@ def test_quadrature_agrees_with_adaptive_cubature_of_the_published_formula(sky):
     # The radiance has a cusp at the sun.
     is_sun_inside = 0 < zenith < HORIZON
     result = cubature(
-        WeightedSky(*sky),
+        partial(weighted_sky, sky=sky),
         [0, azimuth - math.pi],
         [HORIZON, azimuth + math.pi],
         rule="gk21",

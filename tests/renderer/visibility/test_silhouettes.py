@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -101,43 +101,29 @@ def relative_error(found: Tensor, expected: Tensor) -> float:
     return float((found - expected).norm() / expected.norm())
 
 
-@dataclass(frozen=True)
-class MovedVertices:
-    """Image of a mesh whose vertices are moved by a change (V, 3)."""
+def moved_vertices(mesh: renderer.Mesh, camera: Camera, size: int, normals: str) -> ChangedImage:
+    """Return the image of a mesh whose vertices are moved by a change (V, 3)."""
 
-    mesh: renderer.Mesh
-    camera: Camera
-    size: int
-    normals: str
+    def image(change: Tensor, samples: int) -> Tensor:
+        vertices = torch.from_numpy(mesh.vertices) + change
+        options = {"vertices": vertices, "normals": normals, "silhouettes": change.requires_grad}
+        return rendered(mesh, camera, size, samples, **options)
 
-    def __call__(self, change: Tensor, samples: int) -> Tensor:
-        vertices = torch.from_numpy(self.mesh.vertices) + change
-        return rendered(
-            self.mesh,
-            self.camera,
-            self.size,
-            samples,
-            vertices=vertices,
-            normals=self.normals,
-            silhouettes=change.requires_grad,
-        )
+    return image
 
 
-@dataclass(frozen=True)
-class MovedCamera:
-    """Image of a mesh from a camera whose fields are changed by a vector."""
+def moved_camera(
+    mesh: renderer.Mesh, camera: Camera, names: list[str], gloss: renderer.Gloss | None = None
+) -> ChangedImage:
+    """Return the image of a mesh from a camera whose fields are changed by a vector."""
 
-    mesh: renderer.Mesh
-    camera: Camera
-    names: list[str]
-    gloss: renderer.Gloss | None = None
+    def image(change: Tensor, samples: int) -> Tensor:
+        values = {
+            name: getattr(camera, name) + amount for name, amount in zip(names, change, strict=True)
+        }
+        return rendered(mesh, replace(camera, **values), 48, samples, gloss=gloss)
 
-    def __call__(self, change: Tensor, samples: int) -> Tensor:
-        values = {}
-        for name, amount in zip(self.names, change, strict=True):
-            values[name] = getattr(self.camera, name) + amount
-        camera = replace(self.camera, **values)
-        return rendered(self.mesh, camera, 48, samples, gloss=self.gloss)
+    return image
 
 
 def displacements(points: Tensor) -> Tensor:
@@ -164,7 +150,7 @@ BOUNDS = {"cup": 0.03, "plate": 0.04}
 )
 def test_gradients_by_vertices_are_differences_of_new_images(name, normals, camera):
     mesh = named_mesh(name)
-    image = MovedVertices(mesh, camera, 64, normals)
+    image = moved_vertices(mesh, camera, 64, normals)
     directions = displacements(torch.from_numpy(mesh.vertices))
     found = derivatives(image, directions, samples=8)
     expected = differences(image, directions, samples=20, step=0.02)
@@ -173,7 +159,7 @@ def test_gradients_by_vertices_are_differences_of_new_images(name, normals, came
 
 def test_gradients_by_vertices_are_differences_of_new_images_of_a_few_pixels():
     mesh = named_mesh("mushroom")
-    image = MovedVertices(mesh, NEAR, 32, "flat")
+    image = moved_vertices(mesh, NEAR, 32, "flat")
     directions = displacements(torch.from_numpy(mesh.vertices))[::3]
     found = derivatives(image, directions, samples=8)
     expected = differences(image, directions, samples=14, step=0.02)
@@ -190,7 +176,7 @@ def test_gradients_by_the_camera_are_differences_of_new_images(camera):
     if isinstance(camera, PinholeCamera):
         names += ["roll", "center_x", "center_y", "center_z"]
         names += ["principal_right", "principal_up", "pixel_aspect"]
-    image = MovedCamera(named_mesh("pear"), camera, names)
+    image = moved_camera(named_mesh("pear"), camera, names)
     directions = torch.eye(len(names), dtype=torch.float64)
     found = derivatives(image, directions, samples=8)
     expected = differences(image, directions, samples=14, step=0.02)
@@ -200,7 +186,7 @@ def test_gradients_by_the_camera_are_differences_of_new_images(camera):
 @pytest.mark.parametrize("camera", [FAR, NEAR], ids=["orthographic", "perspective"])
 def test_gradients_by_the_camera_include_the_movement_of_highlights(camera):
     metal = renderer.Gloss(0.5, 1.0)
-    image = MovedCamera(named_mesh("pear"), camera, ["polar", "azimuth"], metal)
+    image = moved_camera(named_mesh("pear"), camera, ["polar", "azimuth"], metal)
     directions = torch.eye(2, dtype=torch.float64)
     found = derivatives(image, directions, samples=8)
     # A smaller turn moves outlines across too few samples.
@@ -413,7 +399,7 @@ def moves_of_nearest_vertices(mesh: renderer.Mesh) -> Tensor:
 @pytest.mark.parametrize("name", PARTS)
 def test_gradients_by_single_vertices_are_differences_if_a_part_hides_another(name, size):
     mesh = concatenate(PARTS[name])
-    image = MovedVertices(mesh, NEAR, size, "flat")
+    image = moved_vertices(mesh, NEAR, size, "flat")
     directions = moves_of_nearest_vertices(mesh)
     # The error of differences falls with the square of the step.
     step = min(NEAR.width / size / 2, 0.04)
