@@ -23,7 +23,7 @@ from renderer.errors import MAX_SCALE, InputError, ShortRepr
 from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.io.images import gray_or_image, write_image
 from renderer.io.meshes import export_mesh
-from renderer.light.basis import Basis, parts_of, with_local_lights
+from renderer.light.basis import Basis, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
 from renderer.light.files import load_light, read_light, save_light
 from renderer.light.lamps import LOCAL_LIGHTS
@@ -273,7 +273,7 @@ def save_lights(
     name of each file. Return basis and coefficients of each light, the environment light first.
     """
     lights: list[tuple[Any, Tensor]] = []
-    for rows, basis_of_light in parts_of(basis):
+    for rows, basis_of_light in basis.lights:
         coefficients = light[rows]
         # The first light is the environment.
         name = basis_of_light.name if lights else Path(LIGHT).stem

@@ -16,8 +16,9 @@ In shapes, `size` is the number of functions of a basis.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -65,14 +66,20 @@ class Basis(ABC):
         """Number of basis functions, which is the number of RGB coefficients."""
 
     @property
+    def lights(self) -> list[tuple[slice, Any]]:
+        """All lights, in order: the slice of the coefficients of each one, and its basis."""
+        return [(slice(0, self.size), self)]
+
+    @property
     def environment(self) -> EnvironmentPart | None:
         """Environment light of this basis, or None if all its lights are local."""
-        return None
+        lights = (EnvironmentPart(*light) for light in self.lights)
+        return next((light for light in lights if isinstance(light.basis, Harmonics)), None)
 
     @property
     def local_lights(self) -> list[LocalPart]:
         """Lamps and projectors of this basis, in the order of their coefficients."""
-        return []
+        return [LocalPart(*light) for light in self.lights if isinstance(light[1], LocalBasis)]
 
     @property
     def movable_light(self) -> LocalPart | None:
@@ -144,11 +151,6 @@ class Harmonics(Basis):
     def size(self) -> int:
         """Number of harmonics."""
         return (self.degree + 1) ** 2
-
-    @property
-    def environment(self) -> EnvironmentPart:
-        """Environment light of this basis. Its slice contains all coefficients."""
-        return EnvironmentPart(slice(0, self.size), self)
 
     @property
     def nonzero(self) -> Tensor:
@@ -307,11 +309,6 @@ class LocalBasis(Basis):
             For each emitter, the dictionary that describes it in a Mitsuba scene.
         """
 
-    @property
-    def local_lights(self) -> list[LocalPart]:
-        """List with this light only. Its slice of the coefficients contains all of them."""
-        return [LocalPart(slice(0, self.size), self)]
-
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
         """Clamp RGB coefficients to the range from 0 to the `power` of this light source.
 
@@ -353,7 +350,7 @@ class SumBasis(Basis):
 
     def __post_init__(self) -> None:
         """Check that at most one of the bases in `parts` is environment light."""
-        if sum(part.environment is not None for part in self.parts) > 1:
+        if sum(isinstance(part, Harmonics) for part in self.parts) > 1:
             raise InputError(
                 "parts has two environment lights: give one, with the sum of their coefficients"
             )
@@ -367,46 +364,23 @@ class SumBasis(Basis):
         return sum(part.size for part in self.parts)
 
     @property
-    def environment(self) -> EnvironmentPart | None:
-        """Environment light, with the slice of its coefficients. None if all are local."""
-        for rows, part in self._rows_of_parts():
-            if part.environment is not None:
-                return EnvironmentPart(rows, part.environment.basis)
-        return None
-
-    @property
-    def local_lights(self) -> list[LocalPart]:
-        """Lamps and projectors of all parts, with the slices of their coefficients."""
+    def lights(self) -> list[tuple[slice, Any]]:
+        """All lights, in order: the slice of the coefficients of each one, and its basis."""
+        ends = list(accumulate(part.size for part in self.parts))
         return [
-            LocalPart(rows, light.basis)
-            for rows, part in self._rows_of_parts()
-            for light in part.local_lights
+            (slice(end - part.size, end), part) for end, part in zip(ends, self.parts, strict=True)
         ]
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
         """Replace the coefficients of each light in `parts` by ones without negative radiance."""
         projected = [
-            part.project_nonnegative(coefficients[..., rows, :])
-            for rows, part in self._rows_of_parts()
+            part.project_nonnegative(coefficients[..., rows, :]) for rows, part in self.lights
         ]
         return torch.cat(projected, dim=-2)
 
     def moved(self, positions: Float[Tensor, "L 3"]) -> Self:
         """Return a copy of this basis in which the movable light sources are moved."""
         return replace(self, parts=tuple(part.moved(positions) for part in self.parts))
-
-    def _rows_of_parts(self) -> Iterator[tuple[slice, Harmonics | LocalBasis]]:
-        """Iterate over the bases in `parts`, each after the slice of its coefficients."""
-        first = 0
-        for part in self.parts:
-            yield slice(first, first + part.size), part
-            first += part.size
-
-
-def parts_of(basis: Basis) -> list[EnvironmentPart | LocalPart]:
-    """List the environment light and the local lights of a basis."""
-    environment = [] if basis.environment is None else [basis.environment]
-    return sorted([*environment, *basis.local_lights], key=lambda part: part.rows.start)
 
 
 def harmonics_of(basis: Basis) -> Harmonics:

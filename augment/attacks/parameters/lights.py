@@ -13,7 +13,7 @@ from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.errors import InputError
-from renderer.light.basis import HARMONICS, Harmonics, LocalBasis, parts_of
+from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
 from renderer.light.files import mean_luminance
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.ringing import nonnegative_window
@@ -72,9 +72,7 @@ def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
 
     Return its rows in the coefficients of all lights, and its basis.
     """
-    # `parts_of` returns one pair for each light. The environment comes first.
-    lights = parts_of(scene.basis)
-    return lights[0]
+    return scene.basis.lights[0]
 
 
 def replace_light(

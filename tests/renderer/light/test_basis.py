@@ -7,7 +7,7 @@ import torch
 
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.light.basis import Harmonics, SumBasis, parts_of, split_light
+from renderer.light.basis import Harmonics, SumBasis, split_light
 from renderer.light.environment import read_map
 from renderer.light.lamps import Lamps, Projector
 from renderer.mesh import Mesh
@@ -30,10 +30,10 @@ def numbered_coefficients() -> torch.Tensor:
 
 @pytest.mark.parametrize(("parts", "first_rows"), ORDERS)
 def test_the_parts_of_a_sum_have_their_coefficients_in_the_order_of_the_parts(parts, first_rows):
-    found = parts_of(SumBasis(tuple(parts)))
-    assert [part.basis for part in found] == parts
-    assert [part.rows.start for part in found] == first_rows
-    assert [part.rows.stop for part in found] == [*first_rows[1:], 20]
+    found = SumBasis(tuple(parts)).lights
+    assert [basis for _, basis in found] == parts
+    assert [rows.start for rows, _ in found] == first_rows
+    assert [rows.stop for rows, _ in found] == [*first_rows[1:], 20]
 
 
 @pytest.mark.parametrize(("parts", "first_rows"), ORDERS)

@@ -15,7 +15,6 @@ from augment.scene import patterns
 from augment.scene.objects import Conditions, load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
-from renderer.light.basis import parts_of
 from renderer.light.files import load_light
 from train.auditing import audit, lights
 from train.auditing.audit import run_audit
@@ -66,7 +65,7 @@ def views() -> Views:
 def mean_values(views: Views, power: float) -> torch.Tensor:
     """Render the views with all lamps at a power, and average each image."""
     scene = views.scene(8, "lamps")
-    ((rows, _),) = [part for part in parts_of(scene.basis) if part[1].name == "lamps"]
+    ((rows, _),) = [part for part in scene.basis.lights if part[1].name == "lamps"]
     light = scene.basis.project_nonnegative(scene.lights)
     light[:, rows] = power
     images = scene.render(Conditions(light), torch.arange(len(scene)))
