@@ -77,9 +77,8 @@ class Fragments:
             shape (S,).
         sample_to_seen_face: Index into `faces` of the face that each sample
             shows, int64, shape (S,).
-        sample_numbers: Number of each sample among all samples of the image,
-            covered or not, int64, shape (S,). The samples are numbered pixel by
-            pixel, and row by row within a pixel.
+        sample_numbers: Row-major index of each sample among all samples of the image,
+            covered or not, int64, shape (S,).
         depths: Depths of the corners of seen faces (see `Camera.depths`),
             float64, shape (G, 3). None without perspective.
         camera: Camera of the view. None if the samples come from no camera.
@@ -169,21 +168,13 @@ class Fragments:
         x points to the right and y up, and the image is [-1, 1] in both.
         """
         resolution = self.size * self.samples
-        row, column = _divide(self._finer_pixels.double(), resolution)
+        # Dividing floating-point numbers takes a tenth of the time of dividing integers.
+        numbers = self.sample_numbers.double()
+        row = (numbers / resolution).floor()
+        column = numbers - row * resolution
         # The image [-1, 1] is divided into square cells of width 2 / resolution. A sample
         # is the center of its cell.
         return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
-
-    @cached_property
-    def _finer_pixels(self) -> Tensor:
-        """Row-major index of each covered sample among all samples of the image, shape (S,)."""
-        # Dividing floating-point numbers takes a tenth of the time of dividing integers.
-        pixel_index, number_in_pixel = _divide(self.sample_numbers.double(), self.samples**2)
-        pixel_row, pixel_column = _divide(pixel_index, self.size)
-        row_in_pixel, column_in_pixel = _divide(number_in_pixel, self.samples)
-        row = pixel_row * self.samples + row_in_pixel
-        column = pixel_column * self.samples + column_in_pixel
-        return (row * (self.size * self.samples) + column).long()
 
     def by_sample(self) -> "Fragments":
         """Return a copy for a finer image, in which each sample is a pixel.
@@ -195,10 +186,9 @@ class Fragments:
             self,
             size=self.size * self.samples,
             samples=1,
-            pixels=self._finer_pixels,
+            pixels=self.sample_numbers,
             coverage=self.coverage.new_ones(sample_count),
             sample_to_pixel=torch.arange(sample_count, device=self.sample_numbers.device),
-            sample_numbers=self._finer_pixels,
         )
         # The copy does not compute the weights again.
         vars(finer)["barycentric"] = self.barycentric
@@ -211,14 +201,14 @@ class Fragments:
         """
         resolution = self.size * self.samples
         image = values.new_full((resolution**2,), empty)
-        return image.index_copy_(0, self._finer_pixels, values).view(resolution, resolution)
+        return image.index_copy_(0, self.sample_numbers, values).view(resolution, resolution)
 
     def of_image(self, image: Float[Tensor, "_ _"]) -> Float[Tensor, " S"]:
         """Read the values of the covered samples from an image with one pixel per sample.
 
         This is the inverse of `image_of_samples`.
         """
-        return image.flatten().index_select(0, self._finer_pixels)
+        return image.flatten().index_select(0, self.sample_numbers)
 
     def interpolate(self, corners: Float[Tensor, "G 3 D"]) -> Float[Tensor, "S D"]:
         """Interpolate values at the corners of faces to the S samples.
@@ -349,12 +339,6 @@ def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
     return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
 
 
-def _divide(numbers: Float[Tensor, " S"], divisor: int) -> tuple[Tensor, Tensor]:
-    """Divide whole numbers that are stored as floats into whole quotients and remainders."""
-    quotient = (numbers / divisor).floor()
-    return quotient, numbers - quotient * divisor
-
-
 def build_fragments(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
@@ -401,8 +385,13 @@ def _fragments_of_view(
     """
     size = settings.size
     samples = settings.samples
-    # All face ids of the first pixel, then all of the second pixel, and so on.
-    ids_by_pixel = face_ids.reshape(size, samples, size, samples).swapaxes(1, 2).ravel()
+    resolution = len(face_ids)
+    numbers = np.arange(resolution**2, dtype=np.int32).reshape(face_ids.shape)
+    # Values of all samples of the first pixel, then of all samples of the second pixel, and so on.
+    ids_by_pixel, numbers_by_pixel = (
+        values.reshape(size, samples, size, samples).swapaxes(1, 2).ravel()
+        for values in (face_ids, numbers)
+    )
     covered_samples = np.flatnonzero(ids_by_pixel >= 0)
     seen_faces, sample_to_seen_face = _compact(ids_by_pixel[covered_samples], len(faces))
     counts_of_all_pixels = np.bincount(covered_samples // samples**2, minlength=size**2)
@@ -427,7 +416,7 @@ def _fragments_of_view(
         outlines=torch.from_numpy(outlines.T),
         sample_to_pixel=torch.from_numpy(np.repeat(np.arange(len(pixels)), sample_count)),
         sample_to_seen_face=torch.from_numpy(sample_to_seen_face),
-        sample_numbers=torch.from_numpy(covered_samples),
+        sample_numbers=torch.from_numpy(numbers_by_pixel[covered_samples]).long(),
         depths=None if depths is None else torch.from_numpy(depths.take(corners)).T,
         camera=camera,
     )
