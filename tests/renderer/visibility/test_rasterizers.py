@@ -352,6 +352,7 @@ def test_opengl_and_numpy_agree_on_any_triangles(seed, count, resolution, lattic
 
 @needs_egl
 @pytest.mark.skipif(find_spec("triton") is None, reason="Triton is not installed")
+@pytest.mark.slow
 def test_triton_can_be_loaded_after_opengl():
     """Optimizers of torch load Triton, whose LLVM crashes if that of Mesa was loaded first.
 
