@@ -216,17 +216,14 @@ def lumpy_sphere() -> Mesh:
     return hard.sphere(2, lowest=0.5)
 
 
-def slow_bounces() -> list[object]:
-    """Return the parameters of slow tests of bounces."""
-    scenes = [
-        (hard.heap, "from above", 3, "flat"),
-        (bowl, "near the pole", 3, "flat"),
-        (lumpy_sphere, "from above", 1, "flat"),
-        (lumpy_sphere, "from above", 3, "flat"),
-        (vessel, "near the pole", 1, "smooth"),
-        (vessel, "near the pole", 3, "smooth"),
-    ]
-    return [pytest.param(*scene, marks=pytest.mark.slow) for scene in scenes]
+SLOW_BOUNCES = [
+    (hard.heap, "from above", 3, "flat"),
+    (bowl, "near the pole", 3, "flat"),
+    (lumpy_sphere, "from above", 1, "flat"),
+    (lumpy_sphere, "from above", 3, "flat"),
+    (vessel, "near the pole", 1, "smooth"),
+    (vessel, "near the pole", 3, "smooth"),
+]
 
 
 @pytest.mark.parametrize(
@@ -235,7 +232,7 @@ def slow_bounces() -> list[object]:
         (bowl, "near the pole", 0, "flat"),
         (cup, "near the pole", 0, "smooth"),
         (bowl, "near the pole", 1, "flat"),
-        *slow_bounces(),
+        *(pytest.param(*scene, marks=pytest.mark.slow) for scene in SLOW_BOUNCES),
     ],
 )
 def test_shadows_and_bounces_are_those_of_mitsuba_within_its_noise(
@@ -251,15 +248,12 @@ def test_shadows_and_bounces_are_those_of_mitsuba_within_its_noise(
     """
     monkeypatch.setattr(rays, "DIRECTIONS", 2**12)
     plain = ImageSettings(32, 8, normals=normals)
-    with_shadows = replace(plain, shadows=True)
-    if bounces:
-        settings = replace(plain, bounces=bounces)
-        settings_of_less = with_shadows
-    else:
-        settings = with_shadows
-        settings_of_less = plain
-    mesh = make_mesh()
     theirs_settings = replace(plain, bounces=bounces)
+    with_shadows = replace(plain, shadows=True)
+    settings, settings_of_less = with_shadows, plain
+    if bounces:
+        settings, settings_of_less = theirs_settings, with_shadows
+    mesh = make_mesh()
     theirs = mitsuba_image(tmp_path, mesh, VIEWS[view], theirs_settings, ray_count=128)
     ours = our_image(mesh, VIEWS[view], settings)
     less = our_image(mesh, VIEWS[view], settings_of_less)
