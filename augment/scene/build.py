@@ -13,13 +13,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from augment.attack_settings import MaterialSettings
+from augment.attack_settings import AttackSettings, MaterialSettings
+from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 from augment.progress import progress
 from augment.scene.objects import ROUGHNESS, SceneObject, add_table, initial_materials, load_object
 from augment.scene.scene import Scene
@@ -37,10 +38,6 @@ from renderer.mesh import Mesh, require_mesh, subdivide
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.surface.gloss import Gloss, smallest_roughness
 from renderer.visibility import choose
-
-if TYPE_CHECKING:
-    from augment.attack_settings import AttackSettings
-    from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 
 # Bytes of the linear operator from light to image, for each pixel and each coefficient of the
 # light: two channels of float32.

@@ -70,15 +70,11 @@ def read_image(path: str | Path, size: int) -> Float[Tensor, "3 size size"]:
 
 def gray_or_image(name: str, choice: float | str | Path, size: int) -> Float[Tensor, "_ size size"]:
     """Create a gray image from a value in [0, 1] or its text, or read the square of an image."""
-    advice = "give gray values in [0, 1] or image files"
-    # `float` would accept True as 1.
-    if isinstance(choice, bool):
-        raise InputError(f"{name}={choice} is no image: {advice}")
     try:
-        gray = float(choice)  # type: ignore[arg-type]
+        # `float` would accept True as 1.
+        gray = math.nan if isinstance(choice, bool) else float(choice)  # type: ignore[arg-type]
     except (ValueError, TypeError, OverflowError):
-        # NaN means that the choice is not a
-        # number. It may be the path of a file.
+        # NaN means that the choice is not a number. It may be the path of a file.
         gray = math.nan
     if math.isnan(gray) and isinstance(choice, str | Path):
         try:
@@ -86,6 +82,7 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Float[Ten
         except InputError as error:
             raise InputError(f"{name}: {error} or a gray value") from error
     if not 0 <= gray <= 1:
+        advice = "give gray values in [0, 1] or image files"
         raise InputError(f"{name}={reprlib.repr(choice)} is no image: {advice}")
     import torch
 
