@@ -28,17 +28,7 @@ from train.auditing.network import (
     recommend,
 )
 from train.auditing.relit import relit_sections
-from train.results import compare
-from train.results.first_screen import (
-    ComparedImage,
-    FirstScreen,
-    ShownMetric,
-    ShownPrediction,
-    choose_disagreements,
-    compare_networks,
-    describe_place,
-    describe_prediction,
-)
+from train.results import compare, first_screen
 from train.results.metrics import Metrics
 from train.results.page import scores_section, write_page
 from train.results.pictures import Picture, encode_picture, plot_by_radius, read_pictures
@@ -75,7 +65,7 @@ class Audited(NamedTuple):
     """
 
     path: Path
-    screen: FirstScreen
+    screen: first_screen.FirstScreen
     label: str
     networks: Mapping[str, AuditedNetwork]
     recommendation: Recommendation | None
@@ -107,8 +97,6 @@ def write_audit_page(
     """
     by_key = {key: AuditedNetwork(label, name, out / key) for key, name in names.items()}
     networks = [*by_key.values()]
-    counts = {network.name: network.counts for network in networks}
-    transfers = {network.name: network.transfers for network in networks}
     plain = plain_sentence(networks[0])
     images = next(iter(folders), None)
     screen = _first_screen(networks, images, folders, plain)
@@ -124,7 +112,7 @@ def write_audit_page(
     elif screen.answer in (VERDICTS["No"], VERDICTS["Perhaps not"]):
         advice = [NEXT_HARDENING]
     screen = replace(screen, sentences=[*screen.sentences, *advice])
-    slider = _slider(counts)
+    slider = _slider(networks)
     unreadable = []
     for name in folders:
         files = read_json(networks[-1].folder / name / SUMMARY)["unreadable"]
@@ -135,23 +123,18 @@ def write_audit_page(
         out,
         "audit.html.jinja",
         title=f"Audit: {in_words(label)} under unusual lighting",
-        about=" and ".join(counts),
+        about=" and ".join(names.values()),
         label=in_words(label),
         kinds=KINDS,
         steps=(STEPS, ADDITIONAL_STEPS),
-        counts=counts,
-        correct={network.name: network.recognized for network in networks},
+        networks=networks,
         plain_sentence=plain,
         pictures={network.name: attack_pictures(network) for network in networks},
-        withstood={network.name: network.withstood for network in networks},
         charts=charts(networks),
         slider=slider,
         script=SLIDER_SCRIPT if slider else "",
-        transfers=transfers if len(networks) > 1 else {},
-        answers=[network.answer for network in networks],
         photographs=_score_sections(by_key, remedies, out),
         recommendation=recommendation,
-        rates={network.name: network.rates for network in networks},
         worst=_worst(networks, folders),
         screen=screen,
         caveats=[*caveats, *unreadable],
@@ -167,18 +150,17 @@ def _evaluate(runs: Mapping[str, RunSummary], images: str) -> compare.Evaluation
     return compare.read_evaluations({name: [ScoredRun(run, images)] for name, run in runs.items()})
 
 
-def _slider(counts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
+def _slider(networks: Sequence[AuditedNetwork]) -> dict[str, Any] | None:
     """Choose the attack that the slider of the report shows, the first that succeeds.
 
     "network" and "light" of the result are titles. None if no attack succeeds.
     """
-    for name, counts_of_network in counts.items():
-        for kind, attack_counts in counts_of_network.items():
-            if "slider" in attack_counts:
-                slider = attack_counts["slider"]
-                classes = [in_words(label) for label in slider["classes"]]
-                named = {"network": name, "light": KINDS[kind].title, "classes": classes}
-                return {**slider, **named}
+    for network in networks:
+        for kind, counts in network.counts.items():
+            if "slider" in counts:
+                classes = [in_words(label) for label in counts["slider"]["classes"]]
+                named = {"network": network.name, "light": KINDS[kind].title, "classes": classes}
+                return counts["slider"] | named
     return None
 
 
@@ -187,7 +169,7 @@ def _first_screen(
     images: str | None,
     folders: Mapping[str, Path],
     plain: str,
-) -> FirstScreen:
+) -> first_screen.FirstScreen:
     """Make the top of the report: its headline, main numbers and sentences.
 
     With two networks and test images, it compares the scores of the networks.
@@ -200,13 +182,13 @@ def _first_screen(
         original, hardened = evaluations.values()
         label = networks[0].label
         before, after = (item.pooled.predictions for (item,) in (original, hardened))
-        screen = compare_networks(
+        screen = first_screen.compare_networks(
             in_words(label),
             original,
             hardened,
             (f"before: {networks[0].name}", f"after: {networks[1].name}"),
-            describe_place(folders[images], folders[images].name),
-            choose_disagreements(before, after, folders[images], [label]),
+            first_screen.describe_place(folders[images], folders[images].name),
+            first_screen.choose_disagreements(before, after, folders[images], [label]),
         )
         if screen is not None:
             return screen
@@ -249,17 +231,21 @@ def plain_sentence(network: AuditedNetwork) -> str:
     )
 
 
-def screen_of_one(network: AuditedNetwork, plain: str, metrics: Metrics) -> FirstScreen:
+def screen_of_one(
+    network: AuditedNetwork, plain: str, metrics: Metrics
+) -> first_screen.FirstScreen:
     """Make the top of the report of an audit of one network, with its scores on test images."""
     views = fraction(network.plain.recognized, network.plain.n)
     higher = "higher is better"
-    numbers = [ShownMetric("Views recognized in plain light", higher, None, views)]
+    numbers = [first_screen.ShownMetric("Views recognized in plain light", higher, None, views)]
     sentences = [plain]
     kind = network.strongest_kind
     if kind is not None:
         light = KINDS[kind]
         kept = network.remaining(kind, "adversarial")[-1]
-        numbers.append(ShownMetric(f"Of these, under attack by {light.title}", higher, None, kept))
+        numbers.append(
+            first_screen.ShownMetric(f"Of these, under attack by {light.title}", higher, None, kept)
+        )
         sentences.append(
             f"If an attacker controls {light.title} (radius {light.radii[-1]:g}), it "
             f"still recognizes {kept.hits} of the {kept.n} views that it recognizes "
@@ -269,14 +255,14 @@ def screen_of_one(network: AuditedNetwork, plain: str, metrics: Metrics) -> Firs
     name = in_words(network.label)
     if mistaken.value is not None:
         title = f"Other objects called {name}"
-        numbers.append(ShownMetric(title, "lower is better", None, mistaken))
+        numbers.append(first_screen.ShownMetric(title, "lower is better", None, mistaken))
     if recall.value is not None and mistaken.value is not None:
         sentences.append(
             f"In the scored images, it recognizes {recall.value:.0%} of {name} and calls "
             f"{mistaken.value:.0%} of other objects “{name}”."
         )
     short, _ = network.verdict
-    return FirstScreen(VERDICTS.get(short, short), sentences, numbers, [network.name])
+    return first_screen.FirstScreen(VERDICTS.get(short, short), sentences, numbers, [network.name])
 
 
 def _agreement(networks: Sequence[AuditedNetwork]) -> Proportion:
@@ -286,7 +272,7 @@ def _agreement(networks: Sequence[AuditedNetwork]) -> Proportion:
     return fraction(sum(is_same), len(is_same))
 
 
-def attack_pictures(network: AuditedNetwork) -> list[ComparedImage]:
+def attack_pictures(network: AuditedNetwork) -> list[first_screen.ComparedImage]:
     """Read a picture for each kind of lighting: one view before and after the attack.
 
     A kind of lighting by which no attack succeeds has no picture.
@@ -297,12 +283,14 @@ def attack_pictures(network: AuditedNetwork) -> list[ComparedImage]:
             continue
         light = KINDS[kind]
         shown = zip(counts["predicted"], counts["confidence"], ("right", "wrong"), strict=True)
-        before, after = (ShownPrediction(f"{in_words(a)} {p:.0%}", b) for a, p, b in shown)
+        before, after = (
+            first_screen.ShownPrediction(f"{in_words(a)} {p:.0%}", b) for a, p, b in shown
+        )
         alt_text = f"{light.title}: {before.text}, after the attack {after.text}"
         lost = f"{counts['adversarial'][-1]} of {counts['correct']} views lost"
         caption = f"{light.title}: {lost} at radius {light.radii[-1]:g}"
         for picture in read_pictures(network.folder / f"{kind}.png", alt_text, PAIR_WIDTH):
-            compared.append(ComparedImage(picture, caption, before, after))
+            compared.append(first_screen.ComparedImage(picture, caption, before, after))
     return compared
 
 
@@ -336,7 +324,7 @@ def _worst(
     def draw(images: str, row: int) -> Picture:
         texts = []
         for network in networks:
-            prediction = describe_prediction(network.predictions(images), row)
+            prediction = first_screen.describe_prediction(network.predictions(images), row)
             texts.append(f"{network.name}: {prediction.text}")
         photograph = networks[0].predictions(images).photograph[row]
         caption = f"{in_words(photograph.label)}, {photograph.source}: {'; '.join(texts)}"

@@ -18,15 +18,7 @@ from augment.augmentation_settings import MODES
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.data.photo import DESCRIPTION
-from train.results import compare, store, tables
-from train.results.first_screen import (
-    NETWORKS,
-    FirstScreen,
-    choose_disagreements,
-    compare_networks,
-    describe_place,
-    is_laboratory,
-)
+from train.results import compare, first_screen, store, tables
 from train.results.pictures import Picture, evenly_spaced, plot_curves, plot_roc, read_pictures
 from train.results.predictions import CONTACT_SHEET
 from train.results.store import Methods, RunSummary, Scored, ScoredRun
@@ -60,7 +52,9 @@ SHEET_WIDTH = 1100
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
 
-def write_report(folders: Sequence[Path], out: Path) -> tuple[Path, FirstScreen | None]:
+def write_report(
+    folders: Sequence[Path], out: Path
+) -> tuple[Path, first_screen.FirstScreen | None]:
     """Write the page of the runs and attacks in folders and below them.
 
     A run or attack that cannot be read is listed on the page. Return the path of the page and its
@@ -289,10 +283,10 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
 def _is_scored_on_photographs(run: RunSummary) -> bool:
     """Return whether a run has scores on other images than renders of pnb-lab."""
     folders = [images_folder(run, name) for name in run.photographs]
-    return any(folder is None or not is_laboratory(folder) for folder in folders)
+    return any(folder is None or not first_screen.is_laboratory(folder) for folder in folders)
 
 
-def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
+def _first_screen(groups: Mapping[str, Scored]) -> first_screen.FirstScreen | None:
     """Make the first screen from the first images on which two networks were scored."""
     for group in groups.values():
         with suppress(InputError):
@@ -302,7 +296,7 @@ def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
     return None
 
 
-def _compare_on(group: Scored) -> FirstScreen | None:
+def _compare_on(group: Scored) -> first_screen.FirstScreen | None:
     """Make the first screen, which compares two networks on the images that both were scored on.
 
     They are the last pair of a method and the network that it began with, or else the last pair.
@@ -314,7 +308,7 @@ def _compare_on(group: Scored) -> FirstScreen | None:
     hardened = [pair for pair in pairs if group[pair[1]][0].run.method == store.INITIAL]
     method, base = (hardened or pairs)[-1]
     names = ("before hardening", "after hardening")
-    subjects = NETWORKS
+    subjects = first_screen.NETWORKS
     change = "hardening"
     if not hardened:
         names = (base, method)
@@ -327,13 +321,13 @@ def _compare_on(group: Scored) -> FirstScreen | None:
     rows = {}
     if images is not None:
         before, after = (group[name][0].pooled().predictions for name in (base, method))
-        rows = choose_disagreements(before, after, images, labels, subjects)
-    return compare_networks(
+        rows = first_screen.choose_disagreements(before, after, images, labels, subjects)
+    return first_screen.compare_networks(
         tables.join_words([in_words(name) for name in labels], "or"),
         evaluations[base],
         evaluations[method],
         names,
-        describe_place(images, scored.name),
+        first_screen.describe_place(images, scored.name),
         rows,
         subjects,
         change,

@@ -82,18 +82,13 @@ class StoredScores:
 
     def to_published(self) -> dict[str, Any]:
         """Convert the scores to a mapping for the file of a published network."""
-        entries: dict[str, Any] = {
+        by_label = {name: metrics.to_summary() for name, metrics in self.by_label.items()}
+        return {
             "images": self.images,
-            "label": [*self.labels] if self.by_label else self.labels[0],
+            "label": [*self.labels] if by_label else self.labels[0],
             **self.overall.to_summary(),
+            **({"by_label": by_label} if by_label else {}),
         }
-        if self.thresholds:
-            entries["thresholds"] = dict(self.thresholds)
-            entries["operating_point"] = self.operating_point
-        if self.by_label:
-            by_label = {name: metrics.to_summary() for name, metrics in self.by_label.items()}
-            entries["by_label"] = by_label
-        return entries
 
 
 @dataclass(frozen=True)

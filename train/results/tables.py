@@ -66,59 +66,36 @@ class Table:
     @property
     def without_unknown_columns(self) -> "Table":
         """Copy of the table without the columns whose cells are all "-", for unknown."""
-        known_columns = []
-        for column in range(len(self.header)):
-            if any(row[column] != "-" for row in self.rows):
-                known_columns.append(column)
-        header = [self.header[column] for column in known_columns]
-        rows = [[row[column] for column in known_columns] for row in self.rows]
+        known = [
+            column
+            for column in range(len(self.header))
+            if any(row[column] != "-" for row in self.rows)
+        ]
+        header = [self.header[column] for column in known]
+        rows = [[row[column] for column in known] for row in self.rows]
         return Table(self.title, header, rows)
 
     def __str__(self) -> str:
         lines = [[as_text(cell) for cell in line] for line in (self.header, *self.rows)]
-        columns = [_align(column) for column in zip(*lines, strict=True)]
+        columns = []
+        for header, *cells in zip(*lines, strict=True):
+            width = max(map(len, (header, *cells)))
+            columns.append([cell.ljust(width) for cell in (header, "-" * width, *cells)])
+        # Output to a file is one table.
+        terminal = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+        first, *others = columns
+        parts = [[first]]
+        for column in others:
+            # Each column has a separator of three characters.
+            width = 1 + sum(len(item[0]) + 3 for item in (*parts[-1], column))
+            if len(parts[-1]) > 1 and width > terminal:
+                parts.append([first])
+            parts[-1].append(column)
         paragraphs = [f"{self.title}:"] if self.title else []
-        paragraphs += [_to_markdown(part) for part in _fit_terminal(columns)]
+        for part in parts:
+            rows = zip(*part, strict=True)
+            paragraphs.append("\n".join(f"| {' | '.join(cells)} |" for cells in rows))
         return "\n\n".join(paragraphs)
-
-
-# Column of a Markdown table: the header, a line of dashes, and a cell for each row.
-# All cells have the same width.
-Column = list[str]
-
-
-def _align(cells: Sequence[str]) -> Column:
-    """Pad the header and the cells of a column to the same width, and underline the header."""
-    header, *others = cells
-    width = max(map(len, cells))
-    return [cell.ljust(width) for cell in (header, "-" * width, *others)]
-
-
-def _fit_terminal(columns: Sequence[Column]) -> list[list[Column]]:
-    """Divide the columns of a table into several tables that fit the width of the terminal.
-
-    Each begins with the first column, the titles. Output to a file is one table.
-    """
-    terminal_width = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
-    first, *others = columns
-    tables = [[first]]
-    for column in others:
-        has_other_column = len(tables[-1]) > 1
-        is_too_wide = _width([*tables[-1], column]) > terminal_width
-        if has_other_column and is_too_wide:
-            tables.append([first])
-        tables[-1].append(column)
-    return tables
-
-
-def _width(columns: Sequence[Column]) -> int:
-    """Count the characters of a line of a Markdown table, including the separators."""
-    return sum(len(column[0]) + 3 for column in columns) + 1
-
-
-def _to_markdown(columns: Sequence[Column]) -> str:
-    """Join padded columns to the text of a Markdown table."""
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in zip(*columns, strict=True))
 
 
 def as_text(value: object) -> str:
