@@ -382,6 +382,7 @@ def test_weights(name, trained, verify):
     verify(*weights(trained(run) / compared))
 
 
+@pytest.mark.slow
 def test_weights_of_a_stopped_and_resumed_run(trained, call, monkeypatch, tmp_path, verify):
     initial = f"network={trained('demonstration')}"
     arguments = [*SMALL.split(), *RUNS["harden"].split(), initial, f"out={tmp_path}/run"]

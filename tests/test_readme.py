@@ -113,6 +113,7 @@ def test_attack_block_fools_the_installed_network_in_three_views(folder):
     assert (folder / "attack.png").is_file()
 
 
+@pytest.mark.slow
 def test_block_without_gradients_finds_an_adversary_with_few_queries():
     result = run("Networks without gradients")["result"]
     assert result.success.all()

@@ -73,26 +73,26 @@ def laboratory(tmp_path_factory) -> Path:
     return folder
 
 
-class TestALaboratory:
-    def test_is_a_folder_of_photographs_with_the_pattern_as_the_source(self, laboratory):
-        photographs = find_photographs(laboratory, sorted(SOLIDS), "orange")
-        counts = Counter((item.label, item.source) for item in photographs)
-        for pattern in ("stripes", "half"):
-            assert counts.pop(("orange", pattern)) == 2
-            assert counts.pop(("other_lemon", pattern)) == 1
-            assert counts.pop(("pear", pattern)) == 1
-        assert not counts
-        _, images, _ = load_photographs(laboratory, photographs, 8)
-        assert len(images.unique(dim=0)) == 8
+def test_a_laboratory_is_a_folder_of_photographs_with_the_pattern_as_the_source(laboratory):
+    photographs = find_photographs(laboratory, sorted(SOLIDS), "orange")
+    counts = Counter((item.label, item.source) for item in photographs)
+    for pattern in ("stripes", "half"):
+        assert counts.pop(("orange", pattern)) == 2
+        assert counts.pop(("other_lemon", pattern)) == 1
+        assert counts.pop(("pear", pattern)) == 1
+    assert not counts
+    _, images, _ = load_photographs(laboratory, photographs, 8)
+    assert len(images.unique(dim=0)) == 8
 
-    def test_shows_an_object_of_the_label_and_another_one_in_the_same_light(self, laboratory):
-        pairs = [{"solid:orange:7", "solid:lemon:7"}, {"solid:orange:8", "solid:pear:7"}]
-        for setup, source in enumerate(["stripes", "stripes", "half", "half"]):
-            first, second = [row for row in rows(laboratory) if row["setup"] == str(setup)]
-            assert {first["mesh"], second["mesh"]} == pairs[setup % 2]
-            assert first["source_tag"] == second["source_tag"] == source
-            assert first["brightness"] == second["brightness"]
-            assert 0.2 <= float(first["brightness"]) <= 2.5
+
+def test_a_setup_shows_an_object_of_the_label_and_another_one_in_the_same_light(laboratory):
+    pairs = [{"solid:orange:7", "solid:lemon:7"}, {"solid:orange:8", "solid:pear:7"}]
+    for setup, source in enumerate(["stripes", "stripes", "half", "half"]):
+        first, second = [row for row in rows(laboratory) if row["setup"] == str(setup)]
+        assert {first["mesh"], second["mesh"]} == pairs[setup % 2]
+        assert first["source_tag"] == second["source_tag"] == source
+        assert first["brightness"] == second["brightness"]
+        assert 0.2 <= float(first["brightness"]) <= 2.5
 
 
 def test_the_same_settings_write_the_same_bytes(laboratory, tmp_path):
