@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from augment.attack_settings import AttackSettings, StepSettings
-from renderer.errors import MAX_SCALE, InputError, describe
+from renderer.errors import MAX_SCALE, InputError
 from renderer.settings import MIN_ROUGHNESS, Settings, setting, setting_like
 
 MODES = {
@@ -262,19 +262,11 @@ class AugmentationSettings(Settings):
     random_light: RandomLightSettings = setting(
         RandomLightSettings, "Perturbation of the lighting for mode=random and for init=random."
     )
-    attack: TrainingAttackSettings = setting(
-        TrainingAttackSettings,
-        "The attack during training.",
-        checks_type=False,  # `AttackSettings` are valid, too.
-    )
+    attack: AttackSettings = setting(TrainingAttackSettings, "The attack during training.")
 
     def __post_init__(self) -> None:
         """Check that the settings do not contradict each other."""
         super().__post_init__()
-        if not isinstance(self.attack, AttackSettings):
-            raise InputError(
-                f"attack is {describe(self.attack)}: give the settings of an attack", "attack"
-            )
         if not self.attack.parameters:
             raise InputError(
                 "attack changes nothing: give TrainingAttackSettings(), or name a parameter",
@@ -290,11 +282,8 @@ class AugmentationSettings(Settings):
         for name, steps in self.attack.parameters.items():
             if uses_random_draws and name != "lighting" and steps.radius is None:
                 missing = f"attack.{name}.radius"
-                message = (
-                    f"{missing} is None, but random values are drawn from the norm-ball: "
-                    "set a radius"
-                )
-                raise InputError(message, missing)
+                needed = "random values are drawn from the norm-ball: set a radius"
+                raise InputError(f"{missing} is None, but {needed}", missing)
         if self.warm_start and self.vary.instances:
             raise InputError(
                 "warm_start=True continues the last attack, but vary.instances=True changes the "
