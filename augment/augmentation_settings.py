@@ -6,11 +6,10 @@ This module imports neither torch nor NumPy; see `renderer.settings`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from augment.attack_settings import AttackSettings, StepSettings
 from renderer.errors import MAX_SCALE, InputError
-from renderer.settings import MIN_ROUGHNESS, Settings, setting, setting_like
+from renderer.settings import MIN_ROUGHNESS, Settings, pair, setting, setting_like
 
 MODES = {
     "none": "no renders",
@@ -28,28 +27,18 @@ MIN_FOV = 1.0
 MAX_FOV = 45.0
 UNCHANGED = (1.0, 1.0)  # Range of a factor that is always 1.
 NONE = (0.0, 0.0)  # Range of a number that is always 0.
-# Facts about the fields below: a fraction, a factor, a pair of either, and an angle.
-FRACTION: dict[str, Any] = {"minimum": 0, "maximum": 1}
-FRACTIONS = {**FRACTION, "is_pair": True}
-FACTOR: dict[str, Any] = {"minimum": 1 / MAX_SCALE, "maximum": MAX_SCALE}
-FACTORS = {**FACTOR, "is_pair": True}
-ANGLE: dict[str, Any] = {"unit": "degrees", "minimum": 0, "maximum": 180}
+FRACTION = (0, 1)
+FACTOR = (1 / MAX_SCALE, MAX_SCALE)
 
 
 @dataclass
 class SpecularLayerSettings(Settings):
     """Ranges of a random specular layer, such as varnish, that each object gets in each render."""
 
-    roughness: list[float] = setting(
-        [0.4, 0.8],
-        "Smallest and largest roughness. Below 0.5, the lighting gets a higher degree.",
-        minimum=MIN_ROUGHNESS,
-        maximum=1,
-        is_pair=True,
+    roughness: list[float] = pair(
+        [0.4, 0.8], "roughness. Below 0.5, the lighting gets a higher degree.", (MIN_ROUGHNESS, 1)
     )
-    specular_factor: list[float] = setting(
-        list(NONE), "Smallest and largest strength. [0, 0]: no layer.", **FRACTIONS
-    )
+    specular_factor: list[float] = pair(list(NONE), "strength. [0, 0]: no layer.", FRACTION)
 
 
 @dataclass
@@ -61,23 +50,19 @@ class CameraEffectSettings(Settings):
     """
 
     pattern_fraction: float = setting(
-        0.0, "Fraction of renders under a projected pattern.", **FRACTION
+        0.0, "Fraction of renders under a projected pattern.", within=FRACTION
     )
     slides: str | None = setting(
         None, "Folder of photographs, which half of the patterns show. null: none."
     )
-    pattern_fill: list[float] = setting(
-        list(NONE),
-        "Smallest and largest factor of the lighting of the scene beneath the pattern.",
-        **FRACTIONS,
+    pattern_fill: list[float] = pair(
+        list(NONE), "factor of the lighting of the scene beneath the pattern.", FRACTION
     )
-    white_balance: float = setting(
-        0.0, "Largest change of each channel.", "stops", minimum=0, maximum=5
-    )
+    white_balance: float = setting(0.0, "Largest change of each channel.", "stops", within=(0, 5))
     blur: float = setting(
-        0.0, "Largest standard deviation of the blur.", "pixels", minimum=0, maximum=MAX_BLUR
+        0.0, "Largest standard deviation of the blur.", "pixels", within=(0, MAX_BLUR)
     )
-    noise: float = setting(0.0, "Largest standard deviation of the pixel noise.", **FRACTION)
+    noise: float = setting(0.0, "Largest standard deviation of the pixel noise.", within=FRACTION)
 
 
 @dataclass
@@ -95,14 +80,10 @@ class VariationSettings(Settings):
     shift: float = setting(
         0.0,
         "Largest distance of the mesh from the center of the image, as a fraction of its width.",
-        **FRACTION,
+        within=FRACTION,
     )
-    scale: list[float] = setting(
-        list(UNCHANGED), "Smallest and largest factor of the size in the image.", **FACTORS
-    )
-    exposure: list[float] = setting(
-        list(UNCHANGED), "Smallest and largest factor of the lighting.", **FACTORS
-    )
+    scale: list[float] = pair(list(UNCHANGED), "factor of the size in the image.", FACTOR)
+    exposure: list[float] = pair(list(UNCHANGED), "factor of the lighting.", FACTOR)
     backgrounds: str | None = setting(
         None, "Folder of images that replace scene.backgrounds. null: none."
     )
@@ -112,18 +93,18 @@ class VariationSettings(Settings):
     azimuth: float = setting(
         0.0,
         "Largest motion of the camera around the mesh, to either side and up and down.",
-        **ANGLE,
-    )
-    fov: list[float] = setting(
-        list(NONE),
-        "Smallest and largest angle between the sides of the image, from 1 to 45. [0, 0]: the "
-        "camera of the scene.",
         "degrees",
-        minimum=0,
-        maximum=MAX_FOV,
-        is_pair=True,
+        within=(0, 180),
     )
-    rotation: float = setting(0.0, "Largest rotation of the mesh about a random axis.", **ANGLE)
+    fov: list[float] = pair(
+        list(NONE),
+        "angle between the sides of the image, from 1 to 45. [0, 0]: the camera of the scene.",
+        (0, MAX_FOV),
+        "degrees",
+    )
+    rotation: float = setting(
+        0.0, "Largest rotation of the mesh about a random axis.", "degrees", within=(0, 180)
+    )
     environments: list[str] = setting(
         [], "Environment lightings that replace scene.light, one of them for each render."
     )
@@ -131,22 +112,22 @@ class VariationSettings(Settings):
         0.0,
         "Fraction of renders in directional lighting from the side of the camera, up to 70 "
         "degrees from it.",
-        **FRACTION,
+        within=FRACTION,
     )
-    fill_light: list[float] = setting(
-        list(NONE),
-        "Smallest and largest factor of the environment lighting of these renders.",
-        **FRACTIONS,
+    fill_light: list[float] = pair(
+        list(NONE), "factor of the environment lighting of these renders.", FRACTION
     )
     lit_background: bool = setting(False, "Light the backgrounds as walls that face the camera.")
     tables: float = setting(
         0.0,
         "Fraction of renders on a table in front of a wall, in the lighting and the shadow of the "
         "object.",
-        **FRACTION,
+        within=FRACTION,
     )
     background_saturation: float = setting(
-        0.0, "Largest saturation of a random color that multiplies each background.", **FRACTION
+        0.0,
+        "Largest saturation of a random color that multiplies each background.",
+        within=FRACTION,
     )
     gloss: SpecularLayerSettings = setting(
         SpecularLayerSettings, "A specular layer on each object, which replaces its own material."
@@ -159,11 +140,7 @@ class VariationSettings(Settings):
         """Check the smallest field of view. 0 stands for the camera of the scene."""
         super().__post_init__()
         if tuple(self.fov) != NONE and self.fov[0] < MIN_FOV:
-            raise InputError(
-                f"fov={list(self.fov)}: "
-                f"give [minimum, maximum], both from {MIN_FOV:g} to {MAX_FOV:g}",
-                "fov",
-            )
+            raise self.wrong("fov", f"is wrong: give two angles from {MIN_FOV:g} to {MAX_FOV:g}")
 
     @property
     def moves(self) -> bool:
@@ -181,13 +158,13 @@ class RandomLightSettings(Settings):
     amplitude: float = setting(
         0.5,
         "Each coefficient changes by a uniform draw between minus and plus this value.",
-        **FACTOR,
+        within=FACTOR,
     )
     radius: float | None = setting(
         None,
         "L2 norm of the perturbation instead. 30 attack steps of 0.05 reach 1.5 at most. null: "
         "the amplitude applies.",
-        **FACTOR,
+        within=FACTOR,
     )
 
 
@@ -239,8 +216,7 @@ class AugmentationSettings(Settings):
         100,
         "Renders per regeneration: meshes × views × backgrounds. null: as many as scene.views "
         "makes, or all images of the folder.",
-        minimum=0,
-        maximum=MAX_EXAMPLES,
+        within=(0, MAX_EXAMPLES),
     )
     init: str = setting(
         "scene",
@@ -253,8 +229,7 @@ class AugmentationSettings(Settings):
     regenerate_every: int | None = setting(
         None,
         "Training images between two regenerations. null: regenerate once per epoch.",
-        minimum=1,
-        maximum=MAX_INTERVAL,
+        within=(1, MAX_INTERVAL),
     )
     vary: VariationSettings = setting(
         VariationSettings, "What is drawn anew for each render in each regeneration."
@@ -268,27 +243,18 @@ class AugmentationSettings(Settings):
         """Check that the settings do not contradict each other."""
         super().__post_init__()
         if not self.attack.parameters:
-            raise InputError(
-                "attack changes nothing: give TrainingAttackSettings(), or name a parameter",
-                "attack",
-            )
+            raise InputError("attack changes nothing: name a parameter to attack", "attack")
         if self.mode == "folder" and not self.folder:
-            raise InputError(
-                f"folder is {self.folder}, but mode=folder needs a folder of images: "
-                "set folder, or choose another mode",
-                "folder",
-            )
-        uses_random_draws = "random" in (self.mode, self.init)
-        for name, steps in self.attack.parameters.items():
-            if uses_random_draws and name != "lighting" and steps.radius is None:
+            raise self.wrong("folder", "is wrong: mode=folder needs a folder of images")
+        parameters = self.attack.parameters if "random" in (self.mode, self.init) else {}
+        for name, steps in parameters.items():
+            if name != "lighting" and steps.radius is None:
                 missing = f"attack.{name}.radius"
                 needed = "random values are drawn from the norm-ball: set a radius"
                 raise InputError(f"{missing} is None, but {needed}", missing)
         if self.warm_start and self.vary.instances:
-            raise InputError(
-                "warm_start=True continues the last attack, but vary.instances=True changes the "
-                "shapes: set one of them to False",
-                "warm_start",
+            raise self.wrong(
+                "warm_start", "continues an attack on shapes: set vary.instances=False"
             )
 
     @property

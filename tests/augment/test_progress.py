@@ -18,15 +18,9 @@ class Terminal(io.StringIO):
 
 
 @pytest.fixture
-def patience(monkeypatch) -> float:
-    """Show progress after a tenth of a second."""
-    monkeypatch.setattr(progress_module, "PATIENCE", 0.1)
-    return 0.1
-
-
-@pytest.fixture
-def shown(monkeypatch, patience):
+def shown(monkeypatch):
     """Return a function that works on items, and returns whether each saw progress shown."""
+    monkeypatch.setattr(progress_module, "PATIENCE", 0.1)
 
     def work(stream: io.StringIO, seconds: float, items: list[int]) -> list[bool]:
         monkeypatch.setattr(sys, "stderr", stream)
@@ -42,19 +36,14 @@ def shown(monkeypatch, patience):
 
 
 @pytest.mark.parametrize("items", [[1], [1, 2]], ids=["ends early", "ends"])
-def test_progress_is_shown_after_a_while_even_before_the_first_item_is_done(shown, items):
-    assert shown(Terminal(), 0.3, items) == [True] * len(items)
+def test_progress_is_shown_before_the_first_item_is_done_and_nothing_of_it_is_left(shown, items):
+    stream = Terminal()
+    assert shown(stream, 0.3, items) == [True] * len(items)
+    assert stream.getvalue().rpartition("\r")[2].strip() == ""
 
 
 def test_no_progress_is_shown_of_short_work(shown):
     assert shown(Terminal(), 0.0, [1, 2]) == [False, False]
-
-
-@pytest.mark.parametrize("items", [[1], [1, 2]], ids=["ends early", "ends"])
-def test_nothing_is_left_on_a_terminal(shown, items):
-    stream = Terminal()
-    shown(stream, 0.3, items)
-    assert stream.getvalue().rpartition("\r")[2].strip() == ""
 
 
 def test_a_log_has_no_progress(shown):

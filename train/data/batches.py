@@ -142,8 +142,8 @@ def _draw(
 ) -> tuple[Int[Tensor, "N B"], Int[Tensor, "2 N B"], Bool[Tensor, "N B"], Int[Tensor, "N B"]]:
     """Draw the N batches of B images of a round at random.
 
-    Return the number of the image at each place of each batch, its shift down and to the right in
-    pixels, whether it is flipped, and the seed of its random crop, which only images on disk need.
+    Return the number of the image at each place of each batch, its shifts as `crop_and_flip` takes
+    them, whether it is flipped, and the seed of its random crop, which only images on disk need.
     """
     shown_count = len(this_round.rows)
     draws = generator(seed, this_round.number, "batches")

@@ -19,7 +19,7 @@ from augment.random_streams import stream_seed
 from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
 from train import checkpoints, console, run_folder
-from train.data import photographs as photos
+from train.data import photographs
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
 from train.device import (
     MixedPrecision,
@@ -82,10 +82,10 @@ class Run:
         self._initial_predictions: Tensor | None = None
         inputs.require_label(settings, self.data)
         for name, scored in self.scored_folders.items():
-            photos.require_outside(folder / name, scored)
+            photographs.require_outside(folder / name, scored)
             with keyed("photos"):
-                labels = photos.choose_labels(scored, self.data.classes, settings.label)
-                photos.find_photographs(scored, self.data.classes, labels)
+                labels = photographs.choose_labels(scored, self.data.classes, settings.label)
+                photographs.find_photographs(scored, self.data.classes, labels)
         set_deterministic(settings.train.deterministic)
         # Settings of the run that is resumed. None for a new run.
         earlier: DictConfig | None = None
@@ -324,7 +324,7 @@ class Run:
             scores = evaluate_photographs(
                 predictor,
                 folder=folder,
-                label=photos.choose_labels(folder, self.data.classes, self.settings.label),
+                label=photographs.choose_labels(folder, self.data.classes, self.settings.label),
                 out=out / name,
                 skip_unreadable=self.settings.evaluate.skip_unreadable,
             )

@@ -131,7 +131,7 @@ def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_another_thing
         ({"meshes": [{"mesh": "solid:orange", "label": "other_../../x"}]}, r"has the label '.*x'"),
         ({"meshes": ["solid:orange", "fruit.glb"]}, r"meshes\[1\] has no label"),
         ({"setups": 5}, "setups=5 must be a multiple of the 2 patterns"),
-        ({"patterns": ["stripes+slides"]}, "patterns has slides"),
+        ({"patterns": ["stripes+slides"]}, "patterns=.*slides"),
         ({"patterns": ["stripe"]}, "patterns=stripe"),
     ],
 )
@@ -171,34 +171,27 @@ def test_an_environment_is_used_beside_patterns_and_refused_if_it_is_dark_above(
 
 @pytest.mark.parametrize("family", LAB_PATTERNS)
 @pytest.mark.parametrize("seed", range(3))
-class TestAPattern:
-    def test_is_an_image_that_the_seed_decides(self, family, seed):
-        image = draw_lab_pattern(family, np.random.default_rng(seed))
-        same = draw_lab_pattern(family, np.random.default_rng(seed))
-        other = draw_lab_pattern(family, np.random.default_rng(seed + 100))
-        assert image.shape == (64, 64, 3)
-        assert image.min() >= 0
-        assert image.max() <= 1
-        np.testing.assert_array_equal(image, same)
-        assert not np.array_equal(image, other)
-
-    def test_mixes_two_colors_of_which_one_is_black_in_some_families(self, family, seed):
-        image = draw_lab_pattern(family, np.random.default_rng(seed))
-        colors = np.unique(image.reshape(-1, 3), axis=0)
-        has_black = colors.min(axis=0).max() == 0
-        if family == "colors":
-            assert len(colors) > 100
-        elif family == "text":
-            assert has_black
-        elif family == "gradient":
-            # All colors lie on one line.
-            assert np.linalg.matrix_rank(colors - colors[0], tol=1e-3) == 1
-        elif family == "solid":
-            assert len(colors) == 1
-            assert not has_black
-        else:
-            assert len(colors) == 2
-            assert has_black == (family not in patterns.TWO_COLORED)
+def test_a_pattern_is_an_image_of_the_colors_of_its_family_that_the_seed_decides(family, seed):
+    image = draw_lab_pattern(family, np.random.default_rng(seed))
+    same = draw_lab_pattern(family, np.random.default_rng(seed))
+    other = draw_lab_pattern(family, np.random.default_rng(seed + 100))
+    assert image.shape == (64, 64, 3)
+    assert 0 <= image.min() <= image.max() <= 1
+    np.testing.assert_array_equal(image, same)
+    assert not np.array_equal(image, other)
+    colors = np.unique(image.reshape(-1, 3), axis=0)
+    has_black = colors.min(axis=0).max() == 0
+    if family == "colors":
+        assert len(colors) > 100
+    elif family == "text":
+        assert has_black
+    elif family == "gradient":
+        # All colors lie on one line.
+        assert np.linalg.matrix_rank(colors - colors[0], tol=1e-3) == 1
+    elif family == "solid":
+        assert (len(colors), has_black) == (1, False)
+    else:
+        assert (len(colors), has_black) == (2, family not in patterns.TWO_COLORED)
 
 
 def elevation(direction: np.ndarray) -> float:
@@ -212,32 +205,25 @@ def horizontal_cosine(first: np.ndarray, second: np.ndarray) -> float:
     return product / np.linalg.norm(first[:2]) / np.linalg.norm(second[:2])
 
 
-class TestShots:
-    @pytest.fixture(scope="class")
-    @classmethod
-    def shots(cls) -> list[Shot]:
-        return draw(220, LAB_PATTERNS, seed=3)
-
-    def test_of_a_family_are_evenly_from_dim_to_bright(self, shots):
-        assert [shot.lighting for shot in shots] == np.repeat([*LAB_PATTERNS], 20).tolist()
-        edges = np.geomspace(0.2, 2.5, 21)
-        brightness = np.array([shot.brightness for shot in shots]).reshape(-1, 20)
-        assert (edges[:-1] <= brightness).all()
-        assert (brightness <= edges[1:]).all()
-
-    def test_have_object_camera_and_projector_within_their_ranges(self, shots):
-        for shot in shots:
-            backwards = shot.camera - shot.aim
-            half_width = np.linalg.norm(backwards) * np.tan(np.radians(FOV / 2))
-            assert 18 <= elevation(backwards) <= 60
-            assert 1.2 <= half_width <= 1.9
-            assert np.abs(shot.aim - shot.center).max() <= 0.25
-            towards_projector = shot.projectors[0] - shot.center
-            assert towards_projector[2] > 0
-            cosine = horizontal_cosine(towards_projector, backwards)
-            assert cosine >= np.cos(np.radians(70)) - 1e-9
-            np.testing.assert_allclose(shot.rotation @ shot.rotation.T, np.eye(3), atol=1e-12)
-            assert shot.rotation[2, 2] >= 0.5 - 1e-9
+def test_shots_of_a_family_are_evenly_from_dim_to_bright_and_within_their_ranges():
+    shots = draw(220, LAB_PATTERNS, seed=3)
+    assert [shot.lighting for shot in shots] == np.repeat([*LAB_PATTERNS], 20).tolist()
+    edges = np.geomspace(0.2, 2.5, 21)
+    brightness = np.array([shot.brightness for shot in shots]).reshape(-1, 20)
+    assert (edges[:-1] <= brightness).all()
+    assert (brightness <= edges[1:]).all()
+    for shot in shots:
+        backwards = shot.camera - shot.aim
+        half_width = np.linalg.norm(backwards) * np.tan(np.radians(FOV / 2))
+        assert 18 <= elevation(backwards) <= 60
+        assert 1.2 <= half_width <= 1.9
+        assert np.abs(shot.aim - shot.center).max() <= 0.25
+        towards_projector = shot.projectors[0] - shot.center
+        assert towards_projector[2] > 0
+        cosine = horizontal_cosine(towards_projector, backwards)
+        assert cosine >= np.cos(np.radians(70)) - 1e-9
+        np.testing.assert_allclose(shot.rotation @ shot.rotation.T, np.eye(3), atol=1e-12)
+        assert shot.rotation[2, 2] >= 0.5 - 1e-9
 
 
 def test_settings_leave_draws_that_they_do_not_name_as_they_were():
@@ -250,29 +236,19 @@ def test_settings_leave_draws_that_they_do_not_name_as_they_were():
         np.testing.assert_array_equal(getattr(plain, name), getattr(changed, name))
 
 
-class TestShotsWithWallsAndTwoProjectors:
-    @pytest.fixture(scope="class")
-    @classmethod
-    def shots(cls) -> list[Shot]:
-        return draw(60, ["rings+text"], walls=1.0, azimuth=[-180, 180], elevation=[5, 85])
-
-    def test_have_a_pattern_and_the_elevations_of_the_settings_for_each_projector(self, shots):
-        for shot in shots:
-            assert len(shot.projectors) == len(shot.patterns) == 2
+def test_shots_with_two_projectors_have_two_patterns_and_a_wall_unless_it_would_hide_one():
+    shots = draw(60, ["rings+text"], walls=1.0, azimuth=[-180, 180], elevation=[5, 85])
+    assert {shot.wall is None for shot in shots} == {True, False}
+    for shot in shots:
+        assert len(shot.projectors) == len(shot.patterns) == 2
+        for position in shot.projectors:
+            assert 5 <= elevation(position - shot.center) <= 85
+        if shot.wall is not None:
+            behind = shot.wall - shot.center
+            cosine = horizontal_cosine(behind, shot.camera - shot.aim)
+            assert cosine <= -np.cos(np.radians(30)) + 1e-9
             for position in shot.projectors:
-                assert 5 <= elevation(position - shot.center) <= 85
-
-    def test_have_a_wall_behind_the_object_unless_it_would_hide_a_projector(self, shots):
-        has_wall = [shot.wall is not None for shot in shots]
-        assert any(has_wall)
-        assert not all(has_wall)
-        for shot in shots:
-            if shot.wall is not None:
-                behind = shot.wall - shot.center
-                cosine = horizontal_cosine(behind, shot.camera - shot.aim)
-                assert cosine <= -np.cos(np.radians(30)) + 1e-9
-                for position in shot.projectors:
-                    assert (position - shot.center) @ behind < behind @ behind
+                assert (position - shot.center) @ behind < behind @ behind
 
 
 def test_slides_project_a_picture_in_its_own_colors():

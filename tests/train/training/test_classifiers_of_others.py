@@ -111,34 +111,16 @@ def test_the_result_loads_where_the_original_did_and_in_every_command(tuned, wei
     torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
 
 
-class TestNormalizedLight:
-    @pytest.fixture(scope="class")
-    @classmethod
-    def trained(cls, tuned) -> Path:
-        """Train with images in normalized light, without changing the weights noticeably."""
-        folder, _ = tuned("unlabeled", ALMOST_FIXED, "normalize_light={white_balance: 1.0}")
-        return folder
-
-    @pytest.fixture
-    def expected(self, weights) -> Tensor:
-        """Return the logits of the original network for normalized images."""
-        light = NormalizedLightSettings(white_balance=1.0)
-        images = normalize_light(self.images(), light)
-        return normalized_logits(load_torchvision(weights), images)
-
-    @staticmethod
-    def images() -> Tensor:
-        return torch.rand(4, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
-
-    def test_is_remembered_by_the_network(self, trained, expected):
-        network = load_run(trained)
-        assert network.normalized_light == NormalizedLightSettings(white_balance=1.0)
-        torch.testing.assert_close(network(self.images()), expected, rtol=1e-4, atol=1e-4)
-
-    def test_is_remembered_by_the_network_of_the_next_run(self, tuned, trained, expected):
-        continued, _ = tuned("unlabeled", f"network={trained}", "weights=null", ALMOST_FIXED)
-        images = self.images()
-        torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
+def test_normalized_light_is_remembered_by_the_network_and_by_that_of_the_next_run(tuned, weights):
+    """The weights do not change noticeably."""
+    light = NormalizedLightSettings(white_balance=1.0)
+    images = torch.rand(4, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+    expected = normalized_logits(load_torchvision(weights), normalize_light(images, light))
+    trained, _ = tuned("unlabeled", ALMOST_FIXED, "normalize_light={white_balance: 1.0}")
+    continued, _ = tuned("unlabeled", f"network={trained}", "weights=null", ALMOST_FIXED)
+    assert load_run(trained).normalized_light == light
+    for run in (trained, continued):
+        torch.testing.assert_close(load_run(run)(images), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_a_network_that_hardly_moves_keeps_its_predictions_at_no_loss(almost_fixed):

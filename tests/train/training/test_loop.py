@@ -27,13 +27,8 @@ from train.training.recipe import freeze
 from train.training.run_log import RunLog
 from train.training.step import activation_bytes
 
-ARCHITECTURE = {
-    "classes": ["fig", "lime", "pear"],
-    "size": 16,
-    "depth": 10,
-    "width": 1,
-    "dropout": 0.0,
-}
+SHAPE = {"depth": 10, "width": 1, "dropout": 0.0}
+ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "size": 16, **SHAPE}
 # Noise for training and validation. With 16 images a batch, an epoch has three steps.
 TRAINED = 40
 VALIDATED = 20
@@ -77,9 +72,8 @@ def make_trainer(
     defaults = {"epochs": 3, "batch_size": 16, "learning_rate": 0.05}
     recipe = TrainSettings(**defaults | settings)
     no_labels = torch.zeros(0, dtype=torch.int64)
-    no_renders = AugmentationService(
-        AugmentationSettings(mode="none"), None, no_labels, 0, Phases()
-    )
+    none = AugmentationSettings(mode="none")
+    no_renders = AugmentationService(none, None, no_labels, 0, Phases())
     return Trainer(recipe, model, ARCHITECTURE, no_renders, folder, has_initial=has_initial)
 
 
@@ -163,10 +157,9 @@ def test_a_batch_larger_than_the_data_is_the_data(tmp_path, settings, expected):
     trainer = make_trainer(tmp_path, color_network(), epochs=1, batch_size=960_000, **settings)
     fit_noise(trainer)
     assert trainer.settings.batch_size == expected
-    same = make_trainer(
-        tmp_path / "same", color_network(), epochs=1, batch_size=expected, **settings
-    )
+    settings |= {"epochs": 1, "batch_size": expected}
     (tmp_path / "same").mkdir()
+    same = make_trainer(tmp_path / "same", color_network(), **settings)
     fit_noise(same)
     torch.testing.assert_close(trainer.model.state_dict(), same.model.state_dict(), rtol=0, atol=0)
 
@@ -279,13 +272,11 @@ def test_a_run_in_float16_is_resumed_with_its_scale(tmp_path):
 def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path, stage, trained):
     network = WideResNet(3, 10, 1, dropout=0.0)
     # The statistics of batch normalization are in the state dict, too.
-    before = {name: value.clone() for name, value in network.state_dict().items()}
+    before = copy.deepcopy(network.state_dict())
     freeze(network, stage, size=8)
     fit_noise(make_trainer(tmp_path, network, epochs=1))
-    changed = set()
-    for name, value in network.state_dict().items():
-        if not torch.equal(value, before[name]):
-            changed.add(name)
+    after = network.state_dict()
+    changed = {name for name in before if not torch.equal(after[name], before[name])}
     assert changed == {name for name in before if name.startswith(trained)}
 
 

@@ -41,18 +41,10 @@ def photographs(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def small(weights, photographs) -> list[str]:
     """List the overrides of both experiments for a small network and few photographs."""
-    return [
-        f"network=torchvision:{NAME}",
-        f"weights={weights}",
-        f"unlabeled={photographs}",
-        f"size={SIZE}",
-        "data.test_fraction=0.25",
-        "data.validation=0.25",
-        "train.device=cpu",
-        "train.precision=float32",
-        "train.threads=1",
-        "train.batch_size=8",
-    ]
+    files = [f"network=torchvision:{NAME}", f"weights={weights}", f"unlabeled={photographs}"]
+    data = [f"size={SIZE}", "data.test_fraction=0.25", "data.validation=0.25"]
+    hardware = ["train.device=cpu", "train.precision=float32", "train.threads=1"]
+    return [*files, *data, *hardware, "train.batch_size=8"]
 
 
 @pytest.fixture(scope="module")
@@ -60,15 +52,8 @@ def settings_of(small):
     """Return a function that reads the experiment with small sizes and other overrides."""
 
     def read(folder, *overrides):
-        words = [
-            "experiment=photographs",
-            *small,
-            "train.epochs=2",
-            "train.learning_rate=0.003",
-            f"out={folder}",
-            *overrides,
-        ]
-        return train_command.read(words)
+        words = ["experiment=photographs", "train.epochs=2", "train.learning_rate=0.003"]
+        return train_command.read([*words, *small, f"out={folder}", *overrides])
 
     return read
 
@@ -119,20 +104,10 @@ def chain(small):
     """Return a function that trains on photographs first and then on renders, by one command."""
 
     def start(folder, *overrides):
-        words = [
-            "experiment=classifier",
-            *small,
-            "label='950'",
-            "meshes=[solid:orange]",
-            "hard_negatives=[solid:lemon]",
-            "scene.backgrounds=[0.5]",
-            "scene.views=1",
-            "train.epochs=1",
-            "evaluate.laboratory_setups=0",
-            "photographs_first=true",
-            f"out={folder}",
-            *overrides,
-        ]
+        meshes = ["label='950'", "meshes=[solid:orange]", "hard_negatives=[solid:lemon]"]
+        scene = ["scene.backgrounds=[0.5]", "scene.views=1", "evaluate.laboratory_setups=0"]
+        words = ["experiment=classifier", "photographs_first=true", "train.epochs=1"]
+        words += [*small, *meshes, *scene, f"out={folder}", *overrides]
         train(train_command.compose(words), words)
 
     return start
