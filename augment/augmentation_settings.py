@@ -245,7 +245,8 @@ class AugmentationSettings(Settings):
         if not self.attack.parameters:
             raise InputError("attack changes nothing: name a parameter to attack", "attack")
         if self.mode == "folder" and not self.folder:
-            raise self.wrong("folder", "is wrong: mode=folder needs a folder of images")
+            fault = f"folder is {self.folder}: mode=folder needs a folder of images"
+            raise InputError(fault, "folder")
         parameters = self.attack.parameters if "random" in (self.mode, self.init) else {}
         for name, steps in parameters.items():
             if name != "lighting" and steps.radius is None:
