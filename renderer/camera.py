@@ -454,9 +454,8 @@ def orbit_cameras(
     3.732
     """
     require_whole("views", views, 1, MAX_VIEWS)
-    width = _as_scalar("width", width)
-    polar = _as_scalar("polar", polar)
-    azimuth = _as_scalar("azimuth", azimuth)
+    names = ("width", "polar", "azimuth")
+    width, polar, azimuth = map(_as_scalar, names, (width, polar, azimuth))
     require_range("azimuth", azimuth, -MAX_TURN, MAX_TURN)
     azimuths = [azimuth + 360 * view / views for view in range(views)]
     if fov is None:

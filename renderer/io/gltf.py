@@ -27,9 +27,7 @@ from renderer.io.mesh_file import CPU, MeshFile, Part, colored_mesh, require_bou
 from renderer.mesh import shared_edges
 
 # Kinds of primitives that consist of triangles (5.24.4).
-TRIANGLES = 4
-STRIP = 5
-FAN = 6
+TRIANGLES, STRIP, FAN = 4, 5, 6
 # Alpha from which on a texel with 8 bits counts as opaque.
 ALMOST_ONE = 1 - 0.5 / 255
 # Beginnings of the names of attributes that joints use.

@@ -264,10 +264,8 @@ SPECULAR_GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 SPECULAR = "KHR_materials_specular"
 IOR = "KHR_materials_ior"
 # Extensions that are read. SPECULAR and IOR are read only for the gloss.
-READ = {
-    *(TRANSFORM, QUANTIZATION, SPECULAR_GLOSSINESS, SPECULAR, IOR),
-    *(WEBP, INSTANCING, VISIBILITY),
-}
+READ = {TRANSFORM, QUANTIZATION, SPECULAR_GLOSSINESS, SPECULAR, IOR}
+READ |= {WEBP, INSTANCING, VISIBILITY}
 # Beginnings of the names of extensions that may be required by a
 # file but ignored, because they change neither shape nor color.
 HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation_")
@@ -279,10 +277,7 @@ TRANSPARENT = {
 # Reflectance at normal incidence of a surface with the specular factor 1.
 DIELECTRIC = 0.04
 # Numbers of OpenGL for the use of textures (5.26).
-REPEAT = 10497
-CLAMP = 33071
-MIRROR = 33648
-NEAREST = 9728
+REPEAT, CLAMP, MIRROR, NEAREST = 10497, 33071, 33648, 9728
 
 
 class Placement(NamedTuple):

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -163,13 +164,25 @@ def _read_with_trimesh(file: MeshFile, suffix: str) -> list[Part]:
         known = ", ".join(sorted(formats | READERS.keys()))
         raise ValueError(f"the mesh format {suffix} is unknown: use one of {known}")
     file.assume(f"trimesh reads the format {suffix}, and may leave out colors")
-    files = _Images(file)
-    scene = trimesh.load(
-        io.BytesIO(file.content), file_type=suffix, resolver=files, force="scene", process=False
-    )
+    errors = []
+
+    def get(name: str) -> bytes:
+        """Read an image below the folder of the mesh file, and keep errors."""
+        try:
+            content = file.read(name)
+            identify(io.BytesIO(content)).load()
+        # Pillow can raise almost any exception for a damaged file.
+        except Exception as error:
+            errors.append(error)
+            raise
+        return content
+
+    content = io.BytesIO(file.content)
+    files = SimpleNamespace(get=get)
+    scene = trimesh.load(content, file_type=suffix, resolver=files, force="scene", process=False)
     # trimesh leaves out an image that it cannot read.
-    if files.errors:
-        raise files.errors[0]
+    if errors:
+        raise errors[0]
     parts = {
         name: _as_part(geometry, file)
         for name, geometry in scene.geometry.items()
@@ -179,29 +192,6 @@ def _read_with_trimesh(file: MeshFile, suffix: str) -> list[Part]:
     # Several nodes of the scene may show the same part at different places.
     placements = [scene.graph[node] for node in scene.graph.nodes_geometry]
     return [parts[name]._replace(matrix=matrix) for matrix, name in placements if name in parts]
-
-
-class _Images:
-    """Reader through which trimesh reads the images that a mesh file refers to.
-
-    Attributes:
-        errors: Errors of images that could not be read.
-    """
-
-    def __init__(self, file: MeshFile) -> None:
-        self.file = file
-        self.errors: list[Exception] = []
-
-    def get(self, name: str) -> bytes:
-        """Read an image below the folder of the mesh file."""
-        try:
-            content = self.file.read(name)
-            identify(io.BytesIO(content)).load()
-        # Pillow can raise almost any exception for a damaged file.
-        except Exception as error:
-            self.errors.append(error)
-            raise
-        return content
 
 
 def _as_part(geometry: Any, file: MeshFile) -> Part:

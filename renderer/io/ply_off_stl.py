@@ -196,11 +196,8 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
             case ["element", name, count] if name not in counts:
                 counts[name] = int(count)
                 items = properties[name] = []
-            case ["property", "list", length_type, type_, name] if {
-                length_type,
-                type_,
-            } <= _TYPES.keys():
-                items.append(_Property(name.lower(), _TYPES[type_], _TYPES[length_type]))
+            case ["property", "list", size, type_, name] if {size, type_} <= _TYPES.keys():
+                items.append(_Property(name.lower(), _TYPES[type_], _TYPES[size]))
             case ["property", type_, name] if type_ in _TYPES:
                 items.append(_Property(name.lower(), _TYPES[type_]))
             case [] | ["comment" | "obj_info", *_]:
@@ -418,9 +415,7 @@ def read_stl(file: MeshFile) -> list[Part]:
     if re.match(rb"\W*solid", content, re.IGNORECASE) and b"\0" not in content:
         corners = _text_corners(content, file)
         colors = np.ones((1, 3))
-    elif (
-        len(content) < _HEADER_SIZE + face_count * _STL_FACE.itemsize or len(header) < _HEADER_SIZE
-    ):
+    elif len(content) < _HEADER_SIZE + face_count * _STL_FACE.itemsize:
         raise ValueError("the file is truncated: export it again")
     else:
         faces = np.frombuffer(content, _STL_FACE, face_count, _HEADER_SIZE)
