@@ -173,11 +173,11 @@ def compare_networks(
         return None
     numbers = []
     for name, (title, note) in metrics.items():
-        values = [compare.mean_metric(network, compare.ALL, name) for network in (before, after)]
-        if values[0] is not None and values[1] is not None:
+        was, is_now = (compare.mean_metric(item, compare.ALL, name) for item in (before, after))
+        if was is not None and is_now is not None:
             has_one_seed = len(before) == len(after) == 1
-            interval = describe_intervals(values[1:]) if has_one_seed else values[1].over
-            numbers.append(ShownMetric(title, note, *values, name != "auc", interval))
+            interval = describe_intervals([is_now]) if has_one_seed else is_now.over
+            numbers.append(ShownMetric(title, note, was, is_now, name != "auc", interval))
 
     original, hardened = subjects
     sentences = [

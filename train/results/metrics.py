@@ -249,7 +249,9 @@ class Pool(ShortRepr):
     @cached_property
     def metrics(self) -> Metrics:
         """Metrics of the predictions with their 95% intervals."""
-        proportions = {name: outcome.proportion for name, outcome in self.outcomes.items()}
+        proportions: dict[str, Any] = {
+            name: outcome.proportion for name, outcome in self.outcomes.items()
+        }
         known = {name: jackknife.estimate for name, jackknife in self._rankings.items()}
         auc, *recalls = (known.get(name, Estimate()) for name in ROC_METRICS)
         positives, negatives = self.ranked
@@ -265,7 +267,8 @@ class Pool(ShortRepr):
             auc=auc_with_counts,
             recall_at=dict(zip(RATES, recalls, strict=True)),
             **proportions,
-            **{name: known.get(name) for name in TOP_RANKS},
+            class_top1=known.get("class_top1"),
+            class_top5=known.get("class_top5"),
         )
 
     @cached_property
@@ -399,7 +402,7 @@ class Pooled(ShortRepr):
         """For each class, the predictions for its images, which are scored together."""
         return self._by_content(self.all.predictions.shown)
 
-    def _by_content(self, names: Sequence[str | None]) -> dict[str, Pool]:
+    def _by_content(self, names: Iterable[Any]) -> dict[str, Pool]:
         """Collect the predictions for the images of each mesh, or of each class.
 
         The ROC curve of a mesh of a positive class compares the images of this
@@ -421,13 +424,13 @@ class Pooled(ShortRepr):
         return pools
 
 
-def group_rows(predictions: Predictions, names: Sequence[str | None]) -> dict[str, Predictions]:
+def group_rows(predictions: Predictions, names: Iterable[Any]) -> dict[str, Predictions]:
     """Group predictions by a name, such as the name of their source.
 
     Predictions whose name is None are left out. The names are sorted.
     """
-    column = as_column(names)
-    return {name: predictions[column == name] for name in sorted({*names} - {None})}
+    column = as_column([*names])
+    return {name: predictions[column == name] for name in sorted({*column} - {None})}
 
 
 def metric_title(name: str) -> str:

@@ -105,8 +105,8 @@ def _about(found: store.Findings, folders: Sequence[Path]) -> str:
     if found.attacks:
         counts.append(f"{len(found.attacks)} attacks")
     about = f"{', '.join(counts)}; in {', '.join(map(str, folders))}"
-    shown_folders = [item.folder for item in (*found.runs, *found.attacks)]
-    files = [file for folder in shown_folders for file in folder.iterdir() if file.name != PAGE]
+    shown = [run.folder for run in found.runs] + [attack.folder for attack in found.attacks]
+    files = [file for folder in shown for file in folder.iterdir() if file.name != PAGE]
     if files:
         newest = max(file.stat().st_mtime for file in files)
         about += f", {datetime.fromtimestamp(newest):%Y-%m-%d %H:%M}"
@@ -340,7 +340,7 @@ def _classes_with_trained_objects(scored: ScoredRun, images: Path | None) -> lis
     if images is None or images != scored.run.folder / KEPT_ASIDE:
         return []
     meshes = scored.run.config.meshes
-    trained = {item.mesh if isinstance(item, Mapping) else item for item in meshes}
+    trained = {item["mesh"] if isinstance(item, Mapping) else item for item in meshes}
     shown = read_json(images / DESCRIPTION)["meshes"]
     labels = {item["label"] for item in shown if item["mesh"] in trained}
     return [in_words(label) for label in scored.scores.labels if label in labels]

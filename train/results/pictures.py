@@ -207,7 +207,7 @@ def plot_by_radius(
             # Error bars must not be negative. Rounding errors can put an end of the interval on
             # the wrong side of the fraction.
             errors = np.stack([heights - lows, highs - heights]).clip(min=0)
-            bars = {"marker": "o", "ms": 4, "capsize": 3}
+            bars: dict[str, Any] = {"marker": "o", "ms": 4, "capsize": 3}
             axes.errorbar(positions, heights, errors, color=color, label=name, **bars)
         axes.set(ylim=(-0.02, 1.02), xlabel=x_title, ylabel="still recognized")
         axes.set_xticks(positions, [f"{radius:g}" for radius in radii])
@@ -306,7 +306,7 @@ def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
     return [items[index] for index in indices.round().astype(int)]
 
 
-def _tile(row: Predictions, image: UInt8[np.ndarray, "3 H W"], color: str) -> Tile:
+def _tile(row: Any, image: UInt8[np.ndarray, "3 H W"], color: str) -> Tile:
     """Enlarge an image, and add a frame, its prediction and, if that is wrong, its true class."""
     pixels = Image.fromarray(image.transpose(1, 2, 0))
     enlarged = pixels.resize((IMAGE_SIZE, IMAGE_SIZE), Image.Resampling.NEAREST)

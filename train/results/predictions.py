@@ -71,7 +71,7 @@ class Predictions(ShortRepr):
 
     @classmethod
     def of_labels(
-        cls, columns: Sequence[Sequence[Any]], by_label: Mapping[str, Sequence[Sequence[Any]]]
+        cls, columns: Sequence[Any], by_label: Mapping[str, Sequence[Any]]
     ) -> "Predictions":
         """Repeat the columns that do not depend on the positive class for each of them.
 
@@ -132,7 +132,7 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
     first = next(iter(by_label.values()))
     photographs = first.photograph
     ranks = first.true_rank.tolist()
-    columns: dict[str, Sequence[object]] = {
+    columns: dict[str, Any] = {
         "path": [item.path for item in photographs],
         "label": first.shown,
         "source": first.source,

@@ -422,7 +422,8 @@ def _example_row(line: Mapping[str, Any]) -> ExampleRow:
         outcome = "wrong before any step"
     # The dictionary removes the class of a view if an earlier view has the same class.
     label = ", ".join(dict.fromkeys(map(str, line["label"])))
-    return ExampleRow(int(line["example"]), label, *views, outcome)
+    before, after = views
+    return ExampleRow(int(line["example"]), label, before, after, outcome)
 
 
 class Unfinished(NamedTuple):

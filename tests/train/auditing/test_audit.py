@@ -405,15 +405,3 @@ def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_
     text = AuditedNetwork("orange", "dark", tmp_path).answer
     for light in KINDS.values():
         assert f"{light.title} of radius {light.radii[2]:g} loses 2 of 4 views" in text
-
-
-@pytest.mark.parametrize("withstood", [[], ["skylight"]])
-def test_the_kinds_of_lighting_are_named_that_no_attack_succeeds_with(tmp_path, withstood):
-    write_parts(tmp_path, 4, 4, adversarial=[0, 0, 0, 1])
-    # Without a recognized view there is nothing to attack.
-    counts = {"lamps": {"correct": 0, "adversarial": [0, 0, 0, 0]}}
-    counts |= {kind: {"correct": 4, "adversarial": [0, 0, 0, 0]} for kind in withstood}
-    for kind, content in counts.items():
-        (tmp_path / f"{kind}.json").write_text(json.dumps(content))
-    text = AuditedNetwork("orange", "dark", tmp_path).withstood
-    assert [kind for kind, light in KINDS.items() if light.title in text] == withstood

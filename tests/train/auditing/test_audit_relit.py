@@ -87,12 +87,6 @@ def test_the_budget_limits_the_photographs(photographs, tmp_path):
     assert "holds 10 photographs" in text
 
 
-@pytest.mark.parametrize("values", [{}, {"unlabeled": "a", "hard_negatives": ["solid:ball"]}])
-def test_an_audit_needs_meshes_or_photographs(values):
-    with pytest.raises(InputError, match="meshes"):
-        AuditSettings(network="first", **values)
-
-
 def test_a_missing_folder_is_an_error_before_anything_is_written(tmp_path):
     out = tmp_path / "out"
     settings = AuditSettings(network="first", unlabeled=str(tmp_path / "no"), out=str(out))
