@@ -362,17 +362,10 @@ def build_service(
             f"label={settings.label} has all classes of the network, but some renders show none "
             "of them: remove the objects without a class, or give them a label"
         )
-    return AugmentationService(
-        settings.augment,
-        scene,
-        labels,
-        settings.seed,
-        phases,
-        positive_classes=positive_classes if is_ranked else (),
-        rank=distributed.rank(),
-        world_size=distributed.world_size(),
-        images=images,
-    )
+    rendered = (settings.augment, scene, labels, settings.seed, phases)
+    ranked = positive_classes if is_ranked else ()
+    processes = (distributed.rank(), distributed.world_size())
+    return AugmentationService(*rendered, ranked, *processes, images)
 
 
 def _build_scene(

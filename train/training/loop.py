@@ -188,14 +188,9 @@ class Trainer:
         signal stopped the epoch before its last step.
         """
         settings = self.settings
-        rounds = rounds_of_epoch(
-            image_count=len(rows),
-            render_count=len(self.service),
-            seed=self.seed,
-            epoch=self.epoch,
-            images_per_epoch=settings.images_per_epoch,
-            images_per_round=self.service.settings.regenerate_every,
-        )
+        counts = (len(rows), len(self.service))
+        limits = (settings.images_per_epoch, self.service.settings.regenerate_every)
+        rounds = rounds_of_epoch(*counts, self.seed, self.epoch, *limits)
         steps = [math.ceil(len(one.rows) / settings.batch_size) for one in rounds]
         if self._epoch_state:
             # A resumed run continues within an epoch, with the random numbers of the first attempt.

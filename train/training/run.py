@@ -283,14 +283,10 @@ class Run:
         if INTERPOLATION in trainer.best or trainer.initial is None:
             return
         recipe = self.settings.train
-        weights, factor = interpolate(
-            initial=trainer.initial,
-            selected=trainer.selected,
-            trained=trainer.best["model"],
-            validation=self.data.train[self.held_out],
-            seed=self.settings.seed,
-            weights=(recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0),
-        )
+        networks = (trainer.initial, trainer.selected, trainer.best["model"])
+        validation = self.data.train[self.held_out]
+        losses = (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0)
+        weights, factor = interpolate(*networks, validation, self.settings.seed, losses)
         trainer.best |= {"model": weights, INTERPOLATION: factor}
         if distributed.rank() == 0:
             checkpoints.save(self.folder / run_folder.BEST, trainer.best)
@@ -321,15 +317,11 @@ class Run:
         predictor = Predictor(model, self.data.classes, self.data.size, self.trainer.device)
         values = {}
         for name, folder in self.scored_folders.items():
-            scores = evaluate_photographs(
-                predictor,
-                folder=folder,
-                label=photographs.choose_labels(folder, self.data.classes, self.settings.label),
-                out=out / name,
-                skip_unreadable=self.settings.evaluate.skip_unreadable,
-            )
+            label = photographs.choose_labels(folder, self.data.classes, self.settings.label)
+            skip = self.settings.evaluate.skip_unreadable
+            scores = evaluate_photographs(predictor, folder, label, out / name, skip)
             console.debug("%s: %s", name, format_scores(scores))
-            by_label = [(f"{name}/{label}", one) for label, one in scores.by_label.items()]
+            by_label = [(f"{name}/{one}", metrics) for one, metrics in scores.by_label.items()]
             for prefix, metrics in [(name, scores.overall), *by_label]:
                 for metric in ("top5", *METRICS):
                     estimate = metrics.find(metric)

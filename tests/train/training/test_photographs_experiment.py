@@ -150,7 +150,7 @@ def test_a_command_that_was_stopped_in_its_first_training_ends_as_one_that_was_n
     stopped = tmp_path / "stopped"
     interpolated = run.interpolate
 
-    def stop(**arguments):
+    def stop(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(run, "interpolate", stop)
