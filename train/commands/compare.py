@@ -24,17 +24,12 @@ class CompareSettings(Settings):
     )
 
     def __post_init__(self) -> None:
-        """Check all values, and that each run is named once."""
         super().__post_init__()
         if not self.runs:
             raise InputError(
                 "runs is empty: give the folders of one run or more, as in runs=[runs/a,runs/b]",
                 "runs",
             )
-        folders = [Path(run).resolve() for run in self.runs]
-        for run, folder in zip(self.runs, folders, strict=True):
-            if folders.count(folder) > 1:
-                raise InputError(f"runs names {run} twice: name each run once", "runs")
 
 
 def run(settings: CompareSettings) -> None:

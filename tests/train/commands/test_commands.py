@@ -111,7 +111,6 @@ MISTAKES = [
     ([*EVALUATE, "weights=b"], "weights=b"),
     ([*EVALUATE, "out=file"], "out=file"),
     (["compare"], "runs is not set"),
-    (["compare", "runs=[a,b,./a]"], "runs names a twice"),
     (["compare", "runs=[2024]"], "runs: 2024 holds no run"),
     (["compare", "--multirun"], "--multirun"),
     (["lab", "out=file/out"], "out=file/out"),
