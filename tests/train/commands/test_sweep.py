@@ -118,11 +118,14 @@ def test_a_run_keeps_its_folder_when_a_sweep_gets_more_values(tmp_path):
     assert run_name(["seed=0", "augment=none"], [], str(tmp_path)) == first
 
 
+PARSER = OverridesParser.create()
+
+
 @given(st.dictionaries(st.sampled_from(["seed", "data.path", "meshes"]), st.text(max_size=300)))
 def test_file_systems_and_command_lines_take_the_name_of_a_run(values):
     name = run_name([f"{key}={value}" for key, value in values.items()], ["data.path"])
     assert len(name.encode()) < 256
-    (override,) = OverridesParser.create().parse_overrides([f"out=runs/sweep/{name}"])
+    (override,) = PARSER.parse_overrides([f"out=runs/sweep/{name}"])
     assert override.value() == f"runs/sweep/{name}"
 
 
