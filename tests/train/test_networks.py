@@ -240,40 +240,20 @@ def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_p
     torch.testing.assert_close(classifier(images), network(images), rtol=tolerance, atol=tolerance)
 
 
-OTHER_NETWORKS = ["torchvision:shufflenet_v2_x0_5", "python:own_models:build"]
-
-
-def save_other_network(name: str, folder: Path) -> nn.Module:
+@pytest.mark.parametrize("name", ["torchvision:shufflenet_v2_x0_5", "python:own_models:build"])
+def test_other_networks_are_loaded_by_their_name_and_copied_without_their_code(tmp_path, name):
     network = build_network(CLASSES, 16, name, MEAN, STD).eval()
-    description = describe(network, CLASSES, size=16, encoding="linear", name=name)
-    write(folder, network, description)
-    return network
-
-
-@pytest.mark.parametrize("name", OTHER_NETWORKS)
-def test_other_networks_are_loaded_from_their_file_by_their_name(tmp_path, name):
-    network = save_other_network(name, tmp_path)
+    write(tmp_path, network, describe(network, CLASSES, size=16, encoding="linear", name=name))
     images = torch.rand(2, 3, 16, 16)
-    loaded = load_run(tmp_path / BEST, model=name)
-    assert torch.equal(loaded(images), network(images))
-
-
-@pytest.mark.parametrize("name", OTHER_NETWORKS)
-def test_the_weights_of_other_networks_are_copied_without_running_their_code(tmp_path, name):
-    network = save_other_network(name, tmp_path)
+    assert torch.equal(load_run(tmp_path / BEST, model=name)(images), network(images))
+    if name.startswith("python:"):
+        with pytest.raises(InputError, match=f"model={name}"):
+            load_run(tmp_path)
     fresh = build_network(CLASSES, 16, name)
     (tmp_path / "own_models.py").write_text("raise SystemExit('code ran')")
     description = {"classes": [*CLASSES], "size": 16, "name": name}
     initial_of(tmp_path / BEST).copy_to(fresh, description)
-    images = torch.rand(2, 3, 16, 16)
     assert torch.equal(fresh.eval()(images), network(images))
-
-
-def test_the_code_of_a_network_runs_only_if_it_is_named(tmp_path):
-    name = "python:own_models:build"
-    save_other_network(name, tmp_path)
-    with pytest.raises(InputError, match=f"model={name}"):
-        load_run(tmp_path)
 
 
 @pytest.mark.parametrize(
