@@ -130,11 +130,11 @@ def setting(
 ) -> Any:
     """Create a field of a settings class. `facts` are further attributes of `Facts`.
 
-    `within` is the smallest and the largest permitted value. If the value is a list, its items are
-    checked against the range and the choices. None is
-    permitted if the annotation of the field permits None. A function as default is called
-    for each instance, and REQUIRED means that there is none. `above` and `below` exclude
-    the limit. `is_text` makes the command line read 1.10 as text.
+    `within` is the smallest and the largest permitted value. `above` and `below` exclude the
+    limit. If the value is a list, its items are checked against the range and the choices. None is
+    permitted if the annotation of the field permits None. A function as default is called for each
+    instance, and REQUIRED means that there is none. `is_text` makes the command line read 1.10 as
+    text.
     """
     limits: dict[str, Any] = {"minimum": within[0], "maximum": within[1]}
     return _field(default, Facts(about, unit, **limits | facts))

@@ -417,9 +417,8 @@ def solid_name(mesh: str) -> str:
 
     It is empty for a file.
     """
-    words = mesh.split(":")
-    is_solid = words[0] == "solid" and len(words) > 1
-    return words[1] if is_solid else ""
+    kind, *words = mesh.split(":")
+    return words[0] if kind == "solid" and words else ""
 
 
 def simplified(name: str) -> str:
