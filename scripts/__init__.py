@@ -34,8 +34,8 @@ def name_folders(words: list[str]) -> list[str]:
     begins with "-" is an option. A word with "=" is a setting, unless a file or folder of this name
     exists.
     """
-    folders = []
-    other_words = []
+    folders: list[str] = []
+    other_words: list[str] = []
     for word in words:
         is_option = not word or word.startswith("-")
         is_folder = not is_option and ("=" not in word or os.path.exists(word))

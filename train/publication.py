@@ -151,7 +151,7 @@ def publish(
         # `load_run` raises an InputError if nobody could load the published network.
         loaded = load_run(path, model=network, trust_code=trust_code)
         if calibrate is not None and false_positive_rate is not None:
-            labels = label if label is not None else trained_labels(folder)
+            labels: Any = label if label is not None else trained_labels(folder)
             if not labels:
                 raise InputError(
                     f"label is not set, and run={run} records none: give label", "label"

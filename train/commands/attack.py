@@ -137,7 +137,7 @@ def _write_attack(
     result: AttackResult,
     folder: Path,
     settings: AttackExperimentSettings,
-    targets: Mapping[str, Sequence[Any]],
+    targets: Mapping[str, Any],
 ) -> tuple[str, list[str]]:
     """Check the result of the attack on one mesh, and write it to a folder.
 
@@ -169,7 +169,8 @@ def _format_summary(
     """Return the sentence about one mesh, or the sum and a table of several."""
     if len(rows) == 1:
         return headings
-    correct, hits = (sum(row[column] for row in rows) for column in (2, 3))
+    correct = sum(row[2] for row in rows)
+    hits = sum(row[3] for row in rows)
     total = f"success on {hits} of {correct} examples that were correct before"
     table = Table("", ["mesh", "examples", "correct before", "success"], rows)
     return [f"{len(rows)} meshes: {total}", *str(table).splitlines()]

@@ -104,7 +104,7 @@ def test_camera_and_light_of_a_path_traced_textured_solid_are_found(
     mesh = load_object(ObjectSettings(name, label="orange")).mesh
     side = MARGIN * photograph(tmp_path, mesh, camera, radiance, encoding)
     angle = 2 * math.degrees(math.atan(math.tan(math.radians(camera.angle) / 2) * side))
-    files = f"mesh={name}", "photograph=photo.png", "mask=mask.png", "out=fitted"
+    files = f"mesh={name}", "photograph=photo.png", "mask=mask.png", "out=fitted", "label=orange"
     capsys.readouterr()
     assert call("fit", *files, f"encoding={encoding}", f"fov={angle}") == 0
     output = capsys.readouterr().out
