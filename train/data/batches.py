@@ -108,10 +108,8 @@ def training_batches(
         draws[own] for draws in _draw(images, batch_size, seed, this_round, flips)
     ]
     is_render = order >= len(rows)
-    # `clamp` gives each render some valid row of the data set, and each image of the data set
-    # some valid row of the renders.
+    # `clamp` gives each render some valid row of the data set. It is replaced by the render below.
     row_of_image = rows[order.clamp(max=len(rows) - 1)]
-    render_of_image = (order - len(rows)).clamp(min=0)
     crops: Iterator[Tensor] = iter(())
     if isinstance(split.images, ImageFiles):
         chosen = [~of_batch for of_batch in is_render]
@@ -120,8 +118,10 @@ def training_batches(
         crops = split.images.crops(shown_rows, shown_seeds)
     # All draws are copied before the first batch, since a GPU finishes earlier work before a copy.
     device = split.labels.device
-    draws = (row_of_image, render_of_image, shifts.transpose(0, 1), is_flipped, is_render)
+    draws = (row_of_image, order - len(rows), shifts.transpose(0, 1), is_flipped, is_render)
     on_device = [one.to(device) for one in draws]
+    # Places of the renders in each batch. On a GPU, `nonzero` would wait for earlier work, too.
+    all_places = [mask.nonzero().squeeze(1).to(device) for mask in is_render]
     for index, (row, render, shift, flip, mask) in enumerate(zip(*on_device, strict=True)):
         if isinstance(split.images, ImageFiles):
             shown = torch.empty(own_size, *split.images.shape[1:], dtype=torch.uint8)
@@ -130,10 +130,12 @@ def training_batches(
         else:
             shown = crop_and_flip(split.images, row, shift, flip)
         labels = split.labels[row]
-        if len(renders):
-            rendered = crop_and_flip(cast(Tensor, renders.images), render, shift, flip)
-            shown = torch.where(mask[:, None, None, None], rendered, shown)
-            labels = torch.where(mask, renders.labels[render], labels)
+        places = all_places[index]
+        if len(places):
+            render = render[places]
+            pixels = cast(Tensor, renders.images)
+            shown[places] = crop_and_flip(pixels, render, shift[:, places], flip[places])
+            labels[places] = renders.labels[render]
         yield shown, labels, mask
 
 
