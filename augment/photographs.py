@@ -224,9 +224,7 @@ class RelitPhotographs(NormBalls):
     Args:
         albedo: Photographs, as linear light.
         light: Light of the projector, with a slide for each photograph.
-        cells: Number of cells per side.
-        radius: Largest magnitude of a logarithm.
-        steps: Number of steps in which an attack may cross the ball.
+        settings: Number of cells, radius, and steps in which an attack may cross the ball.
         generators: Generator of the random factors of each photograph. None to draw none.
     """
 
@@ -234,18 +232,17 @@ class RelitPhotographs(NormBalls):
         self,
         albedo: Float[Tensor, "B 3 H W"],
         light: ProjectedLight,
-        cells: int,
-        radius: float,
-        steps: int,
+        settings: RelightingSettings,
         generators: Sequence[Generator] = (),
     ):
-        step_size = max(TRAVELED_RADII * radius / max(steps, 1), 1 / errors.MAX_MAGNITUDE)
-        settings = StepSettings("linf", radius, "sign", step_size)
-        super().__init__(settings, albedo.new_zeros(len(albedo), 3 * cells**2))
+        step_size = TRAVELED_RADII * settings.radius / max(settings.steps, 1)
+        step_size = max(step_size, 1 / errors.MAX_MAGNITUDE)
+        ball = StepSettings("linf", settings.radius, "sign", step_size)
+        super().__init__(ball, albedo.new_zeros(len(albedo), 3 * settings.cells**2))
         self.group_size = len(albedo)
         self._albedo = albedo
         self._light = light
-        self._cells = cells
+        self._cells = settings.cells
         self._generators = generators
 
     def log_gain(self, values: Float[Tensor, "A D"]) -> Float[Tensor, "A 3 cells cells"]:
@@ -493,9 +490,7 @@ def _attack_slide(
     problem = RelitPhotographs(
         decode(images, "srgb"),
         _draw_lights(result.photographs, indices, slide, result.seed).to(images.device),
-        settings.cells,
-        settings.radius,
-        settings.steps,
+        settings,
         [generator(result.seed, "factors", index, slide) for index in indices],
     )
     # Treat each photograph as an example of one view: the second axis has length 1.

@@ -109,7 +109,7 @@ def test_steps_lower_the_confidence_in_the_source(photographs):
     albedo = decode(images, "srgb")
     light = draw_projected_light(len(images), SIZE, generator(0))
     source = network(images).argmax(1)
-    problem = RelitPhotographs(albedo, light, 3, math.log(2), steps=4)
+    problem = RelitPhotographs(albedo, light, SETTINGS)
     settings = AttackSettings(max_steps=4, margin=100.0, quantized=False)
     found = minimize(problem, Objective(network, Criterion(source[:, None]), settings))
     before = network(light.expose(albedo)).log_softmax(1)

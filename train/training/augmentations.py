@@ -4,7 +4,6 @@ The usual ones, with which training on renders is compared, are image transforms
 adversarial attacks on pixels (PGD). "relight" shows the images in the light of a projector.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,9 +29,6 @@ from train.train_settings import TrainSettings
 # 8/255 on CIFAR-10.
 PGD = StepSettings(norm="linf", radius=2 / 255, step="sign", step_size=1 / 255)
 PGD_STEPS = 3
-# The brightness of a projected slide is multiplied by smooth random factors, which are
-# interpolated from a grid with this number of cells per side.
-CELLS = RelightingSettings().cells
 
 
 @dataclass
@@ -170,10 +166,11 @@ class RelitBatches:
         unit = to_unit(images)
         # The linear colors of an image stand for the albedo of what it shows.
         albedo = decode(unit, "srgb")
-        radius, steps = math.log(self.settings.relight_gain), self.settings.relight_steps
-        problem = RelitPhotographs(albedo, light, CELLS, radius, steps)
+        steps = self.settings.relight_steps
+        relighting = RelightingSettings(self.settings.relight_gain, passes=2 * steps + 1)
+        problem = RelitPhotographs(albedo, light, relighting)
         values = problem.sample(draws)
-        if steps and radius and self.teacher is not None:
+        if steps and relighting.radius and self.teacher is not None:
             with torch.no_grad():
                 criterion = Criterion(self.teacher(unit).argmax(1)[:, None])
             values = _attack(problem, values, self.model, criterion, steps)
