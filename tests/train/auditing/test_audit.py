@@ -124,6 +124,7 @@ def test_a_classifier_that_recognizes_nothing_is_not_attacked_with_success(
     views, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(lights, "STEPS", 3)
+    monkeypatch.setattr(lights, "SIZES", (1.0,))
     monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(10.0,)))
     blind = darker_than(-1.0)
     assert find_plain_views(blind, views).recognized == 0
