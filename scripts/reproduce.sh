@@ -46,7 +46,7 @@ tables() {
     printf '\n## experiment=%s: %s\n\n' "$experiment" "$photographs"
     local list
     list=$(IFS=, && echo "${folders[*]%/}")
-    "$python" -m scripts compare "runs=[$list]" "photos=$photographs" "exclude=$exclude" -v
+    "$python" -m scripts.compare "runs=[$list]" "photos=$photographs" "exclude=$exclude" -v
 }
 
 [[ -n ${DATA:-} && -n ${MESHES:-} && -n ${PHOTOS:-} ]] || usage

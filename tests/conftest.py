@@ -5,6 +5,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from ipaddress import ip_address
 
 import pytest
@@ -98,16 +99,13 @@ def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
 
     The command runs within this process, in the temporary folder of the test.
     """
-    import scripts
-    from train.__main__ import main
-
     handlers = logging.root.handlers[:]
 
     def command(name: str, *arguments: str) -> int:
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
         try:
-            (main if name == "train" else getattr(scripts, name))()
+            import_module("train.__main__" if name == "train" else f"scripts.{name}").main()
         except SystemExit as stop:
             return stop.code
         return 0

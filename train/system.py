@@ -183,7 +183,7 @@ def program(name: str, as_called: bool = False) -> list[str]:
         has_path = as_called and called.stem == installed_name
         words = [str(called) if has_path else installed_name]
     else:
-        words = ["-m", *(["train"] if name == "train" else ["scripts", name])]
+        words = ["-m", "train" if name == "train" else f"scripts.{name}"]
     if process_count > 1:
         torchrun = [python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
         no_python = ["--no-python"] if is_installed else []

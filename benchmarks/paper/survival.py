@@ -51,7 +51,7 @@ def run_attack(overrides: Sequence[str], threads: int) -> Row:
         RuntimeError: If the command fails.
     """
     with TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "scripts", "attack"]
+        command = [sys.executable, "-m", "scripts.attack"]
         command += [f"out={folder}/out", "attack.checks=false", *overrides]
         environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)

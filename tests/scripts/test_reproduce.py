@@ -111,8 +111,8 @@ def test_the_training_speed_is_measured_first(tmp_path, command, device):
 )
 def test_the_tables_compare_all_runs_of_an_experiment(tmp_path, command, tables):
     _, calls, _ = reproduce(tmp_path, command, **INPUTS)
-    calls = [call for call in calls if call[:3] == ["-m", "scripts", "compare"]]
+    calls = [call for call in calls if call[:2] == ["-m", "scripts.compare"]]
     for call, (experiment, images) in zip(calls, tables, strict=True):
         runs = [f"runs/{experiment}/augment-none+seed-{seed}" for seed in (0, 1)]
-        assert call[3] == f"runs=[{','.join(runs)}]"
-        assert call[4] == f"photos={images}"
+        assert call[2] == f"runs=[{','.join(runs)}]"
+        assert call[3] == f"photos={images}"

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,11 @@ import trimesh
 from PIL import Image
 
 import norm_balls as nb
-import scripts
 from renderer import export_mesh, save_light, solid
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import probe
 from renderer.light.lamps import Lamps
 from tests.helpers import save_colored_noise
-from train.__main__ import main
 
 ROOT = Path(__file__).parents[2]
 MAX_SECONDS = 300  # A process that should end is killed after this time.
@@ -116,7 +115,7 @@ def run_here(name: str, *arguments: str, folder: Path) -> int:
         patch.setattr(sys, "argv", [f"{name}.py", *arguments])
         patch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
         try:
-            (main if name == "train" else getattr(scripts, name))()
+            import_module("train.__main__" if name == "train" else f"scripts.{name}").main()
         except SystemExit as stop:
             return int(stop.code or 0)
     return 0

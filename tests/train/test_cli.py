@@ -15,8 +15,8 @@ import pytest
 import torch
 import yaml
 
-import scripts
 from renderer.errors import InputError
+from scripts.compare import main as compare
 from train import console
 from train.cli import USER_ERROR
 from train.commands.experiment import logged_to
@@ -209,7 +209,7 @@ def run_python(code: str) -> subprocess.CompletedProcess:
 
 def test_ctrl_c_is_one_line_even_if_a_library_turns_it_into_an_error(capsys):
     """trimesh does so while it imports optional parts."""
-    with pytest.raises(SystemExit) as stop, scripts.compare.handle_errors():
+    with pytest.raises(SystemExit) as stop, compare.handle_errors():
         try:
             raise KeyboardInterrupt
         except KeyboardInterrupt:
@@ -227,12 +227,12 @@ class Finder:
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Finder)
 signal.signal(signal.SIGINT, signal.default_int_handler)
-sys.argv[1:] = ["attack"] if "MODULE" == "scripts" else []
+sys.argv[1:] = []
 runpy.run_module("MODULE", run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("module", ["train", "scripts"])
+@pytest.mark.parametrize("module", ["train", "scripts.attack"])
 def test_an_interrupt_while_torch_is_imported_is_one_line(module):
     ended = run_python(INTERRUPTED.replace("MODULE", module))
     assert ended.returncode == 128 + signal.SIGINT
@@ -245,7 +245,7 @@ def test_a_closed_output_pipe_ends_a_command_silently(capsys, monkeypatch):
     os.close(read)
     with monkeypatch.context() as patch, open(write, "w") as output:
         patch.setattr(sys, "stdout", output)
-        with pytest.raises(SystemExit) as stop, scripts.compare.handle_errors():
+        with pytest.raises(SystemExit) as stop, compare.handle_errors():
             print("a table")
         assert stop.value.code == 128 + signal.SIGPIPE
         print("text that Python writes at its end", flush=True)

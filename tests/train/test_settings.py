@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from augment.augmentation_settings import AugmentationSettings
 from renderer.errors import InputError
-from scripts import attack as attack_command
-from scripts import evaluate as evaluate_command
+from scripts.attack import main as attack_command
+from scripts.evaluate import main as evaluate_command
 from tests.runs import loaded_run
 from train.__main__ import main as train_command
 from train.cli import as_override, quoted

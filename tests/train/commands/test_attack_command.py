@@ -53,7 +53,7 @@ def test_an_attack_prints_what_it_attacked_writes_its_files_and_records_its_sett
     config = OmegaConf.load(tmp_path / "out" / "config.yaml")
     assert set(config.attack) >= set(names)
     arguments = ["out=out", *SMALL, f"attack=[{attacked}]"]
-    assert config.command == shlex.join(["python", "-m", "scripts", "attack", *arguments])
+    assert config.command == shlex.join(["python", "-m", "scripts.attack", *arguments])
 
     folder = tmp_path / "out" / FOLDER_OF_ORANGE
     example, summary = read_lines(folder / "attack.jsonl")

@@ -13,7 +13,7 @@ from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.files import probe
 from renderer.visibility import opengl
-from scripts import attack as attack_command
+from scripts.attack import main as attack_command
 from tests.runs import loaded_run
 from train.command_settings import AttackExperimentSettings
 from train.commands.attack import attacks, overrides

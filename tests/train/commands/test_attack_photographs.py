@@ -8,7 +8,8 @@ import torch
 from PIL import Image
 
 from renderer.errors import InputError
-from scripts import attack, list_parameters
+from scripts.attack import list_parameters
+from scripts.attack import main as attack
 from tests.helpers import bright_or_dark
 from train.auditing.relit import PICTURE_COUNT, read_relit
 from train.commands.attack import run

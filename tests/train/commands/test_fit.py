@@ -25,7 +25,7 @@ from renderer.light.harmonics import equirectangular, project
 from renderer.mesh import Mesh
 from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.settings import ImageSettings
-from scripts import attack as attack_command
+from scripts.attack import main as attack_command
 
 MARGIN = 1.6  # Side of the square around the object, in widths of the object.
 SIZE = 192  # Photographs have so many pixels per side.

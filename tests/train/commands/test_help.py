@@ -4,14 +4,13 @@ import os
 import subprocess
 import sys
 from dataclasses import is_dataclass
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
 
-import scripts
 from renderer.settings import facts_of, field_types
-from train.__main__ import main
 from train.cli import Command
 from train.run_config import format_command
 from train.settings import dotted
@@ -22,17 +21,17 @@ NAMES = ("train", "attack", "audit", "compare", "evaluate", "fit", "lab", "repor
 
 def help_of(name: str, *arguments: str) -> str:
     """Run --help where torch cannot be imported, and return everything that is printed."""
-    module, words = ("train", []) if name == "train" else ("scripts", [name])
+    module = "train" if name == "train" else f"scripts.{name}"
     code = (
         "import runpy, sys; sys.modules['torch'] = sys.modules['numpy'] = None; "
         f"runpy.run_module({module!r}, run_name='__main__')"
     )
-    command = [sys.executable, "-c", code, *words, "--help", *arguments]
+    command = [sys.executable, "-c", code, "--help", *arguments]
     return subprocess.run(command, cwd=ROOT, stdout=-1, stderr=-2, text=True, check=True).stdout
 
 
 def command_of(name: str) -> Command:
-    return main if name == "train" else getattr(scripts, name)
+    return import_module("train.__main__" if name == "train" else f"scripts.{name}").main
 
 
 def facts_below(kind: type) -> list[tuple[type, str]]:
