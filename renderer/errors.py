@@ -491,7 +491,8 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
     if not has_memory(needed, device):
         free = free_memory(device) or 0
         raise InputError(
-            f"{name} need {needed / GIB:.1f} GB of memory, of {free / GIB:.1f} free: reduce them"
+            f"{name} need {needed / GIB:.1f} GB of memory, and {free / GIB:.1f} GB are free: "
+            "reduce them"
         )
 
 

@@ -78,7 +78,7 @@ def test_an_attack_on_light_takes_half_to_all_of_the_memory_that_it_must_find_fr
     """The renders are bytes, as they are in training."""
     required = []
     monkeypatch.setattr(scene, "AT_ONCE", at_once)
-    monkeypatch.setattr(scene, "require_memory", lambda *arguments: required.append(arguments[1]))
+    monkeypatch.setattr(errors, "require_memory", lambda *arguments: required.append(arguments[1]))
     settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=1))
     settings.vary.camera = camera
     service = AugmentationService.from_meshes(
