@@ -627,7 +627,7 @@ def test_a_small_file_that_needs_more_memory_than_is_free_is_refused(tmp_path, m
     monkeypatch.setattr(errors, "GROUP", tmp_path)
     create().write(tmp_path / "mesh.glb")
     assert (tmp_path / "mesh.glb").stat().st_size < 400_000
-    with pytest.raises(InputError, match=r"need .* GB of memory, of 0\.4 free"):
+    with pytest.raises(InputError, match=r"need .* GB of memory, and 0\.4 GB are free"):
         load_mesh(tmp_path / "mesh.glb")
 
 
