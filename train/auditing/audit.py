@@ -21,6 +21,7 @@ from typing import Any
 
 import torch
 
+from augment.attack_settings import RelightingSettings
 from augment.classifier import Classifier
 from augment.scene.objects import load_object
 from renderer.errors import InputError, keyed
@@ -28,34 +29,8 @@ from renderer.io.files import atomic_write
 from renderer.light.files import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
 from train import console
-from train.auditing import page
-from train.auditing.lights import (
-    KINDS,
-    QUERIES,
-    PlainViews,
-    Views,
-    find_plain_views,
-    recognize_in_environments,
-    success_by_light,
-    transfer_success,
-)
-from train.auditing.network import (
-    CLASSIFIER,
-    HARDENED,
-    LABORATORY,
-    NORMALIZED,
-    PHOTOGRAPHS,
-    PLAIN,
-    RECOGNIZED,
-    TRANSFER,
-    name_remedies,
-    normalizing,
-)
-from train.auditing.relit import (
-    RELIT_FOLDER,
-    attack_some,
-    write_photographs_page,
-)
+from train.auditing import lights, page, relit
+from train.auditing.network import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
 from train.checkpoints import load_chosen, load_network
 from train.class_names import class_of_meshes, require_others, with_class_name
 from train.command_settings import AuditSettings, LabSettings
@@ -67,7 +42,15 @@ from train.results.page import PAGE
 from train.results.scoring import Predictor, evaluate_photographs
 from train.run_config import CONFIG, read_config, require_same, write_config
 from train.run_folder import read_json, sole_writer, writable_folder
-from train.settings import OTHER_PREFIX, published, read_objects, simplified, solid_name
+from train.settings import (
+    LABORATORY,
+    OTHER_PREFIX,
+    PHOTOGRAPHS,
+    published,
+    read_objects,
+    simplified,
+    solid_name,
+)
 from train.system import command_line
 
 # Number of views of the meshes that are rendered in environment lighting.
@@ -103,8 +86,7 @@ SETTABLE_LATER = ("hardened", "photos", "unlabeled")
 
 
 def run_audit(
-    settings: AuditSettings,
-    networks: Mapping[str, Classifier] | None = None,
+    settings: AuditSettings, networks: Mapping[str, Classifier] | None = None
 ) -> page.Audited:
     """Test networks in unusual lighting, and write a report to the folder `settings.out`.
 
@@ -145,8 +127,13 @@ def run_audit(
                 _write_folder(renders, partial(_write_renders, settings, plan, size))
             plan.measure(networks, out)
         if settings.unlabeled:
+            # A path below pretrained/ is found from any working folder.
+            photographs = published(Path(str(settings.unlabeled)))
+            attack = RelightingSettings(passes=relit.PASSES)
+            options = {"seed": settings.seed, "limit": settings.scale(relit.PHOTOGRAPH_COUNT)}
             for key, network in networks.items():
-                _write_folder(out / key / RELIT_FOLDER, partial(attack_some, network, settings))
+                write = partial(relit.attack_folder, network, photographs, attack, **options)
+                _write_folder(out / key / relit.RELIT_FOLDER, write)
         names = {key: network.name for key, network in networks.items()}
         if len({*names.values()}) < len(names):
             names[HARDENED] += " (hardened)"
@@ -155,7 +142,7 @@ def run_audit(
             folders = plan.image_folders
             return page.write_audit_page(settings.label, names, remedies, folders, out, caveats)
         results = {name: out / key for key, name in names.items()}
-        return page.Audited(*write_photographs_page(results, out, caveats), "", {}, None)
+        return page.Audited(*relit.write_photographs_page(results, out, caveats), "", {}, None)
 
 
 def _caveats(
@@ -173,7 +160,8 @@ def _caveats(
         if not network.is_differentiable(torch.empty(0, device=device)):
             attack = "only random search attacks it"
             if settings.meshes:
-                attack = f"random search attacks each view with {QUERIES} queries for each radius"
+                queries = f"{lights.QUERIES} queries for each radius"
+                attack = f"random search attacks each view with {queries}"
             caveats.append(f"{network.name} has no gradients: {attack}.")
     return caveats
 
@@ -229,7 +217,7 @@ class _Plan:
         self.random_light_count = settings.scale(RANDOM_LIGHT_COUNT)
         positives = objects[: len(meshes)]
         self.views, self.attacked_views = (
-            Views(positives, settings.scale(count), settings.seed, device)
+            lights.Views(positives, settings.scale(count), settings.seed, device)
             for count in (VIEW_COUNT, ATTACKED_COUNT)
         )
 
@@ -239,25 +227,30 @@ class _Plan:
         The views of all networks have the ordinary light and the size at which the audited network
         recognizes most views.
         """
-        path = out / CLASSIFIER / PLAIN
-        _write_json(path, _search, networks[CLASSIFIER], self.attacked_views)
-        plain = PlainViews(**read_json(path))
+        path = out / CLASSIFIER / lights.PLAIN
+        searched = (networks[CLASSIFIER], self.attacked_views)
+        _write_json(path, lambda: asdict(lights.find_plain_views(*searched)))
+        plain = lights.PlainViews(**read_json(path))
         views, attacked_views = map(plain.apply_to, (self.views, self.attacked_views))
+        environments = (views, self.environments, self.random_light_count)
         for key, network in networks.items():
             results = out / key
-            lights = (self.environments, self.random_light_count)
-            _write_json(results / RECOGNIZED, recognize_in_environments, network, views, *lights)
-            for kind in KINDS:
+            recognize = lights.recognize_in_environments
+            _write_json(results / lights.RECOGNIZED, recognize, network, *environments)
+            for kind in lights.KINDS:
                 path = results / f"{kind}.json"
-                _write_json(path, success_by_light, network, attacked_views, kind, results)
+                attack = lights.success_by_light
+                _write_json(path, attack, network, attacked_views, kind, results)
             for other in networks.values():
                 if other is not network:
                     arguments = (network, other, attacked_views, results)
-                    _write_json(results / TRANSFER, transfer_success, *arguments)
+                    _write_json(results / lights.TRANSFER, lights.transfer_success, *arguments)
         for key, network in {**networks, **normalizing(networks)}.items():
             for name, images in self.image_folders.items():
                 predictor = Predictor(network, network.classes, network.size, self.views.device)
-                _write_folder(out / key / name, partial(_evaluate, predictor, images, self.label))
+                # Unreadable photographs are left out.
+                evaluate = partial(evaluate_photographs, predictor, images, self.label)
+                _write_folder(out / key / name, partial(evaluate, skip_unreadable=True))
 
 
 def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
@@ -360,16 +353,6 @@ def _write_json(path: Path, measure: Callable[..., Mapping[str, Any]], *argument
     """Write the return value of a function to a JSON file, unless the file exists."""
     if not path.exists():
         atomic_write(path, json.dumps(measure(*arguments)) + "\n", durable=True)
-
-
-def _search(classifier: Classifier, views: Views) -> dict[str, Any]:
-    """Find views in ordinary light, and return the attributes of `PlainViews` as a dictionary."""
-    return asdict(find_plain_views(classifier, views))
-
-
-def _evaluate(predictor: Predictor, folder: Path, label: str, out: Path) -> None:
-    """Score a network on a folder of photographs. Unreadable photographs are left out."""
-    evaluate_photographs(predictor, folder, label, out, skip_unreadable=True)
 
 
 def _write_folder(folder: Path, write: Callable[[Path], object]) -> None:

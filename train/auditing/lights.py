@@ -52,6 +52,12 @@ from renderer.rendering import light_sphere
 from renderer.settings import ImageSettings
 from renderer.visibility import choose
 
+# Result file: in which environment lights a network recognizes each view.
+RECOGNIZED = "recognized.json"
+# Result file: the ordinary light in which the audited network recognizes most views.
+PLAIN = "plain_light.json"
+# Result file: how often attacks on a network also fool the other network.
+TRANSFER = "transfer.json"
 # Number of images that a classifier classifies in one pass.
 BATCH = 16
 # Name of the environment lighting in which the views are rendered before an attack.
@@ -189,10 +195,7 @@ class Views:
 
 
 def recognize_in_environments(
-    classifier: Classifier,
-    views: Views,
-    environments: Sequence[str],
-    random_light_count: int,
+    classifier: Classifier, views: Views, environments: Sequence[str], random_light_count: int
 ) -> dict[str, list[bool]]:
     """Test whether a classifier recognizes views in several environment lights."""
     noise = generator(views.seed, "lights")
@@ -228,10 +231,7 @@ def is_correct(
 
 
 def adversaries(
-    classifier: Classifier,
-    views: Views,
-    kind: str,
-    additional: bool = False,
+    classifier: Classifier, views: Views, kind: str, additional: bool = False
 ) -> AttackResult:
     """Attack a classifier by one kind of lighting, within the largest radius of this kind.
 
@@ -263,12 +263,7 @@ def adversaries(
     )
 
 
-def success_by_light(
-    classifier: Classifier,
-    views: Views,
-    kind: str,
-    out: Path,
-) -> dict[str, Any]:
+def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path) -> dict[str, Any]:
     """Attack one kind of lighting, and count the misclassified views for each radius.
 
     The attacked lighting of the largest radius is written to out/KIND.npz, which `transfer_success`
@@ -282,10 +277,7 @@ def success_by_light(
     clean = result.clean_correct
     by_radius = success_by_radius(result, [radius / radii[-1] for radius in radii])
     counts: dict[str, Any] = {"n": views.count, "correct": int(clean.sum())}
-    for suffix, success in (
-        ("", result.success),
-        ("_without_noise", result.success_without_noise),
-    ):
+    for suffix, success in (("", result.success), ("_without_noise", result.success_without_noise)):
         adversarial = f"adversarial{suffix}"
         random = f"random{suffix}"
         # There are two attacks for the largest radius. The attack in `by_radius` starts
@@ -303,29 +295,17 @@ def success_by_light(
         logits = torch.stack([result.logits_before[example], result.logits[example]])
         counts |= predictions(logits, classifier.classes)
         counts["slider"] = frames_of(result, example)
-        write_image(out / f"{kind}.png", _draw_pair(result, example))
+        both = torch.cat([result.images_before[example], result.images[example]], dim=2)
+        pair = Image.fromarray(to_bytes(both.cpu()).permute(1, 2, 0).numpy())
+        # A small render is enlarged without smoothing, so that its pixels are visible.
+        is_enlarged = pair.height < SIDE
+        method = Image.Resampling.NEAREST if is_enlarged else Image.Resampling.LANCZOS
+        write_image(out / f"{kind}.png", pair.resize((2 * SIDE, SIDE), method))
     return counts
 
 
-def _draw_pair(result: AttackResult, example: int) -> Image.Image:
-    """Draw the image of an example before and after the attack, side by side.
-
-    Renders smaller than SIDE pixels are enlarged without smoothing, so that their pixels are
-    visible.
-    """
-    before = result.images_before[example]
-    after = result.images[example]
-    pair = to_bytes(torch.cat([before, after], dim=2).cpu()).permute(1, 2, 0)
-    is_enlarged = before.shape[-1] < SIDE
-    method = Image.Resampling.NEAREST if is_enlarged else Image.Resampling.LANCZOS
-    return Image.fromarray(pair.numpy()).resize((2 * SIDE, SIDE), method)
-
-
 def transfer_success(
-    attacked: Classifier,
-    other: Classifier,
-    views: Views,
-    out: Path,
+    attacked: Classifier, other: Classifier, views: Views, out: Path
 ) -> dict[str, dict[str, list[int]]]:
     """Test whether lighting that fools one classifier also fools another classifier.
 
@@ -352,10 +332,8 @@ def transfer_success(
         for name, (is_wrong, values) in lights.items():
             is_tested = is_wrong.to(recognized) & recognized
             images = problem.images(values.to(problem.start))
-            predicted = objective.logits(images).argmax(2)
-            fooled = objective.fooled_in_views(images, predicted, problem.all_examples).all(1)
-            without_noise = criterion.reached(predicted)
-            masks = (is_tested & fooled, is_tested, is_tested & without_noise)
+            _, fooled, without_noise = objective.judge(images, problem.all_examples)
+            masks = (is_tested & fooled.all(1), is_tested, is_tested & without_noise)
             counts[kind][name] = [int(mask.sum()) for mask in masks]
     return counts
 
@@ -439,23 +417,15 @@ def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
     All combinations are tried, until one is found at which the classifier recognizes a fraction of
     ENOUGH. If no view is ever recognized, the first combination is returned.
     """
-    best: PlainViews | None = None
+    tried: list[PlainViews] = []
     candidates = [*product(SIZES, EXPOSURES, PLAIN_LIGHTS)]
     for size, exposure, name in progress(candidates, "search for plain light"):
         candidate = replace(views, light=name, exposure=exposure, size=size)
         scene = candidate.scene(classifier.size)
         light = load_light(name).to(scene.lights) * exposure
         recognized = int(_recognized(classifier, scene, light).sum())
-        if best is None or recognized > best.recognized:
-            best = PlainViews(
-                light=name,
-                exposure=exposure,
-                size=size,
-                recognized=recognized,
-                n=views.count,
-                recognized_as_given=recognized if best is None else best.recognized_as_given,
-            )
-        if best.recognized >= ENOUGH * views.count:
+        as_given = tried[0].recognized if tried else recognized
+        tried.append(PlainViews(name, exposure, size, recognized, views.count, as_given))
+        if recognized >= ENOUGH * views.count:
             break
-    assert best is not None
-    return best
+    return max(tried, key=lambda item: item.recognized)

@@ -11,35 +11,20 @@ import numpy as np
 from augment.classifier import Classifier
 from renderer.errors import ShortRepr, as_path
 from renderer.io.files import atomic_write
-from train.auditing.lights import KINDS, RANDOM, PlainViews
+from train.auditing.lights import KINDS, PLAIN, RANDOM, RECOGNIZED, TRANSFER, PlainViews
+from train.results import tables
 from train.results.compare import ALL, Difference, Evaluations, difference, mean_metric
 from train.results.first_screen import EQUAL_RATE, gain_sentence
 from train.results.intervals import Units, leave_out, weighted_means
 from train.results.metrics import METRICS, metric_title
 from train.results.predictions import Predictions
 from train.results.store import RunSummary, ScoredRun, read_summaries
-from train.results.tables import (
-    Estimate,
-    Proportion,
-    Table,
-    describe_intervals,
-    format_interval,
-    fraction,
-    join_words,
-)
+from train.results.tables import Estimate, Proportion, Table, fraction
 from train.run_folder import read_json
+from train.settings import LABORATORY, PHOTOGRAPHS
 
-# Names of the two folders of test images, and of the subfolders with their scores.
-LABORATORY = "laboratory"
-PHOTOGRAPHS = "photographs"
-# The images in these folders, in words.
+# The images in the two folders of test images, in words.
 IN_WORDS = {LABORATORY: "path-traced test images", PHOTOGRAPHS: "photographs"}
-# Result file: in which environment lights a network recognizes each view.
-RECOGNIZED = "recognized.json"
-# Result file: the ordinary light in which the audited network recognizes most views.
-PLAIN = "plain_light.json"
-# Result file: how often attacks on a network also fool the other network.
-TRANSFER = "transfer.json"
 # With fewer views that an attack could lose, attacks and renders alone decide nothing.
 MIN_VIEWS = 6
 # A network is called safe only if it classifies at least this fraction of the images
@@ -332,7 +317,7 @@ class AuditedNetwork:
         ]
         if not titles:
             return ""
-        return f"No attack on {self.name} succeeded with {join_words(titles, 'or')}."
+        return f"No attack on {self.name} succeeded with {tables.join_words(titles, 'or')}."
 
     @property
     def strongest_kind(self) -> str | None:
@@ -465,9 +450,9 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
         reason = gain_sentence(f"With {chosen}, {title}", gain)
     rows = []
     for name, evaluations_of_network in evaluations.items():
-        value = format_interval(mean_metric(evaluations_of_network, ALL, metric))
-        rows.append([name, value, format_interval(gains.get(name), "+")])
-    intervals = describe_intervals(gains.values())
+        value = tables.format_interval(mean_metric(evaluations_of_network, ALL, metric))
+        rows.append([name, value, tables.format_interval(gains.get(name), "+")])
+    intervals = tables.describe_intervals(gains.values())
     table = Table(intervals, ["network", title, "gain over the original network"], rows)
     advice = ADVICE[chosen]
     return Recommendation(

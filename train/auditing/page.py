@@ -21,7 +21,6 @@ from train.auditing.network import (
     IN_WORDS,
     NEXT_HARDENING,
     NORMALIZED,
-    PHOTOGRAPHS,
     AuditedNetwork,
     AuditReport,
     Recommendation,
@@ -37,7 +36,7 @@ from train.results.store import RunSummary, ScoredRun
 from train.results.tables import Estimate, Proportion, fraction
 from train.run_config import CONFIG, read_config
 from train.run_folder import read_json
-from train.settings import in_words
+from train.settings import PHOTOGRAPHS, in_words
 
 # Headline of the report, by the answer to the question whether the network is safe.
 VERDICTS = {
@@ -165,10 +164,7 @@ def _slider(networks: Sequence[AuditedNetwork]) -> dict[str, Any] | None:
 
 
 def _first_screen(
-    networks: Sequence[AuditedNetwork],
-    images: str | None,
-    folders: Mapping[str, Path],
-    plain: str,
+    networks: Sequence[AuditedNetwork], images: str | None, folders: Mapping[str, Path], plain: str
 ) -> first_screen.FirstScreen:
     """Make the top of the report: its headline, main numbers and sentences.
 

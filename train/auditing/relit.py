@@ -27,7 +27,6 @@ from augment.photographs import (
 from renderer.errors import ShortRepr
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
-from train.command_settings import AuditSettings
 from train.data.photographs import find_unlabeled, load_photographs
 from train.results.first_screen import FirstScreen, ShownMetric
 from train.results.page import write_page
@@ -36,16 +35,11 @@ from train.results.predictions import RELIT
 from train.results.tables import Proportion, Table, format_fraction, fraction, join_words
 from train.run_config import CONFIG, read_config
 from train.run_folder import read_json
-from train.settings import published
 
 # Pictures are written for this many photographs.
 PICTURE_COUNT = 8
 # Titles of the columns of tables, by the kind of light.
-TITLES = {
-    SLIDE: "random slide",
-    RANDOM: "random search",
-    ADVERSARIAL: "gradient",
-}
+TITLES = {SLIDE: "random slide", RANDOM: "random search", ADVERSARIAL: "gradient"}
 # Sentences of reports about what the simulation of the light leaves out.
 MODELED = (
     "A slide is the picture that a projector shows. "
@@ -152,10 +146,8 @@ class RelitScores(ShortRepr):
         rows: list[Any] = []
         for name in sorted({item.predicted for item in self.photographs}):
             group = [item for item in self.photographs if item.predicted == name]
-            counts = [
-                sum(item.kept[light] == self.slides for item in group) for light in self.lights
-            ]
-            rows.append([name, len(group), *counts])
+            is_kept = [[item.kept[light] == self.slides for item in group] for light in self.lights]
+            rows.append([name, len(group), *map(sum, is_kept)])
         rows.sort(key=lambda row: sum(row[2:]) / row[1])
         titles = [f"kept: {TITLES[light]}" for light in self.lights]
         return [
@@ -186,12 +178,7 @@ def attack_folder(
         folder, chosen, classifier.size, skip_unreadable=True
     )
     result = attack_photographs(
-        classifier,
-        images,
-        settings,
-        sensor_noise=sensor_noise,
-        batch_size=batch_size,
-        seed=seed,
+        classifier, images, settings, sensor_noise=sensor_noise, batch_size=batch_size, seed=seed
     )
     out.mkdir(parents=True, exist_ok=True)
     classes = result.classifier.classes
@@ -201,14 +188,9 @@ def attack_folder(
             light: [classes[label] for label in result.predicted[light][index].tolist()]
             for light in result.changed
         }
-        photographs.append(
-            RelitPhotograph(
-                path=str(photograph.path),
-                predicted=classes[int(result.source[index])],
-                kept={light: int((~item[index]).sum()) for light, item in result.changed.items()},
-                becomes=becomes,
-            )
-        )
+        kept = {light: int((~item[index]).sum()) for light, item in result.changed.items()}
+        predicted = classes[int(result.source[index])]
+        photographs.append(RelitPhotograph(str(photograph.path), predicted, kept, becomes))
     scores = RelitScores(
         folder=str(folder),
         slides=settings.slides,
@@ -257,19 +239,6 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
         names[photograph] = f"relit_{photograph:04d}.png"
         write_image(out / names[photograph], side_by_side)
     return names
-
-
-def attack_some(classifier: Classifier, settings: AuditSettings, out: Path) -> None:
-    """Attack a network on as many photographs as the settings of an audit ask for."""
-    attack_folder(
-        classifier,
-        # A path below pretrained/ is found from any working folder.
-        published(Path(str(settings.unlabeled))),
-        RelightingSettings(passes=PASSES),
-        out,
-        seed=settings.seed,
-        limit=settings.scale(PHOTOGRAPH_COUNT),
-    )
 
 
 def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:

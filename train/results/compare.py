@@ -13,18 +13,11 @@ from typing import NamedTuple
 
 from augment.augmentation_settings import MODES
 from renderer.errors import InputError
+from train.results import store
 from train.results.intervals import Jackknife, change
 from train.results.metrics import COUNTED_EACH, METRICS, TOP_RANKS, Pool, Pooled, metric_title
 from train.results.predictions import CONTACT_SHEET
-from train.results.store import (
-    INITIAL,
-    Methods,
-    RunSummary,
-    Scored,
-    ScoredRun,
-    group_by_method,
-    varied_settings,
-)
+from train.results.store import INITIAL, Methods, RunSummary, Scored, ScoredRun
 from train.results.tables import Estimate, Table, describe_intervals, format_interval
 from train.run_folder import PHASES
 from train.settings import PHOTOGRAPHS, UNLABELED, in_words
@@ -127,20 +120,10 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = ()) -> Evaluations:
             if unknown:
                 known = ", ".join(sorted(filter(None, sources)))
                 raise InputError(
-                    f"exclude: no photograph is of source {min(unknown)!r}: choose among {known}",
+                    f"exclude: no photograph is of source {min(unknown)!r}: choose among {known}"
                 )
             methods.setdefault(method, []).append(Evaluation(scored.run, pooled))
     return methods
-
-
-def _require_meshes(methods: Evaluations, by: str) -> None:
-    """Check that the photographs have meshes if scores by mesh are asked for."""
-    for method, evaluations in methods.items():
-        if by == "mesh" and not all(evaluation.pooled.by_mesh for evaluation in evaluations):
-            raise InputError(
-                f"by=mesh needs the mesh of each photograph, but the photographs of {method} have "
-                "none: leave by=mesh out"
-            )
 
 
 def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) -> Estimate | None:
@@ -165,6 +148,12 @@ def _mean(estimates: Iterable[Estimate | None]) -> Estimate | None:
 
 def group_table(methods: Evaluations, overall: str = "all", by: str = "source") -> Table:
     """Make a table of the metrics, means over seeds, of each method on each subset of images."""
+    for method, evaluations in methods.items():
+        if by == "mesh" and not all(evaluation.pooled.by_mesh for evaluation in evaluations):
+            raise InputError(
+                f"by=mesh needs the mesh of each photograph, but the photographs of {method} have "
+                "none: leave by=mesh out"
+            )
     every_evaluation = [item for evaluations in methods.values() for item in evaluations]
     # A dictionary has each subset once, in order.
     subsets = dict.fromkeys(subset for item in every_evaluation for subset in item.rows(by))
@@ -234,10 +223,7 @@ class Difference(Estimate):
 
 
 def difference(
-    evaluations: Sequence[Evaluation],
-    reference: Sequence[Evaluation],
-    subset: Subset,
-    name: str,
+    evaluations: Sequence[Evaluation], reference: Sequence[Evaluation], subset: Subset, name: str
 ) -> Difference | None:
     """Compare a metric of a method with that of a reference: mean minus mean over the seeds.
 
@@ -250,7 +236,7 @@ def difference(
     if len(after) < len(evaluations) or len(before) < len(reference):
         return None
     return Difference(
-        **asdict(change(after, before, _have_equal_seeds(evaluations, reference))),
+        **asdict(change(after, before, _seeds(evaluations) == _seeds(reference))),
         before=fmean(run.value for run in before),
         after=fmean(run.value for run in after),
     )
@@ -262,10 +248,9 @@ def _jackknives(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
     return [pool.jackknives[name] for pool in pools if pool and name in pool.jackknives]
 
 
-def _have_equal_seeds(evaluations: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
-    """Return whether the runs of two methods have the same seeds, in the same order."""
-    seeds, others = ([item.run.seed or 0 for item in runs] for runs in (evaluations, reference))
-    return seeds == others
+def _seeds(evaluations: Sequence[Evaluation]) -> list[int]:
+    """List the seeds of the runs of a method."""
+    return [item.run.seed or 0 for item in evaluations]
 
 
 def difference_tables(
@@ -285,7 +270,7 @@ def difference_tables(
             shown += differences
             cells = [format_interval(item, sign="+") for item in differences]
             rows.append([subset.title(overall), *cells])
-        paired = ", paired" if _have_equal_seeds(evaluations, reference) else ""
+        paired = ", paired" if _seeds(evaluations) == _seeds(reference) else ""
         counts = f"{len(evaluations)} and {len(reference)} seeds{paired}"
         title = f"{method} minus {base} ({counts}), {describe_intervals(shown)}"
         tables.append(Table(title, [by, *TITLES], rows))
@@ -308,7 +293,7 @@ def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:
     tables += [score_table(title, group) for title, group in groups.items()]
     # The first run of each method. Networks without a run have no settings of a training.
     heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
-    varied = varied_settings([*heads.values()])
+    varied = store.varied_settings([*heads.values()])
     if varied:
         rows = [
             [method, *(str(head.settings.get(key)) for key in varied)]
@@ -406,7 +391,7 @@ def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[L
 
 def format_table(runs: Sequence[RunSummary]) -> str:
     """Compare runs in the tables that pnb-train --verbose prints after training."""
-    methods = group_by_method(runs)
+    methods = store.group_by_method(runs)
     groups = group_by_images(methods)
     tables = run_tables(methods, groups)
     tables += [overall_differences(read_evaluations(group)) for group in groups.values()]
@@ -434,13 +419,12 @@ def format_comparison(
     by: str = "source",
 ) -> str:
     """Compare runs in the tables that pnb-compare --verbose prints."""
-    methods = group_by_method(runs)
+    methods = store.group_by_method(runs)
     groups = group_by_images(methods)
     tables = run_tables(methods, groups)
     title = _find_group(groups, photographs)
     if title:
         evaluations = read_evaluations(groups[title], exclude)
-        _require_meshes(evaluations, by)
         overall = _title_of_all(exclude)
         tables.append(group_table(evaluations, overall, by))
         tables += difference_tables(evaluations, overall, by)
@@ -458,12 +442,11 @@ def format_short_comparison(
     Without the usual sub-folder "photographs", the first photographs of the runs are compared. The
     gain in AUC is over the first method.
     """
-    methods = group_by_method(runs)
+    methods = store.group_by_method(runs)
     groups = group_by_images(methods)
     title = _find_group(groups, photographs) or next(iter(groups), "")
     group = groups.get(title, {})
     evaluations = read_evaluations(group, exclude)
-    _require_meshes(evaluations, by)
     if by != "source" and evaluations:
         return str(group_table(evaluations, _title_of_all(exclude), by).without_unknown_columns)
     first = next(iter(evaluations), None)
@@ -508,11 +491,11 @@ def _find_group(groups: Mapping[str, Scored], photographs: str) -> str | None:
         first, second, *_ = found.values()
         raise InputError(
             f"{second} has other photographs or sources than {first}: "
-            "score both networks on the same folder with pnb-evaluate",
+            "score both networks on the same folder with pnb-evaluate"
         )
     if not found and photographs != PHOTOGRAPHS:
         raise InputError(
             f"photos={photographs}: no run has a sub-folder of this name with scores: "
-            "give a name in the setting photos of the runs",
+            "give a name in the setting photos of the runs"
         )
     return next(iter(found), None)

@@ -373,8 +373,7 @@ def _search(ascending: np.ndarray, scores: np.ndarray, side: str) -> np.ndarray:
 
 
 def roc_curve(
-    positives: Float[np.ndarray, " n"],
-    negatives: Float[np.ndarray, " m"],
+    positives: Float[np.ndarray, " n"], negatives: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Compute the points of the ROC curve, from (0, 0) to (1, 1).
 

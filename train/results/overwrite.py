@@ -45,7 +45,7 @@ def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[s
         return
     if not path.is_dir():
         raise InputError(
-            f"{key}={path} exists: choose another file, or set overwrite=true to replace it",
+            f"{key}={path} exists: choose another file, or set overwrite=true to replace it"
         )
     for pattern in RESULTS:
         if pattern in own:
@@ -56,7 +56,7 @@ def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[s
             name = found.relative_to(path)
             raise InputError(
                 f"{key}={path} holds results of an earlier command ({name}): "
-                "choose another folder, or set overwrite=true to write over them",
+                "choose another folder, or set overwrite=true to write over them"
             )
 
 

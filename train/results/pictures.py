@@ -179,10 +179,7 @@ def _has_both(pair: Pair) -> bool:
 
 
 def plot_by_radius(
-    lines: Mapping[str, Sequence[Estimate]],
-    radii: Sequence[float],
-    title: str,
-    x_title: str,
+    lines: Mapping[str, Sequence[Estimate]], radii: Sequence[float], title: str, x_title: str
 ) -> Picture:
     """Plot which fraction of views is still recognized under attacks of a given radius.
 
@@ -360,9 +357,7 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
 
 
 def draw_roc(
-    axes: "Axes",
-    scores: Mapping[str, Sequence[Pair]],
-    styles: Mapping[str, Mapping[str, Any]],
+    axes: "Axes", scores: Mapping[str, Sequence[Pair]], styles: Mapping[str, Mapping[str, Any]]
 ) -> None:
     """Draw ROC curves, with the AUC in the legend.
 

@@ -188,5 +188,5 @@ def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
         raise InputError(
             f"{path} is not a table of predictions for label={label} ({single_line(error)}): "
-            f"score the photographs again with pnb-evaluate label={label}",
+            f"score the photographs again with pnb-evaluate label={label}"
         ) from error

@@ -33,20 +33,9 @@ from train.data.photographs import (
     require_outside,
     unsupported_files,
 )
+from train.results import metrics, tables
 from train.results.intervals import thresholds
-from train.results.metrics import (
-    COUNTED_EACH,
-    FRACTION_METRICS,
-    ROC_METRICS,
-    TOP_RANKS,
-    Metrics,
-    Outcome,
-    Pool,
-    Pooled,
-    describe_point,
-    group_rows,
-    metric_title,
-)
+from train.results.metrics import Metrics, Outcome, Pool, Pooled, metric_title
 from train.results.pictures import contact_sheet, write_roc
 from train.results.predictions import (
     CONTACT_SHEET,
@@ -55,14 +44,7 @@ from train.results.predictions import (
     Predictions,
     write_predictions,
 )
-from train.results.tables import (
-    Estimate,
-    Proportion,
-    Table,
-    describe_intervals,
-    format_fraction,
-    format_interval,
-)
+from train.results.tables import Estimate, Proportion, Table
 from train.settings import GROUPS, label_names
 
 # Number of images for which the model computes logits in one call.
@@ -73,7 +55,7 @@ Model = Callable[[torch.Tensor], torch.Tensor]
 # common ones.
 WRONG_CLASSES = 5
 # Metrics that depend on a ranking of images or classes.
-RANKING_METRICS = (*ROC_METRICS, *TOP_RANKS)
+RANKING_METRICS = (*metrics.ROC_METRICS, *metrics.TOP_RANKS)
 # Metrics that `format_overall` leaves out, because they matter less.
 DETAILS = ("top5", "recall_at/0.05", "recall_at/0.20")
 
@@ -154,10 +136,7 @@ def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]
 
 
 def compute_logits(
-    model: Model,
-    images: torch.Tensor,
-    classes: int,
-    device: str | torch.device,
+    model: Model, images: torch.Tensor, classes: int, device: str | torch.device
 ) -> torch.Tensor:
     """Compute the logits of a model for images.
 
@@ -168,7 +147,7 @@ def compute_logits(
     if classes < 2:
         raise InputError(
             "the model has a single class, so its log-odds are infinite: "
-            "evaluate a model with at least two classes",
+            "evaluate a model with at least two classes"
         )
     checked = LogitNetwork(model, "model")
     logits = compute_outputs(checked, images, BATCH, device).cpu()
@@ -176,12 +155,12 @@ def compute_logits(
     if logits.shape != expected:
         raise InputError(
             f"the model returned logits of shape {tuple(logits.shape)}, not {expected}: "
-            "evaluate a checkpoint that was trained on these classes",
+            "evaluate a checkpoint that was trained on these classes"
         )
     if not logits.isfinite().all():
         raise InputError(
             "the model returned NaN or infinite logits: "
-            "evaluate a checkpoint of a run that converged",
+            "evaluate a checkpoint of a run that converged"
         )
     return logits
 
@@ -296,7 +275,7 @@ class Scores(ShortRepr):
     def by_class(self) -> dict[str, ClassScores]:
         """Recall and wrong predictions for the photographs of each class."""
         photographs = self.predicted.predictions[: len(self.predicted.images)]
-        classes = group_rows(photographs, photographs.shown)
+        classes = metrics.group_rows(photographs, photographs.shown)
         return {name: _score_class(rows, self.predicted.labels) for name, rows in classes.items()}
 
     @property
@@ -348,7 +327,7 @@ def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
 def _to_entries(groups: Mapping[str, Mapping[str, Metrics] | None]) -> dict[str, Any]:
     """Convert groups of metrics to entries of summary.json. Those that are None are left out."""
     return {
-        by: {name: metrics.to_summary() for name, metrics in group.items()}
+        by: {name: of_group.to_summary() for name, of_group in group.items()}
         for by, group in groups.items()
         if group is not None
     }
@@ -365,9 +344,7 @@ def evaluate_photographs(
 
 
 def score(
-    predicted: FolderPredictions,
-    by: str = "source",
-    points: Sequence[OperatingPoint] = (),
+    predicted: FolderPredictions, by: str = "source", points: Sequence[OperatingPoint] = ()
 ) -> Scores:
     """Score predictions for photographs.
 
@@ -380,7 +357,7 @@ def score(
     if by == "mesh" and not any(item.mesh for item in predicted.predictions.photograph):
         raise InputError(
             f"by=mesh needs the meshes of the photographs, but {predicted.folder} has no "
-            f"{TABLE} with a column mesh: add this table, or remove by=mesh",
+            f"{TABLE} with a column mesh: add this table, or remove by=mesh"
         )
     thresholds_by_label = {point.label: point.threshold for point in points}
     pooled = Pooled(predicted.predictions, thresholds=thresholds_by_label)
@@ -479,7 +456,7 @@ def _count_images(scores: Scores) -> str:
     """Say how many positive and negative images were scored."""
     positives = len(scores.pooled.all.positives)
     negatives = len(scores.pooled.all.negatives)
-    each = COUNTED_EACH if scores.by_label else ""
+    each = metrics.COUNTED_EACH if scores.by_label else ""
     return f"{positives} images of {scores.label}, {negatives} negatives{each}"
 
 
@@ -493,21 +470,23 @@ def format_overall(scores: Scores) -> str:
     for name in (*_fraction_metrics(scores), *RANKING_METRICS):
         if name not in DETAILS:
             rows.append((metric_title(name), _format_metric(overall.find(name))))
-    intervals = describe_intervals([overall.recall, overall.false_positive_rate, overall.auc])
+    intervals = tables.describe_intervals(
+        [overall.recall, overall.false_positive_rate, overall.auc]
+    )
     overall_table = Table(f"{_count_images(scores)}; {intervals}", ["metric", scores.label], rows)
     return "\n".join([str(overall_table), *_notes(scores)])
 
 
 def _fraction_metrics(scores: Scores) -> list[str]:
     """Return the known metrics that are fractions of images, such as recall."""
-    return [name for name in FRACTION_METRICS if scores.overall.find(name) is not None]
+    return [name for name in metrics.FRACTION_METRICS if scores.overall.find(name) is not None]
 
 
 def _format_metric(metric: Estimate | None) -> str:
     """Write a fraction of images with its counts, and any other metric with its interval."""
     if isinstance(metric, Proportion):
-        return format_fraction(metric)
-    return format_interval(metric)
+        return tables.format_fraction(metric)
+    return tables.format_interval(metric)
 
 
 def _metric_table(scores: Scores, names: Sequence[str]) -> Table:
@@ -515,11 +494,11 @@ def _metric_table(scores: Scores, names: Sequence[str]) -> Table:
     groups = scores.by_mesh or scores.class_metrics or scores.by_source
     rows = []
     shown: list[Estimate | None] = []
-    for title, metrics in [("all", scores.overall), *scores.by_label.items(), *groups.items()]:
-        estimates = [metrics.find(name) for name in names]
+    for title, of_group in [("all", scores.overall), *scores.by_label.items(), *groups.items()]:
+        estimates = [of_group.find(name) for name in names]
         shown += estimates
         rows.append([title, *map(_format_metric, estimates)])
-    return Table(describe_intervals(shown), ["", *map(metric_title, names)], rows)
+    return Table(tables.describe_intervals(shown), ["", *map(metric_title, names)], rows)
 
 
 def _class_table(scores: Scores) -> Table:
@@ -530,7 +509,7 @@ def _class_table(scores: Scores) -> Table:
         proportions = (of_class.recall, of_class.top5, of_class.predicted_label)
         wrong_counts = of_class.most_common_wrong.items()
         wrong = ", ".join(f"{wrong_class} {count}" for wrong_class, count in wrong_counts)
-        rows.append([name, *map(format_fraction, proportions), wrong])
+        rows.append([name, *map(tables.format_fraction, proportions), wrong])
     return Table("", header, rows)
 
 
@@ -539,7 +518,7 @@ def _notes(scores: Scores) -> Iterator[str]:
     for point in scores.point_entries:
         label = f" of {point['label']}" if scores.by_label else ""
         threshold = f"threshold {point['threshold']:.3f} on the log-odds{label}"
-        yield f"{threshold}, chosen for {describe_point(point)}"
+        yield f"{threshold}, chosen for {metrics.describe_point(point)}"
     unreadable = scores.predicted.unreadable
     if unreadable:
         yield f"{len(unreadable)} unreadable: {', '.join(unreadable)}"

@@ -199,12 +199,12 @@ def summarize(folder: Path) -> RunSummary:
         files = f"{CONFIG}, {run_folder.METRICS} or a {SUMMARY}"
         reason = f"{type(error).__name__}: {single_line(error)}"
         raise InputError(
-            f"{folder}: {files} is not as `pnb-train` wrote it ({reason}): use another run",
+            f"{folder}: {files} is not as `pnb-train` wrote it ({reason}): use another run"
         ) from error
     if summary is None:
         raise InputError(
             f"{folder} holds no finished run: let its run finish or resume it, "
-            "or give another folder",
+            "or give another folder"
         )
     return summary
 
@@ -402,7 +402,7 @@ def read_attack(folder: Path) -> AttackSummary:
         # A file with other contents than expected raises errors of many types.
         raise InputError(
             f"{path} is damaged or was written by no attack ({single_line(error)}): "
-            "use the folder of another attack",
+            "use the folder of another attack"
         ) from error
 
 
@@ -463,7 +463,7 @@ def find(folders: Sequence[Path]) -> Findings:
     for folder in map(published, folders):
         if not folder.is_dir():
             raise InputError(
-                f"runs: {folder} is not a folder: give folders of runs, of a sweep or of attacks",
+                f"runs: {folder} is not a folder: give folders of runs, of a sweep or of attacks"
             )
         for path in _walk(folder):
             paths.setdefault(path.resolve(), path)

@@ -27,9 +27,10 @@ from train.auditing.lights import (
     success_by_light,
     transfer_success,
 )
-from train.auditing.network import LABORATORY, RECOGNIZED, AuditedNetwork
+from train.auditing.network import RECOGNIZED, AuditedNetwork
 from train.command_settings import AuditSettings
 from train.results.tables import fraction
+from train.settings import LABORATORY
 
 CLASSES = ("orange", "other")
 
