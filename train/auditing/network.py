@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -160,25 +160,16 @@ class AuditReport(ShortRepr):
         return "\n".join(lines)
 
 
-class _Finding(NamedTuple):
-    """Fraction of images that a network classifies correctly, in words and as numbers.
-
-    Attributes:
-        text: Clause for the report, such as "it recognizes 60% of orange".
-        right: Fraction of images that the network classifies correctly.
-        least: Low end of the 95% interval of this fraction.
-    """
-
-    text: str
-    right: float
-    least: float
+# Clause for the report, such as "it recognizes 60% of orange", the fraction of images that a
+# network classifies correctly, and the low end of the 95% interval of this fraction.
+_Finding = tuple[str, float, float]
 
 
 def _findings(subject: str, recall: Estimate) -> list[_Finding]:
     """Describe what fraction of the images of an object a network recognizes, if it is known."""
     if recall.value is None or recall.low is None:
         return []
-    return [_Finding(f"it recognizes {recall.value:.0%} of {subject}", recall.value, recall.low)]
+    return [(f"it recognizes {recall.value:.0%} of {subject}", recall.value, recall.low)]
 
 
 @dataclass(frozen=True)
@@ -256,16 +247,16 @@ class AuditedNetwork:
         of_renders = [item for rate in self.rates.items() for item in _findings(*rate)]
         of_images = self._judge_images()
         findings = [*of_renders, *of_images]
-        faults = [finding.text for finding in findings if finding.right < PASS_THRESHOLD]
+        faults = [text for text, right, _ in findings if right < PASS_THRESHOLD]
         faults += self._attack_faults()
         view_count = max(counts["correct"] for counts in self.counts.values())
-        rests_on_images = any(finding.right < PASS_THRESHOLD for finding in of_images)
+        rests_on_images = any(right < PASS_THRESHOLD for _, right, _ in of_images)
         if faults and not rests_on_images and view_count < MIN_VIEWS:
             reasons = "; ".join(faults)
             return "Perhaps not", f"Perhaps not: {reasons}. Only {view_count} views were attacked."
         if faults:
             return "No", f"No: {'; '.join(faults)}."
-        if self.run.photographs and all(item.least >= PASS_THRESHOLD for item in findings):
+        if self.run.photographs and all(least >= PASS_THRESHOLD for _, _, least in findings):
             answer = "Yes, as far as this audit looks."
         else:
             answer = "No fault is shown, but so few images leave room for one."
@@ -285,7 +276,7 @@ class AuditedNetwork:
             error = scores.overall.false_positive_rate
             if error.value is not None and error.high is not None:
                 text = f"it takes {error.value:.0%} of other objects for {place}"
-                findings.append(_Finding(text, 1 - error.value, 1 - error.high))
+                findings.append((text, 1 - error.value, 1 - error.high))
         return findings
 
     def _attack_faults(self) -> list[str]:
@@ -348,22 +339,13 @@ class AuditedNetwork:
             scores[images] = {name: item for name, item in metrics.items() if item is not None}
         attacks = {}
         for kind, counts in self.counts.items():
-            attacks[kind] = AttackCounts(
-                unit=KINDS[kind].unit,
-                radii=KINDS[kind].radii,
-                views=counts["n"],
-                correct=counts["correct"],
-                adversarial=tuple(counts["adversarial"]),
-                random=tuple(counts["random"]),
-            )
-        return NetworkReport(
-            name=self.name,
-            answer=self.answer,
-            recognized={light: sum(views) / len(views) for light, views in self.recognized.items()},
-            attacks=attacks,
-            scores=scores,
-            transfers=self.transfers,
-        )
+            light = KINDS[kind]
+            lost = (tuple(counts[method]) for method in ("adversarial", "random"))
+            numbers = (counts["n"], counts["correct"], *lost)
+            attacks[kind] = AttackCounts(light.unit, light.radii, *numbers)
+        recognized = {light: sum(views) / len(views) for light, views in self.recognized.items()}
+        results = (recognized, attacks, scores, self.transfers)
+        return NetworkReport(self.name, self.answer, *results)
 
 
 @dataclass(frozen=True)
@@ -455,9 +437,5 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     intervals = tables.describe_intervals(gains.values())
     table = Table(intervals, ["network", title, "gain over the original network"], rows)
     advice = ADVICE[chosen]
-    return Recommendation(
-        remedy=None if gain is None else chosen,
-        advice=advice,
-        sentence=f"{advice} {reason}",
-        table=table,
-    )
+    remedy = None if gain is None else chosen
+    return Recommendation(remedy, advice, f"{advice} {reason}", table)

@@ -13,15 +13,8 @@ from typing import Any
 import numpy as np
 
 from renderer.errors import ShortRepr
-from train.results.intervals import (
-    RATES,
-    Jackknife,
-    Units,
-    class_means,
-    leave_out,
-    leave_out_of_roc,
-    weighted_means,
-)
+from train.results import intervals
+from train.results.intervals import RATES, Jackknife, Units, leave_out
 from train.results.predictions import Predictions, as_column
 from train.results.tables import IMAGES, OBJECTS, THESE_OBJECTS, Estimate, Proportion, fraction
 
@@ -186,7 +179,7 @@ class Outcome:
     @cached_property
     def jackknife(self) -> Jackknife:
         """Fraction of hits without each unit."""
-        statistic = partial(weighted_means, self.hits[None].astype(float))
+        statistic = partial(intervals.weighted_means, self.hits[None].astype(float))
         (jackknife,) = leave_out(statistic, choose_units(self.predictions))
         return jackknife
 
@@ -289,13 +282,13 @@ class Pool(ShortRepr):
         """Values without each unit of the known metrics that depend on a ranking."""
         jackknives: dict[str, Jackknife] = {}
         if all(map(len, self.ranked)):
-            of_roc = leave_out_of_roc(*self.scores, choose_units(*self.ranked))
+            of_roc = intervals.leave_out_of_roc(*self.scores, choose_units(*self.ranked))
             jackknives.update(zip(ROC_METRICS, of_roc, strict=True))
         images = self.classified
         if len(images):
             # One row for top-1 and one for top-5, shape (2, n).
             hits = np.stack([images.true_rank <= max_rank for max_rank in TOP_RANKS.values()])
-            statistic = partial(class_means, hits, images.shown.tolist())
+            statistic = partial(intervals.class_means, hits, images.shown.tolist())
             of_classes = leave_out(statistic, choose_units(images))
             jackknives.update(zip(TOP_RANKS, of_classes, strict=True))
         return jackknives

@@ -143,13 +143,9 @@ def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["as_text"] = tables.as_text
-    environment.filters["command"] = _shell_command
-    environment.filters["fraction"] = tables.fraction
-    environment.filters["hits"] = tables.format_fraction
-    environment.filters["interval"] = tables.format_interval
-    environment.filters["sha256"] = _sha256
-    environment.filters["yaml"] = OmegaConf.to_yaml
+    environment.filters.update(as_text=tables.as_text, fraction=tables.fraction, sha256=_sha256)
+    environment.filters.update(hits=tables.format_fraction, interval=tables.format_interval)
+    environment.filters.update(command=_shell_command, yaml=OmegaConf.to_yaml)
     page = environment.get_template("page.html.jinja").render(body=body, script=script, **content)
     out.mkdir(parents=True, exist_ok=True)
     path = out / PAGE

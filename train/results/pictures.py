@@ -50,13 +50,10 @@ PLOT = {
     "svg.hashsalt": "report",
     "font.size": 10,
     "font.family": "sans-serif",
-    "text.color": INK,
-    "axes.edgecolor": INK,
-    "axes.labelcolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
     "legend.frameon": False,
     "legend.fontsize": 9,
+    **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor"), INK),
+    **dict.fromkeys(("xtick.color", "ytick.color"), INK),
 }
 # Each section of the contact sheet, such as the false positives, shows at most 40
 # photographs.
@@ -157,7 +154,7 @@ def plot_roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | Non
     """
     # Seeds of each method that have both positive and negative images.
     known = {
-        method: [pair for pair in pairs if _has_both(pair)] for method, pairs in methods.items()
+        method: [pair for pair in pairs if all(map(len, pair))] for method, pairs in methods.items()
     }
     if not any(known.values()):
         return None
@@ -171,11 +168,6 @@ def plot_roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | Non
     ]
     alt = f"ROC of {label}; AUC: {', '.join(means)}"
     return _plot(lambda axes: draw_roc(axes, known, styles), f"ROC: {label}", alt)
-
-
-def _has_both(pair: Pair) -> bool:
-    """Return whether there are both positives and negatives."""
-    return all(map(len, pair))
 
 
 def plot_by_radius(
@@ -329,27 +321,25 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
     # This import is here because it takes half a second.
     from matplotlib.figure import Figure
 
-    known = {name: pair for name, pair in by_name.items() if _has_both(pair)}
+    pairs = {"": overall, **by_name}
+    known = {name: pair for name, pair in pairs.items() if all(map(len, pair))}
     # A source or a label can have the name "all", too.
     title = "all images" if "all" in known else "all"
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(["source", "false_positive_rate", "recall", "threshold"])
-    for name, pair in [("", overall), *known.items()]:
-        if _has_both(pair):
-            columns = [column.tolist() for column in roc_curve(*pair)]
-            writer.writerows([name, *point] for point in zip(*columns, strict=True))
+    for name, pair in known.items():
+        columns = [column.tolist() for column in roc_curve(*pair)]
+        writer.writerows([name, *point] for point in zip(*columns, strict=True))
     atomic_write(folder / ROC_TABLE, table.getvalue())
 
     figure = Figure(figsize=(7, 7), layout="constrained")
     axes = figure.subplots()
-    curves = {title: [overall]} if _has_both(overall) else {}
-    curves |= {name: [pair] for name, pair in known.items()}
     bold = {title: {"color": "black", "linewidth": 2.5, "zorder": 3}}
-    draw_roc(axes, curves, bold)
+    draw_roc(axes, {name or title: [pair] for name, pair in known.items()}, bold)
     axes.set_title(f"ROC: {label}")
     axes.set_aspect("equal")
-    if curves:
+    if known:
         axes.legend(loc="lower right")
     image = io.BytesIO()
     figure.savefig(image)

@@ -169,21 +169,17 @@ def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
             )
             for row in rows
         ]
-        columns = (
-            photographs,
-            [row["predicted"] for row in rows],
-            [float(row["probability"]) for row in rows],
-            [float(row[TRUE_PROBABILITY] or "nan") for row in rows],
-            [float(row[TRUE_RANK] or "inf") for row in rows],
-        )
-        by_label = {
-            name: (
-                [float(row[f"{name}_probability"]) for row in rows],
-                [int(row[f"{name}_rank"]) for row in rows],
-                [float(row[f"{name}_log_odds"]) for row in rows],
-            )
-            for name in label_names(label)
-        }
+
+        def numbers(name: str, unknown: str = "") -> list[float]:
+            return [float(row[name] or unknown) for row in rows]
+
+        known = ([row["predicted"] for row in rows], numbers("probability"))
+        of_true = (numbers(TRUE_PROBABILITY, "nan"), numbers(TRUE_RANK, "inf"))
+        columns = (photographs, *known, *of_true)
+        by_label = {}
+        for name in label_names(label):
+            ranks = [int(row[f"{name}_rank"]) for row in rows]
+            by_label[name] = (numbers(f"{name}_probability"), ranks, numbers(f"{name}_log_odds"))
         return Predictions.of_labels(columns, by_label)
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
         raise InputError(

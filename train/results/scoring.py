@@ -149,14 +149,8 @@ def compute_logits(
             "the model has a single class, so its log-odds are infinite: "
             "evaluate a model with at least two classes"
         )
-    checked = LogitNetwork(model, "model")
+    checked = LogitNetwork(model, "model", classes)
     logits = compute_outputs(checked, images, BATCH, device).cpu()
-    expected = (len(images), classes)
-    if logits.shape != expected:
-        raise InputError(
-            f"the model returned logits of shape {tuple(logits.shape)}, not {expected}: "
-            "evaluate a checkpoint that was trained on these classes"
-        )
     if not logits.isfinite().all():
         raise InputError(
             "the model returned NaN or infinite logits: "
@@ -261,15 +255,10 @@ class Scores(ShortRepr):
         """Metrics of the photographs of each source."""
         return _metrics_of(self.pooled.by_source)
 
-    @cached_property
-    def by_mesh(self) -> dict[str, Metrics] | None:
-        """Metrics of the photographs of each mesh. None without by="mesh"."""
-        return _metrics_of(self.pooled.by_mesh) if self.by == "mesh" else None
-
-    @cached_property
-    def class_metrics(self) -> dict[str, Metrics] | None:
-        """Metrics of the photographs of each class. None without by="class"."""
-        return _metrics_of(self.pooled.by_class) if self.by == "class" else None
+    @property
+    def by_group(self) -> dict[str, Metrics]:
+        """Metrics of the photographs of each source, mesh or class, as `by` says."""
+        return _metrics_of(self.pooled.groups(self.by))
 
     @cached_property
     def by_class(self) -> dict[str, ClassScores]:
@@ -293,11 +282,6 @@ class Scores(ShortRepr):
         predicted = self.predicted
         labels = predicted.labels
         points = self.point_entries
-        groups = {
-            "by_label": self.by_label or None,
-            "by_source": self.by_source,
-            "by_mesh": self.by_mesh,
-        }
         summary: dict[str, Any] = {
             "label": labels if self.by_label else labels[0],
             "size": predicted.images.shape[-1],
@@ -313,9 +297,14 @@ class Scores(ShortRepr):
         }
         if points:
             summary["operating_point"] = points if self.by_label else points[0]
-        summary |= _to_entries(groups)
+        if self.by_label:
+            summary["by_label"] = _to_entries(self.by_label)
+        summary["by_source"] = _to_entries(self.by_source)
+        if self.by == "mesh":
+            summary["by_mesh"] = _to_entries(self.by_group)
         summary["by_class"] = {name: asdict(scores) for name, scores in self.by_class.items()}
-        summary |= _to_entries({"class_metrics": self.class_metrics})
+        if self.by == "class":
+            summary["class_metrics"] = _to_entries(self.by_group)
         return summary | {"unreadable": predicted.unreadable, "left_out": predicted.left_out}
 
 
@@ -324,13 +313,9 @@ def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
     return {name: pool.metrics for name, pool in pools.items()}
 
 
-def _to_entries(groups: Mapping[str, Mapping[str, Metrics] | None]) -> dict[str, Any]:
-    """Convert groups of metrics to entries of summary.json. Those that are None are left out."""
-    return {
-        by: {name: of_group.to_summary() for name, of_group in group.items()}
-        for by, group in groups.items()
-        if group is not None
-    }
+def _to_entries(groups: Mapping[str, Metrics]) -> dict[str, Any]:
+    """Convert the metrics of several groups to an entry of summary.json."""
+    return {name: of_group.to_summary() for name, of_group in groups.items()}
 
 
 def evaluate_photographs(
@@ -470,11 +455,9 @@ def format_overall(scores: Scores) -> str:
     for name in (*_fraction_metrics(scores), *RANKING_METRICS):
         if name not in DETAILS:
             rows.append((metric_title(name), _format_metric(overall.find(name))))
-    intervals = tables.describe_intervals(
-        [overall.recall, overall.false_positive_rate, overall.auc]
-    )
-    overall_table = Table(f"{_count_images(scores)}; {intervals}", ["metric", scores.label], rows)
-    return "\n".join([str(overall_table), *_notes(scores)])
+    shown = (overall.recall, overall.false_positive_rate, overall.auc)
+    title = f"{_count_images(scores)}; {tables.describe_intervals(shown)}"
+    return "\n".join([str(Table(title, ["metric", scores.label], rows)), *_notes(scores)])
 
 
 def _fraction_metrics(scores: Scores) -> list[str]:
@@ -491,10 +474,10 @@ def _format_metric(metric: Estimate | None) -> str:
 
 def _metric_table(scores: Scores, names: Sequence[str]) -> Table:
     """Make a table of some metrics of all images, each label, and each mesh, class or source."""
-    groups = scores.by_mesh or scores.class_metrics or scores.by_source
     rows = []
     shown: list[Estimate | None] = []
-    for title, of_group in [("all", scores.overall), *scores.by_label.items(), *groups.items()]:
+    groups = [("all", scores.overall), *scores.by_label.items(), *scores.by_group.items()]
+    for title, of_group in groups:
         estimates = [of_group.find(name) for name in names]
         shown += estimates
         rows.append([title, *map(_format_metric, estimates)])

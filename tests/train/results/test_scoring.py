@@ -463,7 +463,7 @@ class TestPhotographsThatCannotBeRead:
 @pytest.mark.parametrize(
     ("logits", "message"),
     [
-        (torch.zeros(10), r"shape \(10, 10\), not \(10, 6\)"),
+        (torch.zeros(10), r"must return logits \(10, 6\)"),
         (torch.full((6,), torch.nan), "NaN or infinite logits"),
     ],
 )
