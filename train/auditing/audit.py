@@ -67,14 +67,7 @@ PATTERNS = ("gradient", "rings", "window", "leaves", "text", "colors")
 # Number of light paths per pixel of the path-traced renders.
 SPP = 48
 # Generated solids that serve as hard negatives if the user names none.
-HARD_NEGATIVES = (
-    "solid:lemon",
-    "solid:apple",
-    "solid:peach",
-    "solid:pear",
-    "solid:sweet_pepper",
-    "solid:ball",
-)
+NEGATIVE_SOLIDS = ("lemon", "apple", "peach", "pear", "sweet_pepper", "ball")
 NO_HARD_NEGATIVES = (
     "hard_negatives is empty, so false positives are measured on generated fruit and balls; "
     "name meshes of what the classifier may confuse with the class."
@@ -266,7 +259,7 @@ def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
     ]
     if not (negatives or settings.laboratory):
         negatives = [
-            solid for solid in HARD_NEGATIVES if simplified(solid_name(solid)) != simplified(label)
+            f"solid:{name}" for name in NEGATIVE_SOLIDS if simplified(name) != simplified(label)
         ]
     named = read_objects(negatives, "", "hard_negatives")
     require_others(named, [label], classifier.classes)

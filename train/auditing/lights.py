@@ -189,8 +189,7 @@ class Views:
             shared=False,
             basis=basis,
         )
-        scales = [self.size * scale for scale in VARIATION.scale]
-        variation = replace(VARIATION, scale=scales)
+        variation = replace(VARIATION, scale=[self.size * scale for scale in VARIATION.scale])
         return vary(scene, variation, generator(self.seed, "views"))
 
 
@@ -357,10 +356,8 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
         logits = result.objective().logits(images)[:, 0]
     probabilities = logits.softmax(1).cpu()
     label = int(result.criterion.source[example, 0])
-    highest_probability = probabilities.amax(dim=0)
-    ranked = highest_probability.argsort(descending=True).tolist()
-    other_classes = [index for index in ranked if index != label]
-    shown_classes = [label, *other_classes][:CLASS_COUNT]
+    ranked = probabilities.amax(dim=0).argsort(descending=True).tolist()
+    shown_classes = [label, *(index for index in ranked if index != label)][:CLASS_COUNT]
     frames = []
     for index in range(FRAME_COUNT):
         basis = result.problem.scene.basis_under(conditions, index)

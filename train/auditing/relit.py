@@ -304,10 +304,8 @@ def _section(name: str, folder: Path) -> dict[str, Any]:
     for index, file in scores.pictures.items():
         photograph = scores.photographs[index]
         # The predicted class in each light, from left to right.
-        predictions = [
-            f"{TITLES[light]}: {names[0]}" for light, names in photograph.becomes.items()
-        ]
-        predictions.insert(0, f"unchanged: {photograph.predicted}")
-        caption = f"{photograph.path}. {'; '.join(predictions)}"
+        predicted = [f"{TITLES[light]}: {names[0]}" for light, names in photograph.becomes.items()]
+        shown = [f"unchanged: {photograph.predicted}", *predicted]
+        caption = f"{photograph.path}. {'; '.join(shown)}"
         pictures += read_pictures(folder / file, caption, MAX_PICTURE_WIDTH, caption)
     return {"name": name, "sentences": sentences, "tables": scores.tables(), "pictures": pictures}

@@ -16,7 +16,7 @@ from renderer.errors import InputError
 from train.results import store
 from train.results.intervals import Jackknife, change
 from train.results.metrics import COUNTED_EACH, METRICS, TOP_RANKS, Pool, Pooled, metric_title
-from train.results.predictions import CONTACT_SHEET
+from train.results.predictions import CONTACT_SHEET, PREDICTIONS
 from train.results.store import INITIAL, Methods, RunSummary, Scored, ScoredRun
 from train.results.tables import Estimate, Table, describe_intervals, format_interval
 from train.run_folder import PHASES
@@ -112,7 +112,7 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = ()) -> Evaluations:
     methods: dict[str, list[Evaluation]] = {}
     for method, scored_runs in group.items():
         for scored in sorted(scored_runs, key=lambda item: item.run.seed or 0):
-            if not scored.has_predictions:
+            if not (scored.folder / PREDICTIONS).is_file():
                 continue
             pooled = scored.pooled(exclude)
             sources = {*pooled.predictions.source}

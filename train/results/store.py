@@ -150,11 +150,6 @@ class ScoredRun(NamedTuple):
         """Path of this sub-folder."""
         return self.run.folder / self.name
 
-    @property
-    def has_predictions(self) -> bool:
-        """Whether the predictions are known. Those of a published network are not."""
-        return (self.folder / PREDICTIONS).is_file()
-
     def pooled(self, exclude: Sequence[str] = ()) -> Pooled:
         """Read the predictions, which are scored together without those of some sources."""
         path = self.folder / PREDICTIONS

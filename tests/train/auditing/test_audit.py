@@ -262,7 +262,7 @@ class TestAWholeAudit:
         assert len(expected) > 15
         folder.rename(tmp_path / "uninterrupted")
         with monkeypatch.context() as patch:
-            patch.setattr(audit, "success_by_light", stop)
+            patch.setattr(lights, "success_by_light", stop)
             with pytest.raises(KeyboardInterrupt):
                 run_audit(AuditSettings(**given))
         times = modification_times(folder)
@@ -310,9 +310,9 @@ class TestAnAuditWithoutMitsuba:
         recognized = {"uniform": [True], "random 1": [True]}
         transferred = {kind: {"first": [0, 0, 0], "further": [0, 0, 0]} for kind in KINDS}
         monkeypatch.setattr(audit, "mitsuba", missing)
-        monkeypatch.setattr(audit, "recognize_in_environments", lambda *arguments: recognized)
-        monkeypatch.setattr(audit, "success_by_light", lambda *arguments: counts)
-        monkeypatch.setattr(audit, "transfer_success", lambda *arguments: transferred)
+        monkeypatch.setattr(lights, "recognize_in_environments", lambda *arguments: recognized)
+        monkeypatch.setattr(lights, "success_by_light", lambda *arguments: counts)
+        monkeypatch.setattr(lights, "transfer_success", lambda *arguments: transferred)
 
     def test_leaves_the_laboratory_out_and_says_so(self, given, tmp_path):
         report = run_audit(AuditSettings(**given)).path
