@@ -12,7 +12,7 @@ the subfolders are CLASSIFIER and HARDENED.
 
 import json
 import shutil
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -37,7 +37,7 @@ from train.command_settings import AuditSettings, LabSettings
 from train.data.photographs import find_photographs, find_unlabeled
 from train.device import choose_device
 from train.laboratory.laboratory import write_laboratory
-from train.results.overwrite import RESULTS, require_replaceable
+from train.results.overwrite import require_replaceable
 from train.results.page import PAGE
 from train.results.scoring import Predictor, evaluate_photographs
 from train.run_config import CONFIG, read_config, require_same, write_config
@@ -332,14 +332,11 @@ def _require_continuable(out: Path, overwrite: bool, is_named: bool) -> None:
     An audit of networks that the caller passes as objects is never continued. config.yaml does not
     have their names, so the results may be about other networks.
     """
-    # Files with these names are results of this audit, which continues with them.
-    own_results: Collection[str] = ()
     # A folder without config.yaml raises an InputError.
     with suppress(InputError):
-        is_audit = "hard_negatives" in read_config(out / CONFIG)
-        if is_named and is_audit:
-            own_results = RESULTS
-    require_replaceable(out, "out", overwrite, own=own_results)
+        if is_named and "hard_negatives" in read_config(out / CONFIG):
+            return
+    require_replaceable(out, "out", overwrite)
 
 
 def _write_json(path: Path, measure: Callable[..., Mapping[str, Any]], *arguments: Any) -> None:

@@ -340,9 +340,9 @@ class AuditedNetwork:
         attacks = {}
         for kind, counts in self.counts.items():
             light = KINDS[kind]
-            lost = (tuple(counts[method]) for method in ("adversarial", "random"))
-            numbers = (counts["n"], counts["correct"], *lost)
-            attacks[kind] = AttackCounts(light.unit, light.radii, *numbers)
+            adversarial, random = (tuple(counts[method]) for method in ("adversarial", "random"))
+            of_light = (light.unit, light.radii, counts["n"], counts["correct"])
+            attacks[kind] = AttackCounts(*of_light, adversarial, random)
         recognized = {light: sum(views) / len(views) for light, views in self.recognized.items()}
         results = (recognized, attacks, scores, self.transfers)
         return NetworkReport(self.name, self.answer, *results)
@@ -385,15 +385,11 @@ def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
     The values are subfolders. The original network comes first, then the remedies from the cheapest
     to the most expensive.
     """
-    subfolders = {ORIGINAL: CLASSIFIER}
+    subfolders = {}
     for key, network in {**normalizing(networks), **networks}.items():
-        if key == CLASSIFIER:
-            continue
-        is_normalized = network.normalized_light is not None
-        if not key.startswith(HARDENED):
-            subfolders[LIGHT_ALONE] = key
-        else:
-            subfolders[BOTH if is_normalized else HARDENING] = key
+        name = HARDENING if network.normalized_light is None else BOTH
+        name = name if key.startswith(HARDENED) else LIGHT_ALONE
+        subfolders[ORIGINAL if key == CLASSIFIER else name] = key
     order = (ORIGINAL, LIGHT_ALONE, HARDENING, BOTH)
     return {name: subfolders[name] for name in order if name in subfolders}
 
