@@ -255,10 +255,15 @@ class Scores(ShortRepr):
         """Metrics of the photographs of each source."""
         return _metrics_of(self.pooled.by_source)
 
-    @property
-    def by_group(self) -> dict[str, Metrics]:
-        """Metrics of the photographs of each source, mesh or class, as `by` says."""
-        return _metrics_of(self.pooled.groups(self.by))
+    @cached_property
+    def by_mesh(self) -> dict[str, Metrics] | None:
+        """Metrics of the photographs of each mesh. None without by="mesh"."""
+        return _metrics_of(self.pooled.by_mesh) if self.by == "mesh" else None
+
+    @cached_property
+    def class_metrics(self) -> dict[str, Metrics] | None:
+        """Metrics of the photographs of each class. None without by="class"."""
+        return _metrics_of(self.pooled.by_class) if self.by == "class" else None
 
     @cached_property
     def by_class(self) -> dict[str, ClassScores]:
@@ -300,11 +305,11 @@ class Scores(ShortRepr):
         if self.by_label:
             summary["by_label"] = _to_entries(self.by_label)
         summary["by_source"] = _to_entries(self.by_source)
-        if self.by == "mesh":
-            summary["by_mesh"] = _to_entries(self.by_group)
+        if self.by_mesh is not None:
+            summary["by_mesh"] = _to_entries(self.by_mesh)
         summary["by_class"] = {name: asdict(scores) for name, scores in self.by_class.items()}
-        if self.by == "class":
-            summary["class_metrics"] = _to_entries(self.by_group)
+        if self.class_metrics is not None:
+            summary["class_metrics"] = _to_entries(self.class_metrics)
         return summary | {"unreadable": predicted.unreadable, "left_out": predicted.left_out}
 
 
@@ -476,8 +481,8 @@ def _metric_table(scores: Scores, names: Sequence[str]) -> Table:
     """Make a table of some metrics of all images, each label, and each mesh, class or source."""
     rows = []
     shown: list[Estimate | None] = []
-    groups = [("all", scores.overall), *scores.by_label.items(), *scores.by_group.items()]
-    for title, of_group in groups:
+    groups = scores.by_mesh or scores.class_metrics or scores.by_source
+    for title, of_group in [("all", scores.overall), *scores.by_label.items(), *groups.items()]:
         estimates = [of_group.find(name) for name in names]
         shown += estimates
         rows.append([title, *map(_format_metric, estimates)])
