@@ -14,14 +14,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from renderer.errors import (
-    MAX_MAGNITUDE,
-    InputError,
-    describe,
-    is_number,
-    require_range,
-    require_whole,
-)
+from renderer import errors
+from renderer.errors import InputError
 from renderer.settings import MAX_VIEWS
 
 # Default of a camera's `clip_range` in world units. A camera then shows all of a normalized mesh,
@@ -36,7 +30,7 @@ MAX_FOV = 172.0
 # origin. A mesh with a smaller depth raises an error.
 MIN_NEAR_RATIO = 0.01
 # Smallest and largest values of fields that are lengths, ratios or angles.
-_POSITIVE = (1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
+_POSITIVE = (1 / errors.MAX_MAGNITUDE, errors.MAX_MAGNITUDE)
 _TURNS = (-MAX_TURN, MAX_TURN)
 _RANGES = {
     **dict.fromkeys(("width", "clip_range", "distance", "pixel_aspect"), _POSITIVE),
@@ -99,8 +93,8 @@ class Camera(ABC):
         for name, value in vars(self).items():
             if type(value) is not float:
                 object.__setattr__(self, name, _as_scalar(name, value))
-            limits = _RANGES.get(name, (-MAX_MAGNITUDE, MAX_MAGNITUDE))
-            require_range(name, getattr(self, name), *limits)
+            limits = _RANGES.get(name, (-errors.MAX_MAGNITUDE, errors.MAX_MAGNITUDE))
+            errors.require_range(name, getattr(self, name), *limits)
 
     @property
     def near(self) -> float:
@@ -285,10 +279,8 @@ class Camera(ABC):
         The result is differentiable with respect to the points, and with respect
         to fields of the camera that are tensors. The coordinates are measured from the pivot.
         """
-        polar, azimuth, roll = (
-            tensor_like(in_radians(angle), points)
-            for angle in (self.polar, self.azimuth, self.roll)
-        )
+        angles = (self.polar, self.azimuth, self.roll)
+        polar, azimuth, roll = (tensor_like(in_radians(angle), points) for angle in angles)
         center = [self.center_x, self.center_y, self.center_z]
         pivot = torch.stack([tensor_like(coordinate, points) for coordinate in center])
         axes = (
@@ -403,8 +395,8 @@ def _as_scalar(name: str, value: Any) -> Any:
         value = value.reshape(())
     elif isinstance(value, np.ndarray | list | tuple) and np.size(value) == 1:
         value = np.asarray(value).item()
-    if not is_number(value):
-        raise InputError(f"{name} is {describe(value)}: give one number")
+    if not errors.is_number(value):
+        raise InputError(f"{name} is {errors.describe(value)}: give one number")
     return value.item() if isinstance(value, np.generic | np.ndarray) else value
 
 
@@ -421,11 +413,7 @@ def in_radians(degrees: Any) -> Any:
 
 
 def orbit_cameras(
-    views: int,
-    width: float,
-    polar: float = 60.0,
-    azimuth: float = 0.0,
-    fov: float | None = None,
+    views: int, width: float, polar: float = 60.0, azimuth: float = 0.0, fov: float | None = None
 ) -> list[Camera]:
     """Create cameras around the origin, at equally spaced azimuths and the same polar angle.
 
@@ -453,15 +441,15 @@ def orbit_cameras(
     >>> nb.orbit_cameras(views=1, width=2.0, fov=30.0)[0].distance.__round__(3)
     3.732
     """
-    require_whole("views", views, 1, MAX_VIEWS)
+    errors.require_whole("views", views, 1, MAX_VIEWS)
     names = ("width", "polar", "azimuth")
     width, polar, azimuth = map(_as_scalar, names, (width, polar, azimuth))
-    require_range("azimuth", azimuth, -MAX_TURN, MAX_TURN)
+    errors.require_range("azimuth", azimuth, -MAX_TURN, MAX_TURN)
     azimuths = [azimuth + 360 * view / views for view in range(views)]
     if fov is None:
         return [OrthographicCamera(polar, angle, width) for angle in azimuths]
     fov = _as_scalar("fov", fov)
-    require_range("fov", fov, MIN_FOV, MAX_FOV)
+    errors.require_range("fov", fov, MIN_FOV, MAX_FOV)
     # The image of width `width` appears at the angle `fov` from this distance.
     distance = width / 2 / math.tan(math.radians(fov) / 2)
     return [PerspectiveCamera(polar, angle, width, distance=distance) for angle in azimuths]

@@ -40,12 +40,7 @@ _NUMBERS = "fiu"
 _FLOAT64_BYTES = 8
 # Texts in the errors of torch, CUDA, cuDNN
 # and cuBLAS that say that memory ran out.
-OUT_OF_MEMORY = (
-    "out of memory",
-    "can't allocate memory",
-    "ALLOC",
-    "unable to find an engine",
-)
+OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "ALLOC", "unable to find an engine")
 
 
 class InputError(ValueError):
@@ -237,10 +232,7 @@ def require_bounded(**tensors: Tensor) -> None:
             raise InputError(f"{name} is {kind}: give a tensor of floating-point numbers", name)
         # A comparison with NaN is False, so `not` also finds NaN.
         if not _largest_magnitude(tensor) <= MAX_MAGNITUDE:
-            raise InputError(
-                f"{name} holds NaN, infinity or magnitudes beyond {MAX_MAGNITUDE:g}",
-                name,
-            )
+            raise InputError(f"{name} holds NaN, infinity or values beyond {MAX_MAGNITUDE:g}", name)
 
 
 def as_tensor(name: str, value: object) -> Tensor:
@@ -271,9 +263,7 @@ def as_tensor(name: str, value: object) -> Tensor:
             keeps_precision = isinstance(value, np.ndarray) and array.dtype.kind == "f"
             dtype = None if keeps_precision else torch.get_default_dtype()
             return torch.as_tensor(array, dtype=dtype)
-    raise InputError(
-        f"{name} is {describe(value)}: give a tensor, an array or a list of numbers", name
-    )
+    raise InputError(f"{name} is {describe(value)}: give a tensor, array or list of numbers", name)
 
 
 def as_integers(name: str, value: object) -> Tensor:
@@ -488,8 +478,8 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
 
     `name` is a plural such as "40 renders", and `needed` is in bytes.
     """
-    if not has_memory(needed, device):
-        free = free_memory(device) or 0
+    free = free_memory(device)
+    if free is not None and needed > free:
         raise InputError(
             f"{name} need {needed / GIB:.1f} GB of memory, and {free / GIB:.1f} GB are free: "
             "reduce them"

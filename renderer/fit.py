@@ -239,20 +239,6 @@ def _plausible_cameras(
     return kept[:KEPT_CAMERAS]
 
 
-class _LightFit(NamedTuple):
-    """Light with which a render from a given camera resembles the photograph most.
-
-    The residuals are the differences between the render and the photograph for all pixels
-    and channels, followed by the weighted differences between the light and the expected
-    light. The sum of their squares is the error of the camera. `coverage` is the share of
-    each pixel that the mesh covers in the render.
-    """
-
-    residuals: Float[Tensor, " N"]
-    light: Float[Tensor, "49 3"]
-    coverage: Float[Tensor, " P"]
-
-
 class _Target(NamedTuple):
     """Photograph of an object that renders of a mesh should resemble.
 
@@ -300,11 +286,15 @@ class _Target(NamedTuple):
 
     def fit_light(
         self, camera: Camera, min_coverage: float = 0.0, grid: int = SEARCH_GRID
-    ) -> _LightFit:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Find the light under which a render from a camera resembles the photograph most.
 
-        Only pixels of which the mesh and the mask both cover at least `min_coverage` count. The
-        radiance is constrained at the vertices of an icosphere with `grid` subdivisions.
+        The results are the residuals (N,), the light (49, 3), and the share of each pixel that the
+        mesh covers in the render (P,). The residuals are the differences between the render and the
+        photograph for all pixels and channels, followed by the weighted differences between the
+        light and the expected light. The sum of their squares is the error of the camera. Only
+        pixels of which the mesh and the mask both cover at least `min_coverage` count. The radiance
+        is constrained at the vertices of an icosphere with `grid` subdivisions.
         """
         operator = precompute_transfer(self.mesh, camera, self.size, **self.options)
         # 49 lights, of which light k has only coefficient k, shape (49, 49, 3).
@@ -323,7 +313,7 @@ class _Target(NamedTuple):
         rendered_image = background.repeat(CHANNELS, 1).index_copy(1, pixels, rendered)
         differences = rendered_image.clamp(max=1) - self.image
         residuals = torch.cat([differences.flatten(), penalties.flatten()])
-        return _LightFit(residuals, light, coverage)
+        return residuals, light, coverage
 
     def _fit_pixels(
         self,
@@ -360,10 +350,9 @@ class _Target(NamedTuple):
 
     def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
         """Sort cameras by the squared error of a render with their best light, smallest first."""
-        pairs = [
-            (float(self.fit_light(camera).residuals.square().sum()), camera) for camera in cameras
-        ]
-        return sorted(pairs, key=lambda pair: pair[0])
+        cameras = list(cameras)
+        errors = [float(self.fit_light(one)[0].square().sum()) for one in cameras]
+        return sorted(zip(errors, cameras, strict=True), key=lambda pair: pair[0])
 
     def penalty(self, normal_matrix: Float[Tensor, "3 49 49"]) -> Float[Tensor, " 49"]:
         """Compute the weights of the smoothness penalty of a light.
@@ -407,7 +396,7 @@ class _Target(NamedTuple):
             return moved
 
         def residuals(parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, " N"]:
-            return self.fit_light(camera_of(parameters)).residuals.numpy()
+            return self.fit_light(camera_of(parameters))[0].numpy()
 
         def jacobian(parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, "N 5"]:
             columns = []
@@ -438,14 +427,14 @@ class _Target(NamedTuple):
 
         Only the pixels that the object covers completely count.
         """
-        fit = self.fit_light(camera, WHOLE_PIXEL, FINAL_GRID)
-        image = render(self.mesh, camera, fit.light, self.size, self.gray, **self.options)
+        _, light, coverage = self.fit_light(camera, WHOLE_PIXEL, FINAL_GRID)
+        image = render(self.mesh, camera, light, self.size, self.gray, **self.options)
         rendered = decode(image, self.options["encoding"]).flatten(1)
         is_inside = self.mask > WHOLE_PIXEL
         error = (rendered - self.image)[:, is_inside].norm() / self.image[:, is_inside].norm()
-        union = torch.maximum(fit.coverage, self.mask).sum()
-        overlap = torch.minimum(fit.coverage, self.mask).sum() / union
-        return FittedScene(camera, fit.light, float(error), float(overlap))
+        union = torch.maximum(coverage, self.mask).sum()
+        overlap = torch.minimum(coverage, self.mask).sum() / union
+        return FittedScene(camera, light, float(error), float(overlap))
 
 
 def _fit_channels(

@@ -7,7 +7,7 @@ Shading first decodes them to linear values. A mesh has V vertices and F faces.
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -17,15 +17,8 @@ import torch
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from renderer.errors import (
-    InputError,
-    as_array,
-    as_list,
-    describe,
-    require_choice,
-    require_range,
-    require_whole,
-)
+from renderer import errors
+from renderer.errors import InputError
 from renderer.normals import CREASE, doubled_area_vectors, normal_groups, vertex_normals
 from renderer.settings import MAX_VERTICES, NORMALS
 
@@ -121,20 +114,20 @@ class Mesh:
         for name, (kinds, row) in _ARRAYS.items():
             if getattr(self, name) is None and name in ("gloss", "normal_ids"):
                 continue
-            array = as_array(name, getattr(self, name), kinds)
+            array = errors.as_array(name, getattr(self, name), kinds)
             # A frozen dataclass forbids assignments, so fields are set by object.__setattr__.
             object.__setattr__(self, name, array)
             shape = (*(self.faces if name in PER_FACE else array).shape[:1], *row)
             if array.shape != shape:
                 raise InputError(f"{name} has the shape {array.shape}: give the shape {shape}")
-        require_range("the number of faces", len(self.faces), 1, np.inf)
+        errors.require_range("the number of faces", len(self.faces), 1, np.inf)
         for name, channels in (("textures", 3), ("gloss_textures", 2)):
             expected = f"a list of arrays (height, width, {channels}) of uint8"
-            given = as_list(name, getattr(self, name), object, expected)
-            textures = tuple(as_array(name, texture) for texture in given)
+            given = errors.as_list(name, getattr(self, name), object, expected)
+            textures = tuple(errors.as_array(name, texture) for texture in given)
             for texture in textures:
                 if texture.shape[2:] != (channels,) or texture.dtype != np.uint8:
-                    raise InputError(f"{name} has {describe(texture)}: give {expected}")
+                    raise InputError(f"{name} has {errors.describe(texture)}: give {expected}")
             object.__setattr__(self, name, textures)
         limits = {
             "faces": (0, len(self.vertices) - 1),
@@ -176,14 +169,14 @@ class Mesh:
         Raises:
             InputError: If an argument has a wrong shape or is out of range.
         """
-        vertices = np.array(as_array("vertices", vertices), dtype=np.float64)
-        given_faces = as_array("faces", faces)
+        vertices = np.array(errors.as_array("vertices", vertices), dtype=np.float64)
+        given_faces = errors.as_array("faces", faces)
         # astype turns NaN into an arbitrary integer, with a warning.
         with np.errstate(invalid="ignore"):
             faces = given_faces.astype(np.int64)
         if not np.array_equal(faces, given_faces):
             raise InputError("faces has numbers that are not whole: give the indices of vertices")
-        color = as_array("color", color).astype(np.float32)
+        color = errors.as_array("color", color).astype(np.float32)
         if not color.size or not (color.min() >= 0 and color.max() <= 1):
             given = reprlib.repr(color.tolist())
             raise InputError(f"color={given} is not a color: give red, green and blue from 0 to 1")
@@ -195,7 +188,7 @@ class Mesh:
                 f"vertices, faces and color do not fit together ({error}): give the shapes "
                 "(V, 3), (F, 3) and (3,)"
             ) from error
-        require_range("crease", crease, 0, 180)
+        errors.require_range("crease", crease, 0, 180)
         mesh = Mesh(
             vertices=vertices,
             faces=faces,
@@ -242,7 +235,7 @@ class Mesh:
         Raises:
             InputError: If `normals` is neither "smooth" nor "flat".
         """
-        require_choice("normals", normals, NORMALS)
+        errors.require_choice("normals", normals, NORMALS)
         values = self.corner_normals
         if normals == "flat":
             values = np.broadcast_to(self.face_normals()[:, None], values.shape)
@@ -323,13 +316,11 @@ def require_mesh(name: str, value: object) -> None:
     if not isinstance(value, Mesh):
         path = repr(value) if isinstance(value, str) else "path"
         raise InputError(
-            f"{name} is {describe(value)}: give an nb.Mesh, "
+            f"{name} is {errors.describe(value)}: give an nb.Mesh, "
             f"such as nb.load_mesh({path}) or nb.Mesh.plain(vertices, faces)"
         )
     if not value.displayable:
-        raise InputError(
-            f"{name}.corner_colors has values outside of [0, 1]: divide 8-bit colors by 255"
-        )
+        raise InputError(f"{name}.corner_colors has values outside [0, 1]: divide bytes by 255")
 
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
@@ -417,9 +408,7 @@ def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
     """
     areas = mesh.face_areas()
     if not areas.sum() > 0:
-        raise InputError(
-            "the surface of the mesh has the area 0: give a mesh whose faces have an area"
-        )
+        raise InputError("the surface of the mesh has the area 0: give faces with an area")
     face_centers = mesh.vertices.take(mesh.faces, axis=0).mean(axis=1)
     center = np.average(face_centers, axis=0, weights=areas)
     return center, np.abs(mesh.vertices - center).max()
@@ -470,7 +459,7 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
     # A whole number may be written as a float, such as 1e4.
     if isinstance(vertices, float) and vertices.is_integer():
         vertices = int(vertices)
-    require_whole("vertices", vertices, 0, MAX_VERTICES)
+    errors.require_whole("vertices", vertices, 0, MAX_VERTICES)
     while len(mesh.vertices) <= vertices:
         mesh = _quartered(mesh)
     return mesh
@@ -511,6 +500,19 @@ def _rows_of_faces(mesh: Mesh) -> dict[str, np.ndarray]:
     return {name: getattr(mesh, name) for name in PER_FACE if getattr(mesh, name) is not None}
 
 
+def by_material(mesh: Mesh, *columns: np.ndarray) -> Iterator[tuple[np.ndarray, int, Any]]:
+    """Yield the faces (F,) of each texture and gloss, the texture's index and the gloss.
+
+    The gloss is empty for a matte mesh. Faces that differ in `columns`, the first sort keys, are in
+    different groups.
+    """
+    gloss = [] if mesh.gloss is None else [mesh.gloss]
+    keys = np.column_stack([*columns, mesh.texture_ids, *gloss])
+    for key in np.unique(keys, axis=0):
+        texture_id, *group_gloss = key[len(columns) :].tolist()
+        yield (keys == key).all(axis=1), int(texture_id), group_gloss
+
+
 def _quartered(mesh: Mesh) -> Mesh:
     """Return a copy of a mesh in which each face is divided into four triangles (`subdivide`)."""
     edge_ends, edge_of_side = shared_edges(mesh.faces)
@@ -544,10 +546,8 @@ def shared_edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray]
     return np.stack(np.divmod(edge_keys, vertex_count), axis=1), edge_of_side.reshape(-1, 3)
 
 
-def _interpolate_quarters(
-    corner_values: Float[np.ndarray, "F 3 D"],
-) -> Float[np.ndarray, "4*F 3 D"]:
-    """Interpolate corner values to the parts of each face, in the order of `_QUARTERS`."""
+def _interpolate_quarters(corner_values: Float[np.ndarray, "F 3 D"]) -> np.ndarray:
+    """Interpolate corner values to the four parts of each face (`_QUARTERS`), (4 F, 3, D)."""
     # Axes: face, edge, end of the edge, value.
     midpoint_values = corner_values[:, EDGES].mean(axis=2)
     # Values at the three corners and the three midpoints of each face, shape (F, 6, D).

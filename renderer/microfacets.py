@@ -24,6 +24,8 @@ from torch import Tensor
 
 from renderer.vectors import unit
 
+# One number for each of any number of points.
+Numbers = Float[Tensor, " ..."]
 # Refractive index of dielectric (non-metallic) surfaces. 1.5 is typical of varnish, and
 # the default of glTF.
 REFRACTIVE_INDEX = 1.5
@@ -38,7 +40,7 @@ def reflectance(
     normals: Float[Tensor, "... 3"],
     toward: Float[Tensor, "... 3"],
     directions: Float[Tensor, "... 3"],
-    roughness: Float[Tensor, " ..."],
+    roughness: Numbers,
 ) -> Float[Tensor, "3 ..."]:
     """Compute π times the specular reflectance (BRDF) for light from single directions.
 
@@ -63,9 +65,7 @@ def reflectance(
     return torch.stack([without_fresnel * term for term in fresnel_terms])
 
 
-def distribution(
-    cosine: Float[Tensor, " ..."], alpha_squared: Float[Tensor, " ..."]
-) -> Float[Tensor, " ..."]:
+def distribution(cosine: Numbers, alpha_squared: Numbers) -> Numbers:
     """Compute π times the GGX distribution D of the normals of microfacets.
 
     D = α² / (π ((n·h)² (α² - 1) + 1)²), Walter et al. (2007), equation 33. `alpha_squared`
@@ -75,9 +75,7 @@ def distribution(
     return alpha_squared / (cosine**2 * (alpha_squared - 1) + 1) ** 2
 
 
-def masking_denominator(
-    cosine: Float[Tensor, " ..."], alpha_squared: Float[Tensor, " ..."]
-) -> Float[Tensor, " ..."]:
+def masking_denominator(cosine: Numbers, alpha_squared: Numbers) -> Numbers:
     """Compute the denominator of Smith's masking term G₁(c).
 
     G₁(c) is 2 c / (c + √(α² + (1 - α²) c²)). The BRDF contains
@@ -90,7 +88,7 @@ def masking_denominator(
     return facing_cosine + (alpha_squared + (1 - alpha_squared) * facing_cosine**2).sqrt()
 
 
-def fresnel(cosine: Float[Tensor, " ..."]) -> Float[Tensor, "3 ..."]:
+def fresnel(cosine: Numbers) -> Float[Tensor, "3 ..."]:
     """Compute three Fresnel terms, which depend on the angle between light and microfacet.
 
     A metal reflects the fraction F0 · SCHLICK + F90 · EDGE (Schlick's

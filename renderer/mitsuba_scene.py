@@ -42,7 +42,7 @@ from renderer.io.mitsuba_entries import Scene, environment, integrator, sensor_o
 from renderer.light.basis import LocalBasis
 from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
-from renderer.mesh import Mesh
+from renderer.mesh import Mesh, by_material
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.surface.albedo import with_added_albedo
 from renderer.surface.lobes import coat_mean
@@ -201,15 +201,8 @@ def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) 
     if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
         mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
-    # Faces with the same key become one part. The key is the index of the
-    # texture and, if the mesh has gloss, the three values of the gloss.
-    keys = mesh.texture_ids[:, None]
-    if mesh.gloss is not None:
-        keys = np.concatenate([keys, mesh.gloss], axis=1)
     parts = []
-    for key in np.unique(keys, axis=0):
-        is_in_part = (keys == key).all(axis=1)
-        texture_id = int(key[0])
+    for is_in_part, texture_id, gloss in by_material(mesh):
         has_texture = texture_id >= 0
         has_factors = has_texture and mesh.gloss_textures
         part = Part(
@@ -218,7 +211,7 @@ def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) 
             uvs=mesh.corner_uvs[is_in_part],
             colors=colors[is_in_part],
             texture=mesh.textures[texture_id] if has_texture else None,
-            gloss=None if mesh.gloss is None else key[1:],
+            gloss=np.array(gloss) if gloss else None,
             factors=mesh.gloss_textures[texture_id] if has_factors else None,
         )
         parts.append(part)

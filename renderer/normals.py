@@ -38,7 +38,15 @@ MAX_SLIVER_SINE = 1 / 16
 _SPLITTER = 2.0**27 + 1
 
 
-def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
+# Positions of vertices in world axes, and vertex indices of the corners of faces.
+Vertices = Float[Tensor, "V 3"]
+# One row of vertex indices, or of indices of normals, for each face.
+Corners = Int[Tensor, "F 3"]
+# Vectors with their components along the first axis.
+Vectors = Float[Tensor, "3 N"]
+
+
+def face_normals(vertices: Vertices, faces: Corners) -> Float[Tensor, "F 3"]:
     """Compute the unit normals of faces, differentiable with respect to the vertices.
 
     The derivative of the normal n with respect to a corner v of the face is
@@ -51,10 +59,7 @@ def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> F
 
 
 def vertex_normals(
-    vertices: Float[Tensor, "V 3"],
-    faces: Int[Tensor, "F 3"],
-    normal_ids: Int[Tensor, "F 3"] | None = None,
-    count: int | None = None,
+    vertices: Vertices, faces: Corners, normal_ids: Corners | None = None, count: int | None = None
 ) -> Float[Tensor, "N 3"]:
     """Compute the unit normals of vertices, differentiable with respect to the vertices.
 
@@ -89,9 +94,7 @@ def doubled_area_vectors(
     return np.stack(_components(edges[:, 0], edges[:, 1]), axis=1)
 
 
-def area_vectors(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-) -> Float64[Tensor, "3 F"]:
+def area_vectors(vertices: Vertices, faces: Corners) -> Float64[Tensor, "3 F"]:
     """Compute a vector along the normal of each face, whose length is twice the face area.
 
     The vectors are differentiable with respect to the vertices.
@@ -109,9 +112,7 @@ class _AreaVectors(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-    ) -> Float[Tensor, "3 F"]:
+    def forward(ctx: Any, vertices: Vertices, faces: Corners) -> Float[Tensor, "3 F"]:
         """Compute the area vector u × v of each face from its edges u and v."""
         corners = vertices.index_select(0, faces.T.flatten()).T.contiguous().double()
         # Positions of the corners of F faces, shape (3 components, 3 corners, F).
@@ -153,7 +154,7 @@ class _AreaVectors(torch.autograd.Function):
         return gradient.to(ctx.dtype).T, None
 
 
-def _length(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
+def _length(vectors: Vectors) -> Float[Tensor, " N"]:
     """Compute the lengths of N vectors.
 
     torch.norm would be fifty times slower along an axis of length three.
@@ -161,7 +162,7 @@ def _length(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
     return vectors.square().sum(0).sqrt()
 
 
-def _cross(u: Float[Tensor, "3 N"], v: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:
+def _cross(u: Vectors, v: Vectors) -> Vectors:
     """Compute the cross products of N pairs of vectors.
 
     Unlike torch.linalg.cross, this function gives exactly zero for parallel
@@ -177,9 +178,7 @@ def _components(u: Any, v: Any) -> list[Any]:
     return [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx]
 
 
-def _exact_cross(
-    a: Float[Tensor, "3 N"], b: Float[Tensor, "3 N"], c: Float[Tensor, "3 N"]
-) -> Float[Tensor, "3 N"]:
+def _exact_cross(a: Vectors, b: Vectors, c: Vectors) -> Vectors:
     """Compute (b - a) × (c - a) for the corners of N triangles, almost without rounding errors.
 
     The rounding errors of differences (Knuth 1969) and of products (Dekker 1971)
@@ -311,9 +310,8 @@ def _groups_of_file(
     unit_normals = (unit_normals / np.where(is_given, lengths, 1)[..., None]).reshape(-1, 3)
     vertex = faces.ravel()
     # One integer is sorted much faster than four numbers.
-    order = np.argsort(
-        vertex * 2**33 + np.rint(1000 * unit_normals).astype(int) @ [2**22, 2**11, 1]
-    )
+    rounded = np.rint(1000 * unit_normals).astype(int)
+    order = np.argsort(vertex * 2**33 + rounded @ [2**22, 2**11, 1])
     is_same_vertex = vertex[order[1:]] == vertex[order[:-1]]
     first = np.concatenate([first, order[:-1][is_same_vertex]])
     second = np.concatenate([second, order[1:][is_same_vertex]])

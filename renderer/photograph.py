@@ -219,19 +219,19 @@ def fit_photograph(
 
     def fit(window: Window, start: Camera | None) -> FittedScene:
         """Fit the camera and the light in one window. Without a start camera, search for one."""
-        linear_image = window.cut(photograph, size, encoding)
+        image = window.cut(photograph, size, encoding)
         # Share of each pixel that the object covers, shape (size, size).
         coverage = window.cut(mask[..., None], size, beyond=0)[0]
-        camera_options = {**options, "fov": fov, "encoding": encoding, "start": start}
-        return fit_scene(linear_image, coverage, mesh, **camera_options)
+        return fit_scene(image, coverage, mesh, fov=fov, encoding=encoding, start=start, **options)
 
     # The window needs the direction of the world's z-axis in the axes of the photograph's camera:
     # right, up and back. For the first fit, this direction is guessed.
     polar = math.radians(GUESSED_POLAR)
     window = camera_image.window(center, side, np.array([0.0, math.sin(polar), math.cos(polar)]))
     scene = fit(window, None)
-    # The first fit gives a better direction of the z-axis for the second fit.
-    up = _up_direction(scene.camera, window)
+    # The first fit gives a better direction of the z-axis for the second fit. The axes right, up
+    # and back of the fitted camera are also the axes of the window.
+    up = window.axes.T @ scene.camera.axes()[:, 2]
     # The camera of the photograph is upright, so the z-axis does not point to its right.
     up[0] = 0
     upright_window = camera_image.window(center, side, up)
@@ -242,15 +242,9 @@ def fit_photograph(
     camera = scene.camera
     # Offset (right, up) of the mesh center from the window center, in pixels.
     offset = np.array([camera.right, camera.up]) * window.side / camera.width
-    up = _up_direction(camera, window)
+    up = window.axes.T @ camera.axes()[:, 2]
     centered_window = camera_image.window(window.pixels(*offset), window.side, up)
     return FittedPhotograph(scene._replace(camera=_turned_to_mesh(camera)), centered_window)
-
-
-def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
-    """Return the world's z-axis, a unit vector, in the photograph's axes right, up and back."""
-    # The axes right, up and back of the fitted camera are also the axes of the window.
-    return window.axes.T @ camera.axes()[:, 2]
 
 
 def _turned_to_mesh(camera: Camera) -> Camera:

@@ -17,16 +17,9 @@ from typing import Any, Self
 import numpy as np
 from torch import Tensor
 
+from renderer import errors
 from renderer.camera import PerspectiveCamera
-from renderer.errors import (
-    MAX_MAGNITUDE,
-    InputError,
-    as_array,
-    as_path,
-    require_choice,
-    require_file,
-    require_whole,
-)
+from renderer.errors import InputError
 
 # Conventions for the axes of a camera in its view matrix. OpenCV has y down and z forward. OpenGL
 # has y up and z backward.
@@ -151,7 +144,7 @@ class PinholeCamera(PerspectiveCamera):
             >>> nb.render(nb.solid("orange"), camera, nb.load_light("grace"), size=64).shape[-1]
             64
         """
-        require_choice("convention", convention, CONVENTIONS)
+        errors.require_choice("convention", convention, CONVENTIONS)
         # The rows of the rotation matrix are the axes of the camera in world axes.
         rotation, translation = _split_view(view)
         if convention == "opencv":
@@ -161,7 +154,7 @@ class PinholeCamera(PerspectiveCamera):
         focal_x, focal_y, principal_x, principal_y = _split_intrinsics(intrinsics)
         image_width, image_height = size if isinstance(size, tuple | list) else (size, size)
         for side in (image_width, image_height):
-            require_whole("size", side, 1, MAX_MAGNITUDE)
+            errors.require_whole("size", side, 1, errors.MAX_MAGNITUDE)
         side = min(image_width, image_height)
         right, up, back = rotation
         position = -translation @ rotation
@@ -233,7 +226,7 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
         >>> [*cameras], round(cameras["front.png"].distance, 3)
         (['front.png'], 4.0)
     """
-    path = as_path("path", path)
+    path = errors.as_path("path", path)
     if path.is_dir() and (path / COLMAP_IMAGES).exists():
         cameras = _read_colmap(path)
     else:
@@ -246,7 +239,7 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
 @contextmanager
 def _reading(path: Path) -> Iterator[str]:
     """Read the text of a file for a `with` block, and name the file in errors of the block."""
-    require_file(path, "give transforms.json, or a folder with cameras.txt and images.txt")
+    errors.require_file(path, "give transforms.json, or a folder with cameras.txt and images.txt")
     try:
         yield path.read_text(encoding="utf-8-sig")
     except InputError as error:
@@ -273,11 +266,8 @@ def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
     with _reading(folder / "cameras.txt") as text:
         for line in _lines(text):
             camera_id, model, width, height, *parameters = line.split()
-            _add(
-                lenses,
-                camera_id,
-                (_colmap_intrinsics(model, parameters), (int(width), int(height))),
-            )
+            lens = _colmap_intrinsics(model, parameters), (int(width), int(height))
+            _add(lenses, camera_id, lens)
     with _reading(folder / COLMAP_IMAGES) as text:
         may_be_points = False
         for line in _lines(text):
@@ -367,7 +357,7 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
 
 def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
     """Check and split a view matrix, (4, 4) or (3, 4): rotation (3, 3) and translation (3,)."""
-    matrix = as_array("view", view).astype(np.float64)
+    matrix = errors.as_array("view", view).astype(np.float64)
     if matrix.shape in ((4, 4), (3, 4)):
         rotation = matrix[:3, :3]
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
@@ -382,7 +372,7 @@ def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
     """Check an intrinsic matrix in pixels, and return fx, fy, cx and cy."""
-    matrix = as_array("intrinsics", intrinsics).astype(np.float64)
+    matrix = errors.as_array("intrinsics", intrinsics).astype(np.float64)
     if matrix.shape == (3, 3):
         focal_x, focal_y, center_x, center_y = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         expected = [[focal_x, 0, center_x], [0, focal_y, center_y], [0, 0, 1]]

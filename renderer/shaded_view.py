@@ -22,7 +22,7 @@ from renderer.light.basis import SplitLight
 from renderer.mesh import Mesh
 from renderer.operators.rays import LocalLightView
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import Gloss, SampleGloss, sample_gloss
+from renderer.surface.gloss import Gloss, sample_gloss
 from renderer.surface.shading import glossy_radiance, normals_in_sight, radiance
 from renderer.visibility.fragments import Fragments
 from renderer.visibility.silhouettes import moving_outlines
@@ -134,7 +134,7 @@ class ShadedView:
         summands: list[Tensor | None] = []
         if self.light.environment is not None:
             arguments = (fragments, self.vertices, self.light.environment, self.albedo)
-            gloss = self._sample_gloss
+            gloss = sample_gloss(self.mesh, self.fragments, self.gloss)
             if gloss is None:
                 summands.append(radiance(*arguments, self._normals))
             else:
@@ -214,8 +214,3 @@ class ShadedView:
             return self.corner_normals[self.fragments.faces]
         normal_ids = torch.from_numpy(self.mesh.normal_ids).to(self._faces)
         return normals_in_sight(self.fragments, self.vertices, self._faces, normal_ids)
-
-    @cached_property
-    def _sample_gloss(self) -> SampleGloss | None:
-        """Gloss at the samples, or None for a matte shape."""
-        return sample_gloss(self.mesh, self.fragments, self.gloss)

@@ -26,6 +26,9 @@ from numpy.typing import ArrayLike
 from renderer.errors import require_choice, require_whole
 from renderer.mesh import Mesh, concatenate
 
+Random = np.random.Generator
+# Positions or colors of V vertices.
+Points = Float[np.ndarray, "V 3"]
 # Colors of stalks and leaves, sRGB-encoded red, green and blue.
 STALK = (0.36, 0.27, 0.15)
 LEAF_GREEN = (0.25, 0.42, 0.12)
@@ -71,7 +74,7 @@ def solid(name: str, seed: int = 0) -> Mesh:
     return known[name](np.random.default_rng(seed))
 
 
-def orange(rng: np.random.Generator) -> Mesh:
+def orange(rng: Random) -> Mesh:
     """Create an oblate sphere with pores and a green-brown navel in a dimple on top."""
     directions, faces = sphere()
     angle_from_top = np.arccos(np.clip(directions[:, 2], -1, 1))
@@ -79,11 +82,11 @@ def orange(rng: np.random.Generator) -> Mesh:
     waves = ripples(rng, directions, wavelength=2.0)
     dents = 0.01 * waves - 0.04 * bump(angle_from_top / 0.25)
     flattening = rng.uniform(0.9, 0.98)
-    peel_color = choose(rng, (0.97, 0.50, 0.06), (0.95, 0.56, 0.08), (0.96, 0.44, 0.07))
-    patch_color = choose(rng, (0.98, 0.64, 0.14), (0.90, 0.42, 0.05))
+    peel_color = draw(rng, (0.97, 0.5, 0.06), (0.95, 0.56, 0.08), (0.96, 0.44, 0.07))
+    patch_color = draw(rng, (0.98, 0.64, 0.14), (0.9, 0.42, 0.05))
     patches = ripples(rng, directions, wavelength=1.5)
     peel = mix(peel_color, patch_color, 0.4 + 0.3 * patches + 0.1 * pores)
-    navel_color = choose(rng, (0.33, 0.36, 0.13), (0.38, 0.28, 0.12))
+    navel_color = draw(rng, (0.33, 0.36, 0.13), (0.38, 0.28, 0.12))
     colors = mix(peel, navel_color, 1.2 * bump(angle_from_top / 0.15))
     # Distance of each vertex from the center, shape (V,).
     radius = 1 + 0.004 * pores + dents
@@ -91,7 +94,7 @@ def orange(rng: np.random.Generator) -> Mesh:
     return Mesh.plain(vertices, faces, colors)
 
 
-def apple(rng: np.random.Generator) -> Mesh:
+def apple(rng: Random) -> Mesh:
     """Create an apple with a dimple at both ends, a stalk, and red streaks on yellow or green."""
     latitude = np.linspace(-np.pi / 2, 0.49 * np.pi, 40)
     radius = np.cos(latitude) * (1 + rng.uniform(0.1, 0.16) * np.sin(latitude))
@@ -107,13 +110,13 @@ def apple(rng: np.random.Generator) -> Mesh:
     # A random field that varies slowly along z looks like vertical streaks.
     streaks = ripples(rng, vertices * [1, 1, 0.2], wavelength=0.5)
     streaks += ripples(rng, vertices, wavelength=2.0)
-    green = choose(rng, (0.62, 0.72, 0.25), (0.86, 0.76, 0.35))
-    red = choose(rng, (0.72, 0.08, 0.10), (0.80, 0.16, 0.12))
+    green = draw(rng, (0.62, 0.72, 0.25), (0.86, 0.76, 0.35))
+    red = draw(rng, (0.72, 0.08, 0.1), (0.8, 0.16, 0.12))
     skin = mix(green, red, rng.uniform(-0.2, 1.3) + 0.25 * streaks)
     return paint(vertices, faces, section, skin, STALK)
 
 
-def pear(rng: np.random.Generator) -> Mesh:
+def pear(rng: Random) -> Mesh:
     """Create a pear with a neck and a stalk, freckled in yellow to green."""
     latitude = np.linspace(-np.pi / 2, 0.49 * np.pi, 40)
     belly_radius = rng.uniform(0.46, 0.5)
@@ -125,15 +128,15 @@ def pear(rng: np.random.Generator) -> Mesh:
     flesh = np.stack([radius, height], axis=1)
     stalk = [(0.03, 0.97), (0, 0.97)]
     vertices, faces, section = revolve(flesh, stalk)
-    skin_color = choose(rng, (0.78, 0.78, 0.27), (0.60, 0.68, 0.22))
-    patch_color = choose(rng, (0.55, 0.62, 0.16), (0.72, 0.60, 0.24))
+    skin_color = draw(rng, (0.78, 0.78, 0.27), (0.6, 0.68, 0.22))
+    patch_color = draw(rng, (0.55, 0.62, 0.16), (0.72, 0.6, 0.24))
     patches = ripples(rng, vertices, wavelength=1.5)
     freckles = ripples(rng, vertices, wavelength=0.2)
     skin = mix(skin_color, patch_color, 0.4 + 0.25 * patches + 0.15 * freckles)
     return paint(vertices, faces, section, skin, STALK)
 
 
-def sweet_pepper(rng: np.random.Generator) -> Mesh:
+def sweet_pepper(rng: Random) -> Mesh:
     """Create a bell pepper with three or four lobes and a sunken green stalk."""
     # Points (radius, height) of the profile of the fruit and of its stalk.
     belly = arc((0.38, -0.5), (0.2, 0.4), -90, -10)
@@ -150,14 +153,12 @@ def sweet_pepper(rng: np.random.Generator) -> Mesh:
     vertices[:, :2] *= (1.08 - furrows)[:, None]
     vertices[:, 2] *= rng.uniform(0.9, 1.05)
     # Red, yellow, green or orange red.
-    color = choose(
-        rng, (0.78, 0.07, 0.07), (0.95, 0.75, 0.08), (0.22, 0.48, 0.12), (0.93, 0.42, 0.05)
-    )
-    skin = mix(color, LEAF_GREEN, 0.1 * ripples(rng, vertices, wavelength=1.0))
+    hue = draw(rng, (0.78, 0.07, 0.07), (0.95, 0.75, 0.08), (0.22, 0.48, 0.12), (0.93, 0.42, 0.05))
+    skin = mix(hue, LEAF_GREEN, 0.1 * ripples(rng, vertices, wavelength=1.0))
     return paint(vertices, faces, section, skin, LEAF_GREEN)
 
 
-def mushroom(rng: np.random.Generator) -> Mesh:
+def mushroom(rng: Random) -> Mesh:
     """Create a pale stalk under a domed cap that is brown, or red with white flecks."""
     cap_radius = rng.uniform(0.75, 0.95)
     cap_height = rng.uniform(0.5, 0.7)
@@ -166,16 +167,16 @@ def mushroom(rng: np.random.Generator) -> Mesh:
     gills = [(cap_radius - 0.08, -0.02)]
     cap = arc((0, 0.08), (cap_radius, cap_height), 0, 90)
     vertices, faces, section = revolve(stalk, gills, cap)
-    brown = choose(rng, (0.55, 0.34, 0.18), (0.78, 0.62, 0.44))
+    brown = draw(rng, (0.55, 0.34, 0.18), (0.78, 0.62, 0.44))
     white_weight = 4 * ripples(rng, vertices, wavelength=0.5) - 3
-    red_with_flecks = mix(choose(rng, (0.80, 0.10, 0.06)), (0.95, 0.93, 0.88), white_weight)
+    red_with_flecks = mix(draw(rng, (0.8, 0.1, 0.06)), (0.95, 0.93, 0.88), white_weight)
     cap_color = red_with_flecks if rng.random() < 0.4 else brown
-    stalk_color = (0.90, 0.86, 0.76)
-    gill_color = (0.72, 0.60, 0.46)
+    stalk_color = (0.9, 0.86, 0.76)
+    gill_color = (0.72, 0.6, 0.46)
     return paint(vertices, faces, section, stalk_color, gill_color, cap_color)
 
 
-def bottle(rng: np.random.Generator) -> Mesh:
+def bottle(rng: Random) -> Mesh:
     """Create a bottle of colored glass with shoulders, a long neck, a label and a cap."""
     radius = rng.uniform(0.27, 0.34)
     shoulder_height = rng.uniform(0.0, 0.2)
@@ -185,15 +186,13 @@ def bottle(rng: np.random.Generator) -> Mesh:
     shoulder = arc((0.1, shoulder_height - 0.05), (radius - 0.1, 0.35), 0, 85)
     neck = np.concatenate([shoulder, [(0.1, 0.8)]])
     cap = [(0.125, 0.8), (0.125, 1), (0, 1)]
-    glass = choose(
-        rng, (0.10, 0.36, 0.16), (0.36, 0.18, 0.06), (0.20, 0.42, 0.60), (0.62, 0.74, 0.74)
-    )
-    paper = choose(rng, (0.93, 0.90, 0.80), (0.85, 0.20, 0.15), (0.92, 0.78, 0.25))
-    metal = choose(rng, (0.75, 0.62, 0.25), (0.70, 0.12, 0.12), (0.80, 0.80, 0.82))
+    glass = draw(rng, (0.1, 0.36, 0.16), (0.36, 0.18, 0.06), (0.2, 0.42, 0.6), (0.62, 0.74, 0.74))
+    paper = draw(rng, (0.93, 0.9, 0.8), (0.85, 0.2, 0.15), (0.92, 0.78, 0.25))
+    metal = draw(rng, (0.75, 0.62, 0.25), (0.7, 0.12, 0.12), (0.8, 0.8, 0.82))
     return paint(*revolve(base, label, neck, cap), glass, paper, glass, metal)
 
 
-def cup(rng: np.random.Generator) -> Mesh:
+def cup(rng: Random) -> Mesh:
     """Create a mug with a drink. Its handle is a bent tube that ends inside the wall."""
     foot_radius = rng.uniform(0.42, 0.55)
     rim_radius = rng.uniform(0.58, 0.65)
@@ -202,10 +201,8 @@ def cup(rng: np.random.Generator) -> Mesh:
     outside = [(0, -0.7), (foot_radius, -0.7), (rim_radius, 0.7)]
     inside = [(rim_radius - 0.07, 0.7), (rim_radius - 0.1, drink_height)]
     drink = [(0, drink_height)]
-    glaze = choose(
-        rng, (0.93, 0.93, 0.90), (0.20, 0.35, 0.62), (0.75, 0.16, 0.14), (0.30, 0.52, 0.42)
-    )
-    white = (0.95, 0.94, 0.90)
+    glaze = draw(rng, (0.93, 0.93, 0.9), (0.2, 0.35, 0.62), (0.75, 0.16, 0.14), (0.3, 0.52, 0.42))
+    white = (0.95, 0.94, 0.9)
     coffee = (0.28, 0.16, 0.08)
     body = paint(*revolve(outside, inside, drink), glaze, white, coffee)
     # The handle ends in the middle of the wall of thickness 0.07, at the heights -0.4 and 0.4.
@@ -235,7 +232,7 @@ def _handle(end_radii: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "19 12 3"]:
     return ring_center + radius * (np.cos(around) * outward + np.sin(around) * y_axis)
 
 
-def plate(rng: np.random.Generator) -> Mesh:
+def plate(rng: Random) -> Mesh:
     """Create a pale, shallow dish with a colored band on its brim."""
     well_radius = rng.uniform(0.5, 0.62)
     brim_height = rng.uniform(0.1, 0.2)
@@ -243,14 +240,12 @@ def plate(rng: np.random.Generator) -> Mesh:
     underside = [(0, -0.06), (well_radius, -0.06), (0.97, brim_height - 0.03), (0.97, brim_height)]
     band = [(0.85, brim_height - 0.03)]
     inside = [(well_radius + 0.08, brim_height - 0.06), (well_radius, 0), (0, 0)]
-    china = choose(rng, (0.95, 0.95, 0.93), (0.93, 0.89, 0.80))
-    stripe = choose(
-        rng, (0.15, 0.25, 0.60), (0.70, 0.15, 0.12), (0.20, 0.50, 0.45), (0.80, 0.65, 0.25)
-    )
+    china = draw(rng, (0.95, 0.95, 0.93), (0.93, 0.89, 0.8))
+    stripe = draw(rng, (0.15, 0.25, 0.6), (0.7, 0.15, 0.12), (0.2, 0.5, 0.45), (0.8, 0.65, 0.25))
     return paint(*revolve(underside, band, inside), china, stripe, china)
 
 
-def lamp(rng: np.random.Generator) -> Mesh:
+def lamp(rng: Random) -> Mesh:
     """Create a table lamp with a bulbous foot, a rod, and a shade that is hollow from below."""
     shade_radius = rng.uniform(0.55, 0.7)
     top_radius = rng.uniform(0.25, 0.4)
@@ -261,18 +256,14 @@ def lamp(rng: np.random.Generator) -> Mesh:
     rod = [(0.05, -0.15), (0.05, 0.9)]
     lining = [(top_radius - 0.03, 0.9), (shade_radius - 0.03, 0)]
     shade = [(shade_radius, 0), (top_radius, 0.95), (0, 0.95)]
-    foot_color = choose(
-        rng, (0.62, 0.48, 0.22), (0.25, 0.18, 0.14), (0.30, 0.45, 0.55), (0.85, 0.85, 0.82)
-    )
-    shade_color = choose(
-        rng, (0.95, 0.88, 0.70), (0.90, 0.80, 0.55), (0.70, 0.22, 0.16), (0.92, 0.92, 0.90)
-    )
-    brass = (0.70, 0.60, 0.35)
+    base = draw(rng, (0.62, 0.48, 0.22), (0.25, 0.18, 0.14), (0.3, 0.45, 0.55), (0.85, 0.85, 0.82))
+    cloth = draw(rng, (0.95, 0.88, 0.7), (0.9, 0.8, 0.55), (0.7, 0.22, 0.16), (0.92, 0.92, 0.9))
+    brass = (0.7, 0.6, 0.35)
     cream = (0.98, 0.93, 0.75)
-    return paint(*revolve(foot, rod, lining, shade), foot_color, brass, cream, shade_color)
+    return paint(*revolve(foot, rod, lining, shade), base, brass, cream, cloth)
 
 
-def table(rng: np.random.Generator) -> Mesh:
+def table(rng: Random) -> Mesh:
     """Create a wooden table with four square legs, as one closed polyhedron."""
     # The table consists of cubic cells. True marks the filled cells along x, y and z.
     is_filled = np.zeros((14, 10, 10), dtype=bool)
@@ -283,14 +274,14 @@ def table(rng: np.random.Generator) -> Mesh:
     vertices, faces = surface_of_cells(is_filled)
     half_size = rng.uniform([0.85, 0.5, 0.45], [1, 0.75, 0.6])
     vertices = (2 * vertices / is_filled.shape - 1) * half_size
-    wood = choose(rng, (0.55, 0.34, 0.17), (0.74, 0.54, 0.32), (0.36, 0.21, 0.12))
-    dark_wood = (0.40, 0.23, 0.11)
+    wood = draw(rng, (0.55, 0.34, 0.17), (0.74, 0.54, 0.32), (0.36, 0.21, 0.12))
+    dark_wood = (0.4, 0.23, 0.11)
     # A random field that varies slowly along x looks like wood grain.
     grain = ripples(rng, vertices * [0.1, 1, 1], wavelength=0.3)
     return Mesh.plain(vertices, faces, mix(wood, dark_wood, 0.3 + 0.3 * grain))
 
 
-def lemon(rng: np.random.Generator) -> Mesh:
+def lemon(rng: Random) -> Mesh:
     """Create a yellow ellipsoid with pores and a tip at both ends, often greener toward one end."""
     directions, faces = sphere()
     # Angle from the nearer one of both ends of the lemon, which are on the z-axis.
@@ -300,15 +291,15 @@ def lemon(rng: np.random.Generator) -> Mesh:
     vertices = radius[:, None] * directions * [0.68, 0.68, rng.uniform(0.78, 0.86)]
     tips = rng.uniform(0.08, 0.15) * bump(angle_from_end / 0.25)
     vertices[:, 2] += np.sign(directions[:, 2]) * tips
-    yellow = choose(rng, (0.96, 0.85, 0.18), (0.93, 0.78, 0.12), (0.90, 0.86, 0.30))
-    second_color = choose(rng, (0.74, 0.76, 0.20), (0.95, 0.74, 0.10))
+    yellow = draw(rng, (0.96, 0.85, 0.18), (0.93, 0.78, 0.12), (0.9, 0.86, 0.3))
+    second_color = draw(rng, (0.74, 0.76, 0.2), (0.95, 0.74, 0.1))
     # The weight of the second color rises or falls from one end to the other.
     slope_along_z = 0.5 * rng.uniform(-1, 1) * directions[:, 2]
     colors = mix(yellow, second_color, 0.3 + slope_along_z + 0.15 * pores)
     return Mesh.plain(vertices, faces, colors)
 
 
-def peach(rng: np.random.Generator) -> Mesh:
+def peach(rng: Random) -> Mesh:
     """Create a yellow or pale sphere with a dimple on top, a furrow on one side and a red cheek."""
     directions, faces = sphere()
     angle_from_top = np.arccos(np.clip(directions[:, 2], -1, 1))
@@ -319,8 +310,8 @@ def peach(rng: np.random.Generator) -> Mesh:
     cheek_direction = rng.normal(size=3)
     # Cosine of the angle between each vertex and the middle of the cheek.
     toward_cheek = directions @ cheek_direction / np.linalg.norm(cheek_direction)
-    pale = choose(rng, (0.95, 0.72, 0.38), (0.96, 0.80, 0.55), (0.93, 0.62, 0.32))
-    red = choose(rng, (0.78, 0.22, 0.18), (0.86, 0.38, 0.26))
+    pale = draw(rng, (0.95, 0.72, 0.38), (0.96, 0.8, 0.55), (0.93, 0.62, 0.32))
+    red = draw(rng, (0.78, 0.22, 0.18), (0.86, 0.38, 0.26))
     least_red = rng.uniform(0.1, 0.6)
     patches = ripples(rng, directions, wavelength=0.6)
     skin = mix(pale, red, least_red + 0.5 * toward_cheek + 0.2 * patches)
@@ -328,7 +319,7 @@ def peach(rng: np.random.Generator) -> Mesh:
     return Mesh.plain(vertices, faces, skin)
 
 
-def ball(rng: np.random.Generator) -> Mesh:
+def ball(rng: Random) -> Mesh:
     """Create a rubber ball of one color, or a yellow or green tennis ball with a white seam."""
     directions, faces = sphere(SUBDIVISIONS + 1)
     if rng.random() < 0.5:
@@ -336,17 +327,15 @@ def ball(rng: np.random.Generator) -> Mesh:
         # Approximate distance from the seam f(x, y, z) = z - 1.2 (x² - y²)
         # = 0: the magnitude of f, divided by the length of its gradient.
         seam_distance = np.abs(z - 1.2 * (x**2 - y**2)) / np.sqrt(1 + 5.76 * (x**2 + y**2))
-        felt = choose(rng, (0.80, 0.88, 0.22), (0.72, 0.84, 0.30))
+        felt = draw(rng, (0.8, 0.88, 0.22), (0.72, 0.84, 0.3))
         skin = mix(felt, (0.92, 0.92, 0.88), (0.07 - seam_distance) / 0.02)
     else:
         # Red, orange red, blue or white.
-        skin = choose(
-            rng, (0.80, 0.12, 0.12), (0.93, 0.40, 0.10), (0.15, 0.35, 0.75), (0.93, 0.90, 0.85)
-        )
+        skin = draw(rng, (0.8, 0.12, 0.12), (0.93, 0.4, 0.1), (0.15, 0.35, 0.75), (0.93, 0.9, 0.85))
     return Mesh.plain(0.95 * directions, faces, skin)
 
 
-def fruit(rng: np.random.Generator) -> Mesh:
+def fruit(rng: Random) -> Mesh:
     """Create a made-up fruit in two shades of any hue except those of oranges.
 
     Its shape lies between a ball, a lemon and an apple.
@@ -372,7 +361,7 @@ def fruit(rng: np.random.Generator) -> Mesh:
     return Mesh.plain(vertices, faces, colors)
 
 
-def _random_shade(rng: np.random.Generator, hue: float) -> Float[np.ndarray, " 3"]:
+def _random_shade(rng: Random, hue: float) -> Float[np.ndarray, " 3"]:
     """Draw a color (HSV) of a hue, a fraction of the circle, clipped to exclude oranges."""
     clipped_hue = np.clip(hue, LOWEST_HUE, HIGHEST_HUE) % 1
     saturation = rng.uniform(0.1, 0.95)
@@ -488,10 +477,7 @@ def surface_of_cells(is_filled: Bool[np.ndarray, "X Y Z"]) -> tuple[np.ndarray, 
 
 
 def paint(
-    vertices: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    section: Int[np.ndarray, " F"],
-    *colors: ArrayLike,
+    vertices: Points, faces: Int[np.ndarray, "F 3"], section: np.ndarray, *colors: ArrayLike
 ) -> Mesh:
     """Create a mesh whose faces have the color of their section, one color or one per vertex."""
     # Color that each vertex has in each section, shape (sections, V, 3).
@@ -518,9 +504,7 @@ def bump(x: Float[np.ndarray, " ..."]) -> np.ndarray:
     return np.exp(-(x**2))
 
 
-def ripples(
-    rng: np.random.Generator, points: Float[np.ndarray, "V 3"], wavelength: float
-) -> Float[np.ndarray, " V"]:
+def ripples(rng: Random, points: Points, wavelength: float) -> Float[np.ndarray, " V"]:
     """Draw a smooth random field, and evaluate it at points.
 
     The field is a sum of plane waves in random directions, with the mean 0 and
@@ -535,15 +519,11 @@ def ripples(
     return waves.sum(axis=1) / 4
 
 
-def choose(
-    rng: np.random.Generator, *colors: tuple[float, float, float]
-) -> Float[np.ndarray, " 3"]:
+def draw(rng: Random, *colors: tuple[float, float, float]) -> Float[np.ndarray, " 3"]:
     """Draw one of several colors, and change it by up to 0.04 per channel. Colors are in [0, 1]."""
     return np.clip(rng.choice(colors) + rng.uniform(-0.04, 0.04, 3), 0, 1)
 
 
-def mix(
-    from_color: np.ndarray, to_color: ArrayLike, weight: np.ndarray
-) -> Float[np.ndarray, "V 3"]:
+def mix(from_color: np.ndarray, to_color: ArrayLike, weight: np.ndarray) -> Points:
     """Interpolate from a color (weight 0) to another (weight 1). Weights are clipped to [0, 1]."""
     return from_color + np.clip(weight, 0, 1)[..., None] * (np.asarray(to_color) - from_color)

@@ -15,6 +15,10 @@ from torch.autograd.function import once_differentiable
 Components = tuple[Tensor, Tensor, Tensor]
 
 
+# Rows of a batch.
+Rows = Float[Tensor, "N ..."]
+
+
 def unit_vectors(vectors: Float[Tensor, "3 ..."]) -> tuple[Tensor, Tensor]:
     """Compute the unit vectors and the lengths of vectors.
 
@@ -97,9 +101,7 @@ class Angle(NamedTuple):
 
     def for_columns(self, coefficients: Tensor) -> Angle:
         """Convert an angle of shape () to shape (1,), and to another dtype and device."""
-        return Angle(
-            sine=self.sine[None].to(coefficients), cosine=self.cosine[None].to(coefficients)
-        )
+        return Angle(self.sine[None].to(coefficients), self.cosine[None].to(coefficients))
 
 
 def _rotate(axis: int, vectors: Components, angle: Angle) -> Components:
@@ -134,7 +136,7 @@ class Ball:
             all values of a row.
     """
 
-    center: Float[Tensor, "N ..."]
+    center: Rows
     radius: float
     norm: str
 
@@ -151,9 +153,7 @@ class Ball:
         return self.center - self.radius, self.center + self.radius
 
 
-def nearest_in_box(
-    values: Float[Tensor, "N ..."], low: Any, high: Any, within: Ball | None = None
-) -> Float[Tensor, "N ..."]:
+def nearest_in_box(values: Rows, low: Any, high: Any, within: Ball | None = None) -> Rows:
     """Project each row of values onto a box, or onto the intersection of a box and a norm-ball.
 
     The projection is the nearest point with respect to the Euclidean distance. Centers of
@@ -166,9 +166,7 @@ def nearest_in_box(
     return _nearest_in_box_and_sphere(values, low, high, within)
 
 
-def _nearest_in_box_and_sphere(
-    values: Float[Tensor, "N ..."], low: Any, high: Any, ball: Ball
-) -> Float[Tensor, "N ..."]:
+def _nearest_in_box_and_sphere(values: Rows, low: Any, high: Any, ball: Ball) -> Rows:
     """Project each row of values onto the intersection of a box and an L2 ball.
 
     Let v be a row and c the center of its ball. The projection is the point of the box that is
@@ -205,7 +203,7 @@ def _nearest_in_box_and_sphere(
     return nearest
 
 
-def _squared_norm(offsets: Float[Tensor, "N ..."]) -> Tensor:
+def _squared_norm(offsets: Rows) -> Tensor:
     """Compute the squared L2 norm of each row of a batch.
 
     All axes but the first one have size 1, so that the result broadcasts.

@@ -116,9 +116,7 @@ def file_below(folder: Path, name: str) -> Path:
     path = Path(root, relative_path).resolve()
     # A colon begins with a drive of Windows or with a scheme, such as "http:".
     if not path.is_relative_to(root) or ":" in relative_path.partition("/")[0]:
-        raise ValueError(
-            f"it refers to {name}, which is not below its folder: put the file into {folder}"
-        )
+        raise ValueError(f"it refers to {name}, not below its folder: put the file into {folder}")
     # `is_file` is False for a named pipe. Reading a pipe might never end.
     if not path.is_file():
         raise ValueError(f"it refers to {name}, which does not exist in {folder}")

@@ -100,9 +100,8 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
             else:
                 read = part(node["mesh"], number, weights)
                 placed_parts += _place(file, index, read)
-    if not placed_parts and any(
-        m.get("alphaMode") == "MASK" for m in file.tree.get("materials", ())
-    ):
+    modes = {material.get("alphaMode") for material in file.tree.get("materials", ())}
+    if not placed_parts and "MASK" in modes:
         raise ValueError("its alpha cuts out all faces (alphaMode MASK): use OPAQUE")
     return placed_parts
 
@@ -284,9 +283,7 @@ def _posed(
     # A joint with the weight 0 may be any number, so it is replaced by joint 0.
     joints = np.where(weights == 0, 0, joints)
     if not 0 <= joints.min(initial=0) <= joints.max(initial=0) < len(matrices):
-        raise ValueError(
-            f"a vertex has the joint {joints.max()}, but its skin has {len(matrices)} joints"
-        )
+        raise ValueError(f"a vertex has the joint {joints.max()}, but its skin has {len(matrices)}")
     # Weighted sum of the matrices of the joints, and of the weights, for each vertex.
     blended = np.zeros((len(part.surface.values), 4, 4))
     for joint, weight in zip(joints.T, weights.T, strict=True):
@@ -387,9 +384,8 @@ def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: f
             )
         surface = _halve(values, faces[is_shown], lengths[is_shown], is_large[is_shown])
     # SciPy has rows first.
-    flat_alpha = map_coordinates(
-        texture.texels, positions.T[::-1], np.float64, order=1, mode="grid-wrap"
-    )
+    places = positions.T[::-1]
+    flat_alpha = map_coordinates(texture.texels, places, np.float64, order=1, mode="grid-wrap")
     excess = flat_alpha / FULL * values[:, ALPHA] - cutoff
     crossed = faces[is_crossed]
     if is_shown.all() and not (excess[crossed] < 0).any():

@@ -375,9 +375,7 @@ class Material:
         assert material.texture is not None
         # Textures that will be extended need the same size.
         if placement.wraps != (REPEAT, REPEAT):
-            channels = [
-                _resized(channel, material.texture) for channel in np.moveaxis(texels, 2, 0)
-            ]
+            channels = [_resized(plane, material.texture) for plane in np.moveaxis(texels, 2, 0)]
             texels = np.stack(channels, axis=-1)
         return replace(material, gloss_texture=texels)
 

@@ -60,7 +60,7 @@ def read_image(path: str | Path, size: int) -> Float[Tensor, "3 size size"]:
         square = read_square(path, size)
     except Exception as error:
         raise InputError(
-            f"{path} cannot be read as an image ({error}): give an image file"
+            f"{path} cannot be read as an image ({error}): give another one"
         ) from error
     # Pages of results need no tensors, and do not wait for this import.
     import torch
@@ -177,9 +177,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
         raise ValueError(f"the format {image.format} of an image is not read: use PNG or JPEG")
     if image.mode == "F" or (image.mode == "I" and image.format == "TIFF"):
         kind = "floating-point numbers" if image.mode == "F" else "signed or 32-bit integers"
-        raise ValueError(
-            f"the pixels are {kind}, so the value of white is unknown: save 8 or 16 bits"
-        )
+        raise ValueError(f"the pixels are {kind}, so their white is unknown: save 8 or 16 bits")
     if image.mode.startswith("I"):
         # Pixels of the mode "I" have 16 bits, or the 12 bits of a TIFF file. `Image.convert`
         # would clip their values at 255 instead of dividing them.

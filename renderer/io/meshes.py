@@ -19,33 +19,18 @@ import torch
 from jaxtyping import Float, Int
 from PIL import Image
 
+from renderer import errors
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.errors import (
-    MAX_MAGNITUDE,
-    InputError,
-    as_list,
-    as_path,
-    require_choice,
-    require_file,
-    require_flag,
-    require_whole,
-    single_line,
-)
+from renderer.errors import InputError
 from renderer.image import decode
+from renderer.io import mesh_file
 from renderer.io.files import atomic_write
 from renderer.io.gltf import read_gltf
 from renderer.io.images import eight_bits, identify
-from renderer.io.mesh_file import (
-    MeshFile,
-    Part,
-    colored_mesh,
-    require_bounded,
-    require_opaque,
-    unit_colors,
-)
+from renderer.io.mesh_file import MeshFile, Part
 from renderer.io.obj import read_obj
 from renderer.io.ply_off_stl import read_off, read_ply, read_stl
-from renderer.mesh import NO_TEXTURE, Y_UP_TO_Z_UP, Mesh, concatenate, require_mesh, transformed
+from renderer.mesh import Y_UP_TO_Z_UP, Mesh, by_material, concatenate, require_mesh, transformed
 from renderer.normals import normal_groups
 
 # Suffixes of archive files, which are not read. trimesh could read them,
@@ -104,9 +89,9 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
         >>> nb.load_mesh("cup.glb").faces.shape == cup.faces.shape
         True
     """
-    path = as_path("path", path)
-    require_choice(f"{path}: up", up, ("auto", "y", "z"))
-    require_flag("gloss", gloss)
+    path = errors.as_path("path", path)
+    errors.require_choice(f"{path}: up", up, ("auto", "y", "z"))
+    errors.require_flag("gloss", gloss)
     parts = read_parts(path, gloss)
     if not parts:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
@@ -121,15 +106,13 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     mesh = replace(mesh, vertices=vertices, faces=faces, normal_ids=normal_ids)
     # The matrices of a scene may have huge numbers or NaN. A
     # comparison with NaN is False, so `not` also finds NaN.
-    if not (np.abs(mesh.vertices) <= MAX_MAGNITUDE).all():
+    if not (np.abs(mesh.vertices) <= errors.MAX_MAGNITUDE).all():
         raise InputError(
-            f"{path} has coordinates that are not finite or beyond {MAX_MAGNITUDE:g}: "
+            f"{path} has coordinates that are not finite or beyond {errors.MAX_MAGNITUDE:g}: "
             "export the mesh again"
         )
     if not mesh.face_areas().sum() > 0:
-        raise InputError(
-            f"the surface of {path} has the area 0: give a mesh whose faces have an area"
-        )
+        raise InputError(f"the surface of {path} has the area 0: give faces with an area")
     is_gltf = path.suffix.lower().lstrip(".") in GLTF
     is_y_up = up == "y" or (up == "auto" and is_gltf)
     return transformed(mesh, Y_UP_TO_Z_UP) if is_y_up else mesh
@@ -137,7 +120,7 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
 
 def read_parts(path: Path, gloss: bool = False) -> list[Part]:
     """Read the parts of a mesh file, and warn once of what is ignored or assumed."""
-    require_file(path, "give the path of a mesh file")
+    errors.require_file(path, "give the path of a mesh file")
     suffix = path.suffix.lower().lstrip(".")
     readers = READERS | dict.fromkeys(GLTF, partial(read_gltf, gloss=gloss))
     # trimesh and Pillow can raise almost any exception for a damaged file.
@@ -145,7 +128,7 @@ def read_parts(path: Path, gloss: bool = False) -> list[Part]:
         file = MeshFile(path)
         parts = readers[suffix](file) if suffix in readers else _read_with_trimesh(file, suffix)
     except Exception as error:
-        message = single_line(error)
+        message = errors.single_line(error)
         # The message of a missing key is only this key.
         if isinstance(error, KeyError):
             message = f"the entry {message} is missing or unknown, so export the mesh again"
@@ -164,7 +147,7 @@ def _read_with_trimesh(file: MeshFile, suffix: str) -> list[Part]:
         known = ", ".join(sorted(formats | READERS.keys()))
         raise ValueError(f"the mesh format {suffix} is unknown: use one of {known}")
     file.assume(f"trimesh reads the format {suffix}, and may leave out colors")
-    errors = []
+    unreadable: list[Exception] = []
 
     def get(name: str) -> bytes:
         """Read an image below the folder of the mesh file, and keep errors."""
@@ -173,7 +156,7 @@ def _read_with_trimesh(file: MeshFile, suffix: str) -> list[Part]:
             identify(io.BytesIO(content)).load()
         # Pillow can raise almost any exception for a damaged file.
         except Exception as error:
-            errors.append(error)
+            unreadable.append(error)
             raise
         return content
 
@@ -181,8 +164,8 @@ def _read_with_trimesh(file: MeshFile, suffix: str) -> list[Part]:
     files = SimpleNamespace(get=get)
     scene = trimesh.load(content, file_type=suffix, resolver=files, force="scene", process=False)
     # trimesh leaves out an image that it cannot read.
-    if errors:
-        raise errors[0]
+    if unreadable:
+        raise unreadable[0]
     parts = {
         name: _as_part(geometry, file)
         for name, geometry in scene.geometry.items()
@@ -197,7 +180,7 @@ def _read_with_trimesh(file: MeshFile, suffix: str) -> list[Part]:
 def _as_part(geometry: Any, file: MeshFile) -> Part:
     """Convert a mesh of trimesh to a matte part in the same coordinates."""
     faces = np.array(geometry.faces, dtype=np.int64)
-    require_bounded(coordinates=geometry.vertices)
+    mesh_file.require_bounded(coordinates=geometry.vertices)
     visual = geometry.visual
     colors = None
     uvs = None
@@ -211,9 +194,9 @@ def _as_part(geometry: Any, file: MeshFile) -> Part:
         uvs = None if visual.uv is None else visual.uv[faces, :2]
         if visual.material.baseColorTexture is not None:
             textures = [np.array(eight_bits(visual.material.baseColorTexture).convert("RGB"))]
-    unit = unit_colors(np.ones(3) if colors is None else colors, file)
-    require_opaque(unit[..., 3:])
-    mesh = colored_mesh(geometry.vertices, faces, unit[..., :3], uvs, textures=textures)
+    unit = mesh_file.unit_colors(np.ones(3) if colors is None else colors, file)
+    mesh_file.require_opaque(unit[..., 3:])
+    mesh = mesh_file.colored_mesh(geometry.vertices, faces, unit[..., :3], uvs, textures=textures)
     # trimesh computes `vertex_normals` if the file has none, but not before they are used.
     normals = geometry._cache.cache.get("vertex_normals")
     return Part(mesh, None if normals is None else normals[faces])
@@ -258,15 +241,13 @@ def export_mesh(
     >>> nb.export_mesh(apple, "apple.glb", cameras=cameras)
     """
     require_mesh("mesh", mesh)
-    path = as_path("path", path)
-    cameras = as_list("cameras", cameras, Camera, "a list of cameras")
+    path = errors.as_path("path", path)
+    cameras = errors.as_list("cameras", cameras, Camera, "a list of cameras")
     if first is not None:
-        require_whole("first", first, 0, len(mesh.faces))
+        errors.require_whole("first", first, 0, len(mesh.faces))
     unit_normals = mesh.written_normals(normals)
     if path.suffix.lower() != ".glb":
-        raise InputError(
-            f"{path} cannot be written as a mesh: choose a file name that ends in .glb"
-        )
+        raise InputError(f"{path} cannot be written as a mesh: choose a name that ends in .glb")
     content = _glb(mesh, unit_normals, cameras, len(mesh.faces) if first is None else first)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -329,20 +310,15 @@ def _glb(
 ) -> bytes:
     """Create the content of a .glb file, with y up and linear colors."""
     tree = _Tree()
-    # Faces with the same key are written together. The key tells whether a face is one of the
-    # first ones, and has the index of the texture and, if the mesh has gloss, its three values.
     is_later = np.arange(len(mesh.faces)) >= first_count
-    gloss = [] if mesh.gloss is None else [mesh.gloss]
-    keys = np.column_stack([is_later, mesh.texture_ids, *gloss])
     # A row vector times this matrix is rotated in the opposite direction: from z up to y up.
     rotation = Y_UP_TO_Z_UP[:3, :3]
     primitives = []
-    for key in np.unique(keys, axis=0):
-        has_key = (keys == key).all(1)
+    for is_written, texture_id, gloss in by_material(mesh, is_later):
         # Eight values for each corner: color (3), texture coordinates (2) and normal (3).
-        parts = [mesh.corner_colors[has_key], mesh.corner_uvs[has_key], normals[has_key]]
+        parts = [mesh.corner_colors[is_written], mesh.corner_uvs[is_written], normals[is_written]]
         corner_values = np.concatenate(parts, axis=-1)
-        vertex_ids, values, faces = _split_vertices(mesh.faces[has_key], corner_values)
+        vertex_ids, values, faces = _split_vertices(mesh.faces[is_written], corner_values)
         attributes = {
             "POSITION": mesh.vertices[vertex_ids] @ rotation,
             # v points down in glTF.
@@ -353,7 +329,7 @@ def _glb(
         primitive = {
             "attributes": {n: tree.add_array(a.astype(np.float32)) for n, a in attributes.items()},
             "indices": tree.add_array(faces.astype(np.uint32).ravel()),
-            "material": _add_material(tree, mesh, int(key[1]), key[2:].tolist()),
+            "material": _add_material(tree, mesh, texture_id, gloss),
         }
         primitives.append(primitive)
     tree.add("nodes", {"mesh": tree.add("meshes", {"primitives": primitives})})
@@ -368,10 +344,10 @@ def _glb(
 
 
 def _add_material(tree: _Tree, mesh: Mesh, texture_id: int, gloss: list[float]) -> int:
-    """Add the material of one texture, or NO_TEXTURE, and gloss, which is empty if matte."""
+    """Add the material of one texture, or -1, and gloss, which is empty if matte."""
     roughness, metallic, *specular_factors = gloss or (1.0, 0.0)
     model: dict[str, Any] = {"roughnessFactor": roughness, "metallicFactor": metallic}
-    if texture_id != NO_TEXTURE:
+    if texture_id >= 0:
         model["baseColorTexture"] = tree.add_texture(mesh.textures[texture_id])
         if mesh.gloss_textures:
             # glTF stores roughness in green and metallic in blue, so an empty red channel is

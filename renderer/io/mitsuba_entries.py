@@ -18,6 +18,8 @@ from renderer.camera import Camera, PerspectiveCamera
 # the scene such as a camera: a dictionary.
 Scene = dict[str, Any]
 
+# Matrix from the axes of a camera or a projector to world axes.
+Pose = Float[np.ndarray, "4 4"]
 # Matrix from the axes of Mitsuba's environment maps to world
 # axes. In Mitsuba's maps, y is up and the middle column shows
 # +z. In our maps, z is up and the middle column shows +x.
@@ -45,7 +47,7 @@ def environment(radiance: Scene, scale: float = 1.0) -> Scene:
     return {"type": "envmap", **radiance, "scale": scale, "to_world": TO_Z_UP}
 
 
-def projector(pose: Float[np.ndarray, "4 4"], fov: float, pattern: Scene, scale: float) -> Scene:
+def projector(pose: Pose, fov: float, pattern: Scene, scale: float) -> Scene:
     """Describe a projector for Mitsuba.
 
     A white surface that faces the projector at distance 1 has the radiance pattern · scale. The
@@ -57,11 +59,7 @@ def projector(pose: Float[np.ndarray, "4 4"], fov: float, pattern: Scene, scale:
 
 
 def sensor(
-    pose: Float[np.ndarray, "4 4"],
-    size: int,
-    lens: Scene,
-    pixel_format: str = "rgba",
-    pixel_aspect: float = 1.0,
+    pose: Pose, size: int, lens: Scene, pixel_format: str = "rgba", pixel_aspect: float = 1.0
 ) -> Scene:
     """Describe a camera for Mitsuba, which calls it a sensor.
 
@@ -88,7 +86,7 @@ def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
     return sensor(pose_of(camera), size, lens, pixel_format, camera.pixel_aspect)
 
 
-def pose_of(camera: Camera, scale: float = 1.0) -> Float[np.ndarray, "4 4"]:
+def pose_of(camera: Camera, scale: float = 1.0) -> Pose:
     """Compute the pose of a camera, or of a projector at the same place, for Mitsuba.
 
     Mitsuba's cameras and projectors look along +z, and x points to the left. Our
@@ -102,9 +100,7 @@ def pose_of(camera: Camera, scale: float = 1.0) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def look_at(
-    origin: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "4 4"]:
+def look_at(origin: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Pose:
     """Compute the pose of a Mitsuba camera or projector that looks at a point, with z up."""
     ahead = (target - origin) / np.linalg.norm(target - origin)
     left = np.cross([0, 0, 1], ahead)

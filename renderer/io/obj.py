@@ -5,21 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from renderer.io.mesh_file import (
-    OPAQUE,
-    TOLERANCE,
-    MeshFile,
-    Part,
-    as_utf8,
-    colored_mesh,
-    parse_numbers,
-    product,
-    require_bounded,
-    triangles_of,
-    unit_colors,
-    without_comments,
-    words_per_line,
-)
+from renderer.io import mesh_file
+from renderer.io.mesh_file import MeshFile, Part
 from renderer.mesh import NO_TEXTURE
 
 # Statements that describe the surface or name groups of faces.
@@ -58,8 +45,8 @@ class _Lines(NamedTuple):
 
     def words(self) -> tuple[np.ndarray, bytes]:
         """Return the number of words of each line, and all lines, without keyword and comment."""
-        text = without_comments(b"".join([text + b"\n" for text in self.texts]))
-        return words_per_line(text), text
+        text = mesh_file.without_comments(b"".join([text + b"\n" for text in self.texts]))
+        return mesh_file.words_per_line(text), text
 
     def names(self) -> list[str]:
         """Return the text of each line, which is a name."""
@@ -92,15 +79,13 @@ def read_obj(file: MeshFile) -> list[Part]:
         elif keyword in _IGNORED:
             file.ignore(keyword)
         else:
-            raise ValueError(
-                f"the statement {keyword[:20]} is not supported: convert the file to polygons"
-            )
+            raise ValueError(f"the statement {keyword[:20]} is not supported: use polygons")
     vertices, vertex_colors = _vertices(lines["v"], file)
     uvs, _ = _table(lines["vt"], (1, 2, 3))
     normals, _ = _table(lines["vn"], (3,))
-    require_bounded(texture_coordinates=uvs)
+    mesh_file.require_bounded(texture_coordinates=uvs)
     indices, sizes = _polygons(lines)
-    corners, polygons = triangles_of(file, vertices, indices[:, 0], sizes)
+    corners, polygons = mesh_file.triangles_of(file, vertices, indices[:, 0], sizes)
     if not len(corners):
         return []
     faces, uv_ids, normal_ids = np.moveaxis(indices[corners], 2, 0)
@@ -108,7 +93,7 @@ def read_obj(file: MeshFile) -> list[Part]:
     material_of_face = material_of_polygon[polygons]
     colors = np.array([material.color for material in materials])[material_of_face, None]
     if vertex_colors is not None:
-        colors = product(colors, vertex_colors[faces])
+        colors = mesh_file.product(colors, vertex_colors[faces])
     # Several materials may have the same texture.
     textures = list(dict.fromkeys(item.texture for item in materials if item.texture))
     ids = [textures.index(item.texture) if item.texture else NO_TEXTURE for item in materials]
@@ -119,14 +104,14 @@ def read_obj(file: MeshFile) -> list[Part]:
         raise ValueError("textures with the option -clamp are not supported beyond their edges")
     texture_ids = np.array(ids)[material_of_face]
     texels = [file.texture(*texture) for texture in textures]
-    mesh = colored_mesh(vertices, faces, colors, corner_uvs, texture_ids, texels)
+    mesh = mesh_file.colored_mesh(vertices, faces, colors, corner_uvs, texture_ids, texels)
     normals = np.append(normals, [[0.0] * 3], axis=0)
     return [Part(mesh, normals[normal_ids] if len(normals) > 1 else None)]
 
 
 def _cleaned(text: bytes) -> bytes:
     """Convert text to UTF-8 with one statement per line, without lines of comments."""
-    text = as_utf8(text).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    text = mesh_file.as_utf8(text).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     # Comments are removed first, because a backslash
     # at their end does not continue the line.
     if b"#" in text:
@@ -144,7 +129,7 @@ def _table(lines: _Lines, lengths: tuple[int, ...]) -> tuple[np.ndarray, np.ndar
         )
     table = np.zeros((len(counts), max(lengths)))
     is_given = np.arange(max(lengths)) < counts[:, None]
-    table[is_given] = parse_numbers(text, np.float64)
+    table[is_given] = mesh_file.parse_numbers(text, np.float64)
     return table, counts
 
 
@@ -156,7 +141,7 @@ def _vertices(lines: _Lines, file: MeshFile) -> tuple[np.ndarray, np.ndarray | N
     is_colored = counts == 6
     if is_colored.any():
         colors = np.ones((len(table), 3))
-        colors[is_colored] = unit_colors(table[is_colored, 3:], file)
+        colors[is_colored] = mesh_file.unit_colors(table[is_colored, 3:], file)
         return table[:, :3], colors
     painted = bytes.fromhex(b"".join(_POLYPAINT.findall(file.content)).decode())
     if not painted:
@@ -205,7 +190,7 @@ def _corners(words: list[bytes]) -> np.ndarray:
     firsts = np.flatnonzero(np.append(True, is_last[:-1]))
     corners = np.cumsum(is_last) - is_last
     columns = np.arange(len(is_last)) - firsts[corners]
-    numbers = parse_numbers(text.replace(b"/", b" "), np.int64)
+    numbers = mesh_file.parse_numbers(text.replace(b"/", b" "), np.int64)
     if columns.max() > 2 or len(numbers) != len(columns):
         raise ValueError("a corner of a face is not like 1, 1/2, 1//3 or 1/2/3")
     table = np.full((len(words), 3), _LEFT_OUT)
@@ -270,8 +255,8 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
     for keyword, text in properties:
         match keyword.lower():
             case "kd":
-                values = [float(word) for word in without_comments(text.encode()).split()]
-                is_color = all(0 <= value <= 1 + TOLERANCE for value in values)
+                values = [float(word) for word in mesh_file.without_comments(text.encode()).split()]
+                is_color = all(0 <= value <= 1 + mesh_file.TOLERANCE for value in values)
                 if len(values) not in (1, 3) or not is_color:
                     raise ValueError(f'"Kd {text}" is no color: give red, green, blue from 0 to 1')
                 color = tuple(min(value, 1.0) for value in values * (3 // len(values)))
@@ -286,7 +271,7 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
                 raise ValueError(f"the material {name} has {keyword}, which is not supported")
             case _:
                 file.ignore(keyword)
-    if not opacities.get("d", 1 - opacities.get("tr", 0)) >= OPAQUE:
+    if not opacities.get("d", 1 - opacities.get("tr", 0)) >= mesh_file.OPAQUE:
         raise ValueError(f"the material {name} is transparent, which is not supported")
     return material
 

@@ -6,19 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from renderer.io.mesh_file import (
-    MeshFile,
-    Part,
-    as_utf8,
-    colored_mesh,
-    parse_numbers,
-    product,
-    require_bounded,
-    require_opaque,
-    triangles_of,
-    unit_colors,
-    without_comments,
-)
+from renderer.io import mesh_file
+from renderer.io.mesh_file import MeshFile, Part
 from renderer.mesh import NO_TEXTURE
 
 # Types of NumPy by the names of types in the header.
@@ -86,15 +75,15 @@ def read_ply(file: MeshFile) -> list[Part]:
         if name.startswith(_REFUSED):
             raise ValueError(f"{name} is not supported: export the mesh with colors or one texture")
         file.ignore(name)
-    corners, polygons = triangles_of(file, vertices, faces.numbers, faces.lengths)
+    corners, polygons = mesh_file.triangles_of(file, vertices, faces.numbers, faces.lengths)
     if not len(corners):
         return []
     triangles = faces.numbers[corners]
     colors = np.ones((1, 3)) if vertex_colors is None else vertex_colors[triangles]
     if face_colors is not None:
-        colors = product(colors, face_colors[polygons, None])
+        colors = mesh_file.product(colors, face_colors[polygons, None])
     textures = [file.texture(name) for name in texture_names]
-    mesh = colored_mesh(
+    mesh = mesh_file.colored_mesh(
         vertices, triangles, colors, corner_uvs[corners], texture_ids[polygons], textures
     )
     return [Part(mesh, None if normals is None else normals[triangles])]
@@ -136,10 +125,10 @@ def _rgb(values: _Values, file: MeshFile) -> np.ndarray | None:
         colors = _columns(values, *names)
         if colors is None:
             continue
-        found.append(unit_colors(colors, file))
+        found.append(mesh_file.unit_colors(colors, file))
         alpha = _columns(values, alpha_name)
         if alpha is not None:
-            require_opaque(unit_colors(alpha, file))
+            mesh_file.require_opaque(mesh_file.unit_colors(alpha, file))
     if len(found) > 1:
         raise ValueError("an element has two kinds of colors, such as red and diffuse_red")
     return found[0] if found else None
@@ -187,7 +176,7 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
     counts: dict[str, int] = {}
     properties: dict[str, list[_Property]] = {}
     items: list[_Property] = []
-    for line in as_utf8(header[2]).decode().split(header[1].decode()):
+    for line in mesh_file.as_utf8(header[2]).decode().split(header[1].decode()):
         match line.split():
             case ["format", form, *_]:
                 pass
@@ -208,7 +197,7 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
         raise ValueError(f"the format is {form}: choose {', '.join(_BYTE_ORDERS)}")
     body = content[header.end() :]
     if form == "ascii":
-        body = parse_numbers(body, np.float64).astype("<f8").tobytes()
+        body = mesh_file.parse_numbers(body, np.float64).astype("<f8").tobytes()
     offset = 0
     elements: dict[str, _Values] = {}
     for name, items in properties.items():
@@ -285,9 +274,7 @@ def _different_rows(
                 offset += length_type.itemsize
             numbers[index] += struct.unpack_from(f"{order}{length}{number_type.char}", body, offset)
             offset += length * number_type.itemsize
-    columns = [
-        np.array(values, item.type) for values, item in zip(numbers, properties, strict=True)
-    ]
+    columns = [np.array(values, types[i]) for i, values in enumerate(numbers)]
     return [
         _Lists(np.array(lengths[i], np.int64), column) if properties[i].length_type else column
         for i, column in enumerate(columns)
@@ -321,8 +308,8 @@ _OFF_HEADER = re.compile(rb"\s*(ST)?(C)?(N)?(4)?(n)?(?:OFF|off)")
 
 def read_off(file: MeshFile) -> list[Part]:
     """Read an .off file as one part, or none if the file has no faces."""
-    text = as_utf8(file.content).replace(b"\r", b"\n")
-    text = without_comments(text)
+    text = mesh_file.as_utf8(file.content).replace(b"\r", b"\n")
+    text = mesh_file.without_comments(text)
     header = _OFF_HEADER.match(text)
     if header is None:
         raise ValueError("the file does not begin with OFF")
@@ -357,18 +344,18 @@ def read_off(file: MeshFile) -> list[Part]:
     if not is_plain or any(len(words) not in (0, 3, 4) for words in color_words):
         raise ValueError("a face is not a number of vertices, the vertices, and maybe a color")
     face_colors = _colors(color_words, file)
-    corners, polygons = triangles_of(file, vertices, indices, sizes)
+    corners, polygons = mesh_file.triangles_of(file, vertices, indices, sizes)
     if not len(corners):
         return []
     faces = indices[corners]
-    colors = product(vertex_colors[faces], face_colors[polygons, None])
+    colors = mesh_file.product(vertex_colors[faces], face_colors[polygons, None])
     normals = table[:, 3:6][faces] if has_normals else None
-    return [Part(colored_mesh(vertices, faces, colors), normals)]
+    return [Part(mesh_file.colored_mesh(vertices, faces, colors), normals)]
 
 
 def _numbers(lines: list[list[bytes]]) -> np.ndarray:
     """Parse the words of all lines, shape (N,)."""
-    return parse_numbers(b" ".join(word for line in lines for word in line), np.float64)
+    return mesh_file.parse_numbers(b" ".join(word for line in lines for word in line), np.float64)
 
 
 def _colors(lines: list[list[bytes]], file: MeshFile) -> np.ndarray:
@@ -387,8 +374,8 @@ def _colors(lines: list[list[bytes]], file: MeshFile) -> np.ndarray:
         )
     colors = np.ones((len(lines), 4))
     values = given.astype(np.uint8) if is_whole and highest > 1 else given
-    colors[np.arange(4) < widths[:, None]] = unit_colors(values, file)
-    require_opaque(colors[:, 3])
+    colors[np.arange(4) < widths[:, None]] = mesh_file.unit_colors(values, file)
+    mesh_file.require_opaque(colors[:, 3])
     return colors[:, :3]
 
 
@@ -423,21 +410,21 @@ def read_stl(file: MeshFile) -> list[Part]:
         colors = _face_colors(header, faces["attribute"].astype(np.int64), file)
     if not len(corners):
         return []
-    require_bounded(coordinates=corners)
+    mesh_file.require_bounded(coordinates=corners)
     vertex_ids = np.arange(corners.size // 3).reshape(-1, 3)
-    return [Part(colored_mesh(corners.reshape(-1, 3), vertex_ids, colors))]
+    return [Part(mesh_file.colored_mesh(corners.reshape(-1, 3), vertex_ids, colors))]
 
 
 def _text_corners(content: bytes, file: MeshFile) -> np.ndarray:
     """Parse the corners of the faces of a text file, shape (F, 3, 3)."""
-    text = as_utf8(content).replace(b"\r", b"\n")
+    text = mesh_file.as_utf8(content).replace(b"\r", b"\n")
     for keyword in dict.fromkeys(_OTHER_LINE.findall(text)):
         if re.match(rb"colou?r|rgb", keyword, re.IGNORECASE):
             raise ValueError("colors in the text form of STL are not supported: export it as PLY")
         file.ignore(keyword.decode())
     vertices = re.findall(rb"^\s*vertex\b(.*)", text, re.MULTILINE | re.IGNORECASE)
     face_count = len(re.findall(rb"^\s*endfacet\b", text, re.MULTILINE | re.IGNORECASE))
-    coordinates = parse_numbers(b"\n".join(vertices), np.float64)
+    coordinates = mesh_file.parse_numbers(b"\n".join(vertices), np.float64)
     if len(coordinates) != 9 * face_count or len(vertices) != 3 * face_count:
         raise ValueError("a facet does not have three vertices with three coordinates")
     return coordinates.reshape(-1, 3, 3)
@@ -459,5 +446,5 @@ def _face_colors(header: bytes, attributes: np.ndarray, file: MeshFile) -> np.nd
     if b"MATERIAL=" in header:
         file.ignore("MATERIAL")
     red, green, blue, alpha = np.frombuffer(default, np.uint8) / 255
-    require_opaque(alpha)
+    mesh_file.require_opaque(alpha)
     return np.where(has_flag[:, None], [red, green, blue], channels)[:, None]

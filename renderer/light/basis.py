@@ -31,27 +31,17 @@ from renderer.settings import MAX_DEGREE
 from renderer.vectors import Ball, nearest_in_box, unit
 
 
-class EnvironmentPart(NamedTuple):
-    """Environment light as one of the lights of a basis.
+class Part(NamedTuple):
+    """One of the lights of a basis: environment light, lamps or a projector.
 
     Attributes:
-        rows: Slice that selects the coefficients of the environment light from
-            the coefficients of all lights, shape (size, 3).
-        basis: Basis of the environment light.
+        rows: Slice that selects the coefficients of this light from the
+            coefficients of all lights, shape (size, 3).
+        basis: Basis of this light, `Harmonics` for environment light.
     """
 
     rows: slice
-    basis: Harmonics
-
-
-class LocalPart(NamedTuple):
-    """Local light, such as lamps or a projector, as one of the lights of a basis.
-
-    Its attributes are like those of `EnvironmentPart`.
-    """
-
-    rows: slice
-    basis: LocalBasis
+    basis: Any
 
 
 class Basis(ABC):
@@ -66,23 +56,22 @@ class Basis(ABC):
         """Number of basis functions, which is the number of RGB coefficients."""
 
     @property
-    def lights(self) -> list[tuple[slice, Any]]:
-        """All lights, in order: the slice of the coefficients of each one, and its basis."""
-        return [(slice(0, self.size), self)]
+    def lights(self) -> list[Part]:
+        """All lights, in the order of their coefficients."""
+        return [Part(slice(0, self.size), self)]
 
     @property
-    def environment(self) -> EnvironmentPart | None:
+    def environment(self) -> Part | None:
         """Environment light of this basis, or None if all its lights are local."""
-        lights = (EnvironmentPart(*light) for light in self.lights)
-        return next((light for light in lights if isinstance(light.basis, Harmonics)), None)
+        return next((part for part in self.lights if isinstance(part.basis, Harmonics)), None)
 
     @property
-    def local_lights(self) -> list[LocalPart]:
+    def local_lights(self) -> list[Part]:
         """Lamps and projectors of this basis, in the order of their coefficients."""
-        return [LocalPart(*light) for light in self.lights if isinstance(light[1], LocalBasis)]
+        return [part for part in self.lights if isinstance(part.basis, LocalBasis)]
 
     @property
-    def movable_light(self) -> LocalPart | None:
+    def movable_light(self) -> Part | None:
         """First local light of this basis whose sources can be moved, or None."""
         return next((part for part in self.local_lights if part.basis.is_movable), None)
 
@@ -351,9 +340,7 @@ class SumBasis(Basis):
     def __post_init__(self) -> None:
         """Check that at most one of the bases in `parts` is environment light."""
         if sum(isinstance(part, Harmonics) for part in self.parts) > 1:
-            raise InputError(
-                "parts has two environment lights: give one, with the sum of their coefficients"
-            )
+            raise InputError("parts has two environment lights: give their sum as one light")
 
     def __str__(self) -> str:
         return " and ".join(map(str, self.parts))
@@ -364,19 +351,16 @@ class SumBasis(Basis):
         return sum(part.size for part in self.parts)
 
     @property
-    def lights(self) -> list[tuple[slice, Any]]:
-        """All lights, in order: the slice of the coefficients of each one, and its basis."""
-        ends = list(accumulate(part.size for part in self.parts))
-        return [
-            (slice(end - part.size, end), part) for end, part in zip(ends, self.parts, strict=True)
-        ]
+    def lights(self) -> list[Part]:
+        """All lights, in the order of their coefficients."""
+        ends = accumulate(basis.size for basis in self.parts)
+        bases_and_ends = zip(self.parts, ends, strict=True)
+        return [Part(slice(end - basis.size, end), basis) for basis, end in bases_and_ends]
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
         """Replace the coefficients of each light in `parts` by ones without negative radiance."""
-        projected = [
-            part.project_nonnegative(coefficients[..., rows, :]) for rows, part in self.lights
-        ]
-        return torch.cat(projected, dim=-2)
+        parts = [part.project_nonnegative(coefficients[..., at, :]) for at, part in self.lights]
+        return torch.cat(parts, dim=-2)
 
     def moved(self, positions: Float[Tensor, "L 3"]) -> Self:
         """Return a copy of this basis in which the movable light sources are moved."""
@@ -406,10 +390,10 @@ class SplitLight(NamedTuple):
     @property
     def basis(self) -> SumBasis:
         """Basis of all lights, with the environment light first."""
-        environment = (
-            [] if self.environment is None else [Harmonics(harmonics.degree_of(self.environment))]
-        )
-        return SumBasis((*environment, *(basis for basis, _ in self.local_lights)))
+        bases: list[Any] = [basis for basis, _ in self.local_lights]
+        if self.environment is not None:
+            bases.insert(0, Harmonics(harmonics.degree_of(self.environment)))
+        return SumBasis(tuple(bases))
 
 
 def split_light(basis: Basis, coefficients: Float[Tensor, "size 3"]) -> SplitLight:
@@ -428,9 +412,7 @@ def with_local_lights(
 
     The environment light comes first.
     """
-    environment = Harmonics(harmonics.degree_of(sky))
     if not lights:
-        return environment, sky
-    bases = [basis for basis, _ in lights]
-    coefficients = [values.to(sky) for _, values in lights]
-    return SumBasis((environment, *bases)), torch.cat([sky, *coefficients])
+        return Harmonics(harmonics.degree_of(sky)), sky
+    coefficients = torch.cat([sky, *(values.to(sky) for _, values in lights)])
+    return SplitLight(sky, list(lights)).basis, coefficients

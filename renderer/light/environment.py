@@ -161,9 +161,7 @@ def write_map(path: str | Path, radiance: Float[Tensor, "H W 3"]) -> None:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(
-            f"{path} has no suffix of an environment map: use one of {', '.join(SUFFIXES)}"
-        )
+        raise InputError(f"{path} has an unknown suffix: use one of {', '.join(SUFFIXES)}")
     radiance = radiance.detach().cpu().float()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -218,14 +216,9 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]
         raise InputError(
             f"the file is a {image.file_format_name} image, but an .hdr or .exr file is needed"
         )
-    is_cropped = spec.roi != spec.roi_full
     # The orientation 1 of EXIF means that the top row is stored first.
-    is_turned = image.orientation != 1
-    if is_cropped or is_turned:
-        raise InputError(
-            "the image is stored cropped, mirrored or rotated: save the whole image again, with "
-            "its top row first"
-        )
+    if spec.roi != spec.roi_full or image.orientation != 1:
+        raise InputError("the image is stored cropped or rotated: save the whole, upright image")
     chromaticities = spec.getattribute("chromaticities") or REC_709
     if image.file_format_name == "hdr":
         factors, chromaticities = _radiance_header(path)
@@ -294,8 +287,7 @@ def _to_rgbe_precision(radiance: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3
     _, exponent = torch.frexp(radiance.amax(dim=-1, keepdim=True))
     # Difference between neighboring values that can be stored with this exponent.
     step = torch.ldexp(torch.ones_like(radiance[..., :1]), exponent - _RGBE_BITS)
-    largest_integer = 2**_RGBE_BITS - 1
-    return (radiance / step).round().clamp(max=largest_integer) * step
+    return (radiance / step).round().clamp(max=2**_RGBE_BITS - 1) * step
 
 
 def _color_channels(names: Sequence[str]) -> list[int]:
@@ -310,11 +302,8 @@ def _color_channels(names: Sequence[str]) -> list[int]:
             channels = [(layer, color_name) for color_name in color_names]
             if set(channels) <= set(keys):
                 return [keys.index(channel) for channel in channels]
-    gray_channels = [
-        index
-        for index, name in enumerate(names)
-        if _OTHER_NAMES.isdisjoint(name.casefold().split("."))
-    ]
+    words = [name.casefold().split(".") for name in names]
+    gray_channels = [i for i, parts in enumerate(words) if _OTHER_NAMES.isdisjoint(parts)]
     if len(gray_channels) == 1:
         return gray_channels * 3
     raise InputError(

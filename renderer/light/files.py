@@ -127,9 +127,7 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # A damaged file raises many kinds of errors.
-        raise InputError(
-            f"{path} does not describe a light ({error}): write the file again"
-        ) from error
+        raise InputError(f"{path} does not describe a light ({error}): write it again") from error
     # The comparison is False for NaN, so NaN counts as too large.
     is_bounded = bool((coefficients.abs() <= errors.MAX_SCALE).all())
     if coefficients.shape != (basis.size, 3) or not is_bounded:
@@ -208,14 +206,12 @@ def load_light(
     else:
         raise InputError(
             f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or "
-            f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)",
+            f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)"
         )
     # Number of coefficients of the result. Only zeros may be appended or removed.
     size = len(coefficients) if degree is None else Harmonics(degree).size
     if coefficients[size:].any():
-        raise InputError(
-            f"light {light} has harmonics beyond degree={degree}: give a higher degree"
-        )
+        raise InputError(f"light {light} has harmonics beyond degree={degree}: set a higher degree")
     return F.pad(coefficients, (0, 0, 0, size - len(coefficients)))
 
 

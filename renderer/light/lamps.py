@@ -259,7 +259,7 @@ class Lamps(LocalBasis):
         if not ((start >= 0) & (start <= settings.power)).all():
             raise InputError(
                 f"start={settings.start} is out of range: give coefficients from 0 to "
-                f"power={settings.power:g}",
+                f"power={settings.power:g}"
             )
         return lamps, lamps.project_nonnegative(start)
 
@@ -314,9 +314,7 @@ class Lamps(LocalBasis):
         source = sources[set_of_point[point], lamp, point_on_lamp]
         irradiance = self._irradiance(source - points[point], normals[point], positions[lamp])
         paths_per_lamp = sources.shape[2]
-        return LightPaths(
-            point=point, function=lamp, source=source, irradiance=irradiance / paths_per_lamp
-        )
+        return LightPaths(point, lamp, source, irradiance / paths_per_lamp)
 
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
         """Create an entry of a Mitsuba scene for each lamp.
@@ -350,19 +348,16 @@ class Lamps(LocalBasis):
             emitters.append({"type": "disk", "to_world": pose, "emitter": area_light})
         return emitters
 
-    def _disc_points(
-        self, positions: Float[Tensor, "L 3"]
-    ) -> Float[Tensor, "POINT_SETS L POINTS_PER_SET 3"]:
+    def _disc_points(self, positions: Float[Tensor, "L 3"]) -> Float[Tensor, "_ L _ 3"]:
         """Choose points on disc lamps, to which shadow rays are cast.
 
         There are several sets of points. The points of a set represent equal areas
         of the disc. They lie on Vogel's spiral (1979), which is rotated by another
-        angle in each set. Positions and points are in world axes.
+        angle in each set. Positions and points are in world axes, and the result has the axes: set,
+        lamp, point of the set, coordinate.
         """
-        # Both index tensors have one row for each set and one column for each point.
-        set_index, point_index = torch.meshgrid(
-            torch.arange(POINT_SETS), torch.arange(POINTS_PER_SET), indexing="ij"
-        )
+        # Tensors have one row for each set and one column for each point.
+        set_index, point_index = torch.arange(POINT_SETS)[:, None], torch.arange(POINTS_PER_SET)
         area_fraction = (point_index + (set_index + 0.5) / POINT_SETS) / POINTS_PER_SET
         distance = self.radius * area_fraction.sqrt()
         # Successive points of the spiral are apart by the golden angle π (3 - √5).

@@ -124,9 +124,8 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
     """
     # Find the distinct channels, so that the equal channels of a gray light are projected
     # only once.
-    unique_channels, unique_index = np.unique(
-        _split_channels(coefficients)[:, 0], axis=0, return_inverse=True
-    )
+    channels = _split_channels(coefficients)[:, 0]
+    unique_channels, unique_index = np.unique(channels, axis=0, return_inverse=True)
     light_of_minimum, _ = _find_negative_minima(
         unique_channels, _rounding_radiance(unique_channels), _LOWEST_STARTS
     )
@@ -237,9 +236,9 @@ def _create_programs(
     # One row for each channel of each light becomes one block (C, K) for each light.
     shape = coefficients.mT.shape
     centers = _split_channels(within.center).reshape(shape)
-    pairs = zip(original.reshape(shape), centers, strict=True)
     return [
-        _QuadraticProgram(light, center=center, radius=within.radius) for light, center in pairs
+        _QuadraticProgram(light, center=center, radius=within.radius)
+        for light, center in zip(original.reshape(shape), centers, strict=True)
     ]
 
 
@@ -306,10 +305,8 @@ class _QuadraticProgram:
         |x − c| = r, or inside of it with t = 1. The new harmonics are one matrix (M, K) for each
         channel.
         """
-        constraints = [
-            np.concatenate(pair)
-            for pair in zip(self._active_constraints, new_harmonics, strict=True)
-        ]
+        pairs = zip(self._active_constraints, new_harmonics, strict=True)
+        constraints = [np.concatenate(pair) for pair in pairs]
         for _ in range(_MAX_RADIUS_STEPS):
             target = self._unconstrained_point()
             nearest, self._active_constraints = self._project(target, constraints)
@@ -321,9 +318,8 @@ class _QuadraticProgram:
             if is_inside or is_on_sphere:
                 break
             channels = zip(self._offset, nearest - target, self._active_constraints, strict=True)
-            derivatives, multipliers, rates = zip(
-                *(_differentiate(*channel) for channel in channels), strict=True
-            )
+            parts = [_differentiate(*channel) for channel in channels]
+            derivatives, multipliers, rates = zip(*parts, strict=True)
             velocity = np.stack(derivatives)
             # r² - |x - c|² = (r - |x - c|) (r + |x - c|).
             missing_squared = missing * (self._radius + distance)

@@ -109,13 +109,11 @@ class _FittedSky(torch.autograd.Function):
         # The zenith angle from 0 to π/2 is mapped to the domain [-1, 1] of the polynomials.
         zenith_values, zenith_slopes = _chebyshev(4 / math.pi * zenith - 1, 4 / math.pi, len(fit))
         # 1 / turbidity from 1/10 to 1/2 is mapped to the domain [-1, 1], too.
-        turbidity_values, turbidity_slopes = _chebyshev(
-            5 / turbidity - 1.5, -5 / turbidity**2, fit.shape[1]
-        )
+        haze_values, haze_slopes = _chebyshev(5 / turbidity - 1.5, -5 / turbidity**2, fit.shape[1])
         # Factors of the sky, of its derivative with respect to the zenith angle, and of
         # its derivative with respect to the turbidity, along the first axis.
         zenith_factors = torch.stack([zenith_values, zenith_slopes, zenith_values])
-        turbidity_factors = torch.stack([turbidity_values, turbidity_values, turbidity_slopes])
+        turbidity_factors = torch.stack([haze_values, haze_values, haze_slopes])
         products = zenith_factors[..., :, None] * turbidity_factors[..., None, :]
         polynomials = fit.to(products).flatten(2).flatten(0, 1)
         # Coefficients with m ≥ 0 for a sun at azimuth 0, with the axes: sky and its two
@@ -134,10 +132,8 @@ class _FittedSky(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, upstream: Float[Tensor, "... 49 3"]) -> tuple[Tensor | None, ...]:
         """Compute the gradients with respect to the three parameters of the sky."""
-        by_zenith, by_azimuth, by_turbidity = (
-            (upstream * partial).sum((-2, -1)) for partial in ctx.saved_tensors
-        )
-        return by_zenith, by_azimuth, by_turbidity, None
+        gradients = [(upstream * partial).sum((-2, -1)) for partial in ctx.saved_tensors]
+        return *gradients, None
 
 
 @cache
@@ -192,9 +188,7 @@ def _require_in_range(name: str, value: Tensor, limits: tuple[float, float], exp
     is_outside = ~((value >= low * (1 - rounding)) & (value <= high * (1 + rounding)))
     if is_outside.any():
         first = value[is_outside][0].item()
-        raise InputError(
-            f"{name}={first:.9g} is outside of the range of the sky model: give {expected}"
-        )
+        raise InputError(f"{name}={first:.9g} is outside of the sky model's range: give {expected}")
 
 
 def _chebyshev(

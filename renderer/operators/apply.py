@@ -26,13 +26,20 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
-from renderer.errors import MAX_MAGNITUDE, InputError, as_device, as_tensor, require_bounded
+from renderer import errors
+from renderer.errors import InputError, as_device, as_tensor, require_bounded
 from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light.basis import HARMONICS, Basis
 from renderer.settings import ImageSettings
 
 # Number of color channels.
 COLORS = 3
+
+
+# Coefficients of lights, and radiance of the P covered pixels.
+Lights = Float[Tensor, "... coefficients 3"]
+# Values of the P covered pixels under each light.
+PixelValues = Float[Tensor, "... 3 P"]
 
 
 class SparseTransfer(NamedTuple):
@@ -246,17 +253,11 @@ class TransferOperator:
         """
         radiance_gradient = as_tensor("radiance_gradient", radiance_gradient)
         require_bounded(radiance_gradient=radiance_gradient)
-        if radiance_gradient.shape[-2:] != self.albedo.shape:
-            given = tuple(radiance_gradient.shape)
-            expected = tuple(self.albedo.shape)
-            raise InputError(
-                f"radiance_gradient has shape {given}, but the operator needs (..., 3, P) for its "
-                f"P = {expected[1]} covered pixels: give a gradient of this shape"
-            )
+        errors.require_shape("radiance_gradient", radiance_gradient, "...", *self.albedo.shape)
         return self._light_gradient(radiance_gradient)
 
     def _images(
-        self, lights: Float[Tensor, "... coefficients 3"], background: tuple[Tensor, Tensor]
+        self, lights: Lights, background: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Render images without autograd, and return what the gradient needs.
 
@@ -280,9 +281,9 @@ class TransferOperator:
     def _gradient_of_images(
         self,
         image_gradient: Float[Tensor, "... 3 size size"],
-        is_unclamped: Float[Tensor, "... 3 P"],
-        clamped_values: Float[Tensor, "... 3 P"],
-    ) -> Float[Tensor, "... coefficients 3"]:
+        is_unclamped: PixelValues,
+        clamped_values: PixelValues,
+    ) -> Lights:
         """Convert the gradient of a loss from the images of `_images` to the lights.
 
         The last two arguments are the last two results of `_images`.
@@ -318,10 +319,10 @@ class TransferOperator:
         # The sum of squares is faster to check than each value. If it is too large or NaN,
         # `require_bounded` checks each value and raises the error.
         values = lights.detach().reshape(-1)
-        if not torch.dot(values, values).item() <= MAX_MAGNITUDE**2:
+        if not torch.dot(values, values).item() <= errors.MAX_MAGNITUDE**2:
             require_bounded(lights=lights)
 
-    def _radiance(self, lights: Float[Tensor, "... coefficients 3"]) -> Float[Tensor, "... 3 P"]:
+    def _radiance(self, lights: Lights) -> PixelValues:
         """Compute `radiance` without checks."""
         # Coefficients that change a pixel. All other coefficients have no row in the matrix.
         used_lights = lights.index_select(-2, self.nonzero).to(self.transfer.dtype)
@@ -340,9 +341,7 @@ class TransferOperator:
             radiance = radiance.index_add(-1, self.sparse.pixel, contributions.mT)
         return radiance.to(lights.dtype)
 
-    def _light_gradient(
-        self, radiance_gradient: Float[Tensor, "... 3 P"]
-    ) -> Float[Tensor, "... coefficients 3"]:
+    def _light_gradient(self, radiance_gradient: PixelValues) -> Lights:
         """Compute `light_gradient` without checks."""
         upstream = radiance_gradient.to(self.transfer.dtype)
         # Compute the gradient with respect to the K used coefficients, shape (..., 3, K). The
@@ -364,7 +363,7 @@ class TransferOperator:
         return gradient.to(radiance_gradient.dtype)
 
     def _prepare_background(
-        self, background: float | Tensor, lights: Float[Tensor, "... coefficients 3"]
+        self, background: float | Tensor, lights: Lights
     ) -> tuple[Tensor, Tensor]:
         """Convert a background to images, and compute what it adds to the covered pixels.
 
@@ -456,10 +455,7 @@ class _Image(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        lights: Float[Tensor, "... coefficients 3"],
-        operator: TransferOperator,
-        background: tuple[Tensor, Tensor],
+        ctx: Any, lights: Lights, operator: TransferOperator, background: tuple[Tensor, Tensor]
     ) -> Float[Tensor, "... 3 size size"]:
         """Render one image under each light."""
         images, is_unclamped, clamped_values = operator._images(lights, background)

@@ -57,9 +57,7 @@ def build_operators(
     Surfaces are shaded on the side that the camera sees. A `gloss` of None is that of the
     mesh.
     """
-    views = build_fragments(
-        mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed
-    )
+    views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, mesh.closed)
     transport = build_transport(mesh, settings, albedo_scale, basis)
     rays = transport.rays if transport else Rays(mesh)
     surfaces = [Surface(mesh, fragments, settings, given_gloss=gloss) for fragments in views]
@@ -107,10 +105,8 @@ def _build(
         transfer = transfer.unflatten(1, (len(functions), pixel_count))
         dense.append((local_rows.start + functions, transfer))
     if basis.environment is not None:
-        rows, harmonics_basis = basis.environment
-        coefficients, transfer = _environment_rows(
-            surface, albedo, harmonics_basis, dtype, transport
-        )
+        rows, sky = basis.environment
+        coefficients, transfer = _environment_rows(surface, albedo, sky, dtype, transport)
         dense.append((rows.start + coefficients, transfer))
     if len(dense) != 1:
         # The rows of a single light are used as they are, because `cat` copies them.

@@ -98,8 +98,7 @@ class Surface:
 
         The normal points to the side of the face that the camera sees.
         """
-        sample_to_seen_face = self.fragments.sample_to_seen_face
-        return self.face_planes[sample_to_seen_face]
+        return self.face_planes[self.fragments.sample_to_seen_face]
 
     @cached_property
     def face_planes(self) -> Tensor:
@@ -131,9 +130,7 @@ class Surface:
     @cached_property
     def points(self) -> Tensor:
         """Position in world axes of each of the S samples, shape (S, 3)."""
-        # Axes: seen face, corner, coordinate.
-        corner_positions = self.vertices[self.fragments.corners]
-        return self.fragments.interpolate(corner_positions)
+        return self.fragments.interpolate(self.vertices[self.fragments.corners])
 
     @cached_property
     def gloss(self) -> SampleGloss | None:
@@ -189,8 +186,7 @@ class Rays:
     @cached_property
     def offset(self) -> float:
         """Distance above the surface at which rays start, in world units."""
-        largest_coordinate = float(np.abs(self._mesh.vertices).max())
-        return OFFSET * largest_coordinate
+        return OFFSET * float(np.abs(self._mesh.vertices).max())
 
     def hits(self, surface: Surface, directions: Float[Tensor, "D 3"]) -> Iterator[RayHits]:
         """Cast rays in D directions from all pixels that may see another face of the mesh.
@@ -288,10 +284,8 @@ class Rays:
         is_below_a_vertex = highest - height_of_face > self.offset
         cosine_of_normals = (surface.normals * surface.planes).sum(1)
         blocks_light = cosine_of_normals < 1 - 2 * MAX_IGNORED_LIGHT
-        sample_to_seen_face = fragments.sample_to_seen_face
-        casts_rays = is_below_a_vertex[sample_to_seen_face] | blocks_light
-        sample_to_pixel = fragments.sample_to_pixel
-        return sample_to_pixel[casts_rays].unique()
+        casts_rays = is_below_a_vertex[fragments.sample_to_seen_face] | blocks_light
+        return fragments.sample_to_pixel[casts_rays].unique()
 
     def first_hit(
         self,
@@ -303,11 +297,9 @@ class Rays:
 
         Rays are infinite if `lengths` is None.
         """
-        rays = [origins, directions] if lengths is None else [origins, directions, lengths]
-        faces = self._scene.run(
-            *(np.ascontiguousarray(array.numpy(), np.float32) for array in rays)
-        )
-        return torch.from_numpy(faces).long()
+        tensors = [origins, directions] if lengths is None else [origins, directions, lengths]
+        rays = (np.ascontiguousarray(tensor.numpy(), np.float32) for tensor in tensors)
+        return torch.from_numpy(self._scene.run(*rays)).long()
 
 
 def dot(vectors: Float[Tensor, "B D 3"], directions: Float[Tensor, "D 3"]) -> Float[Tensor, "B D"]:

@@ -14,13 +14,8 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, as_tensor
 from renderer.image import as_background, background_term, clamp, encode
-from renderer.operators.apply import (
-    COLORS,
-    SparseTransfer,
-    TransferOperator,
-    concatenate_entries,
-    require_image_gradient,
-)
+from renderer.operators import apply
+from renderer.operators.apply import COLORS, SparseTransfer, TransferOperator
 
 # Operators of small images are copied into common tensors (a stack) until their images have
 # this many pixels in total. Larger stacks are not faster.
@@ -30,6 +25,8 @@ PIXELS_PER_STACK = 2**16
 FEWEST_STACKED = 8
 # Type of an index that selects some images of a batch.
 Rows = slice | Tensor
+# N images, whose pixels are in row-major order.
+Images = Float[Tensor, "N 3 pixels"]
 
 
 class TransferOperators(Sequence[TransferOperator]):
@@ -156,9 +153,7 @@ class TransferOperators(Sequence[TransferOperator]):
             except RuntimeError as error:
                 given = tuple(backgrounds.shape)
                 raise InputError(
-                    f"background has the shape {given}, which does not broadcast to the shape "
-                    f"{image_shape} of the rendered images: give one background image, or one per "
-                    "view and light"
+                    f"background has shape {given}: give images that broadcast to {image_shape}"
                 ) from error
         operators_in_stack = min(len(self), self._operators_per_stack)
         if operators_in_stack >= FEWEST_STACKED and not backgrounds.requires_grad:
@@ -209,7 +204,7 @@ class TransferOperators(Sequence[TransferOperator]):
             images = self.image(variable_lights, background, light_per_view=light_per_view)
         detached_images = images.detach()
         image_gradient = loss_gradient(detached_images)
-        require_image_gradient(image_gradient, detached_images)
+        apply.require_image_gradient(image_gradient, detached_images)
         [gradient] = torch.autograd.grad(images, variable_lights, image_gradient.detach())
         return detached_images, gradient
 
@@ -268,9 +263,7 @@ class TransferOperators(Sequence[TransferOperator]):
         return images.view(*view_lights.shape[:-2], COLORS, settings.size, settings.size)
 
 
-def _select_pixels(
-    images: Float[Tensor, "N 3 pixels"], pixels: Int[Tensor, " P"]
-) -> Float[Tensor, "N 3 P"]:
+def _select_pixels(images: Images, pixels: Int[Tensor, " P"]) -> Float[Tensor, "N 3 P"]:
     """Select the same pixels from all images.
 
     The axes of images and colors are merged, because torch selects from two axes ten times as
@@ -288,10 +281,7 @@ class ScatterLayers(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        canvas: Float[Tensor, "N 3 pixels"],
-        targets: Sequence[tuple[Rows, Tensor]],
-        *layers: Tensor,
+        ctx: Any, canvas: Images, targets: Sequence[tuple[Rows, Tensor]], *layers: Tensor
     ) -> Tensor:
         """Write the values of all layers, shape (B, 3, P) each, into the images in place.
 
@@ -309,7 +299,7 @@ class ScatterLayers(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Float[Tensor, "N 3 pixels"]) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, upstream: Images) -> tuple[Tensor | None, ...]:
         """Compute the gradients with respect to the new values of the overwritten pixels."""
         gradients = (_select_pixels(upstream[rows], pixels) for rows, pixels in ctx.targets)
         return None, None, *gradients
@@ -427,7 +417,7 @@ class OperatorStack:
     ) -> Float[Tensor, "A 3 P"]:
         """Compute the radiance of A images that the nonzero entries of further rows add."""
         parts = [self._sparse[operator] for operator in operator_of_image.tolist()]
-        entries = concatenate_entries(parts)
+        entries = apply.concatenate_entries(parts)
         entry_counts = torch.tensor([len(part.function) for part in parts])
         image_of_entry = torch.arange(len(parts)).repeat_interleave(entry_counts).to(lights.device)
         # Row of the coefficient of each entry, if the coefficients of all images are

@@ -46,15 +46,9 @@ from renderer.light.harmonics import bands, lambertian_factors
 from renderer.mesh import Mesh, require_mesh
 from renderer.microfacets import DIELECTRIC, EDGE, SCHLICK, reflectance
 from renderer.settings import MIN_ROUGHNESS
+from renderer.surface import lobes
 from renderer.surface.albedo import Texture, sample_textures
-from renderer.surface.lobes import (
-    ViewFrame,
-    coat_albedo,
-    coat_irradiance_factors,
-    coat_mean,
-    lobe_functions,
-    roughness_polynomials,
-)
+from renderer.surface.lobes import ViewFrame
 from renderer.vectors import unit
 from renderer.visibility.fragments import Fragments
 
@@ -182,7 +176,7 @@ class SampleGloss(NamedTuple):
         # The terms of metals are also needed for the gradient of `metallic`.
         has_metal = self.metallic.requires_grad or bool(self.metallic.any())
         terms = (DIELECTRIC, SCHLICK, EDGE) if has_metal else (DIELECTRIC,)
-        dielectric, *metal_terms = lobe_functions(cosine, self.roughness, degree, terms)
+        dielectric, *metal_terms = lobes.lobe_functions(cosine, self.roughness, degree, terms)
         white = (1 - self.metallic) * self.specular_factor * dielectric
         if not has_metal:
             return None, white
@@ -213,7 +207,7 @@ class SampleGloss(NamedTuple):
         cosine and to the gloss. Negative cosines μ, between the normal
         and the beam, count as 0.
         """
-        return 1 - self.specular_factor * coat_albedo(cosine.clamp(0, 1), self.roughness)
+        return 1 - self.specular_factor * lobes.coat_albedo(cosine.clamp(0, 1), self.roughness)
 
     def factors_below_coat(self, degree: int) -> Float[Tensor, "K S"]:
         """Compute the factor of each SH coefficient in the irradiance below the dielectric coat.
@@ -227,8 +221,8 @@ class SampleGloss(NamedTuple):
         """
         # Factors B_l of the light that the coat reflects: one row for each degree l, one column
         # for each sample.
-        polynomials = roughness_polynomials(self.roughness)
-        coat_factors = coat_irradiance_factors(degree).to(self.roughness) @ polynomials
+        polynomials = lobes.roughness_polynomials(self.roughness)
+        coat_factors = lobes.coat_irradiance_factors(degree).to(self.roughness) @ polynomials
         # Factors A_l without a coat, one for each SH coefficient of the light.
         uncoated_factors = lambertian_factors(degree).to(self.roughness)
         return uncoated_factors[:, None] - self.specular_factor * coat_factors[bands(degree)]
@@ -246,7 +240,7 @@ class SampleGloss(NamedTuple):
         the gloss. n is the normal, and v leads to the camera.
         """
         transmittance = self.coat_transmittance((normals * toward).sum(1))
-        mean_transmittance = 1 - self.specular_factor * coat_mean(self.roughness)
+        mean_transmittance = 1 - self.specular_factor * lobes.coat_mean(self.roughness)
         return (1 - self.metallic) * transmittance / mean_transmittance
 
     def specular_transfer(

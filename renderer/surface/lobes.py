@@ -400,17 +400,13 @@ def _table(degree: int) -> Float[Tensor, "3 M ROUGHNESS_POLYNOMIALS _"]:
     cosines = (nodes + 1) / (3 - nodes)
     roughnesses = MIN_ROUGHNESS ** ((1 - roughness_nodes) / 2)
     # Axes: Fresnel term, pair (l, m), roughness, cosine.
-    blocks = [
-        lobe_integrals(block, roughnesses, degree) for block in cosines.split(COSINES_AT_ONCE)
-    ]
+    cosine_blocks = cosines.split(COSINES_AT_ONCE)
+    blocks = [lobe_integrals(block, roughnesses, degree) for block in cosine_blocks]
     orders = torch.tensor([m for l in range(degree + 1) for m in range(l + 1)])
     sine_factors = (1 - cosines**2).sqrt() ** _sine_exponents(orders)[:, None, None]
     values = torch.cat(blocks, dim=-1) / sine_factors
     return torch.einsum(
-        "tmrc,kr,pc->tmkp",
-        values,
-        roughness_interpolation * roughnesses**2,
-        interpolation,
+        "tmrc,kr,pc->tmkp", values, roughness_interpolation * roughnesses**2, interpolation
     ).contiguous()
 
 

@@ -323,7 +323,8 @@ def _evaluate_polynomial(
         # A tensor of monomials with a name would stay in memory.
         gradient = torch.addmm(
             linear_gradient, even_gradient, harmonics.monomials(block, degree - 1)
-        ).unflatten(0, (3, COLORS))
+        )
+        gradient = gradient.unflatten(0, (3, COLORS))
         # Because p(n) = n · ∇p(n) / d, the irradiance is the sum of two terms: first
         # c + (1 - 1/d) a · n, and then n · (a + ∇p(n)) / d, which the loop adds.
         value = torch.addmm(constant, linear, block, alpha=1 - 1 / degree)

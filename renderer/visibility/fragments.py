@@ -144,10 +144,8 @@ class Fragments:
             weights, self.sample_to_seen_face, self.positions().T
         ):
             # `gather` takes a third of the time of `index_select`.
-            values_at_samples = face_values.gather(
-                1, sample_to_seen_face.expand(len(face_values), -1)
-            )
-            x0, y0, bx, cx, by, cy = values_at_samples
+            at_samples = face_values.gather(1, sample_to_seen_face.expand(len(face_values), -1))
+            x0, y0, bx, cx, by, cy = at_samples
             # Position of the sample relative to the first corner.
             x = position[0] - x0
             y = position[1] - y0
@@ -361,9 +359,8 @@ def build_fragments(
     # The third coordinate is the depth. It is less than -1 in front of the near plane,
     # which would cut the mesh open.
     is_uncut = bool((projected[..., 2] >= -1).all())
-    face_ids = rasterizer.rasterize(
-        projected, faces, settings.size * settings.samples, closed=closed and is_uncut
-    )
+    resolution = settings.size * settings.samples
+    face_ids = rasterizer.rasterize(projected, faces, resolution, closed and is_uncut)
     views = []
     for camera, points, ids_of_view in zip(cameras, projected, face_ids, strict=True):
         depths = camera.depths(vertices)

@@ -106,15 +106,13 @@ def _context() -> Iterator[moderngl.Context]:
         _check(context)
         yield context
     except moderngl.Error as error:
-        raise InputError(
-            f"the OpenGL driver failed ({error}): choose the rasterizer numpy"
-        ) from error
+        raise InputError(f"the OpenGL driver failed ({error}): use the rasterizer numpy") from error
     finally:
         context.release()
 
 
 def _check(context: moderngl.Context) -> None:
-    """Draw a test image, and raise InputError if the driver renders wrong face ids.
+    """Draw a test image, and raise InputError if the driver renders wrong faces.
 
     Face 0 is a large triangle that is seen from behind, face 1 is the same
     triangle seen from the front, and face 2 is a small triangle in front of them.
@@ -124,18 +122,11 @@ def _check(context: moderngl.Context) -> None:
     points = np.array([large_triangle + small_triangle])
     faces = np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]])
     # Expected face at each of 4 × 4 samples. Face 0 is seen from behind and is left out.
-    expected = [
-        [2, 2, 1, 1],
-        [2, 1, 1, 1],
-        [1, 1, 1, 1],
-        [1, 1, 1, 1],
-    ]
+    expected = [[2, 2, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]]
     ids = _draw(context, points, faces, resolution=4, closed=True)
     if ids[0].tolist() != expected:
         name = context.info["GL_RENDERER"]
-        raise InputError(
-            f"the OpenGL driver {name} renders wrong face ids: choose the rasterizer numpy"
-        )
+        raise InputError(f"the OpenGL driver {name} renders wrong faces: use the rasterizer numpy")
 
 
 def _draw(

@@ -107,14 +107,12 @@ def moving_outlines(
     these pixels. The background is that of all pixels, and it is linear.
     """
     positions, nearness = camera.homogeneous(vertices.double())
-    sample_indices = torch.arange(
-        len(fragments.sample_numbers), dtype=torch.int32, device=vertices.device
-    )
+    indices = torch.arange(len(fragments.sample_numbers), dtype=torch.int32, device=vertices.device)
     # Index of each sample of the image among the covered samples, or NOT_COVERED.
-    sample_grid = fragments.image_of_samples(sample_indices, NOT_COVERED)
-    silhouettes = _Silhouettes(
-        fragments.to("cpu"), *map(_to_numpy, (positions, nearness, faces, sample_grid))
-    )
+    sample_grid = fragments.image_of_samples(indices, NOT_COVERED)
+    tensors = (positions, nearness, faces, sample_grid)
+    arrays = (tensor.detach().cpu().numpy() for tensor in tensors)
+    silhouettes = _Silhouettes(fragments.to("cpu"), *arrays)
     crossings = Crossings(*(array.to(sample_grid.device) for array in silhouettes.crossings()))
     # Pixels that show no mesh, but have a sample beside a visible silhouette.
     crossed_pixels = _pixels_of_cells(crossings.cells, fragments).unique()
@@ -122,11 +120,6 @@ def moving_outlines(
     constants = radiance.detach(), background.detach()
     view = _MovingView(fragments, crossings, sample_grid, uncovered_pixels, *constants)
     return uncovered_pixels, _ZerosWithGradient.apply(positions, view)
-
-
-def _to_numpy(tensor: Tensor) -> np.ndarray:
-    """Convert a tensor on any device to a NumPy array, without gradients."""
-    return tensor.detach().cpu().numpy()
 
 
 class _ZerosWithGradient(torch.autograd.Function):
@@ -484,9 +477,7 @@ def _silhouette_edges(
 
     The result has the vertices at both ends of each edge.
     """
-    ends, edge_of_face_side, face_count = _edges(
-        np.ascontiguousarray(faces, dtype=np.int64).tobytes()
-    )
+    ends, edge_of_side, face_count = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
     # Positions (x, y) of the corners a, b and c of all faces, shape (F,) each.
     (ax, bx, cx), (ay, by, cy) = places.take(faces.T, axis=1)
     orientation = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
@@ -497,7 +488,7 @@ def _silhouette_edges(
     # One number for each face and each of its three edges: 1 if the face lies on one side of
     # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
     side_of_face = (orientation * direction).ravel()
-    side_sums = np.bincount(edge_of_face_side, side_of_face, len(face_count))
+    side_sums = np.bincount(edge_of_side, side_of_face, len(face_count))
     # All n faces of an edge lie on the same side if the sum is n or -n. It is n - 1 or
     # 1 - n if one of them is seen edge-on, because this face counts 0.
     is_silhouette = np.abs(side_sums) > face_count - 2
@@ -521,7 +512,7 @@ def _edges(face_bytes: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     vertex_count = int(high.max()) + 1
     # The two vertices of a side are combined to one number, because `np.unique` sorts
     # numbers faster than pairs.
-    keys, edge_of_face_side, face_count = np.unique(
+    keys, edge_of_side, face_count = np.unique(
         low * vertex_count + high, return_inverse=True, return_counts=True
     )
-    return np.stack(np.divmod(keys, vertex_count)), edge_of_face_side.ravel(), face_count
+    return np.stack(np.divmod(keys, vertex_count)), edge_of_side.ravel(), face_count

@@ -406,5 +406,5 @@ def test_opengl_cannot_be_chosen_without_a_device(monkeypatch):
 def test_a_driver_that_renders_wrong_ids_is_refused(monkeypatch):
     wrong_shader = opengl.VERTEX_SHADER.replace("gl_VertexID / 3", "0")
     monkeypatch.setattr(opengl, "VERTEX_SHADER", wrong_shader)
-    with pytest.raises(InputError, match="wrong face ids"):
+    with pytest.raises(InputError, match="wrong faces"):
         choose("opengl")
