@@ -75,22 +75,15 @@ class SkylightSettings(StepSettings):
     degrees, and of the turbidity by 0.4. Step sizes have the same units.
     """
 
-    zenith: float = setting(
-        45.0, "Zenith angle of the sun at the start.", "degrees", within=(0, 90)
-    )
+    zenith: float = setting(45.0, "Initial zenith angle of the sun.", "degrees", within=(0, 90))
     azimuth: float = setting(
-        0.0, "Azimuth of the sun at the start.", "degrees", within=(-MAX_SCALE, MAX_SCALE)
+        0.0, "Initial azimuth of the sun.", "degrees", within=(-MAX_SCALE, MAX_SCALE)
     )
     turbidity: float = setting(
-        3.0,
-        "Turbidity of the air at the start, from 2 (clear) to 10 (hazy).",
-        within=(TURBIDITY[0], TURBIDITY[1]),
+        3.0, "Initial turbidity of the air, from 2 (clear) to 10 (hazy).", within=TURBIDITY
     )
     sun: float = setting(
-        math.degrees(1),
-        "Change of the sun's zenith angle and azimuth for a value of 1.",
-        "degrees",
-        within=(0.1, 360),
+        math.degrees(1), "Change of both angles for a value of 1.", "degrees", within=(0.1, 360)
     )
 
 
@@ -106,29 +99,19 @@ class PoseSettings(StepSettings):
     parts = POSE_PARTS
 
     rotation: float = setting(
-        10.0,
-        "Rotation of the object about its center for a value of 1.",
-        "degrees",
-        within=(0, 180),
+        10.0, "Rotation of the object for a value of 1.", "degrees", within=(0, 180)
     )
     shift: float = setting(
-        0.1,
-        "Shift of the object along x and y for a value of 1. The mesh spans [-1, 1].",
-        within=(0, 10),
+        0.1, "Shift of the object, which spans [-1, 1], for a value of 1.", within=(0, 10)
     )
     scale: float = setting(
         0.1, "Growth of the object for a value of 1. 0.1 is a factor of 1.1.", within=(0, 1)
     )
     view: float = setting(
-        10.0,
-        "Change of the camera's polar angle and azimuth for a value of 1.",
-        "degrees",
-        within=(0, 180),
+        10.0, "Change of the camera's angles for a value of 1.", "degrees", within=(0, 180)
     )
     distance: float = setting(
-        0.1,
-        "Growth of the distance of the camera for a value of 1. 0.1 is a factor of 1.1.",
-        within=(0, 1),
+        0.1, "Growth of the distance of the camera for a value of 1.", within=(0, 1)
     )
 
 
@@ -145,26 +128,18 @@ class MaterialSettings(StepSettings):
 
     roughness: float = setting(
         0.3,
-        "Change of the roughness for a value of 1. The roughness stays between 0.2 and 1. "
-        "A matte mesh starts with a dielectric specular layer of roughness 0.5 and strength 1.",
+        "Change of the roughness for a value of 1. It stays between 0.2 and 1. A matte mesh "
+        "starts with a dielectric specular layer of roughness 0.5 and strength 1.",
         within=(0, 1),
     )
     metallic: float = setting(
-        0.3,
-        "Change of the metallic factor for a value of 1, of meshes that are metallic.",
-        within=(0, 1),
+        0.3, "Change of the metallic factor of metals for a value of 1.", within=(0, 1)
     )
     specular_factor: float = setting(
-        1.0,
-        "Change of the strength of the highlight for a value of 1. "
-        "The strength is the specularFactor of KHR_materials_specular.",
-        within=(0, 1),
+        1.0, "Change of the strength of the highlight for a value of 1.", within=(0, 1)
     )
     hue: float = setting(
-        0.0,
-        "Rotation of the albedo about the gray axis for a value of 1.",
-        "degrees",
-        within=(0, 180),
+        0.0, "Rotation of the albedo about gray for a value of 1.", "degrees", within=(0, 180)
     )
 
 
@@ -218,15 +193,12 @@ class EOTSettings(Settings):
     """Random transformations of an image over which an attack averages (Athalye et al. 2018)."""
 
     draws: int = setting(
-        0,
-        "Number of transformations of each image at each step. 0 transforms nothing.",
-        within=(0, 1000),
+        0, "Transformations of each image at each step. 0 transforms nothing.", within=(0, 1000)
     )
     jitter: float = setting(
         0.03,
-        "Largest motion of the camera: its shift as a fraction of the width of the image, and its "
-        "approach as a fraction of the distance. It also rolls by up to 57 degrees times this "
-        "number, which is 1.7 degrees for 0.03.",
+        "Largest shift of the camera as a fraction of the width of the image, approach as a "
+        "fraction of the distance, and roll in radians.",
         within=(0, 0.5),
     )
     exposure: float = setting(0.2, "Largest change of the exposure.", "stops", within=(0, 5))
@@ -239,26 +211,19 @@ class RelightingSettings(Settings):
     """Attack on photographs in the light of a projector; see `augment.photographs`.
 
     The projector shows a random slide. The attack multiplies each channel of the slide by a smooth
-    factor, which is at most `gain` and at least 1 / gain.
+    factor, which is at most `gain` and at least 1 / gain. Its logarithm is interpolated linearly
+    between the centers of the cells. Random search draws as many factors as it has passes. The
+    gradient attack takes half as many steps.
     """
 
     gain: float = setting(
-        3.0,
-        "Largest factor of a channel of the slide. Its inverse is the smallest.",
-        within=(1, 100),
+        3.0, "Largest factor of a channel. The smallest is its inverse.", within=(1, 100)
     )
     cells: int = setting(
-        6,
-        "Number of cells per side with a factor of their own. Between their centers, the "
-        "logarithm of the factor is interpolated linearly.",
-        within=(1, 64),
+        6, "Cells per side with factors of their own, interpolated between.", within=(1, 64)
     )
     passes: int = setting(
-        21,
-        "Passes through the classifier of each search: forward ones, and those backward for the "
-        "gradient. Random search draws as many factors. The gradient attack takes half as many "
-        "steps.",
-        within=(1, 10**6),
+        21, "Forward and backward passes of each search through the classifier.", within=(1, 10**6)
     )
     slides: int = setting(1, "Number of random slides for each photograph.", within=(1, 10**4))
 
@@ -293,14 +258,11 @@ class AttackSettings(ParameterSettings):
         choices=OPTIMIZERS,
     )
     max_steps: int = setting(
-        30,
-        "Largest number of steps along the gradient. The paper takes 30 (appendix C).",
-        within=(0, 10**6),
+        30, "Largest number of steps along the gradient. The paper takes 30.", within=(0, 10**6)
     )
     max_queries: int | None = setting(
         None,
-        "Largest number of forward passes for each example: images that the search shows to the "
-        "classifier. All starts have the same share of it. "
+        "Largest number of forward passes for each example. All starts have the same share of it. "
         f"null: {DEFAULT_QUERIES}, and no limit besides max_steps for optimizer=gradient.",
         within=(1, 10**9),
     )
@@ -308,9 +270,7 @@ class AttackSettings(ParameterSettings):
         False, "Take back a step that did not lower the cost, and try half of it (backtracking)."
     )
     restarts: int = setting(
-        0,
-        "Number of additional starts, drawn from the norm-balls, for examples without success.",
-        within=(0, 10**6),
+        0, "Random starts that examples without success get in addition.", within=(0, 10**6)
     )
     margin: float = setting(
         2.0,
@@ -335,18 +295,12 @@ class AttackSettings(ParameterSettings):
         "Otherwise it is 0.",
         within=(0, MAX_SCALE),
     )
-    eot: EOTSettings = setting(
-        EOTSettings, "Attack the mean over random transformations of the image."
-    )
+    eot: EOTSettings = setting(EOTSettings, "Attack the mean over random transformations.")
     allow_negative: bool = setting(
-        False,
-        "Permit lighting with negative radiance, as in the paper. Otherwise the lighting stays "
-        "physically possible.",
+        False, "Permit lighting with negative radiance, which is not physically possible."
     )
     batch_size: int = setting(
-        32,
-        "Images per pass through the classifier. Fewer are passed if memory runs out.",
-        within=(1, 10**6),
+        32, "Images per pass through the classifier, or fewer if memory is full.", within=(1, 10**6)
     )
 
     def __post_init__(self) -> None:

@@ -49,9 +49,7 @@ class CameraEffectSettings(Settings):
     render is drawn uniformly between 0 and the limit.
     """
 
-    pattern_fraction: float = setting(
-        0.0, "Fraction of renders under a projected pattern.", within=FRACTION
-    )
+    pattern_fraction: float = setting(0.0, "Fraction of renders with a pattern.", within=FRACTION)
     slides: str | None = setting(
         None, "Folder of photographs, which half of the patterns show. null: none."
     )
@@ -59,9 +57,7 @@ class CameraEffectSettings(Settings):
         list(NONE), "factor of the lighting of the scene beneath the pattern.", FRACTION
     )
     white_balance: float = setting(0.0, "Largest change of each channel.", "stops", within=(0, 5))
-    blur: float = setting(
-        0.0, "Largest standard deviation of the blur.", "pixels", within=(0, MAX_BLUR)
-    )
+    blur: float = setting(0.0, "Largest deviation of the blur.", "pixels", within=(0, MAX_BLUR))
     noise: float = setting(0.0, "Largest standard deviation of the pixel noise.", within=FRACTION)
 
 
@@ -78,29 +74,19 @@ class VariationSettings(Settings):
     """
 
     shift: float = setting(
-        0.0,
-        "Largest distance of the mesh from the center of the image, as a fraction of its width.",
-        within=FRACTION,
+        0.0, "Largest shift of the mesh in the image, as a fraction of its width.", within=FRACTION
     )
     scale: list[float] = pair(list(UNCHANGED), "factor of the size in the image.", FACTOR)
     exposure: list[float] = pair(list(UNCHANGED), "factor of the lighting.", FACTOR)
     backgrounds: str | None = setting(
         None, "Folder of images that replace scene.backgrounds. null: none."
     )
-    instances: bool = setting(
-        False, "Draw another instance of each solid that is named without a seed."
-    )
+    instances: bool = setting(False, "Draw another instance of each solid without a seed.")
     azimuth: float = setting(
-        0.0,
-        "Largest motion of the camera around the mesh, to either side and up and down.",
-        "degrees",
-        within=(0, 180),
+        0.0, "Largest turn of the camera to either side, up and down.", "degrees", within=(0, 180)
     )
     fov: list[float] = pair(
-        list(NONE),
-        "angle between the sides of the image, from 1 to 45. [0, 0]: the camera of the scene.",
-        (0, MAX_FOV),
-        "degrees",
+        list(NONE), "field of view. [0, 0]: the camera of the scene.", (0, MAX_FOV), "degrees"
     )
     rotation: float = setting(
         0.0, "Largest rotation of the mesh about a random axis.", "degrees", within=(0, 180)
@@ -109,32 +95,22 @@ class VariationSettings(Settings):
         [], "Environment lightings that replace scene.light, one of them for each render."
     )
     directional_fraction: float = setting(
-        0.0,
-        "Fraction of renders in directional lighting from the side of the camera, up to 70 "
-        "degrees from it.",
-        within=FRACTION,
+        0.0, "Fraction of renders in directional light from near the camera.", within=FRACTION
     )
     fill_light: list[float] = pair(
         list(NONE), "factor of the environment lighting of these renders.", FRACTION
     )
     lit_background: bool = setting(False, "Light the backgrounds as walls that face the camera.")
     tables: float = setting(
-        0.0,
-        "Fraction of renders on a table in front of a wall, in the lighting and the shadow of the "
-        "object.",
-        within=FRACTION,
+        0.0, "Fraction of renders on a table in front of a wall, with shadows.", within=FRACTION
     )
     background_saturation: float = setting(
-        0.0,
-        "Largest saturation of a random color that multiplies each background.",
-        within=FRACTION,
+        0.0, "Largest saturation of a random color of each background.", within=FRACTION
     )
     gloss: SpecularLayerSettings = setting(
         SpecularLayerSettings, "A specular layer on each object, which replaces its own material."
     )
-    camera: CameraEffectSettings = setting(
-        CameraEffectSettings, "Effects of a camera on each render."
-    )
+    camera: CameraEffectSettings = setting(CameraEffectSettings, "Effects of a camera.")
 
     def __post_init__(self) -> None:
         """Check the smallest field of view. 0 stands for the camera of the scene."""
@@ -156,15 +132,10 @@ class RandomLightSettings(Settings):
     """Random perturbation of the lighting of the scene."""
 
     amplitude: float = setting(
-        0.5,
-        "Each coefficient changes by a uniform draw between minus and plus this value.",
-        within=FACTOR,
+        0.5, "Largest change of a coefficient, which is drawn uniformly.", within=FACTOR
     )
     radius: float | None = setting(
-        None,
-        "L2 norm of the perturbation instead. 30 attack steps of 0.05 reach 1.5 at most. null: "
-        "the amplitude applies.",
-        within=FACTOR,
+        None, "L2 norm of the perturbation. null: the amplitude applies.", within=FACTOR
     )
 
 
@@ -208,9 +179,7 @@ class AugmentationSettings(Settings):
 
     mode: str = setting("adversarial", "Kind of renders.", choices=MODES)
     folder: str | None = setting(
-        None,
-        "Folder of images for mode=folder: a folder per class, or other_NAME. They replace the "
-        "renders.",
+        None, "Folder of images for mode=folder: a folder per class, or other_NAME."
     )
     examples: int | None = setting(
         100,
@@ -219,21 +188,15 @@ class AugmentationSettings(Settings):
         within=(0, MAX_EXAMPLES),
     )
     init: str = setting(
-        "scene",
-        "Start of an attack: the lighting of the scene (scene) or a random perturbation (random).",
-        choices=INITS,
+        "scene", "Start of an attack: the light of the scene, or a random one.", choices=INITS
     )
     warm_start: bool = setting(
         False, "Start each attack where the attack of the previous regeneration ended."
     )
     regenerate_every: int | None = setting(
-        None,
-        "Training images between two regenerations. null: regenerate once per epoch.",
-        within=(1, MAX_INTERVAL),
+        None, "Training images between regenerations. null: an epoch.", within=(1, MAX_INTERVAL)
     )
-    vary: VariationSettings = setting(
-        VariationSettings, "What is drawn anew for each render in each regeneration."
-    )
+    vary: VariationSettings = setting(VariationSettings, "What is drawn anew for each render.")
     random_light: RandomLightSettings = setting(
         RandomLightSettings, "Perturbation of the lighting for mode=random and for init=random."
     )
@@ -245,8 +208,7 @@ class AugmentationSettings(Settings):
         if not self.attack.parameters:
             raise InputError("attack changes nothing: name a parameter to attack", "attack")
         if self.mode == "folder" and not self.folder:
-            fault = f"folder is {self.folder}: mode=folder needs a folder of images"
-            raise InputError(fault, "folder")
+            raise self.wrong("folder", "is missing: mode=folder needs a folder of images")
         parameters = self.attack.parameters if "random" in (self.mode, self.init) else {}
         for name, steps in parameters.items():
             if name != "lighting" and steps.radius is None:
@@ -276,10 +238,7 @@ def count_views(examples: int | None, objects: int, backgrounds: int, views: int
         return views
     derived, rest = divmod(examples or 0, objects * backgrounds)
     if rest or derived < 1 or views not in (None, derived):
-        raise InputError(
-            f"examples={examples} is not "
-            f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds: "
-            "change one of these numbers, or set views or examples to None to compute it",
-            "examples",
-        )
+        product = f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds"
+        advice = "change one of these numbers, or set views or examples to None to compute it"
+        raise InputError(f"examples={examples} is not {product}: {advice}", "examples")
     return derived

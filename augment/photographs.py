@@ -88,10 +88,6 @@ class ProjectedLight(NamedTuple):
         """Return a copy whose tensors are on a device."""
         return ProjectedLight(*(values.to(device) for values in self))
 
-    def select(self, photographs: Int[Tensor, " A"]) -> ProjectedLight:
-        """Return the light on some of the photographs."""
-        return ProjectedLight(*(values[photographs] for values in self))
-
     def light(
         self, log_gain: Float[Tensor, "B 3 cells cells"] | None = None
     ) -> Float[Tensor, "B 3 H W"]:
@@ -102,8 +98,7 @@ class ProjectedLight(NamedTuple):
         """
         slide = self.slide
         if log_gain is not None:
-            size = slide.shape[-2:]
-            slide = slide * F.interpolate(log_gain, size, mode="bilinear").exp()
+            slide = slide * F.interpolate(log_gain, slide.shape[-2:], mode="bilinear").exp()
         return slide * self.shading + self.ambient
 
     def expose(
@@ -157,12 +152,8 @@ def draw_projected_light(
     shading = draw_shading(count, size, draws)
     # Fractions in [0, 1] of the ranges of the ambient light and of the exposure.
     ambient, stops = torch.rand(2, count, 1, 1, 1, generator=draws)
-    return ProjectedLight(
-        slide=slide,
-        shading=shading,
-        ambient=AMBIENT[0] + (AMBIENT[1] - AMBIENT[0]) * ambient,
-        stops=STOPS[0] + (STOPS[1] - STOPS[0]) * stops,
-    )
+    ambient = AMBIENT[0] + (AMBIENT[1] - AMBIENT[0]) * ambient
+    return ProjectedLight(slide, shading, ambient, STOPS[0] + (STOPS[1] - STOPS[0]) * stops)
 
 
 def relight_photographs(
@@ -253,16 +244,14 @@ class RelitPhotographs(NormBalls):
         self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
     ) -> Float[Tensor, "A 1 3 H W"]:
         """Show photographs in the light of the projector, each in one view."""
-        light = self._light.select(examples)
+        light = ProjectedLight(*(values[examples] for values in self._light))
         return light.expose(self._albedo[examples], self.log_gain(values))[:, None]
 
     def draw(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
         """Draw random factors of some photographs, whose logarithms are uniform in the ball."""
-        drawn = [
-            sample(self.settings, self.start[[example]], self._generators[example])
-            for example in examples.tolist()
-        ]
-        return torch.cat(drawn)
+        draws, start = self._generators, self.start
+        rows = examples.tolist()
+        return torch.cat([sample(self.settings, start[[row]], draws[row]) for row in rows])
 
 
 class UniformDraws(Optimizer):
@@ -273,14 +262,6 @@ class UniformDraws(Optimizer):
     def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N 1 D"]:
         """Draw values of each photograph."""
         return self.problem.draw(self.examples[rows])[:, None]
-
-
-# Optimizers that search for factors of the slide, by the names of the lights.
-OPTIMIZERS: dict[str, type[Optimizer]] = {
-    SLIDE: Gradient,
-    RANDOM: UniformDraws,
-    ADVERSARIAL: Gradient,
-}
 
 
 @dataclass(frozen=True, repr=False)
@@ -419,9 +400,8 @@ def attack_photographs(
         tensor(0.4100)
     """
     require_photographs("photographs", photographs)
-    errors.require_kind(
-        "settings", settings, RelightingSettings | None, "RelightingSettings(...) or None"
-    )
+    expected = "RelightingSettings(...) or None"
+    errors.require_kind("settings", settings, RelightingSettings | None, expected)
     errors.require_whole("seed", seed)
     settings = settings or RelightingSettings()
     success_settings = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
@@ -508,7 +488,8 @@ def _attack_slide(
             sensor_noise=0.0,
         )
         objective = Objective(result.classifier, criterion, search)
-        found = minimize(problem, objective, examples=examples, optimizer=OPTIMIZERS[light])
+        optimizer: type[Optimizer] = UniformDraws if light == RANDOM else Gradient
+        found = minimize(problem, objective, examples=examples, optimizer=optimizer)
         # The sensor noise differs for each pair of a photograph and a slide.
         noise_indices = rows * settings.slides + slide
         noisy = Objective(result.classifier, criterion, success, result.seed)
@@ -536,8 +517,6 @@ def _draw_lights(
     but not on the other photographs.
     """
     size = photographs.shape[-1]
-    lights = [
-        draw_projected_light(1, size, generator(seed, "light", row, slide), photographs)
-        for row in rows
-    ]
+    streams = [generator(seed, "light", row, slide) for row in rows]
+    lights = [draw_projected_light(1, size, draws, photographs) for draws in streams]
     return ProjectedLight(*map(torch.cat, zip(*lights, strict=True)))

@@ -155,16 +155,11 @@ class AugmentationService:
         if self.images is not None:
             require_kind("images", self.images, Tensor, "a tensor of bytes, or None")
             if self.images.dtype != torch.uint8 or self.images.shape[:2] != (len(self.labels), 3):
-                raise InputError(
-                    f"images is {describe(self.images)}: give bytes (E, 3, H, W), one for each "
-                    "label"
-                )
+                given = describe(self.images)
+                raise InputError(f"images is {given}: give bytes (E, 3, H, W), one for each label")
         source = "images" if self.settings.mode == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
-            raise InputError(
-                f"{source} is None, and mode={self.settings.mode} needs examples: "
-                "give a scene, or images for a folder"
-            )
+            raise InputError(f"{source} is None, but mode={self.settings.mode} needs it: give one")
         attack = self.settings.attack
         if self.scene is not None and self.settings.renders:
             self.scene = with_needed_degree(self.scene, attack.material, self.settings.vary.gloss)

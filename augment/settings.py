@@ -29,7 +29,7 @@ from renderer.settings import (
 )
 
 UP_AXES = ("auto", "y", "z")
-MAX_PROP_DISTANCE = 10.0  # Largest distance and size of meshes beside an object, in world units.
+PROP_DISTANCES = (-10.0, 10.0)  # Range of the coordinates of meshes beside an object.
 MAX_PROJECTOR_PIXELS = 256  # per side
 
 
@@ -37,16 +37,11 @@ MAX_PROJECTOR_PIXELS = 256  # per side
 class MeshSettings(Settings):
     """A mesh and its material."""
 
-    mesh: str = setting(
-        REQUIRED, "A mesh file, or a procedural solid as solid:NAME or solid:NAME:SEED."
-    )
+    mesh: str = setting(REQUIRED, "A mesh file, or a solid: solid:NAME or solid:NAME:SEED.")
     _: KW_ONLY
     up: str = setting("auto", "Axis that points up in the file.", choices=UP_AXES)
     color: list[float] | None = setting(
-        None,
-        "Color of a mesh without colors: red, green and blue in sRGB, from 0 to 1.",
-        length=3,
-        within=(0, 1),
+        None, "Color of a mesh without colors: [r, g, b] in sRGB.", length=3, within=(0, 1)
     )
     gloss: Any = setting(
         None,
@@ -59,17 +54,11 @@ class MeshSettings(Settings):
         if isinstance(self.mesh, Path):
             self.mesh = str(self.mesh)
         super().__post_init__()
-        if self.gloss == "file" and self.mesh.startswith("solid:"):
+        is_file = self.gloss == "file" and not self.mesh.startswith("solid:")
+        if not (self.gloss is None or is_file or _is_gloss(self.gloss)):
             raise InputError(
-                f"gloss=file, but {self.mesh} is not a file with a material: "
-                "give [roughness, metallic, specular factor] in [0, 1]",
-                "gloss",
-            )
-        if self.gloss not in (None, "file") and not _is_gloss(self.gloss):
-            raise InputError(
-                f"gloss={self.gloss}: "
-                "give [roughness, metallic, specular factor] in [0, 1], "
-                "or the word file for the material in the file of the mesh",
+                f"gloss={self.gloss} of {self.mesh}: give [roughness, metallic, specular factor] "
+                "in [0, 1], or the word file for the material in the file of a mesh",
                 "gloss",
             )
 
@@ -86,16 +75,9 @@ class PropSettings(MeshSettings):
     """A prop: a mesh beside the object, on the same ground. It is never attacked."""
 
     at: list[float] = setting(
-        REQUIRED,
-        "x and y of its centroid in world units.",
-        length=2,
-        within=(-MAX_PROP_DISTANCE, MAX_PROP_DISTANCE),
+        REQUIRED, "x and y of its centroid in world units.", length=2, within=PROP_DISTANCES
     )
-    scale: float = setting(
-        1.0,
-        "Its largest coordinate. The largest coordinate of the object is 1.",
-        within=(1 / MAX_PROP_DISTANCE, MAX_PROP_DISTANCE),
-    )
+    scale: float = setting(1.0, "Its largest coordinate. The object has 1.", within=(0.1, 10))
     azimuth: float = setting(0.0, "Rotation about the vertical.", "degrees", within=(-360, 360))
 
 
@@ -127,20 +109,12 @@ class ProjectorSettings(Settings):
     """A projector, and the pattern that it shows before an attack."""
 
     pixels: int = setting(16, "Pixels per side of its pattern.", within=(1, MAX_PROJECTOR_PIXELS))
-    polar: float = setting(
-        45.0, "Polar angle of the projector from +z.", "degrees", within=(0, 180)
-    )
-    azimuth: float = setting(45.0, "Azimuth of the projector.", "degrees", within=(-360, 360))
-    distance: float = setting(
-        4.0, "Distance from the origin in world units.", within=(2, MAX_SCALE)
-    )
-    fov: float = setting(
-        30.0, "Angle between the sides of its image.", "degrees", within=(0.1, 170)
-    )
+    polar: float = setting(45.0, "Its polar angle from +z.", "degrees", within=(0, 180))
+    azimuth: float = setting(45.0, "Its azimuth.", "degrees", within=(-360, 360))
+    distance: float = setting(4.0, "Its distance in world units.", within=(2, MAX_SCALE))
+    fov: float = setting(30.0, "Its field of view.", "degrees", within=(0.1, 170))
     power: float = setting(1.0, "Largest value of a pixel.", within=(1 / MAX_SCALE, MAX_SCALE))
-    pattern: Any = setting(
-        0.0, "Pattern with which attacks start: a gray value in [0, 1] or an image file."
-    )
+    pattern: Any = setting(0.0, "Initial pattern: a gray value in [0, 1] or an image file.")
 
 
 @dataclass
@@ -172,28 +146,19 @@ class SceneSettings(Settings):
     """Cameras, backgrounds and lighting of a scene."""
 
     backgrounds: list[Any] = setting([0.5], "Gray values in [0, 1] or image files.")
-    views: int | None = setting(
-        1, "Number of cameras per mesh, at equal azimuths.", within=(1, MAX_VIEWS)
-    )
+    views: int | None = setting(1, "Cameras per mesh, at equal azimuths.", within=(1, MAX_VIEWS))
     polar: float = setting(60.0, "Polar angle of the cameras from +z.", "degrees", within=(0, 180))
     azimuth: float = setting(
         0.0, "Azimuth of the first camera from +x toward +y.", "degrees", within=(-360, 360)
     )
-    width: float = setting(
-        2.0, "Width of the image in world units, at the mesh. The mesh spans [-1, 1]."
-    )
+    width: float = setting(2.0, "Width of the image at the mesh, which spans [-1, 1].")
     fov: float | None = setting(
-        None,
-        "Angle between the sides of the image. null: orthographic.",
-        "degrees",
-        within=(0.1, 150),
+        None, "Field of view. null: orthographic.", "degrees", within=(0.1, 150)
     )
     vertices: int = setting(
         0,
-        "Subdivide each mesh until it has more vertices than this. The paper attacks shapes with "
-        "more than 10,000.",
-        minimum=0,
-        maximum=MAX_VERTICES,
+        "Subdivide each mesh until it has more vertices than this, such as 1e4 in the paper.",
+        within=(0, MAX_VERTICES),
         checks_type=False,  # A float such as 1e4 is valid, too.
     )
     light: str = setting(
@@ -222,10 +187,7 @@ class SceneSettings(Settings):
         "or some of these keys. null: none.",
     )
     ground: list[float] | None = setting(
-        None,
-        "Color of a table under each mesh: [r, g, b] in sRGB. null: no table.",
-        length=3,
-        within=(0, 1),
+        None, "Color of a table: [r, g, b] in sRGB. null: no table.", length=3, within=(0, 1)
     )
 
     def __post_init__(self) -> None:
@@ -246,8 +208,7 @@ class RendererSettings(Settings):
     )
     samples: int | None = setting(
         None,
-        "Samples per side of a pixel. With 2, each pixel has 4 samples. null: 2, or 8 with "
-        "silhouettes.",
+        "Samples per side of a pixel. null: 2, or 8 with silhouettes.",
         within=(1, MAX_SAMPLES),
     )
     encoding: str = setting_like(ImageSettings, "encoding", "linear")
@@ -276,23 +237,14 @@ class NormalizedLightSettings(Settings):
     """
 
     percentile: float = setting(
-        95.0,
-        "Percentile of all pixels and channels that the exposure maps to `level`.",
-        above=0,
-        maximum=100,
+        95.0, "Percentile of the pixels that the exposure maps to `level`.", above=0, maximum=100
     )
-    level: float = setting(
-        1.0, "Linear value of this percentile after the exposure.", above=0, maximum=1
-    )
+    level: float = setting(1.0, "Linear value of this percentile.", above=0, maximum=1)
     white_balance: float = setting(
-        0.0,
-        "Degree of the white balance. 0: none. 1: all channels have the same mean (gray world).",
-        within=(0, 1),
+        0.0, "White balance. 0: none. 1: all channels have the same mean.", within=(0, 1)
     )
     gamma: float = setting(
-        1.25,
-        "Exponent of the encoded image. 1: sRGB. Less than 1 brightens the image.",
-        within=(0.1, 10),
+        1.25, "Exponent of the encoded image. Less than 1 brightens it.", within=(0.1, 10)
     )
 
 

@@ -124,9 +124,8 @@ def build_scene(
         10
     """
     errors.require_kind("scene", scene, SceneSettings | None, "SceneSettings(...) or None")
-    errors.require_kind(
-        "renderer", renderer, RendererSettings | None, "RendererSettings(...) or None"
-    )
+    expected = "RendererSettings(...) or None"
+    errors.require_kind("renderer", renderer, RendererSettings | None, expected)
     errors.require_flag("shared", shared)
     errors.require_whole("views", views)
     errors.require_flag("normalize", normalize)
@@ -184,30 +183,24 @@ def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
     members = errors.as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
     if not members:
         raise InputError(f"meshes is empty: give pairs {example}")
-    for index, member in enumerate(members):
-        if isinstance(member, ObjectSettings):
-            continue
-        if len(member) != 2:
-            raise InputError(
-                f"meshes[{index}] is {errors.describe(member)}: give a pair of a mesh and a label, "
-                f"{example}"
-            )
-        mesh, label = member
-        if not isinstance(mesh, str | Path):
-            require_mesh(f"meshes[{index}]", mesh)
-        if not errors.is_whole(label):
-            label_name = f"meshes[{index}]: its label"
-            errors.require_kind(label_name, label, str, "the name of a class, or its index")
     objects = []
-    for member in progress(members, "reading meshes"):
+    for index, member in enumerate(progress(members, "reading meshes")):
+        name = f"meshes[{index}]"
         if isinstance(member, ObjectSettings):
             item = load_object(member, settings.vertices)
+        elif len(member) != 2:
+            given = errors.describe(member)
+            raise InputError(f"{name} is {given}: give a pair of a mesh and a label, {example}")
         else:
             mesh, label = member
-            if isinstance(mesh, Mesh):
-                item = SceneObject.from_mesh("", subdivide(mesh, settings.vertices))
-            else:
+            if not errors.is_whole(label):
+                expected = "the name of a class, or its index"
+                errors.require_kind(f"{name}: its label", label, str, expected)
+            if isinstance(mesh, str | Path):
                 item = load_object(ObjectSettings(str(mesh), ""), settings.vertices)
+            else:
+                require_mesh(name, mesh)
+                item = SceneObject.from_mesh("", subdivide(mesh, settings.vertices))
             # An index remains a number, because a class may have this number as its name.
             item = replace(item, label=label if isinstance(label, str) else int(label))
         objects.append(add_table(item, settings.ground))
@@ -221,9 +214,7 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
     """
     if cameras is None:
         if not normalize:
-            raise InputError(
-                "normalize=False needs cameras: give cameras=[...] in the coordinates of the mesh"
-            )
+            raise InputError("normalize=False needs cameras in the units of the mesh: give them")
         return []
     expected = "a list of cameras, such as list(nb.load_cameras(path).values())"
     given = errors.as_list("cameras", cameras, Camera, expected)
@@ -249,8 +240,8 @@ def _build_lights(
     """
     if isinstance(environment, str | Path):
         environment = load_light(environment, degree, roughness)
-    local_settings = [getattr(settings, name) for name in LOCAL_LIGHTS]
-    local = [build_local_light(light) for light in local_settings if light is not None]
+    given = [getattr(settings, name) for name in LOCAL_LIGHTS]
+    local = [build_local_light(light) for light in given if light is not None]
     return with_local_lights(environment * settings.exposure, local)
 
 
@@ -280,9 +271,6 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor
 # Warnings are given if the irradiance of a lighting is off by more than this: the rms error divided
 # by the rms irradiance.
 MAX_IRRADIANCE_ERROR = 0.05
-# Lowest degree of spherical harmonics that shades the sides of an object about right. The
-# irradiance of a point source has an error of 0.09 at this degree, and of 0.42 or more below it.
-MIN_SHADING_DEGREE = 2
 # The irradiance of lighting of this degree counts as exact. More harmonics change it by less than
 # `MAX_IRRADIANCE_ERROR`.
 REFERENCE_DEGREE = 8
@@ -318,9 +306,8 @@ class Smoothest(NamedTuple):
         """Return the degree of lighting that the surface needs, as far as memory permits."""
         degree = max(DEGREE, self.degree)
         cpu = torch.device("cpu")
-        while degree > DEGREE and not errors.has_memory(
-            OPERATOR_BYTES * (degree + 1) ** 2 * pixels, cpu
-        ):
+        bytes_per_value = OPERATOR_BYTES * pixels
+        while degree > DEGREE and not errors.has_memory(bytes_per_value * (degree + 1) ** 2, cpu):
             degree -= 1
         return degree
 
@@ -400,12 +387,6 @@ def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int
         return degree
     if smoothest.degree > given:
         smoothest.warn(f"degree={given}", given)
-    if given < MIN_SHADING_DEGREE:
-        warnings.warn(
-            f"degree={given} is too low to shade objects correctly, and attacks and variations of "
-            f"the light have the same degree: give {MIN_SHADING_DEGREE} or more, or leave it out",
-            stacklevel=3,
-        )
     return given
 
 
@@ -420,7 +401,7 @@ def _warn_of_wrong_irradiance(name: str, light: Tensor, degree: int) -> None:
     if error > MAX_IRRADIANCE_ERROR:
         warnings.warn(
             f"light {name} of degree={degree} has an irradiance that is off by {error:.0%} (rms "
-            "over normals): give a higher degree",
+            "over normals), and attacks of it have the same degree: give a higher degree",
             stacklevel=3,
         )
 

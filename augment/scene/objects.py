@@ -78,9 +78,8 @@ class SceneObject:
         Returns:
             The object, without props and table.
         """
-        mesh = normalize(given)
         center, extent = center_and_extent(given)
-        place = tuple(center.tolist())
+        place, mesh = tuple(center.tolist()), normalize(given)
         return cls(label, mesh, albedo_scale, name, center=place, extent=float(extent))
 
     @property
@@ -220,7 +219,7 @@ def resample_instance(item: SceneObject, seed: int) -> SceneObject:
     if gloss is not None:
         # All faces of a solid have the same gloss. Repeat it for the faces of the new shape.
         gloss = gloss[:1].repeat(len(mesh.faces), axis=0)
-    return _with_mesh(item, replace(mesh, gloss=gloss))
+    return with_own_mesh(item, replace(mesh, gloss=gloss))
 
 
 def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObject:
@@ -229,16 +228,11 @@ def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObjec
     They stand at the height of its new lowest vertex.
     """
     mesh = item.own_mesh
-    return _with_mesh(item, mesh.moved(_rounded(mesh.vertices @ rotation.T)))
+    return with_own_mesh(item, mesh.moved(_rounded(mesh.vertices @ rotation.T)))
 
 
-def add_specular_layer(item: SceneObject, gloss: Gloss) -> SceneObject:
-    """Return a copy of an object with another specular material. Props and table keep their own."""
-    return _with_mesh(item, gloss.on(item.own_mesh))
-
-
-def _with_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
-    """Return a copy of an object with another mesh."""
+def with_own_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
+    """Return a copy of an object with another mesh. Its props and its table keep their own."""
     without_props = replace(item, mesh=mesh, own=None)
     return add_table(with_props(without_props, item.props), item.ground)
 
@@ -275,10 +269,8 @@ def _load(item: MeshSettings) -> Mesh:
         mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
     has_colors = bool(mesh.textures) or bool((mesh.corner_colors != 1).any())
     if item.color is not None and has_colors:
-        raise InputError(
-            f"color is set, but {item.mesh} has its own colors: "
-            "remove color, and set albedo_scale to make them brighter or darker",
-        )
+        advice = "remove color, and set albedo_scale to make them brighter or darker"
+        raise InputError(f"color is set, but {item.mesh} has its own colors: {advice}")
     if item.color is not None:
         colored = Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
         mesh = replace(colored, gloss=mesh.gloss)
@@ -287,10 +279,8 @@ def _load(item: MeshSettings) -> Mesh:
         mesh = Gloss(*(float(value) for value in item.gloss)).on(mesh)
     is_metal = mesh.gloss is not None and mesh.gloss[:, METALLIC].any()
     if item.gloss is not None and is_metal and item.color is None and not has_colors:
-        raise InputError(
-            f"{item.mesh} is a metal without a color: "
-            "give color=[red,green,blue], or a metallic of 0",
-        )
+        advice = "give color=[red,green,blue], or a metallic of 0"
+        raise InputError(f"{item.mesh} is a metal without a color: {advice}")
     return mesh
 
 

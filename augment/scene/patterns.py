@@ -295,32 +295,12 @@ LINE_LENGTH = 24
 LINE_SPACING = 1.2
 
 
-def _solid(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
-    """Light the whole image in the first color."""
-    return solid(points)
-
-
-def _gradient(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
-    """Draw a linear ramp along x, whose value at the center of the image is 0.5."""
-    return (points[0] / rng.uniform(0.6, 1.6) + 0.5).clamp(0, 1)
-
-
-def _stripes(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
-    """Draw stripes along y with a random width and a random position."""
-    scaled = points / rng.uniform(0.12, 0.5)
+def _stripes(
+    positions: Float[Tensor, " ..."], rng: np.random.Generator, widest: float = 0.5
+) -> Tensor:
+    """Draw stripes with a random width and a random position. Row 0 is the position across."""
+    scaled = positions / rng.uniform(0.12, widest)
     return stripes(scaled, shift=rng.uniform(), bright=rng.uniform(0.3, 0.7))
-
-
-def _checkers(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
-    """Draw a checkerboard with a random size and a random position."""
-    scaled = points / rng.uniform(0.12, 0.5)
-    return checkers(scaled, _pair(rng.uniform(size=2)))
-
-
-def _half(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
-    """Light the pixels on one side of a vertical line that crosses the object."""
-    # `half` lights the points to the right of the line x = shift - 0.5.
-    return half(points, shift=0.5 + rng.uniform(-0.12, 0.12))
 
 
 def _spots(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
@@ -336,8 +316,7 @@ def _spots(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
 def _rings(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     """Draw concentric rings of the same width around a random center."""
     radius = (points - _pair(rng.uniform(-0.5, 0.5, 2))).norm(dim=0, keepdim=True)
-    scaled = radius / rng.uniform(0.12, 0.4)
-    return stripes(scaled, shift=rng.uniform(), bright=rng.uniform(0.3, 0.7))
+    return _stripes(radius, rng, widest=0.4)
 
 
 def _window(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
@@ -385,9 +364,8 @@ def _text(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
 
 def _colors(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "3 H W"]:
     """Draw smooth colors: random values on a coarse grid, interpolated by cubic splines."""
-    row_count = rng.integers(3, 6)
-    column_count = rng.integers(3, 6)
-    grid = rng.uniform(0, 1, (row_count, column_count, 3))
+    rows, columns = rng.integers(3, 6), rng.integers(3, 6)
+    grid = rng.uniform(0, 1, (rows, columns, 3))
     return _interpolate(grid, points, order=3).clamp(0, 1)
 
 
@@ -419,12 +397,16 @@ def _interpolate(
 
 # Functions that draw the patterns, by the name of the pattern. PATTERNS in
 # train/command_settings.py lists the same names.
-LAB_PATTERNS = {
-    "solid": _solid,
-    "gradient": _gradient,
+LAB_PATTERNS: dict[str, Callable[[Tensor, np.random.Generator], Tensor]] = {
+    "solid": lambda points, rng: solid(points),
+    # A linear ramp along x, whose value at the center of the image is 0.5.
+    "gradient": lambda points, rng: (points[0] / rng.uniform(0.6, 1.6) + 0.5).clamp(0, 1),
     "stripes": _stripes,
-    "checkers": _checkers,
-    "half": _half,
+    "checkers": lambda points, rng: checkers(
+        points / rng.uniform(0.12, 0.5), _pair(rng.uniform(size=2))
+    ),
+    # The line x = shift - 0.5 crosses the object.
+    "half": lambda points, rng: half(points, 0.5 + rng.uniform(-0.12, 0.12)),
     "spots": _spots,
     "rings": _rings,
     "window": _window,
@@ -448,8 +430,7 @@ def draw_lab_pattern(
     second = torch.from_numpy(draw_lab_color(rng))[:, None, None]
     # The brightness is drawn even if it is not used, so that all patterns take the same
     # number of random draws.
-    second_brightness = rng.uniform()
-    second = second * (second_brightness if name in TWO_COLORED else 0.0)
+    second = second * rng.uniform() * (name in TWO_COLORED)
     angle = rng.uniform(0, 2 * math.pi)
     centers = pixel_centers(LAB_RESOLUTION)[:, 0].double()
     points = turned(centers, math.cos(angle), -math.sin(angle))

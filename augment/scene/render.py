@@ -386,14 +386,8 @@ class DirectRenderer:
             positions = vertices.detach().cpu().double().numpy()
             fragments, albedo = self._rasterize(object_index, fixed_camera, positions)
         if changed.albedo is not None:
-            albedo = paint_faces(
-                item.mesh,
-                fragments,
-                self.settings.encoding,
-                item.albedo_scale,
-                changed.albedo,
-                changed.hue,
-            )
+            of_view = (item.mesh, fragments, self.settings.encoding, item.albedo_scale)
+            albedo = paint_faces(*of_view, changed.albedo, changed.hue)
         gloss = None
         if changed.gloss is not None:
             gloss = Gloss(*changed.gloss.unbind(1), textured=True)
@@ -482,14 +476,8 @@ class DirectRenderer:
     ) -> tuple[Fragments, Tensor]:
         """Rasterize an object with given vertices."""
         item = self.objects[object_index]
-        [fragments] = build_fragments(
-            vertices,
-            item.mesh.faces,
-            [camera],
-            self.settings,
-            self.rasterizer,
-            closed=item.mesh.closed,
-        )
+        shown = (vertices, item.mesh.faces, [camera], self.settings, self.rasterizer)
+        [fragments] = build_fragments(*shown, closed=item.mesh.closed)
         fragments = fragments.to(self.like.device)
         albedo = surface_albedo(item.mesh, fragments, self.settings.encoding)
         return fragments, (albedo * item.albedo_scale).to(self.like)

@@ -42,7 +42,7 @@ NUMBERS_PER_PIXEL = 8
 NUMBERS_PER_RENDERED_PIXEL = 16
 # If effects of a camera, such as blur and noise, are rendered, an attack on the light keeps about
 # so many numbers for each pixel of the images that are rendered at the same time.
-NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA = 48
+NUMBERS_WITH_CAMERA = 48
 
 
 class Scene:
@@ -113,9 +113,8 @@ class Scene:
         errors.require_kind("settings", settings, ImageSettings, "nb.ImageSettings(size)")
         errors.require_kind("basis", basis, Basis, "a basis of light, such as Harmonics(degree)")
         errors.require_kind("camera_effects", camera_effects, Callable | None, effects)
-        errors.require_kind(
-            "rasterizer", rasterizer, Rasterizer, "renderer.visibility.choose(name)"
-        )
+        chosen_by = "renderer.visibility.choose(name)"
+        errors.require_kind("rasterizer", rasterizer, Rasterizer, chosen_by)
         self.settings = settings
         self.rasterizer = rasterizer
         self.basis = basis
@@ -134,17 +133,15 @@ class Scene:
         self.views = len(examples[0].cameras)
         device = lights.device
         self.object_of = torch.tensor([example.object for example in examples], device=device)
-        backgrounds_of_examples = [example.background for example in examples]
-        self._background = torch.tensor(backgrounds_of_examples, device=device)
+        chosen = [example.background for example in examples]
+        self._background = torch.tensor(chosen, device=device)
         exposures = torch.tensor([example.exposure for example in examples])
         # Two axes of size 1 let the exposures multiply lights of shape (E, coefficients, 3).
         self._exposure = exposures.to(lights)[:, None, None]
 
         pixels_per_example = self.views * settings.size**2
         self.group_size = max(1, AT_ONCE // pixels_per_example)
-        per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL
-        if camera_effects:
-            per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA
+        per_rendered_pixel = NUMBERS_WITH_CAMERA if camera_effects else NUMBERS_PER_RENDERED_PIXEL
         numbers = NUMBERS_PER_PIXEL * len(self) * pixels_per_example
         numbers += per_rendered_pixel * min(len(self), self.group_size) * pixels_per_example
         numbers += NUMBERS_PER_LIGHT_VALUE * self.lights.numel()
@@ -176,9 +173,7 @@ class Scene:
     ) -> None:
         """Check that examples, lights and backgrounds fit the objects, the basis and the size."""
         if not examples:
-            raise InputError(
-                "examples is empty: give at least one mesh, one view and one background"
-            )
+            raise InputError("examples is empty: give a mesh, a view and a background")
         highest = max(example.object for example in examples)
         if highest >= len(self.objects):
             raise InputError(
@@ -452,13 +447,9 @@ class Scene:
             example = self.examples[example_index]
             camera = self.cameras_under(conditions, row, example_index)[view]
             background = self.backgrounds[example.background].flatten(1)
+            changed = conditions.row(row, self.mesh(example_index))
             pixels, coverage, radiance = self._direct_renderer.radiance(
-                example_index,
-                example.object,
-                camera,
-                light[row],
-                conditions.row(row, self.mesh(example_index)),
-                background,
+                example_index, example.object, camera, light[row], changed, background
             )
             background_pixels = background.index_select(1, pixels)
             term = background_term(coverage[None], background_pixels, self.settings.encoding)

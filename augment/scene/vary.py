@@ -15,13 +15,7 @@ from torch import Generator, Tensor
 from augment.augmentation_settings import CameraEffectSettings, VariationSettings
 from augment.progress import progress
 from augment.scene import patterns
-from augment.scene.objects import (
-    Example,
-    SceneObject,
-    add_specular_layer,
-    resample_instance,
-    rotated,
-)
+from augment.scene.objects import Example, SceneObject, resample_instance, rotated, with_own_mesh
 from augment.scene.scene import Scene
 from augment.scene.tabletop import Room, above_table, irradiance, project_along_light
 from renderer.camera import Camera, PerspectiveCamera
@@ -62,10 +56,7 @@ def vary(scene: Scene, settings: VariationSettings, draws: Generator, once: bool
     is_on_table = torch.zeros(len(scene), dtype=torch.bool)
     if settings.tables:
         if scene.views > 1 or any(item.ground is not None for item in scene.objects):
-            raise InputError(
-                "tables require one view per example and objects without a table of their own: "
-                "set views=1 and remove ground, or set tables=0"
-            )
+            raise InputError("tables need views=1 and ground=None: set both, or tables=0")
         is_on_table = torch.rand(len(scene), generator=draws) < settings.tables
     if settings.moves or settings.backgrounds is not None:
         scene = _Variation(scene, settings, draws, is_on_table).change_geometry(once)
@@ -160,8 +151,8 @@ class _Variation:
             fractions = torch.rand(count, 2, generator=self.draws, dtype=torch.float64)
             values = torch.lerp(ranges[:, 0], ranges[:, 1], fractions).tolist()
             objects = [
-                add_specular_layer(item, Gloss(roughness, specular_factor=specular_factor))
-                for item, (roughness, specular_factor) in zip(objects, values, strict=True)
+                with_own_mesh(item, Gloss(rough, specular_factor=strength).on(item.own_mesh))
+                for item, (rough, strength) in zip(objects, values, strict=True)
             ]
         return objects
 
@@ -226,11 +217,8 @@ class _Variation:
         low, high = settings.fill_light
         fill = low + (high - low) * torch.rand(count, 1, 1, generator=self.draws)
         is_chosen = torch.rand(count, 1, 1, generator=self.draws) < settings.directional_fraction
-        to_lights = []
-        for example, turn in zip(scene.examples, self._draw_pairs(MAX_LIGHT_ANGLE), strict=True):
-            # The third axis of a camera points from the origin to the camera.
-            to_lights.append(_turn(example.cameras[0], *turn).axes()[2])
-        directions = torch.from_numpy(np.stack(to_lights))
+        turns = zip(scene.cameras, self._draw_pairs(MAX_LIGHT_ANGLE), strict=True)
+        directions = _towards_cameras([_turn(cameras[0], *turn) for cameras, turn in turns])
         # A table blocks light from below, so such directions are mirrored to above.
         grounds = [scene.objects[example.object].ground for example in scene.examples]
         has_table = self.is_on_table | torch.tensor([ground is not None for ground in grounds])
@@ -304,6 +292,11 @@ def _number_backgrounds(examples: Sequence[Example]) -> list[Example]:
     return [replace(example, background=index) for index, example in enumerate(examples)]
 
 
+def _towards_cameras(cameras: Sequence[Camera]) -> Float[Tensor, "E 3"]:
+    """Return the unit vectors from the origin to cameras, which are their third axes."""
+    return torch.from_numpy(np.stack([camera.axes()[2] for camera in cameras]))
+
+
 def _turn(camera: Camera, polar: float, azimuth: float) -> Camera:
     """Return a copy of a camera that is turned around the object."""
     return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
@@ -361,9 +354,7 @@ def _facing_irradiance(scene: Scene) -> Float[Tensor, "E 3 1 1"]:
 
     It is multiplied by the exposure. The first camera of each example counts.
     """
-    # The normal of the surface points to the camera.
-    directions = [example.cameras[0].axes()[2] for example in scene.examples]
-    normals = torch.from_numpy(np.stack(directions))
+    normals = _towards_cameras([cameras[0] for cameras in scene.cameras])
     exposures = torch.tensor([example.exposure for example in scene.examples])[:, None]
     harmonics = harmonics_of(scene.basis)
     coefficients = scene.lights.cpu().double()[:, harmonics.nonzero]
@@ -436,8 +427,7 @@ def draw_camera_effects(
     stops = settings.white_balance * (2 * torch.rand(count, 3, 1, 1, generator=draws) - 1)
     deviations = (settings.blur * torch.rand(count, generator=draws)).to(device)
     noise_deviations = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
-    noises = noise_deviations * torch.randn(count, 3, size, size, generator=draws)
-    noises = noises.to(device)
+    noises = (noise_deviations * torch.randn(count, 3, size, size, generator=draws)).to(device)
     gains = (pattern_gains * 2**stops).to(device)
 
     def apply_effects(

@@ -78,11 +78,10 @@ def rounds_of_epoch(
     shown_images = torch.randperm(image_count, generator=draws)[:images_per_epoch]
     render_numbers = torch.arange(image_count, image_count + render_count)
     parts = shown_images.split(images_per_round or len(shown_images))
-    rounds = []
-    for index, part in enumerate(parts):
-        rows = torch.cat([part.sort().values, render_numbers])
-        rounds.append(Round(epoch * len(parts) + index, epoch, rows))
-    return rounds
+    return [
+        Round(epoch * len(parts) + index, epoch, torch.cat([part.sort().values, render_numbers]))
+        for index, part in enumerate(parts)
+    ]
 
 
 def training_batches(

@@ -70,10 +70,6 @@ class ImageFiles:
         """Return the files themselves, which are read on the CPU."""
         return self
 
-    def file_sizes(self) -> list[tuple[str, int]]:
-        """Return the path and the size in bytes of each image file."""
-        return [(str(path), (self.folder / path).stat().st_size) for path in self.paths]
-
     def squares(self, rows: Iterable[Tensor]) -> Iterator[Tensor]:
         """Read the central squares of images, batch by batch.
 

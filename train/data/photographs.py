@@ -29,8 +29,6 @@ MACOS_FOLDER = "__MACOSX"
 # Largest number of classes that are positive because they have a sub-folder. The scores of each
 # class take as much time and memory as all photographs.
 MAX_LABELS = 50
-# Source, sources of hard negatives and mesh of a photograph that photos.csv does not name.
-NO_ROW = (None, (), None)
 # What `Photograph` has after its path and label.
 Row = tuple[str | None, tuple[str, ...], str | None]
 
@@ -83,18 +81,19 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     table = folder / TABLE
     rows = _read_table(table)
     missing = sorted(rows.keys() - set(map(_composed_path, files)))
-    if missing and len(missing) == len(rows):
-        raise InputError(
-            f"{table} names a missing file in each of its {len(rows)} rows, such as "
-            f"{missing[0]}: give paths relative to the folder, such as {paths[0]}"
-        )
     if missing:
         counts = f"{len(missing)} of {len(rows)} rows"
-        _warn_once(f"{table} names a missing file in {counts}, such as {missing[0]}")
+        fault = f"{table} names a missing file in {counts}, such as {missing[0]}"
+        if len(missing) == len(rows):
+            advice = f"give paths relative to the folder, such as {paths[0]}"
+            raise InputError(f"{fault}: {advice}")
+        _warn_once(fault)
     photographs = []
     for path in paths:
         name = composed(path.parts[0]) if has_class_folders else labels[0]
-        photographs.append(Photograph(path, name, *rows.get(_composed_path(path), NO_ROW)))
+        photographs.append(
+            Photograph(path, name, *rows.get(_composed_path(path), (None, (), None)))
+        )
     hard_negatives = {name for item in photographs for name in item.hard_negatives}
     unknown = hard_negatives - {item.source for item in photographs}
     if unknown:
@@ -146,8 +145,7 @@ def folder_names(folder: Path) -> list[str]:
 
 def find_unlabeled(folder: Path) -> list[Photograph]:
     """Find all images of a folder and its subfolders, without their classes."""
-    image_paths, _ = _image_files(folder)
-    return [Photograph(path, label="", source=None) for path in image_paths]
+    return [Photograph(path, label="", source=None) for path in _image_files(folder)[0]]
 
 
 def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]]:
@@ -173,8 +171,8 @@ def unsupported_files(folder: Path) -> list[PurePosixPath]:
     Files that the library itself reads or writes there, photos.csv and
     lab.json, are left out.
     """
-    own_files = (PurePosixPath(TABLE), PurePosixPath(DESCRIPTION))
-    other_files = [path for path in visible_files(folder) if path not in own_files]
+    own_files = {PurePosixPath(TABLE), PurePosixPath(DESCRIPTION)}
+    other_files = {*visible_files(folder)} - own_files
     return sorted(path for path in other_files if not _is_image(folder, path))
 
 
@@ -213,15 +211,13 @@ def visible_files(folder: Path) -> Iterator[PurePosixPath]:
         raise error
 
     for parent, subfolders, files in os.walk(folder, onerror=raise_error, followlinks=True):
-        real_parent = Path(os.path.realpath(parent))
-        to_visit = []
-        for name in subfolders:
-            target = os.path.realpath(os.path.join(parent, name))
-            contains_parent = real_parent.is_relative_to(target)
-            if not is_hidden(name) and not contains_parent:
-                to_visit.append(name)
+        real_parent = Path(parent).resolve()
         # This changes the list of `os.walk`, which then visits only these subfolders.
-        subfolders[:] = to_visit
+        subfolders[:] = [
+            name
+            for name in subfolders
+            if not is_hidden(name) and not real_parent.is_relative_to(Path(parent, name).resolve())
+        ]
         relative_parent = PurePosixPath(Path(parent).relative_to(folder).as_posix())
         yield from (relative_parent / name for name in files if not is_hidden(name))
 
@@ -247,10 +243,8 @@ def _has_class_folders(
             )
     if no_classes:
         count = f"{len(no_classes)} of {len(names)} folders in {folder}"
-        shown = ", ".join(no_classes)
-        _warn_once(
-            f"{count} are not named after a class of the model and count as negatives: {shown}"
-        )
+        fault = "are not named after a class of the model and count as negatives"
+        _warn_once(f"{count} {fault}: {', '.join(no_classes)}")
     outside = [path for path in paths if len(path.parts) == 1]
     if names and outside:
         raise InputError(
@@ -276,11 +270,8 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
             composed_lines = (composed(line) for line in file)
             for line in csv.DictReader(composed_lines, restval="", strict=True):
                 path = PurePosixPath(line["path"].replace("\\", "/"))
-                row = (
-                    line["source_tag"] or None,
-                    split_sources(line.get("hard_negatives", "")),
-                    line.get("mesh") or None,
-                )
+                hard_negatives = split_sources(line.get("hard_negatives", ""))
+                row = (line["source_tag"] or None, hard_negatives, line.get("mesh") or None)
                 if rows.setdefault(path, row) != row:
                     raise ValueError(f"two different rows for {path}")
     except (ValueError, LookupError, csv.Error, OSError) as error:
@@ -317,7 +308,7 @@ def load_photographs(
         # If Ctrl-C is pressed, images that no thread has begun to read are not read.
         pool.shutdown(cancel_futures=True)
     readable = [index for index, error in enumerate(errors) if error is None]
-    unreadable = [index for index, error in enumerate(errors) if error is not None]
+    unreadable = [index for index, error in enumerate(errors) if error]
     if unreadable and not (readable and skip_unreadable):
         first = unreadable[0]
         advice = ", or set skip_unreadable=True to skip them" if readable else ""

@@ -27,7 +27,7 @@ from renderer.errors import require_memory
 from renderer.image import to_bytes
 from renderer.io.files import atomic_write
 from renderer.light.files import ambient, directional
-from renderer.mesh import Mesh, normalize
+from renderer.mesh import normalize
 from renderer.settings import ImageSettings
 from renderer.solids import SOLIDS, solid
 from renderer.visibility import choose
@@ -46,10 +46,11 @@ def source_key(*packages: Path) -> str:
 
     As part of the key of a cache, the hash makes cached results of other code unused.
     """
-    files = []
-    for folder in packages:
-        for path in folder.rglob("*.py"):
-            files.append((path.relative_to(folder).as_posix(), path.read_bytes()))
+    files = [
+        (path.relative_to(folder).as_posix(), path.read_bytes())
+        for folder in packages
+        for path in folder.rglob("*.py")
+    ]
     return content_hash([torch.__version__, np.__version__, sorted(files)])
 
 
@@ -140,21 +141,19 @@ def _render(
     draws = generator(seed, split_name)
     images = []
     for name in progress(CLASSES, f"{split_name} images"):
-        images_of_class = []
-        for _ in range(solids_per_class):
-            mesh = solid(name, int(torch.randint(2**31, (1,), generator=draws)))
-            images_of_class.append(_render_solid(mesh, settings, draws))
+        images_of_class = [_render_solid(name, settings, draws) for _ in range(solids_per_class)]
         images.append(torch.cat(images_of_class)[:images_per_class])
     return torch.cat(images)
 
 
 def _render_solid(
-    mesh: Mesh, settings: ImageSettings, draws: torch.Generator
+    name: str, settings: ImageSettings, draws: torch.Generator
 ) -> UInt8[Tensor, "_ 3 size size"]:
-    """Render one solid for each pair of a random camera and a random background.
+    """Render a random solid for each pair of a random camera and a random background.
 
     Each image has another light.
     """
+    mesh = solid(name, int(torch.randint(2**31, (1,), generator=draws)))
     polar, azimuth, width = torch.rand(3, CAMERAS, generator=draws, dtype=torch.float64).tolist()
     cameras = [
         OrthographicCamera(40 + 45 * polar[index], 360 * azimuth[index], 2 + width[index])
@@ -165,10 +164,8 @@ def _render_solid(
     for camera in cameras:
         to_camera = torch.tensor(camera.axes()[2], dtype=torch.float32)
         lights += [soft_front_light(to_camera, draws) for _ in grays]
-    subject = SceneObject("", normalize(mesh))
-    backgrounds = load_backgrounds(grays, settings.size)
-    options = (torch.stack(lights), settings, choose("numpy"))
-    scene = Scene.grid([subject], cameras, backgrounds, *options)
+    shown = ([SceneObject("", normalize(mesh))], cameras, load_backgrounds(grays, settings.size))
+    scene = Scene.grid(*shown, torch.stack(lights), settings, choose("numpy"))
     examples = torch.arange(len(scene))
     images = scene.render(scene.conditions(examples), examples)
     return to_bytes(images.flatten(0, 1))

@@ -15,7 +15,7 @@ from torch import Tensor
 from augment.classifier import class_index
 from augment.progress import progress
 from augment.random_streams import generator
-from renderer.errors import InputError, single_line
+from renderer.errors import InputError, describe, single_line
 from train import console
 from train.data import photographs
 from train.data.images import MAX_SIZE_IN_MEMORY, ImageFiles
@@ -81,8 +81,10 @@ class Split:
         For images on disk, the names and sizes of the files are hashed instead
         of the pixels.
         """
-        images = self.images
-        content = images.file_sizes() if isinstance(images, ImageFiles) else images
+        content: Any = self.images
+        if isinstance(content, ImageFiles):
+            folder = content.folder
+            content = [(str(path), (folder / path).stat().st_size) for path in content.paths]
         return content_hash([content, self.labels])
 
     def to(self, device: torch.device) -> "Split":
@@ -230,11 +232,10 @@ def load_npz(path: str) -> DataSet:
             classes = archive["classes"]
             if classes.ndim != 1 or classes.dtype.kind != "U" or len({*classes}) != len(classes):
                 raise ValueError("classes must be distinct strings, one per class")
-            splits = []
-            for name in progress(("train", "test"), "reading the data"):
-                arrays = archive[f"{name}_images"], archive[f"{name}_labels"]
-                splits.append(_npz_split(*arrays, len(classes)))
-        train, test = splits
+            train, test = (
+                _npz_split(archive[f"{name}_images"], archive[f"{name}_labels"], len(classes))
+                for name in progress(("train", "test"), "reading the data")
+            )
         if train.images.shape[1:] != test.images.shape[1:]:
             raise ValueError("train_images and test_images differ in size")
         return DataSet(tuple(classes.tolist()), train, test)
@@ -252,11 +253,9 @@ def _npz_split(images: np.ndarray, labels: np.ndarray, class_count: int) -> Spli
     """Check arrays of images and labels, and convert them to a `Split`."""
     is_square = images.ndim == 4 and images.shape[1] == 3 and images.shape[2] == images.shape[3]
     if not is_square or images.dtype != np.uint8:
-        given = f"images are {images.dtype} of shape {images.shape}"
-        raise ValueError(f"{given}; they must be uint8 (N, 3, S, S)")
+        raise ValueError(f"images are {describe(images)}; they must be uint8 (N, 3, S, S)")
     if labels.shape != images.shape[:1] or labels.dtype.kind not in "iu":
-        given = f"labels are {labels.dtype} of shape {labels.shape}"
-        raise ValueError(f"{given}; they must be integers ({len(images)},)")
+        raise ValueError(f"labels are {describe(labels)}; they must be integers ({len(images)},)")
     if not len(labels) or labels.min() < 0 or labels.max() >= class_count:
         raise ValueError(f"labels must be 0 to {class_count - 1}, one at least")
     return Split(torch.from_numpy(images), torch.from_numpy(labels.astype(np.int64)))
@@ -275,25 +274,17 @@ def load_folder(
     used if there is a subfolder `test`.
     """
     root = Path(path)
-    if not root.is_dir():
-        raise InputError(
-            f"path={path} is not a folder: give a folder with one folder of images per class",
-            "path",
-        )
     split_names = [name for name in photographs.folder_names(root) if name.lower() in SPLIT_NAMES]
     if split_names not in ([], ["test", "train"]):
+        advice = "give a folder with the two folders train and test, or with class folders only"
         raise InputError(
-            f"path={path} holds the folders {', '.join(split_names)}: "
-            "give a folder with the two folders train and test, or with class folders only",
-            "path",
+            f"path={path} holds the folders {', '.join(split_names)}: {advice}", "path"
         )
     train_root = root / "train" if split_names else root
     classes = tuple(photographs.folder_names(train_root))
     if len(classes) < 2:
-        raise InputError(
-            f"path={path} holds {len(classes)} class folders: give a folder with two or more",
-            "path",
-        )
+        fault = f"path={path} holds {len(classes)} class folders"
+        raise InputError(f"{fault}: give a folder with two or more", "path")
     other_files = photographs.unsupported_files(root)
     if other_files:
         shown = ", ".join(map(str, other_files[:3]))

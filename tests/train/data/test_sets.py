@@ -64,7 +64,7 @@ def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
     "changes, fault",
     [
         ({"test_labels": None}, "test_labels is not a file in the archive"),
-        ({"train_images": np.zeros((5, 8, 8, 3), np.uint8)}, r"images are uint8 of shape \(5, 8"),
+        ({"train_images": np.zeros((5, 8, 8, 3), np.uint8)}, r"of uint8 and shape \(5, 8"),
         ({"test_images": np.zeros((2, 3, 9, 9), np.uint8)}, "differ in size"),
         ({"train_labels": np.zeros(4, int)}, r"\(4,\); they must be integers \(5,\)"),
         ({"test_labels": np.array([0, 2])}, "labels must be 0 to 1"),
