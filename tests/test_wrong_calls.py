@@ -19,7 +19,7 @@ from torch import Tensor, nn
 import augment
 import renderer
 from augment.attacks.result import AttackResult
-from augment.augmentation_settings import RandomLightSettings
+from augment.augmentation_settings import RandomLightSettings, TrainingAttackSettings
 from augment.progress import Phases
 from augment.scene.objects import Conditions
 from renderer import InputError, harmonics, skylight
@@ -456,6 +456,15 @@ SERVICES = [
     *by_name(augment.AugmentationSettings, warm_start=["yes"], regenerate_every=[0, 2.5]),
     *by_name(augment.AugmentationSettings, vary=[{"shift": 0.1}], random_light=[0.5, None]),
     *by_name(augment.AugmentationSettings, attack=[STEPS]),
+    *by_name(
+        partial(augment.AugmentationSettings, warm_start=True),
+        vary=[augment.VariationSettings(instances=True)],
+    ),
+    *calls_of(
+        "radius",
+        lambda x: augment.AugmentationSettings("random", attack=x),
+        TrainingAttackSettings(albedo=STEPS),
+    ),
     *calls_of("amplitude", RandomLightSettings, 0, "x", NAN),
     *calls_of(
         "meshes", lambda x: augment.AugmentationService.from_meshes(x, SIZE), [(MESH,)], [MESH], 3

@@ -1,6 +1,5 @@
 """Classifiers of networks, which stay frozen; what a plain network does not tell is assumed."""
 
-import re
 from functools import partial
 
 import numpy as np
@@ -78,39 +77,6 @@ def test_a_classifier_is_frozen_and_stays_in_eval_mode():
     assert torch.equal(network[1].running_mean, statistics)
     assert not before.requires_grad
     assert not any(parameter.requires_grad for parameter in network.parameters())
-
-
-@pytest.mark.parametrize(
-    ("function", "shape", "message"),
-    [
-        (mean_color, (2, 3, 8, 9), "(N, 3, 8, 8), not (2, 3, 8, 9)"),
-        (lambda images: images[:, :2, 0, 0], (2, 3, 8, 8), "returned (2, 2)"),
-        (lambda images: images.detach().mean((2, 3)), (2, 3, 8, 8), "without a gradient"),
-        (lambda images: images.mean((2, 3)) / 0, (2, 3, 8, 8), "NaN or infinite"),
-        (lambda images: images @ images.double(), (2, 3, 8, 8), "float32 images (2, 3, 8, 8)"),
-    ],
-    ids=["shape of images", "number of logits", "no gradient", "no numbers", "an error"],
-)
-def test_wrong_images_and_logits_are_refused(function, shape, message):
-    classifier = Classifier(function, 8, COLORS, name="mine")
-    with pytest.raises(InputError, match=re.escape(message)) as caught:
-        classifier(torch.rand(shape, requires_grad=True))
-    assert str(caught.value).startswith("classifier mine ")
-
-
-@pytest.mark.parametrize("classes", [["crane", "orange", "crane"], ["crane"], []])
-def test_class_names_must_be_unique_and_at_least_two(classes):
-    with pytest.raises(InputError, match="classifier mine"):
-        Classifier(mean_color, 8, classes, name="mine")
-
-
-def test_a_wrong_class_name_is_refused_with_similar_ones():
-    classifier = Classifier(mean_color, 8, ["lemon", "orange", "pear"], name="mine")
-    with pytest.raises(InputError, match=r"'ornage'.*orange"):
-        classifier.label("ornage")
-
-
-# --------------------------------------------------------------- plain networks
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from augment.classifier import Classifier, as_classifier
-from augment.network import LightNormalization, normalize_light
+from augment.network import normalize_light
 from augment.settings import NormalizedLightSettings
 from renderer import InputError
 
@@ -146,9 +146,3 @@ def test_light_is_not_normalized_twice():
     classifier = Classifier(Spy(), SIZE, ["red", "green", "blue"], normalize_light=True)
     with pytest.raises(InputError, match="normalize_light"):
         classifier.normalizing_light()
-
-
-def test_networks_with_other_settings_are_told_apart():
-    """Stored logits have keys with the text of the network."""
-    networks = [LightNormalization(NormalizedLightSettings(level=x)) for x in (0.5, 0.6)]
-    assert str(networks[0]) != str(networks[1])

@@ -42,10 +42,6 @@ def test_progress_is_shown_before_the_first_item_is_done_and_nothing_of_it_is_le
     assert stream.getvalue().rpartition("\r")[2].strip() == ""
 
 
-def test_no_progress_is_shown_of_short_work(shown):
-    assert shown(Terminal(), 0.0, [1, 2]) == [False, False]
-
-
 def test_a_log_has_no_progress(shown):
     stream = io.StringIO()
     shown(stream, 0.3, [1, 2])

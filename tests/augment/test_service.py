@@ -6,7 +6,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.data import ConcatDataset, DataLoader
 
 from augment.attack_settings import StepSettings
 from augment.attacks.objective import complementary_label
@@ -20,8 +19,7 @@ from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
-from augment.service import AugmentationService, Renders
-from renderer.errors import InputError
+from augment.service import AugmentationService
 from renderer.light.files import probe
 from renderer.solids import solid
 
@@ -266,20 +264,6 @@ def test_a_warm_start_in_another_environment_lies_in_the_ball_around_it(serve):
 
 
 @pytest.mark.parametrize("mode", ["random", "adversarial"])
-def test_a_label_beyond_the_classes_of_the_network_is_refused(serve, model, labels, mode):
-    with pytest.raises(InputError, match="label=53"):
-        serve(mode=mode, labels=labels + 51).regenerate(model, 0)
-
-
-def test_settings_that_contradict_are_refused():
-    with pytest.raises(InputError, match="warm_start=True"):
-        AugmentationSettings(warm_start=True, vary=VariationSettings(instances=True))
-    unlimited = TrainingAttackSettings(albedo=StepSettings())
-    with pytest.raises(InputError, match="radius is None"):
-        AugmentationSettings(mode="random", attack=unlimited)
-
-
-@pytest.mark.parametrize("mode", ["random", "adversarial"])
 def test_both_arms_change_shape_and_albedo_within_their_norm_balls(model, mode):
     """Shapes are rasterized in every step, so that one view before one background is enough."""
     attack = TrainingAttackSettings(
@@ -316,15 +300,6 @@ def test_a_service_from_meshes_renders_as_one_around_the_same_scene(model):
     scene = built(2, 0.25, 0.75)
     same = AugmentationService(settings, scene, renders.labels, 0, Phases())
     assert torch.equal(same.regenerate(model, 0).images, renders.images)
-
-
-def test_a_data_set_with_numbers_as_labels_goes_into_batches_with_renders():
-    photographs = [(torch.zeros(3, 8, 8), 1)] * 5
-    renders = Renders(torch.ones(3, 3, 8, 8), torch.tensor([2, 3, 4]), {})
-    images, labels = zip(*DataLoader(ConcatDataset([photographs, renders]), 4), strict=True)
-    labels = torch.cat(labels)
-    assert labels.tolist() == [1] * 5 + [2, 3, 4]
-    assert torch.equal(torch.cat(images).flatten(1).amax(1), (labels > 1).float())
 
 
 def probability_rises(model: nn.Module, scene: Scene, after: Tensor) -> Tensor:

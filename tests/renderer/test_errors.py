@@ -23,54 +23,24 @@ from renderer.errors import (
     require_range,
     require_whole,
 )
-from renderer.image import tonemap
 from renderer.light.harmonics import basis, project, rotate
 from renderer.mesh import Mesh
-from renderer.normals import face_normals, vertex_normals
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
-from renderer.surface.albedo import face_albedo, surface_albedo
-from renderer.surface.shading import irradiance, normals_in_sight, radiance
+from renderer.surface.albedo import surface_albedo
 from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
 
 MESH = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
 CAMERA = OrthographicCamera(0, 0, 2.0)
 SETTINGS = ImageSettings(2, 2)
-RASTERIZER = choose("numpy")
-[FRAGMENTS] = build_fragments(MESH.vertices, MESH.faces, [CAMERA], SETTINGS, RASTERIZER)
-[OPERATOR] = build_operators(MESH, [CAMERA], SETTINGS, RASTERIZER)
-FACES = torch.from_numpy(MESH.faces)
-# Valid arguments of `radiance`.
-GOOD = {
-    "vertices": torch.from_numpy(MESH.vertices),
-    "light": torch.ones(49, 3),
-    "albedo": surface_albedo(MESH, FRAGMENTS, "linear").contiguous(),
-}
-
-
-def shade(name: str, values: Tensor, smooth: bool = False) -> Tensor:
-    """Compute the radiance with other values for one argument."""
-    arguments = {**GOOD, name: values}
-    normals = None
-    if smooth:
-        normals = normals_in_sight(FRAGMENTS, arguments["vertices"], FACES, FACES)
-    return radiance(FRAGMENTS, **arguments, normals=normals)
+[FRAGMENTS] = build_fragments(MESH.vertices, MESH.faces, [CAMERA], SETTINGS, choose("numpy"))
+[OPERATOR] = build_operators(MESH, [CAMERA], SETTINGS, choose("numpy"))
 
 
 def corner_albedo(corner_colors: Tensor) -> Tensor:
     """Compute the albedo of the mesh with other corner colors."""
     return surface_albedo(replace(MESH, corner_colors=corner_colors.numpy()), FRAGMENTS, "srgb")
-
-
-def texture_albedo(texture: Tensor) -> Tensor:
-    """Compute the albedo of the mesh with two textures."""
-    return surface_albedo(MESH, FRAGMENTS, "linear", [torch.ones(3, 3, 3), texture])
-
-
-def rasterize(vertices: Tensor) -> object:
-    """Rasterize the mesh with other vertices."""
-    return build_fragments(vertices.numpy(), MESH.faces, [CAMERA], SETTINGS, RASTERIZER)
 
 
 # Each case has the name of a tensor, valid values and the function that takes
@@ -81,26 +51,12 @@ FINITE = [
     ("radiance", torch.ones(28, 3), lambda x: project(lambda _: x, 2, quadrature_degree=6)),
     ("coefficients", torch.ones(9, 3), lambda x: rotate(x, torch.eye(3))),
     ("rotation", torch.eye(3), lambda x: rotate(torch.ones(9, 3), x)),
-    ("vertices", torch.ones(4, 3), lambda x: face_normals(x, FACES)),
-    ("vertices", torch.ones(4, 3), lambda x: vertex_normals(x, FACES)),
-    ("vertices", torch.ones(4, 3), rasterize),
-    ("vertices", GOOD["vertices"], lambda x: shade("vertices", x)),
-    ("vertices", GOOD["vertices"], lambda x: shade("vertices", x, smooth=True)),
 ]
 # Values that are multiplied by each other must also be of limited size.
 BOUNDED = [
-    ("texture", torch.ones(2, 2, 3), texture_albedo),
-    ("albedo", torch.ones(2, 3), lambda x: face_albedo(x, FRAGMENTS)),
     ("corner_colors", torch.ones(2, 3, 3), corner_albedo),
-    ("light", torch.ones(9, 3), lambda x: irradiance(torch.ones(3, 2), x, x.dtype)),
-    ("light", GOOD["light"], lambda x: shade("light", x)),
-    ("albedo", GOOD["albedo"], lambda x: shade("albedo", x)),
-    ("albedo", GOOD["albedo"], lambda x: shade("albedo", x, smooth=True)),
     ("lights", torch.ones(2, 49, 3), OPERATOR.radiance),
     ("radiance_gradient", torch.ones(2, 3, 4), OPERATOR.light_gradient),
-    ("radiance", torch.ones(3, 4), lambda x: tonemap(x, torch.ones(1, 4), torch.ones(3, 1))),
-    ("coverage", torch.ones(1, 4), lambda x: tonemap(torch.ones(3, 4), x, torch.ones(3, 1))),
-    ("background", torch.ones(3, 1), lambda x: tonemap(torch.ones(3, 4), torch.ones(1, 4), x)),
 ]
 
 

@@ -63,9 +63,6 @@ def positive_light(seed: int) -> np.ndarray:
 LIGHT = torch.from_numpy(positive_light(1))
 
 
-# ---------------------------------------------------------------------------- meshes
-
-
 def ball() -> Mesh:
     """Create a ball of one color."""
     return mesh_of(trimesh.creation.icosphere(subdivisions=1), (0.9, 0.5, 0.2))
@@ -128,9 +125,6 @@ def vessel() -> Mesh:
     return Mesh.plain(revolved.vertices, revolved.faces, (0.8, 0.8, 0.3))
 
 
-# ---------------------------------------------------------------------------- images
-
-
 def our_image(mesh: Mesh, camera: Camera, settings: ImageSettings) -> np.ndarray:
     """Render radiance and coverage with an operator, shape (size, size, 4)."""
     [operator] = build_operators(mesh, [camera], settings, choose("numpy"))
@@ -169,9 +163,6 @@ def mitsuba_image(
 def mean_square(values: np.ndarray) -> float:
     """Compute the mean of the squares."""
     return float((values**2).mean())
-
-
-# ---------------------------------------------------------------------------- tests
 
 
 @pytest.mark.parametrize(

@@ -158,12 +158,6 @@ def test_light_in_bfloat16_does_not_move_silhouettes(light):
     torch.testing.assert_close(found.float(), expected, rtol=0, atol=0.03)
 
 
-def test_the_number_of_backgrounds_is_that_of_the_cameras(stone, light):
-    options = {**SMALL, "background": torch.zeros(2, 3, 9, 9)}
-    with pytest.raises(InputError, match="backgrounds"):
-        renderer.render(stone, CAMERAS, light, **options)
-
-
 def views_of(background: Tensor) -> Tensor:
     """Repeat a background that broadcasts to (3 views, 3, 9, 9) to that shape."""
     return background.expand(3, 3, 9, 9)

@@ -85,9 +85,6 @@ def scene_with(item: SceneObject) -> Scene:
     return scene.changed(objects=[item])
 
 
-# --------------------------------------------------------------- what is read back
-
-
 @pytest.mark.parametrize(
     ("kinds", "encoding"),
     [
@@ -149,9 +146,6 @@ def test_exposure_albedo_scale_background_and_camera_are_kept(tmp_path, fov):
     torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=1e-5)
 
 
-# --------------------------------------------------------------- props and table
-
-
 @pytest.fixture(scope="module")
 def pear_with_prop() -> SceneObject:
     """Return a pear with a prop and a table; both meshes have textures of their own."""
@@ -195,9 +189,6 @@ def test_an_attack_on_shape_moves_the_object_alone_even_after_it_is_read_back(
     before = points(pear_with_prop, own=True)
     assert moved != before
     assert len(moved) == len(before)
-
-
-# --------------------------------------------------------------- damaged folders
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.objective import Criterion
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
-from renderer.light.files import directional
 from renderer.light.nonnegative import project_nonnegative
 
 SHARED = {"views": 2, "shared": True}
@@ -80,9 +79,6 @@ def test_a_gpu_attacks_as_a_cpu_does_to_rounding(attacked, by_color, parameters)
     assert torch.equal(found.success.cpu(), expected.success)
 
 
-# --------------------------------------------------------------- targets and seeds
-
-
 @pytest.mark.parametrize(
     ("target", "labels"),
     [("lime", [1, 1]), (["sky", "lime"], [2, 1]), ("least_likely", None)],
@@ -105,9 +101,6 @@ def test_the_same_seed_gives_the_same_result(attacked):
     assert not first.success.any()
     for name, value in vars(first).items():
         assert torch.equal(value, getattr(second, name)), name
-
-
-# --------------------------------------------------------------- final images and success
 
 
 @pytest.mark.parametrize("bounces", [0, pytest.param(1, marks=pytest.mark.slow)])
@@ -195,9 +188,6 @@ def test_a_network_may_return_logits_in_half_precision(tmp_path, optimizer, dtyp
     augment.save(result, tmp_path, verify=())
 
 
-# --------------------------------------------------------------- refusals and warnings
-
-
 def orange_labeled(label: str) -> augment.Scene:
     """Build the scene of an orange under any label."""
     return augment.build_scene([("solid:orange", label)], 8, rasterizer="numpy", width=2.4)
@@ -208,28 +198,3 @@ def test_misclassified_examples_are_refused_unless_the_attack_is_forced(by_color
     with pytest.raises(InputError, match=r"1 of 1 images .*solid:orange"):
         augment.attack(by_color, scene)
     assert augment.attack(by_color, scene, force=True).minimum.success_before.all()
-
-
-@pytest.mark.parametrize(
-    ("label", "target", "message"),
-    [
-        ("mango", None, "'mango'"),
-        ("lime", ["lime", "sky"], "2 classes for 1 views"),
-        ("lime", "lime", "target=lime"),
-    ],
-)
-def test_impossible_classes_are_refused(by_color, label, target, message):
-    with pytest.raises(InputError, match=message):
-        augment.attack(by_color, orange_labeled(label), target, force=True)
-
-
-def test_the_warning_of_changed_light_names_the_line_that_attacks(by_color):
-    """A directional light of degree 6 is negative on its far side."""
-    light = directional(torch.tensor([0.0, 0.0, 1.0]), torch.ones(3))
-    scene = augment.build_scene([("solid:orange", "orange")], by_color.size, light=light)
-    lighting = augment.StepSettings()
-    settings = augment.AttackSettings(lighting=lighting, max_steps=1, allow_negative=False)
-    with pytest.warns(UserWarning) as warnings:
-        augment.attack(by_color, scene, settings=settings, force=True)
-    changed = [warning for warning in warnings if "irradiance" in str(warning.message)]
-    assert [warning.filename for warning in changed] == [__file__]

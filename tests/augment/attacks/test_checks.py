@@ -13,8 +13,6 @@ from renderer.errors import InputError
 
 SMALL_STEPS = {"lighting": StepSettings(step_size=0.02)}
 
-# --------------------------------------------------------------- checks
-
 
 @pytest.fixture(scope="module")
 def slow_attack(attacked) -> AttackResult:
@@ -81,9 +79,6 @@ def test_random_search_that_does_as_well_is_a_warning(attacked):
     assert len(warnings(checks)) == 1
 
 
-# --------------------------------------------------------------- success by radius
-
-
 @pytest.fixture(scope="module")
 def linear(make_scene, make_linear) -> AttackResult:
     """Return an attack on the pixels of three examples.
@@ -143,8 +138,6 @@ def test_larger_balls_hold_the_successes_of_smaller_ones_and_more_than_random_dr
         assert (success[1:] >= success[:-1]).all()
     assert (adversarial >= random).all()
 
-
-# --------------------------------------------------------------- transfer
 
 CLASSES = ("orange", "lime", "sky")
 TWO_VIEWS = {"views": 2, "backgrounds": [0.4]}

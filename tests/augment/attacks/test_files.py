@@ -20,8 +20,6 @@ from renderer.mitsuba_scene import mitsuba_map
 
 CLASSES = ("orange", "lime", "sky", "night")
 
-# --------------------------------------------------------------- numbers
-
 
 @pytest.mark.parametrize("margin", [0.5, 100.0])
 def test_the_lines_of_an_attack_have_its_numbers_and_its_checks(
@@ -91,9 +89,6 @@ def test_no_version_of_an_example_that_was_wrong_before_is_a_success(by_color, t
         assert not counted["success_without_noise"]
 
 
-# --------------------------------------------------------------- light and shape
-
-
 @pytest.fixture(scope="module", params=["st_peters", "grace"])
 def saved_light(request, attacked, tmp_path_factory) -> tuple[str, Path, torch.Tensor, dict]:
     """Attack a named light within a small ball: St. Peter's is positive all round, Grace is not.
@@ -130,8 +125,6 @@ def test_negative_light_is_told_clipped_for_mitsuba_and_not_written_as_a_map(sav
     # A channel has 8 bits of the texel's largest channel.
     assert (error <= exact.amax(2, keepdim=True) / 128).all()
 
-
-# --------------------------------------------------------------- figure
 
 SHARED = {"views": 2, "shared": True}
 COLUMN_WIDTH = SIDE + GAP

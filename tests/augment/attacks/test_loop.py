@@ -175,24 +175,6 @@ def test_descent_on_a_linear_classifier_follows_its_closed_form(rule):
     torch.testing.assert_close(result.images, images, rtol=0, atol=16 * EPS)
 
 
-@pytest.mark.parametrize(
-    ("source", "target", "predicted", "is_reached"),
-    [
-        ([0, 1], None, [2, 2], True),
-        ([0, 1], None, [1, 0], True),
-        ([0, 1], None, [2, 1], False),
-        ([0, 0], [1, 2], [1, 2], True),
-        ([0, 0], [1, 2], [2, 1], False),
-        ([0, 0], [1, 2], [1, 1], False),
-    ],
-)
-def test_a_criterion_is_reached_by_all_views(source, target, predicted, is_reached):
-    """Without a target, every view is misclassified; with one, each view has its own target."""
-    targets = None if target is None else torch.tensor([target])
-    criterion = Criterion(torch.tensor([source]), targets)
-    assert criterion.reached(torch.tensor([predicted])).tolist() == [is_reached]
-
-
 def test_descent_ends_when_every_view_is_misclassified_by_the_margin():
     start = random(EXAMPLE_COUNT, VALUE_COUNT, seed=2)
     problem = LinearScene(start, StepSettings(step_size=0.3), views=2)

@@ -154,9 +154,6 @@ def test_the_cost_without_any_class_is_zero():
     assert not Criterion(nothing, nothing).cost(LOGITS).any()
 
 
-# --------------------------------------------------------------- what a network gets
-
-
 class Means(nn.Module):
     """A classifier by the channels' means, which records its images."""
 
@@ -195,8 +192,6 @@ def test_a_model_is_given_bytes_and_its_derivative_ignores_the_rounding():
     assert (seen - images).abs().max() <= 0.5 / 255 + 1e-7
     torch.testing.assert_close(images.grad, torch.full_like(images, 30 / 64))
 
-
-# --------------------------------------------------------------- transformations
 
 ALL_CHANGES = {"draws": 3, "noise": 0.3, "exposure": 1.0, "jitter": 0.2, "jpeg": 50}
 
@@ -252,8 +247,6 @@ def test_jpeg_is_pillows():
         expected = torch.from_numpy(np.array(Image.open(file))).permute(2, 0, 1) / 255
         assert torch.equal(found, expected)
 
-
-# --------------------------------------------------------------- attacks
 
 SMALL_STEPS = augment.StepSettings(step_size=0.02)
 

@@ -34,9 +34,6 @@ def dual_norms(offsets: Tensor, name: str) -> Tensor:
     return offsets.norm(dim=1) if name == "l2" else offsets.abs().sum(1)
 
 
-# --------------------------------------------------------------- projections
-
-
 def project(name: str, radius: float | None, values: Tensor, center: Tensor) -> Tensor:
     """Project values (N, D) onto norm-balls around centers (N, D)."""
     balls = NormBalls(StepSettings(name, radius), center)
@@ -119,9 +116,6 @@ def test_within_a_box_no_descent_by_scipy_gets_nearer_than_the_projection(
     assert distance <= nearest_distance(name, radius, *arrays_of) + 1e-5
 
 
-# --------------------------------------------------------------- draws
-
-
 @pytest.mark.parametrize("dimensions", [1, 3, 12])
 @pytest.mark.parametrize("name", NORMS)
 def test_draws_are_uniform_in_the_ball(name, dimensions):
@@ -159,9 +153,6 @@ def test_draws_along_some_axes_are_uniform_in_the_ball_of_these_axes(name):
 def test_a_ball_without_a_radius_has_no_uniform_draw():
     with pytest.raises(InputError, match="radius is None"):
         sample(StepSettings(), torch.zeros(1, 2), torch.Generator())
-
-
-# --------------------------------------------------------------- steps
 
 
 @pytest.mark.parametrize(

@@ -70,9 +70,6 @@ def survival(images: Tensor, classifier: augment.Classifier, deviation: float) -
     return float(torch.stack(rates).mean())
 
 
-# --------------------------------------------------------------- what counts
-
-
 @pytest.fixture(params=[0.3, 0.8, 1.5])
 def with_lead(request) -> tuple[float, Tensor]:
     """Return images whose resemblance leads the threshold 0 by a number of deviations."""
@@ -144,8 +141,6 @@ def test_a_target_must_be_reached_with_noise(source):
     criterion = Criterion(torch.tensor([[source]]), torch.tensor([[1]]))
     assert not counted(images, nervous(AT_GRAY), criterion).any()
 
-
-# --------------------------------------------------------------- attacks
 
 # Small steps end close to where the classifier errs.
 FINE = {
@@ -285,9 +280,6 @@ def test_checks_files_transfers_and_sweeps_count_as_the_attack_does(attacked, tm
     (row,) = augment.success_by_radius(result, [100.0])
     for method in ("adversarial", "random"):
         assert (row[method] <= row[f"{method}_without_noise"]).all()
-
-
-# --------------------------------------------------------------- training
 
 
 def training_renders(**settings) -> Renders:

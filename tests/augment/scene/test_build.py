@@ -60,9 +60,6 @@ def lowest_roughness(scene: Scene, settings: MaterialSettings) -> float:
     return float(roughness.expand(is_own.shape)[torch.from_numpy(is_own)].min())
 
 
-# --------------------------------------------------------------- the degree that is needed
-
-
 @pytest.mark.parametrize("radius", [0.3, 0.64, 1.5, None])
 @pytest.mark.parametrize("smoothest", [0.6, 0.5])
 def test_the_degree_shows_the_least_roughness_that_an_attack_on_the_material_reaches(
@@ -140,9 +137,6 @@ def test_the_gloss_of_single_faces_and_of_other_objects_counts(single_glossy_fac
     assert attacked.basis == Harmonics(required_degree(0.2))
 
 
-# --------------------------------------------------------------- attacks in Python
-
-
 def always_a_pear(images: Tensor) -> Tensor:
     """Return logits (N, 2) of which the first is much higher."""
     mean = images.mean((1, 2, 3))
@@ -192,9 +186,6 @@ def test_an_attack_keeps_the_degree_or_the_light_that_was_given(map_name):
     scene, _ = scene_of(MATTE, light=0.9 * load_light(map_name))
     shown, _ = attacked_scene(scene, ON_MATERIAL)
     assert shown.basis == Harmonics(6)
-
-
-# --------------------------------------------------------------- warnings
 
 
 def test_degree_0_is_exact_for_even_light():

@@ -36,9 +36,6 @@ METALLIC = {"varnish": 0.0, "metal": 1.0}
 pytestmark = pytest.mark.filterwarnings("ignore:.*takes light of degree")
 
 
-# --------------------------------------------------------------- glTF's formulas
-
-
 def masking(cosine: np.ndarray, roughness: float) -> np.ndarray:
     """Return Smith's masking of one direction, for the distribution GGX."""
     alpha = roughness**2
@@ -105,9 +102,6 @@ def brdf(
     leaving = 1 - np.interp(view_cosine, cosines, reflectance)
     diffuse = entering * leaving / (1 - mean)
     return specular * fresnel(view_half_cosine) + ALBEDO * diffuse
-
-
-# --------------------------------------------------------------- both images
 
 
 def glossy_pear(roughness: float, metallic: float) -> Mesh:

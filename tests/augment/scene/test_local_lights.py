@@ -60,9 +60,6 @@ def test_each_kind_of_local_light_is_read_back_from_its_file(kind, tmp_path):
     assert torch.equal(values, coefficients)
 
 
-# --------------------------------------------------------------- attacked parameters
-
-
 @pytest.mark.parametrize("parameter", ["lighting", "projector", "lamps", "positions"])
 def test_each_light_changes_alone_with_the_gradient_of_finite_differences(parameter):
     """On most of an orange, no shadow moves with the lamps. Two views share the lights."""
@@ -102,9 +99,6 @@ def test_patterns_and_powers_stay_in_range_and_in_their_norm_ball(norm, paramete
         offset = values - changed.start
         distance = offset.norm(dim=1) if norm == "l2" else offset.abs()
         assert distance.max() <= 0.4 * (1 + 1e-5)
-
-
-# --------------------------------------------------------------- attacks and their files
 
 
 @pytest.fixture(scope="module", params=[0.0, 0.1], ids=["points", "discs"])
@@ -173,9 +167,6 @@ def test_moved_lamps_are_read_back_where_they_ended(tmp_path):
     assert torch.equal(powers, written.light[-len(powers) :])
     with pytest.raises(InputError, match=r"projector\.json"):
         build_local_light(LampsSettings(start=str(tmp_path / "projector.json")))
-
-
-# --------------------------------------------------------------- images
 
 
 def test_a_table_receives_the_projection_and_the_shadow():
@@ -250,42 +241,6 @@ def test_a_moved_mesh_under_moved_lamps_looks_like_a_mesh_built_there(
     images = rendered(shown, conditions)
     torch.testing.assert_close(images, rendered(other), rtol=0, atol=tolerance)
     assert (images - rendered(shown)).abs().max() > 0.02
-
-
-def images_and_gradients(**choices) -> dict[str, Tensor]:
-    """Return images of a cup, and gradients of a weighted sum by its shape and color.
-
-    Nothing is clamped, and the background is black.
-    """
-    shown = scene(**CUP | choices)
-    vertices = shown.vertices.expand(2, -1, -1).clone().requires_grad_()
-    albedo = torch.zeros(2, len(shown.mesh(0).faces), 3).requires_grad_()
-    images = rendered(shown, Conditions(shown.lights, vertices, albedo))
-    weights = torch.rand(images.shape, generator=torch.Generator().manual_seed(0))
-    by_vertices, by_albedo = torch.autograd.grad((images * weights).sum(), (vertices, albedo))
-    return {
-        "unmoved": rendered(shown),
-        "moved": images.detach(),
-        "by vertices": by_vertices,
-        "by albedo": by_albedo,
-    }
-
-
-def test_images_and_gradients_by_shape_and_color_add_up_over_the_lights():
-    whole = images_and_gradients()
-    sky = images_and_gradients(projector=None, lamps=None)
-    projector = images_and_gradients(light=NO_SKY, lamps=None)
-    lamps = images_and_gradients(light=NO_SKY, projector=None)
-    assert whole["unmoved"].max() < 1
-    for name, expected in whole.items():
-        parts = [sky[name], projector[name], lamps[name]]
-        for part in parts:
-            assert part.abs().max() > 1e-3
-        rounding = 1e-5 * float(expected.abs().max())
-        torch.testing.assert_close(sum(parts), expected, rtol=0, atol=rounding)
-
-
-# --------------------------------------------------------------- errors
 
 
 @pytest.mark.parametrize(

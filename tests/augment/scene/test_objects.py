@@ -23,9 +23,6 @@ def plain_mesh(tmp_path) -> str:
     return path
 
 
-# --------------------------------------------------------------- colors
-
-
 def test_a_mesh_without_colors_takes_the_given_one_which_a_metal_needs(plain_mesh):
     color = [0.9, 0.5, 0.1]
     metal = [0.3, 1, 1]
@@ -43,9 +40,6 @@ def test_a_mesh_without_colors_takes_the_given_one_which_a_metal_needs(plain_mes
 def test_colors_and_seeds_that_a_mesh_cannot_have_are_refused(mesh, color, message):
     with pytest.raises(InputError, match=message):
         load_object(ObjectSettings(mesh, "orange", color=color))
-
-
-# --------------------------------------------------------------- props and tables
 
 
 def test_props_stand_on_the_objects_ground_shifted_and_turned():
@@ -91,9 +85,6 @@ def test_another_instance_has_the_same_props():
     np.testing.assert_array_equal(other.own_faces, expected.own_faces)
     own = other.mesh.vertices[other.own_vertices]
     assert not np.array_equal(own, item.mesh.vertices[item.own_vertices])
-
-
-# --------------------------------------------------------------- gloss
 
 
 @pytest.mark.parametrize(

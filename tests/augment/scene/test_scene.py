@@ -57,9 +57,6 @@ def first_image(scene: Scene) -> torch.Tensor:
     return scene.render(scene.conditions(FIRST), FIRST)[0, 0]
 
 
-# --------------------------------------------------------------- what a scene is built from
-
-
 @pytest.mark.parametrize(
     ("examples", "meshes", "backgrounds", "views", "expected"),
     [(100, 2, 5, None, 10), (100, 2, 5, 10, 10), (None, 7, 5, 36, 36)],
@@ -89,8 +86,6 @@ def test_a_scene_takes_paths_as_text_and_as_path_and_cuts_the_center_out_of_a_ba
     for image in images[1:]:
         assert torch.equal(image, images[0])
 
-
-# --------------------------------------------------------------- the degree of light
 
 SHINY = ObjectSettings("solid:pear", "pear", gloss=[0.35])
 MATTE = ("solid:orange", "pear")
@@ -138,9 +133,6 @@ def test_attacked_light_of_a_higher_degree_is_read_back_to_its_image(glossy, tmp
     write_adversary(Adversary.of(glossy, 1, conditions, image, image), tmp_path / "adversary")
     found = reload(tmp_path / "adversary").render_views(RASTERIZER)
     torch.testing.assert_close(found, image, rtol=0, atol=1e-5)
-
-
-# --------------------------------------------------------------- several meshes
 
 
 def test_each_mesh_is_rasterized_once_in_all_views_when_it_is_needed(rasterized):
@@ -236,9 +228,6 @@ def test_values_that_a_smaller_mesh_does_not_use_have_no_gradient(several, padde
     (gradient,) = torch.autograd.grad(images.square().sum(), values)
     assert not gradient[is_unused].any()
     assert gradient.any(1).all()
-
-
-# --------------------------------------------------------------- shadows
 
 
 @pytest.mark.parametrize(("names", "bounces"), [(["cup", "ball"], 0), (["cup"], 2)])

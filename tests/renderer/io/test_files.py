@@ -1,6 +1,5 @@
 """Files are replaced as a whole: a write that fails leaves the old file, and no other file."""
 
-import json
 import math
 import os
 import resource
@@ -19,7 +18,6 @@ from renderer.errors import InputError
 from renderer.io.files import (
     TEMPORARY,
     atomic_write,
-    file_below,
     remove_unfinished,
     replacing,
     write_numbers,
@@ -140,18 +138,6 @@ def test_the_temporary_files_of_a_killed_process_are_removed(tmp_path):
     assert list(contents(tmp_path)) == ["own.tmp"]
 
 
-@pytest.mark.parametrize("path_type", [str, Path])
-def test_lights_and_meshes_are_saved_and_loaded_by_either_type_of_path(tmp_path, path_type):
-    path = path_type(tmp_path / "light.json")
-    renderer.save_light(path, LIGHT)
-    assert torch.equal(renderer.load_light(path), LIGHT)
-    assert json.loads(Path(path).read_text())["basis"] == "harmonics"
-    path = path_type(tmp_path / "orange.glb")
-    mesh = renderer.solid("orange")
-    renderer.export_mesh(mesh, path)
-    assert len(renderer.load_mesh(path).faces) == len(mesh.faces)
-
-
 class TestAMapOfALightThatIsNegativeInPlaces:
     """Light of radiance 1 + 2 z has the irradiance π (1 + 4/3 z)."""
 
@@ -192,19 +178,3 @@ def test_coefficients_beyond_the_power_of_a_projector_are_white_in_the_image(tmp
     renderer.save_light(tmp_path / "light.json", coefficients, projector)
     values = np.unique(np.asarray(Image.open(tmp_path / "light.png")))
     assert values.tolist() == [0, 255]
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["../secret", "{outside}", "link", "folder/../../secret", "C:\\secret", "http://host/secret"],
-)
-def test_a_file_that_is_named_by_another_file_is_below_its_folder(tmp_path, name):
-    outside = tmp_path / "secret"
-    outside.write_text("secret")
-    folder = tmp_path / "mesh"
-    (folder / "folder").mkdir(parents=True)
-    (folder / "link").symlink_to(outside)
-    (folder / "folder" / "peel").write_text("peel")
-    assert file_below(folder, "folder\\peel").read_text() == "peel"
-    with pytest.raises(ValueError, match=r"secret|link"):
-        file_below(folder, name.format(outside=outside))

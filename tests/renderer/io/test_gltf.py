@@ -22,7 +22,7 @@ from renderer import errors
 from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io import gltf as gltf_reader
-from renderer.io.meshes import export_mesh, load_mesh, read_parts
+from renderer.io.meshes import load_mesh, read_parts
 from renderer.mesh import Mesh
 
 
@@ -296,12 +296,6 @@ def test_the_alpha_of_vertices_and_of_the_material_is_cut_exactly(tmp_path):
     # Colors are interpolated linearly before they are encoded.
     expected = np.float64(corners_of(mesh))
     assert_allclose(linear(mesh.corner_colors)[..., :2], expected[..., :2], atol=1e-6)
-
-
-def test_alpha_is_ignored_in_the_mode_opaque(tmp_path):
-    mesh = masked(hole(16, 5), "OPAQUE").load(tmp_path)
-    assert_array_equal(corners_of(mesh).reshape(-1, 3), SQUARE[SQUARE_FACES])
-    assert (mesh.textures[0] == 200).all()
 
 
 def test_blended_surfaces_are_read_if_they_are_opaque(tmp_path):
@@ -806,11 +800,3 @@ def test_an_ordinary_file_is_read_as_trimesh_reads_it(tmp_path, suffix):
     distances, _ = KDTree(mesh.vertices).query(expected.vertices)
     assert distances.max() < 1e-5
     assert mesh.closed
-
-
-def test_a_mesh_that_was_cut_is_exported_and_read_again(tmp_path):
-    mesh = masked(hole(16, 5)).load(tmp_path)
-    export_mesh(mesh, tmp_path / "again.glb")
-    again = load_mesh(tmp_path / "again.glb")
-    assert_allclose(np.sort(again.face_areas()), np.sort(mesh.face_areas()), atol=1e-6)
-    assert_array_equal(again.textures[0], mesh.textures[0])

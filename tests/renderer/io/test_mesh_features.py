@@ -6,7 +6,7 @@ Ignored features change neither the shape nor the base color.
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,18 +30,6 @@ WARNINGS = {IGNORED: "ignored", ASSUMED: "taken as"}
 RGB = "uchar red;uchar green;uchar blue"
 
 Files = Mapping[str, str | bytes]
-
-
-class Row(NamedTuple):
-    """Row of the table.
-
-    The first file is the mesh, a white triangle with the corners (0, 0, 0), (1, 0, 0) and
-    (0, 1, 0), apart from the feature. The outcome may be the color of all corners.
-    """
-
-    feature: str
-    files: Files
-    outcome: str | tuple[float, ...]
 
 
 def color_of(folder: Path, files: Files) -> np.ndarray:
@@ -147,28 +135,31 @@ NUMBERED = f"{UV};int texnumber"
 IMAGE = "comment TextureFile red.png"
 IMAGES = f"{IMAGE};comment TextureFile b.png"
 TEXTURED = "f 1/1 2/2 3/3"
+# Features, files and outcomes. The first file is the mesh, a white triangle with the corners
+# (0, 0, 0), (1, 0, 0) and (0, 1, 0), apart from the feature. The outcome may be the color of all
+# corners.
 ROWS = [
-    Row("triangle", obj(), WHITE),
-    Row("g, o", obj("g part\no thing"), WHITE),
-    Row("vn", obj(face="f 1//1 2//1 3//1"), WHITE),
-    Row("vt without texture", obj(face=TEXTURED), WHITE),
-    Row("vt for some corners", obj(face="f 1/1 2 3//1"), WHITE),
-    Row("vertex colors", obj(vertex="1 0 0"), RED),
-    Row("vertex colors and vt", obj(vertex="1 0 0", face=TEXTURED), RED),
-    Row("polypaint", obj("#MRGB ffff0000ffff0000\n#MRGB 00ff0000"), RED),
-    Row("polypaint of two vertices", obj("#MRGB ffff0000ffff0000"), REFUSED),
-    Row("weight 1", obj(vertex="1"), WHITE),
-    Row("weight", obj(vertex="2"), REFUSED),
-    Row("color and weight", obj(vertex="1 1 0 0"), REFUSED),
-    Row("color above 1", obj(vertex="1.5 0 0"), REFUSED),
-    Row("negative color", obj(vertex="-1 0 0"), REFUSED),
-    Row("line", obj("l 1 2"), IGNORED),
-    Row("point", obj("p 1"), IGNORED),
-    Row("smoothing group", obj("s 1"), IGNORED),
-    Row("level of detail", obj("lod 3"), IGNORED),
-    Row("face with two corners", obj("f 1 2"), IGNORED),
+    ("triangle", obj(), WHITE),
+    ("g, o", obj("g part\no thing"), WHITE),
+    ("vn", obj(face="f 1//1 2//1 3//1"), WHITE),
+    ("vt without texture", obj(face=TEXTURED), WHITE),
+    ("vt for some corners", obj(face="f 1/1 2 3//1"), WHITE),
+    ("vertex colors", obj(vertex="1 0 0"), RED),
+    ("vertex colors and vt", obj(vertex="1 0 0", face=TEXTURED), RED),
+    ("polypaint", obj("#MRGB ffff0000ffff0000\n#MRGB 00ff0000"), RED),
+    ("polypaint of two vertices", obj("#MRGB ffff0000ffff0000"), REFUSED),
+    ("weight 1", obj(vertex="1"), WHITE),
+    ("weight", obj(vertex="2"), REFUSED),
+    ("color and weight", obj(vertex="1 1 0 0"), REFUSED),
+    ("color above 1", obj(vertex="1.5 0 0"), REFUSED),
+    ("negative color", obj(vertex="-1 0 0"), REFUSED),
+    ("line", obj("l 1 2"), IGNORED),
+    ("point", obj("p 1"), IGNORED),
+    ("smoothing group", obj("s 1"), IGNORED),
+    ("level of detail", obj("lod 3"), IGNORED),
+    ("face with two corners", obj("f 1 2"), IGNORED),
     *(
-        Row(statement, obj(statement), REFUSED)
+        (statement, obj(statement), REFUSED)
         for statement in each(
             "call other.obj|csh ls|cstype bezier|curv 0 1 1 2 3|surf 0 1 0 1 1 2 3|"
             "usemap red.png|polygon 1 2 3|f 1 2 4|f 1 2 -4|f 0 1 2|f 1/9 2 3|f 1/1/1/1 2 3|"
@@ -176,22 +167,22 @@ ROWS = [
             "vt nan 0|\0"
         )
     ),
-    Row("Kd", obj(mtl="Kd 1 0 0"), RED),
-    Row("Kd of one number", obj(mtl="Kd 0.5"), GRAY),
-    Row("Kd and vertex colors", obj(mtl="Kd 1 1 0", vertex="0 1 1"), GREEN),
-    Row("map_Kd", obj(mtl="map_Kd red.png", face=TEXTURED), RED),
-    Row(
+    ("Kd", obj(mtl="Kd 1 0 0"), RED),
+    ("Kd of one number", obj(mtl="Kd 0.5"), GRAY),
+    ("Kd and vertex colors", obj(mtl="Kd 1 1 0", vertex="0 1 1"), GREEN),
+    ("map_Kd", obj(mtl="map_Kd red.png", face=TEXTURED), RED),
+    (
         "map_Kd, Kd and vertex colors",
         obj(mtl="map_Kd red.png\nKd 0.5 1 1", vertex="1 0 0", face=TEXTURED),
         (0.5, 0.0, 0.0),
     ),
-    Row("map_Kd and comment", obj(mtl="map_Kd red.png # base", face=TEXTURED), RED),
-    Row("map_Kd without vt", obj(mtl="map_Kd red.png"), REFUSED),
-    Row("map_Kd with some vt", obj(mtl="map_Kd red.png", face="f 1/1 2/2 3"), REFUSED),
-    Row("d 1, Tr 0", obj(mtl="d 1\nTr 0"), WHITE),
-    Row("map_Kd with alpha", obj(mtl="map_Kd clear.png", face=TEXTURED), IGNORED),
+    ("map_Kd and comment", obj(mtl="map_Kd red.png # base", face=TEXTURED), RED),
+    ("map_Kd without vt", obj(mtl="map_Kd red.png"), REFUSED),
+    ("map_Kd with some vt", obj(mtl="map_Kd red.png", face="f 1/1 2/2 3"), REFUSED),
+    ("d 1, Tr 0", obj(mtl="d 1\nTr 0"), WHITE),
+    ("map_Kd with alpha", obj(mtl="map_Kd clear.png", face=TEXTURED), IGNORED),
     *(
-        Row(line, obj(mtl=line), IGNORED)
+        (line, obj(mtl=line), IGNORED)
         for line in each(
             "Ns 10|Ks 1 1 1|Ka 1 1 1|Ke 0 0 0|Ni 1.5|illum 2|Tf 1 1 1|Pr 0.5|map_Ks red.png|"
             "map_Bump missing.png|bump -bm 0.2 missing.png|norm missing.png|"
@@ -199,7 +190,7 @@ ROWS = [
         )
     ),
     *(
-        Row(line, obj(mtl=line, face=TEXTURED), REFUSED)
+        (line, obj(mtl=line, face=TEXTURED), REFUSED)
         for line in each(
             "d 0.5|d -halo 0.5|Tr 0.5|map_d red.png|disp red.png|decal red.png|Kd 1 0|Kd red|"
             "Kd 2 0 0|Kd -1 0 0|Kd nan 0 0|Kd 1.#IND 0 0|Kd spectral red.rfl|map_Kd|"
@@ -207,114 +198,114 @@ ROWS = [
         )
     ),
     *(
-        Row(option, obj(mtl=f"map_Kd {option} red.png", face=TEXTURED), RED)
+        (option, obj(mtl=f"map_Kd {option} red.png", face=TEXTURED), RED)
         for option in each(
             "-s 1 1 1|-s 1|-o 0 0 0 -s 1 1|-t 0 0 0|-mm 0 1|-cc off|-clamp on|-clamp off|-bm 1.0|"
             "-blendu on -blendv off|-texres 256|-boost 2"
         )
     ),
     *(
-        Row(option, obj(mtl=f"map_Kd {option} red.png", face=TEXTURED), REFUSED)
+        (option, obj(mtl=f"map_Kd {option} red.png", face=TEXTURED), REFUSED)
         for option in ("-s 2 2 1", "-o 0.5", "-t 1", "-mm 0 2", "-cc on", "-imfchan r")
     ),
-    Row("triangle", ply(), WHITE),
-    Row("uchar red", ply(RGB, at="255 0 0"), RED),
-    Row("ushort red", ply(RGB.replace("uchar", "ushort"), at="65535 0 0"), RED),
-    Row("float red", ply(RGB.replace("uchar", "float"), at="1 0 0"), RED),
-    Row("int red", ply(RGB.replace("uchar", "int"), at="255 0 0"), ASSUMED),
-    Row("float red to 255", ply(RGB.replace("uchar", "float"), at="255 0 0"), ASSUMED),
-    Row("float red 2.5", ply(RGB.replace("uchar", "float"), at="2.5 0 0"), REFUSED),
-    Row("r g b", ply("uchar r;uchar g;uchar b", at="255 0 0"), RED),
-    Row("diffuse_red", ply(RGB.replace(" ", " diffuse_"), at="255 0 0"), RED),
-    Row("red and r", ply(f"uchar r;uchar g;uchar b;{RGB}", at="9 9 9 8 8 8"), REFUSED),
-    Row("Red", ply(RGB.title().replace("Uchar", "uchar"), at="255 0 0"), RED),
+    ("triangle", ply(), WHITE),
+    ("uchar red", ply(RGB, at="255 0 0"), RED),
+    ("ushort red", ply(RGB.replace("uchar", "ushort"), at="65535 0 0"), RED),
+    ("float red", ply(RGB.replace("uchar", "float"), at="1 0 0"), RED),
+    ("int red", ply(RGB.replace("uchar", "int"), at="255 0 0"), ASSUMED),
+    ("float red to 255", ply(RGB.replace("uchar", "float"), at="255 0 0"), ASSUMED),
+    ("float red 2.5", ply(RGB.replace("uchar", "float"), at="2.5 0 0"), REFUSED),
+    ("r g b", ply("uchar r;uchar g;uchar b", at="255 0 0"), RED),
+    ("diffuse_red", ply(RGB.replace(" ", " diffuse_"), at="255 0 0"), RED),
+    ("red and r", ply(f"uchar r;uchar g;uchar b;{RGB}", at="9 9 9 8 8 8"), REFUSED),
+    ("Red", ply(RGB.title().replace("Uchar", "uchar"), at="255 0 0"), RED),
     *(
-        Row(f"only {name}", ply(f"uchar {name}", at="9"), REFUSED)
+        (f"only {name}", ply(f"uchar {name}", at="9"), REFUSED)
         for name in ("red", "diffuse_green", "rgb")
     ),
-    Row("x twice", ply("float x", at="7"), REFUSED),
-    Row("vertex twice", ply(tail="element vertex 1;property int a;0"), REFUSED),
-    Row("alpha 255", ply(f"{RGB};uchar alpha", at="255 0 0 255"), RED),
-    Row("alpha", ply(f"{RGB};uchar alpha", at="255 0 0 25"), REFUSED),
-    Row("face red", ply(face=RGB, of="255 0 0"), RED),
-    Row("face and vertex red", ply(RGB, RGB, at="255 255 0", of="0 255 255"), GREEN),
-    Row("nx, ny, nz", ply("float nx;float ny;float nz", at="0 0 1"), WHITE),
-    Row("confidence", ply("float confidence", at="0.5"), IGNORED),
-    Row("face flags", ply(face="int flags", of="1"), IGNORED),
-    Row("material_index", ply(face="int material_index", of="1"), REFUSED),
-    Row("edges", ply(tail="element edge 1;property int vertex1;0"), IGNORED),
-    Row("materials", ply(tail="element material 1;property int red;0"), REFUSED),
-    Row("multi_texture_face", ply(tail="element multi_texture_face 1;property int tx;0"), REFUSED),
+    ("x twice", ply("float x", at="7"), REFUSED),
+    ("vertex twice", ply(tail="element vertex 1;property int a;0"), REFUSED),
+    ("alpha 255", ply(f"{RGB};uchar alpha", at="255 0 0 255"), RED),
+    ("alpha", ply(f"{RGB};uchar alpha", at="255 0 0 25"), REFUSED),
+    ("face red", ply(face=RGB, of="255 0 0"), RED),
+    ("face and vertex red", ply(RGB, RGB, at="255 255 0", of="0 255 255"), GREEN),
+    ("nx, ny, nz", ply("float nx;float ny;float nz", at="0 0 1"), WHITE),
+    ("confidence", ply("float confidence", at="0.5"), IGNORED),
+    ("face flags", ply(face="int flags", of="1"), IGNORED),
+    ("material_index", ply(face="int material_index", of="1"), REFUSED),
+    ("edges", ply(tail="element edge 1;property int vertex1;0"), IGNORED),
+    ("materials", ply(tail="element material 1;property int red;0"), REFUSED),
+    ("multi_texture_face", ply(tail="element multi_texture_face 1;property int tx;0"), REFUSED),
     *(
-        Row(f"texture, {u}", ply(f"float {u};float {v}", header=IMAGE, at="0 0"), RED)
+        (f"texture, {u}", ply(f"float {u};float {v}", header=IMAGE, at="0 0"), RED)
         for u, v in (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
     ),
-    Row("s without texture", ply("float s;float t", at="0 0"), WHITE),
-    Row("texture without uvs", ply(header=IMAGE), REFUSED),
-    Row("texcoord", ply(face=UV, header=IMAGE, of=UVS), RED),
-    Row("texcoord of no face", ply(face=UV, header=IMAGE, of="0"), REFUSED),
-    Row("short texcoord", ply(face=UV, header=IMAGE, of="4 0 0 1 1"), REFUSED),
-    Row("texcoord without texture", ply(face=UV, of=UVS), WHITE),
-    Row("texnumber 0", ply(face=NUMBERED, header=IMAGES, of=f"{UVS} 0"), RED),
-    Row("texnumber -1", ply(face=NUMBERED, header=IMAGES, of=f"{UVS} -1"), WHITE),
-    Row("texnumber 2", ply(face=NUMBERED, header=IMAGES, of=f"{UVS} 2"), REFUSED),
-    Row("two textures without texnumber", ply(face=UV, header=IMAGES, of=UVS), REFUSED),
-    Row(
+    ("s without texture", ply("float s;float t", at="0 0"), WHITE),
+    ("texture without uvs", ply(header=IMAGE), REFUSED),
+    ("texcoord", ply(face=UV, header=IMAGE, of=UVS), RED),
+    ("texcoord of no face", ply(face=UV, header=IMAGE, of="0"), REFUSED),
+    ("short texcoord", ply(face=UV, header=IMAGE, of="4 0 0 1 1"), REFUSED),
+    ("texcoord without texture", ply(face=UV, of=UVS), WHITE),
+    ("texnumber 0", ply(face=NUMBERED, header=IMAGES, of=f"{UVS} 0"), RED),
+    ("texnumber -1", ply(face=NUMBERED, header=IMAGES, of=f"{UVS} -1"), WHITE),
+    ("texnumber 2", ply(face=NUMBERED, header=IMAGES, of=f"{UVS} 2"), REFUSED),
+    ("two textures without texnumber", ply(face=UV, header=IMAGES, of=UVS), REFUSED),
+    (
         "missing texture",
         ply("float s;float t", header="comment TextureFile x.png", at="0 0"),
         REFUSED,
     ),
-    Row("too many numbers", ply(at="0"), REFUSED),
-    Row("too few numbers", ply("float s;float t", at="0"), REFUSED),
-    Row("word", ply("float s", at="x"), REFUSED),
-    Row("nan", ply(corners=("0 0 nan", "1 0 0", "0 1 0")), REFUSED),
-    Row("unknown type", ply("quad s", at="0"), REFUSED),
-    Row("fraction of a byte", ply(RGB, at="0.5 0 0"), REFUSED),
-    Row("byte 256", ply(RGB, at="256 0 0"), REFUSED),
-    Row("element without properties", ply(tail="element x 1000000000000;"), REFUSED),
-    Row("triangle", off(), WHITE),
-    Row("OFF3 1 0", {"mesh.off": off()["mesh.off"].replace("OFF\n", "OFF")}, WHITE),
-    Row("COFF 255", off("COFF", "255 0 0"), RED),
-    Row("COFF 255 and alpha", off("COFF", "255 0 0 255"), RED),
-    Row("COFF 1.0", off("COFF", "1.0 0.0 0.0"), RED),
-    Row("COFF and alpha", off("COFF", "1.0 0 0 0.5"), REFUSED),
-    Row("COFF without colors", off("COFF"), REFUSED),
-    Row("OFF with colors", off("OFF", "1 0 0"), REFUSED),
-    Row("NOFF", off("NOFF", "0 0 1"), WHITE),
-    Row("CNOFF", off("CNOFF", "0 0 1 255 0 0"), RED),
-    Row("STOFF", off("STOFF", "0.5 0.5"), WHITE),
-    Row("STCNOFF", off("STCNOFF", "0 0 1 255 0 0 255 0.5 0.5"), RED),
-    Row("4OFF", off("4OFF", "1"), REFUSED),
-    Row("nOFF", off("nOFF"), REFUSED),
-    Row("binary", off("OFF BINARY"), REFUSED),
-    Row("face color 255", off(face="255 0 0"), RED),
-    Row("face color 255 and alpha", off(face="255 0 0 255"), RED),
-    Row("face color 1.0", off(face="1.0 0.0 0.0"), RED),
-    Row("face alpha", off(face="255 0 0 9"), REFUSED),
-    Row("negative face color", off(face="255 -1 0"), REFUSED),
-    Row("NCOFF", off("NCOFF", "255 0 0 0 0 1"), REFUSED),
-    Row("lines with CRLF", {"mesh.off": off()["mesh.off"].replace("\n", "\r\n")}, WHITE),
-    Row("face color 1 0 0 without a point", off(face="1 0 0"), REFUSED),
-    Row("COFF 1 0 0 without a point", off("COFF", "1 0 0"), REFUSED),
-    Row("COFF 1 0 0 and alpha 1, transparent as bytes", off("COFF", "1 0 0 1"), RED),
-    Row("face color 0 0 0", off(face="0 0 0"), (0.0, 0.0, 0.0)),
-    Row("face color 256", off(face="256 0 0"), REFUSED),
-    Row("color of a map", off(face="7"), REFUSED),
-    Row("1.#IND", {"mesh.off": off()["mesh.off"].replace("0 0 0", "0 0 0.#IND")}, REFUSED),
-    Row("comments", off("# OFF\nOFF # 1 2 3\n\n", face="255 0 0 # red"), RED),
-    Row("missing vertex", {"mesh.off": off()["mesh.off"].replace("3 0", "3 9")}, REFUSED),
-    Row("no faces", {"mesh.off": off()["mesh.off"].rpartition("\n")[0]}, REFUSED),
-    Row("triangle", gltf(), WHITE),
-    Row("baseColorFactor", gltf(pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 1]}), RED),
-    Row("normalTexture", gltf(normalTexture={"index": 0}), IGNORED),
-    Row("alpha of OPAQUE", gltf(**alpha(0.1)), WHITE),
-    Row("alpha of MASK", gltf(alphaMode="MASK", **alpha(0.5)), WHITE),
-    Row("low alpha of MASK", gltf(alphaMode="MASK", **alpha(0.49)), REFUSED),
-    Row("alpha of BLEND", gltf(alphaMode="BLEND", **alpha(0.9)), REFUSED),
-    Row("opaque BLEND", gltf(alphaMode="BLEND", **alpha(1)), WHITE),
-    Row("unlit", gltf(extensions={"KHR_materials_unlit": {}}), IGNORED),
+    ("too many numbers", ply(at="0"), REFUSED),
+    ("too few numbers", ply("float s;float t", at="0"), REFUSED),
+    ("word", ply("float s", at="x"), REFUSED),
+    ("nan", ply(corners=("0 0 nan", "1 0 0", "0 1 0")), REFUSED),
+    ("unknown type", ply("quad s", at="0"), REFUSED),
+    ("fraction of a byte", ply(RGB, at="0.5 0 0"), REFUSED),
+    ("byte 256", ply(RGB, at="256 0 0"), REFUSED),
+    ("element without properties", ply(tail="element x 1000000000000;"), REFUSED),
+    ("triangle", off(), WHITE),
+    ("OFF3 1 0", {"mesh.off": off()["mesh.off"].replace("OFF\n", "OFF")}, WHITE),
+    ("COFF 255", off("COFF", "255 0 0"), RED),
+    ("COFF 255 and alpha", off("COFF", "255 0 0 255"), RED),
+    ("COFF 1.0", off("COFF", "1.0 0.0 0.0"), RED),
+    ("COFF and alpha", off("COFF", "1.0 0 0 0.5"), REFUSED),
+    ("COFF without colors", off("COFF"), REFUSED),
+    ("OFF with colors", off("OFF", "1 0 0"), REFUSED),
+    ("NOFF", off("NOFF", "0 0 1"), WHITE),
+    ("CNOFF", off("CNOFF", "0 0 1 255 0 0"), RED),
+    ("STOFF", off("STOFF", "0.5 0.5"), WHITE),
+    ("STCNOFF", off("STCNOFF", "0 0 1 255 0 0 255 0.5 0.5"), RED),
+    ("4OFF", off("4OFF", "1"), REFUSED),
+    ("nOFF", off("nOFF"), REFUSED),
+    ("binary", off("OFF BINARY"), REFUSED),
+    ("face color 255", off(face="255 0 0"), RED),
+    ("face color 255 and alpha", off(face="255 0 0 255"), RED),
+    ("face color 1.0", off(face="1.0 0.0 0.0"), RED),
+    ("face alpha", off(face="255 0 0 9"), REFUSED),
+    ("negative face color", off(face="255 -1 0"), REFUSED),
+    ("NCOFF", off("NCOFF", "255 0 0 0 0 1"), REFUSED),
+    ("lines with CRLF", {"mesh.off": off()["mesh.off"].replace("\n", "\r\n")}, WHITE),
+    ("face color 1 0 0 without a point", off(face="1 0 0"), REFUSED),
+    ("COFF 1 0 0 without a point", off("COFF", "1 0 0"), REFUSED),
+    ("COFF 1 0 0 and alpha 1, transparent as bytes", off("COFF", "1 0 0 1"), RED),
+    ("face color 0 0 0", off(face="0 0 0"), (0.0, 0.0, 0.0)),
+    ("face color 256", off(face="256 0 0"), REFUSED),
+    ("color of a map", off(face="7"), REFUSED),
+    ("1.#IND", {"mesh.off": off()["mesh.off"].replace("0 0 0", "0 0 0.#IND")}, REFUSED),
+    ("comments", off("# OFF\nOFF # 1 2 3\n\n", face="255 0 0 # red"), RED),
+    ("missing vertex", {"mesh.off": off()["mesh.off"].replace("3 0", "3 9")}, REFUSED),
+    ("no faces", {"mesh.off": off()["mesh.off"].rpartition("\n")[0]}, REFUSED),
+    ("triangle", gltf(), WHITE),
+    ("baseColorFactor", gltf(pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 1]}), RED),
+    ("normalTexture", gltf(normalTexture={"index": 0}), IGNORED),
+    ("alpha of OPAQUE", gltf(**alpha(0.1)), WHITE),
+    ("alpha of MASK", gltf(alphaMode="MASK", **alpha(0.5)), WHITE),
+    ("low alpha of MASK", gltf(alphaMode="MASK", **alpha(0.49)), REFUSED),
+    ("alpha of BLEND", gltf(alphaMode="BLEND", **alpha(0.9)), REFUSED),
+    ("opaque BLEND", gltf(alphaMode="BLEND", **alpha(1)), WHITE),
+    ("unlit", gltf(extensions={"KHR_materials_unlit": {}}), IGNORED),
     *(
-        Row(f"{name} VEC{width}", gltf(name, width), outcome)
+        (f"{name} VEC{width}", gltf(name, width), outcome)
         for name, width, outcome in (
             ("COLOR_0", 3, RED),
             ("COLOR_0", 4, RED),
@@ -325,49 +316,50 @@ ROWS = [
             ("_FEATURE_ID_0", 3, WHITE),
         )
     ),
-    Row("_FEATURE_ID_0 of integers", gltf("_FEATURE_ID_0", 3, np.uint8), WHITE),
-    Row("text", {"mesh.stl": STL_TEXT}, WHITE),
-    Row("text with CR", {"mesh.stl": STL_TEXT.replace("\n", "\r")}, WHITE),
+    ("_FEATURE_ID_0 of integers", gltf("_FEATURE_ID_0", 3, np.uint8), WHITE),
+    ("text", {"mesh.stl": STL_TEXT}, WHITE),
+    ("text with CR", {"mesh.stl": STL_TEXT.replace("\n", "\r")}, WHITE),
     *(
-        Row(line, {"mesh.stl": STL_TEXT.replace("outer", f"{line}\nouter")}, outcome)
+        (line, {"mesh.stl": STL_TEXT.replace("outer", f"{line}\nouter")}, outcome)
         for line, outcome in (
             ("color 1 0 0", REFUSED),
             ("  COLOUR 255 0 0", REFUSED),
             ("attribute 31", IGNORED),
         )
     ),
-    Row("four vertices", {"mesh.stl": STL_TEXT.replace(" endl", "vertex 0 0 0\nendl")}, REFUSED),
-    Row("half a file", {"mesh.stl": STL_TEXT[:90]}, REFUSED),
-    Row("binary", stl(0), WHITE),
-    Row("binary that begins with solid", stl(0, b"solid thing"), WHITE),
-    Row("text in upper case", {"mesh.stl": " " + STL_TEXT.upper()}, WHITE),
-    Row("text with a NUL block", {"mesh.stl": STL_TEXT + "\0" * 99}, REFUSED),
-    Row(
-        "binary with more bytes", {"mesh.stl": b"".join([*stl(0, b"solid").values(), b"12"])}, WHITE
-    ),
-    Row("empty", {"mesh.stl": ""}, REFUSED),
-    Row("binary that is truncated", stl(0, face_count=2), REFUSED),
-    Row("VisCAM", stl(0x8000 | 31 << 10), RED),
-    Row("VisCAM that begins with solid", stl(0x8000 | 31 << 10, b"solid"), RED),
-    Row("attribute without a color", stl(31), IGNORED),
-    Row("Magics", stl(31, b"COLOR=\x00\xff\x00\xff"), RED),
-    Row("Magics for all faces", stl(0x8000, b"COLOR=\x00\xff\x00\xff"), GREEN),
-    Row("Magics and alpha", stl(31, b"COLOR=\x00\xff\x00\x09"), REFUSED),
-    Row("Magics and material", stl(31, b"COLOR=\0\0\0\xff,MATERIAL=" + bytes(12)), IGNORED),
+    ("four vertices", {"mesh.stl": STL_TEXT.replace(" endl", "vertex 0 0 0\nendl")}, REFUSED),
+    ("half a file", {"mesh.stl": STL_TEXT[:90]}, REFUSED),
+    ("binary", stl(0), WHITE),
+    ("binary that begins with solid", stl(0, b"solid thing"), WHITE),
+    ("text in upper case", {"mesh.stl": " " + STL_TEXT.upper()}, WHITE),
+    ("text with a NUL block", {"mesh.stl": STL_TEXT + "\0" * 99}, REFUSED),
+    ("binary with more bytes", {"mesh.stl": b"".join([*stl(0, b"solid").values(), b"12"])}, WHITE),
+    ("empty", {"mesh.stl": ""}, REFUSED),
+    ("binary that is truncated", stl(0, face_count=2), REFUSED),
+    ("VisCAM", stl(0x8000 | 31 << 10), RED),
+    ("VisCAM that begins with solid", stl(0x8000 | 31 << 10, b"solid"), RED),
+    ("attribute without a color", stl(31), IGNORED),
+    ("Magics", stl(31, b"COLOR=\x00\xff\x00\xff"), RED),
+    ("Magics for all faces", stl(0x8000, b"COLOR=\x00\xff\x00\xff"), GREEN),
+    ("Magics and alpha", stl(31, b"COLOR=\x00\xff\x00\x09"), REFUSED),
+    ("Magics and material", stl(31, b"COLOR=\0\0\0\xff,MATERIAL=" + bytes(12)), IGNORED),
 ]
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{next(iter(row.files))} {row.feature!r}")
-def test_a_feature_is_read_or_ignored_with_a_warning_or_refused(tmp_path, row: Row):
-    if row.outcome == REFUSED:
-        with pytest.raises(InputError, match=next(iter(row.files))):
-            color_of(tmp_path, row.files)
-    elif row.outcome in WARNINGS:
-        with pytest.warns(UserWarning, match=WARNINGS[row.outcome]) as caught:
-            color_of(tmp_path, row.files)
+@pytest.mark.parametrize(
+    ("files", "outcome"),
+    [pytest.param(*row, id=f"{next(iter(row[0]))} {feature!r}") for feature, *row in ROWS],
+)
+def test_a_feature_is_read_or_ignored_with_a_warning_or_refused(tmp_path, files, outcome):
+    if outcome == REFUSED:
+        with pytest.raises(InputError, match=next(iter(files))):
+            color_of(tmp_path, files)
+    elif outcome in WARNINGS:
+        with pytest.warns(UserWarning, match=WARNINGS[outcome]) as caught:
+            color_of(tmp_path, files)
         assert len(caught) == 1
     else:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            colors = color_of(tmp_path, row.files)
-        assert_allclose(colors, np.broadcast_to(row.outcome, colors.shape), atol=1e-6)
+            colors = color_of(tmp_path, files)
+        assert_allclose(colors, np.broadcast_to(outcome, colors.shape), atol=1e-6)

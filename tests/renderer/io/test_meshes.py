@@ -309,13 +309,6 @@ def test_a_damaged_or_unknown_image_inside_of_a_gltf_is_refused(tmp_path, image)
     require_refusal(write_gltf(tmp_path, image))
 
 
-def test_a_damaged_image_inside_of_a_glb_is_refused(tmp_path):
-    content = fruit_and_leaf().export(file_type="glb")
-    start = content.index(b"IDAT") + 8
-    damaged = content[:start] + b"\xff" * 40 + content[start + 40 :]
-    require_refusal(write(tmp_path / "mesh.glb", damaged))
-
-
 def base_color(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the entries of the color of the material."""
     return tree["materials"][0]["pbrMetallicRoughness"]

@@ -1,7 +1,6 @@
 """Spellings of .obj and .mtl files, and the files that they name."""
 
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -248,16 +247,6 @@ def test_concave_faces_keep_their_shape_and_their_texture_coordinates(tmp_path):
     assert_allclose(mesh.corner_uvs, corners_of(mesh)[..., :2] / 2)
 
 
-def test_the_given_normals_of_corners_are_kept_for_shading(tmp_path):
-    from renderer.io.mesh_file import MeshFile
-    from renderer.io.obj import read_obj
-
-    path = tmp_path / "mesh.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nvn 0 1 1\nf 1//1 2//2 3\n")
-    (part,) = read_obj(MeshFile(path))
-    assert_array_equal(part.normals, [[[0, 0, 1], [0, 1, 1], [0, 0, 0]]])
-
-
 @pytest.mark.parametrize("place", ["mesh", "library"])
 def test_text_with_nul_bytes_is_refused(tmp_path, place):
     texts = {"mesh": PLAIN, "library": LIBRARY}
@@ -282,14 +271,3 @@ def test_files_outside_of_the_folder_are_refused(tmp_path, kind, written):
     text = f"mtllib {library}\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
     with pytest.raises(InputError, match="not below"):
         load(folder, text, m=f"newmtl red\nmap_Kd {name}\n")
-
-
-def test_what_all_files_of_a_set_ignore_is_said_once(tmp_path):
-    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n"
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("once")
-        for name, properties in (("a", "Ns 9\nKs 0 0 0"), ("b", "Ks 1 1 1\nNs 2"), ("c", "Ni 1")):
-            (tmp_path / f"{name}.mtl").write_text(f"newmtl m\nKd 1 0 0\n{properties}\n")
-            (tmp_path / f"{name}.obj").write_text(f"mtllib {name}.mtl\n{triangle}")
-            load_mesh(tmp_path / f"{name}.obj")
-    assert [str(item.message).partition("color: ")[2] for item in caught] == ["Ks, Ns", "Ni"]

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from renderer.camera import OrthographicCamera
-from renderer.errors import InputError
 from renderer.light.basis import Harmonics, SumBasis, split_light
 from renderer.light.environment import read_map
 from renderer.light.lamps import Lamps, Projector
@@ -49,17 +48,6 @@ def test_a_light_is_split_into_environment_light_and_local_lights(parts, first_r
     assert lamp_values[:, 0].tolist() == expected_values.tolist()
     assert projector == PROJECTOR
     assert pattern[:, 0].tolist() == list(range(11, 20))
-
-
-def test_a_sum_has_one_environment_light_at_most():
-    with pytest.raises(InputError, match=r"^parts"):
-        SumBasis((SKY, LAMPS, Harmonics(3)))
-
-
-def test_only_lamps_are_moved():
-    positions = torch.tensor([[0.0, 0.0, 3.0], [1.0, 0.0, 3.0]])
-    moved = SumBasis((SKY, PROJECTOR, LAMPS)).moved(positions)
-    assert moved.parts == (SKY, PROJECTOR, Lamps(((0.0, 0.0, 3.0), (1.0, 0.0, 3.0))))
 
 
 def test_each_projector_has_its_own_pattern_in_a_scene_of_mitsuba(tmp_path):

@@ -158,14 +158,6 @@ def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monke
 
 
 @pytest.mark.parametrize("bounces", [0, 1])
-def test_a_mesh_outside_of_the_image_has_no_pixels(bounces, monkeypatch):
-    monkeypatch.setattr(precomputed, "PATCHES", 2**7)
-    camera = OrthographicCamera(0, 0, 1.0, right=20.0)
-    operator = operator_of(dented(), camera, bounces=bounces)
-    assert operator.transfer.numel() == 0
-
-
-@pytest.mark.parametrize("bounces", [0, 1])
 def test_a_face_without_area_leaves_the_transfer_finite(bounces, monkeypatch):
     monkeypatch.setattr(precomputed, "PATCHES", 2**7)
     heap = hard.heap()

@@ -1,7 +1,6 @@
 """Samples that a camera sees of a mesh, compared with loops over the rasterized image."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -44,31 +43,10 @@ def fragments_of(
     return fragments
 
 
-class CoveredSample(NamedTuple):
-    """Sample of an image that shows a face, with its position in the image."""
-
-    pixel: int
-    face: int
-    x: float
-    y: float
-
-
-def covered_samples(ids: np.ndarray, size: int, samples: int) -> list[CoveredSample]:
-    """List the covered samples of an image of face ids, pixel by pixel."""
-    resolution = size * samples
-    found = []
-    for pixel in range(size**2):
-        first_row = pixel // size * samples
-        first_column = pixel % size * samples
-        for row in range(first_row, first_row + samples):
-            for column in range(first_column, first_column + samples):
-                face = ids[row, column]
-                if face < 0:
-                    continue
-                x = (2 * column + 1) / resolution - 1
-                y = 1 - (2 * row + 1) / resolution
-                found.append(CoveredSample(pixel, face, x, y))
-    return found
+def covered_samples(ids: np.ndarray, size: int, samples: int) -> np.ndarray:
+    """Return the indices of the covered samples of an image of face ids, pixel by pixel."""
+    indices = np.arange(ids.size).reshape(size, samples, size, samples).swapaxes(1, 2).ravel()
+    return indices[ids.ravel()[indices] >= 0]
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -77,18 +55,17 @@ def test_the_samples_are_those_of_the_image_pixel_by_pixel(size, samples, camera
     vertices, faces = open_shell()
     fragments = fragments_of((vertices, faces), ImageSettings(size, samples), camera)
     [ids] = RASTERIZER.rasterize(camera.project(vertices)[None], faces, size * samples)
-    expected = covered_samples(ids, size, samples)
-
-    pixel = np.array([sample.pixel for sample in expected])
+    sample = covered_samples(ids, size, samples)
+    row, column = np.divmod(sample, size * samples)
+    pixel = row // samples * size + column // samples
     pixels, counts = np.unique(pixel, return_counts=True)
     np.testing.assert_array_equal(fragments.pixels, pixels)
     np.testing.assert_array_equal(fragments.coverage, counts / samples**2)
     np.testing.assert_array_equal(fragments.pixels[fragments.sample_to_pixel], pixel)
-
-    face = [sample.face for sample in expected]
-    np.testing.assert_array_equal(fragments.faces[fragments.sample_to_seen_face], face)
-
-    positions = [[sample.x, sample.y] for sample in expected]
+    face = fragments.faces[fragments.sample_to_seen_face]
+    np.testing.assert_array_equal(face, ids.ravel()[sample])
+    centers = (2 * np.stack([column, row], axis=1) + 1) / (size * samples) - 1
+    positions = centers * [1, -1]
     np.testing.assert_allclose(fragments.positions(), positions, rtol=0, atol=2 * EPS)
 
 

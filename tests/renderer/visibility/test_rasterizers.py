@@ -18,7 +18,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-import renderer.visibility
 from renderer.errors import InputError
 from renderer.visibility import SPAN, Rasterizer, choose, opengl
 
@@ -109,77 +108,44 @@ def doubled_area(a: Point, b: Point, c: Point) -> int:
     return (b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x)
 
 
-class ReferenceFace:
-    """Face of the reference, which computes coverage in Python's integers.
-
-    Its corners are in ascending order of their indices, and depths are from 0 to `FAR`.
-    """
-
-    def __init__(self, corners: list[Point], depths: list[float]) -> None:
-        a, b, c = corners
-        self.first_corner = a
-        self.first_depth = depths[0]
-        self.area = doubled_area(a, b, c)
-        if self.area > 0:
-            self.edges = [(b, c), (c, a), (a, b)]
-        else:
-            self.edges = [(c, b), (a, c), (b, a)]
-        # Depth lies on the plane from the corner with the lowest index, in float64.
-        b_rise = depths[1] - depths[0]
-        c_rise = depths[2] - depths[0]
-        scale = PARTS / self.area if self.area else 0
-        self.rise_by_column = (b_rise * (c.y - a.y) - c_rise * (b.y - a.y)) * scale
-        self.rise_by_row = (c_rise * (b.x - a.x) - b_rise * (c.x - a.x)) * scale
-
-    def covers(self, sample: Point) -> bool:
-        """Return whether a sample is inside: on the inner side of each edge.
-
-        A sample on an edge counts if a point a little to the right is inside or,
-        where the edge is horizontal, a point a little below.
-        """
-        if self.area == 0:
-            return False
-        for start, end in self.edges:
-            value = doubled_area(start, end, sample)
-            change_to_the_right = start.y - end.y
-            change_downward = end.x - start.x
-            if (value, change_to_the_right, change_downward) <= (0, 0, 0):
-                return False
-        return True
-
-    def depth_at(self, sample: Point) -> int:
-        """Compute the depth at a sample."""
-        columns = (sample.x - self.first_corner.x) / PARTS
-        rows = (sample.y - self.first_corner.y) / PARTS
-        return round((self.first_depth + rows * self.rise_by_row) + columns * self.rise_by_column)
-
-
 def reference(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
-    """Rasterize one view as the contract says, one sample of one face after another."""
-    points = np.clip(points, -SPAN / resolution, SPAN / resolution)
-    positions = []
-    for x, y, _ in points.tolist():
-        position = Point(rounded_coordinate(x, resolution), rounded_coordinate(-y, resolution))
-        positions.append(position)
-    depths = ((points[:, 2] + 1) / 2 * FAR).tolist()
+    """Rasterize one view as the contract says, one sample of one face after another.
 
+    Coverage is computed in Python's integers. A sample on an edge counts if a point a little to
+    the right is inside or, where the edge is horizontal, a point a little below.
+    """
+    points = np.clip(points, -SPAN / resolution, SPAN / resolution)
+    positions = [
+        Point(rounded_coordinate(x, resolution), rounded_coordinate(-y, resolution))
+        for x, y, _ in points.tolist()
+    ]
+    depths = ((points[:, 2] + 1) / 2 * FAR).tolist()
     ids = np.full((resolution, resolution), NO_FACE)
     nearest = np.full((resolution, resolution), FAR)
     for index, face in enumerate(faces.tolist()):
-        a, b, c = (positions[corner] for corner in face)
-        if closed and doubled_area(a, b, c) > 0:
+        a, b, c = (positions[corner] for corner in sorted(face))
+        area = doubled_area(a, b, c)
+        if area == 0 or (closed and doubled_area(*(positions[corner] for corner in face)) > 0):
             continue
-        ascending = sorted(face)
-        corners = [positions[corner] for corner in ascending]
-        reference_face = ReferenceFace(corners, [depths[corner] for corner in ascending])
+        edges = [(b, c), (c, a), (a, b)] if area > 0 else [(c, b), (a, c), (b, a)]
+        # Depth lies on the plane from the corner with the lowest index, in float64.
+        depth, *others = (depths[corner] for corner in sorted(face))
+        b_rise, c_rise = (other - depth for other in others)
+        rise_by_column = (b_rise * (c.y - a.y) - c_rise * (b.y - a.y)) * (PARTS / area)
+        rise_by_row = (c_rise * (b.x - a.x) - b_rise * (c.x - a.x)) * (PARTS / area)
         for row, column in np.ndindex(ids.shape):
-            center = Point(column * PARTS + PARTS // 2, row * PARTS + PARTS // 2)
-            if not reference_face.covers(center):
+            sample = Point(column * PARTS + PARTS // 2, row * PARTS + PARTS // 2)
+            sides = [
+                (doubled_area(start, end, sample), start.y - end.y, end.x - start.x)
+                for start, end in edges
+            ]
+            if min(sides) <= (0, 0, 0):
                 continue
-            depth = reference_face.depth_at(center)
-            if 0 <= depth < nearest[row, column]:
+            columns, rows = (sample.x - a.x) / PARTS, (sample.y - a.y) / PARTS
+            found = round((depth + rows * rise_by_row) + columns * rise_by_column)
+            if 0 <= found < nearest[row, column]:
                 ids[row, column] = index
-                nearest[row, column] = depth
+                nearest[row, column] = found
     return ids
 
 
@@ -382,15 +348,6 @@ def test_numpy_takes_less_memory_than_a_list_of_all_candidates():
     tracemalloc.stop()
     assert (ids >= 0).all()
     assert peak < 1024**2 * 5 * 8
-
-
-@pytest.mark.parametrize("name", [pytest.param("numba", marks=needs_numba), "numpy"])
-def test_numba_is_chosen_by_default_if_it_is_installed(name, monkeypatch):
-    if name == "numpy":
-        monkeypatch.setitem(sys.modules, "numba", None)
-        monkeypatch.delitem(sys.modules, "renderer.visibility.numba", raising=False)
-        monkeypatch.delattr(renderer.visibility, "numba", raising=False)
-    assert choose("auto").name == name
 
 
 def test_opengl_cannot_be_chosen_without_a_device(monkeypatch):

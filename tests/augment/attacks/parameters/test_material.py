@@ -72,9 +72,6 @@ def problem_of(scene: Scene, **settings) -> SceneProblem:
     return SceneProblem(scene, [Material(scene, chosen)])
 
 
-# --------------------------------------------------------------- values
-
-
 @pytest.mark.parametrize(
     ("mesh", "options"),
     [
@@ -182,9 +179,6 @@ def test_the_hue_turns_by_the_angle_and_keeps_the_mean(angle):
     assert abs(math.remainder(after - before - angle, 360)) < 2.6
 
 
-# --------------------------------------------------------------- files
-
-
 def write(problem: SceneProblem, values: torch.Tensor, folder: Path) -> Adversary:
     """Write the only example of a problem with some attack values."""
     before, after = (
@@ -223,9 +217,6 @@ def test_a_material_is_read_back_to_its_image_and_written_as_gltfs_factors(writt
     assert surface["metallicFactor"] == pytest.approx(0.42, abs=1e-5)
     strength = material["extensions"]["KHR_materials_specular"]["specularFactor"]
     assert strength == pytest.approx(0.8, abs=1e-5)
-
-
-# --------------------------------------------------------------- attacks
 
 
 def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color):

@@ -41,9 +41,6 @@ def costs(
     return logits.log_softmax(1)[:, result.criterion.source[0, 0]]
 
 
-# --------------------------------------------------------------- what the values mean
-
-
 @pytest.mark.parametrize("ground", [None, GRAY])
 def test_values_are_a_rotation_vector_a_shift_and_a_scale(ground):
     """An object on the ground stays on it."""
@@ -109,9 +106,6 @@ def test_gradients_by_the_pose_are_differences_of_new_images(ground):
     assert (found - expected).norm() < 0.03 * expected.norm()
 
 
-# --------------------------------------------------------------- attacks
-
-
 @pytest.fixture(scope="module")
 def result(attacked) -> augment.AttackResult:
     """Return an attack on the two angles of the view alone."""
@@ -143,9 +137,6 @@ def test_an_adversarial_pose_is_read_back_to_its_image_and_camera(result, tmp_pa
     camera = augment.reload(tmp_path / "example_000").cameras[0]
     assert isinstance(camera.polar, float)
     assert camera.polar != result.problem.scene.cameras[0][0].polar
-
-
-# --------------------------------------------------------------- errors
 
 
 def test_a_pose_without_outlines_is_refused():
