@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from oracles import linear_of, srgb_of
 from torch import Tensor, nn
 
 from augment.classifier import Classifier, as_classifier
@@ -13,16 +14,6 @@ from renderer import InputError
 SIZE = 12
 
 
-def srgb(linear: np.ndarray) -> np.ndarray:
-    """Encode linear values by IEC 61966-2-1."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def linear_of(encoded: np.ndarray) -> np.ndarray:
-    """Decode sRGB values by IEC 61966-2-1."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
 @pytest.fixture
 def radiance() -> np.ndarray:
     """Return linear values of four color images in [0, 0.3]."""
@@ -31,7 +22,7 @@ def radiance() -> np.ndarray:
 
 def normalized(linear: np.ndarray, **settings) -> np.ndarray:
     """Normalize linear images, with half of a white balance, and return linear images."""
-    images = torch.from_numpy(srgb(linear))
+    images = torch.from_numpy(srgb_of(linear))
     defaults = {"white_balance": 0.5, "gamma": 1.0}
     result = normalize_light(images, NormalizedLightSettings(**(defaults | settings)))
     return linear_of(result.numpy())
@@ -66,8 +57,8 @@ def test_an_image_in_normalized_light_stays_as_it_is(radiance):
 
 
 def test_gamma_is_the_exponent_of_the_encoded_image(radiance):
-    plain = srgb(normalized(radiance))
-    powered = srgb(normalized(radiance, gamma=0.7))
+    plain = srgb_of(normalized(radiance))
+    powered = srgb_of(normalized(radiance, gamma=0.7))
     is_bright = plain > 0.01
     np.testing.assert_allclose(powered[is_bright], plain[is_bright] ** 0.7, rtol=1e-9)
 
@@ -120,7 +111,7 @@ class Spy(nn.Module):
 
 
 def test_a_classifier_sees_normalized_images(radiance):
-    images = torch.from_numpy(srgb(radiance))
+    images = torch.from_numpy(srgb_of(radiance))
     settings = NormalizedLightSettings(white_balance=0.25)
     expected = normalize_light(images, settings).mean((2, 3))
     classes = ["red", "green", "blue"]
@@ -134,7 +125,7 @@ def test_a_classifier_sees_normalized_images(radiance):
 
 
 def test_light_is_normalized_before_the_mean_is_subtracted(radiance):
-    images = torch.from_numpy(srgb(radiance)).float()
+    images = torch.from_numpy(srgb_of(radiance)).float()
     mean, std = (0.4, 0.5, 0.6), (0.1, 0.2, 0.3)
     classifier = as_classifier(Spy().eval(), SIZE, normalization=(mean, std), normalize_light=True)
     light = normalize_light(images, NormalizedLightSettings())

@@ -146,7 +146,7 @@ class Setup:
 
 
 def harmonics_cases(degree: int) -> Iterator[Case[Tensor]]:
-    directions = draw_directions(6)
+    directions = torch.from_numpy(np.random.default_rng(0).normal(size=(6, 3)))
     every_degree = partial(harmonics_errors, degrees=range(1, degree + 1))
     last_degree = partial(harmonics_errors, degrees=[degree])
     degree_6 = partial(harmonics_errors, degrees=[6])
@@ -178,11 +178,6 @@ def harmonics_cases(degree: int) -> Iterator[Case[Tensor]]:
 
     zero = torch.zeros(1, 3, dtype=torch.float64)
     yield Case("a direction of zero, degree 6", 1, degree_6, [zero])
-
-
-def draw_directions(count: int) -> Tensor:
-    """Draw directions (count, 3) of various lengths, float64."""
-    return torch.from_numpy(np.random.default_rng(0).normal(size=(count, 3)))
 
 
 def directions_near_poles() -> Tensor:
@@ -505,14 +500,14 @@ def random_upstream(rows: int) -> Tensor:
 # ---------------------------------------------------------------------------- tests
 
 
-def quick_cases() -> Iterator[Any]:
-    """Yield all rows of the tables as parameters of a test."""
-    for title, cases in tables(**QUICK).items():
-        for case in cases:
-            yield pytest.param(case, id=f"{title}: {case.name}")
-
-
-@pytest.mark.parametrize("case", list(quick_cases()))
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=f"{title}: {case.name}")
+        for title, cases in tables(**QUICK).items()
+        for case in cases
+    ],
+)
 def test_every_error_is_rounding(case):
     """Errors are a few ε, and more if thousands of pixels or hundreds of harmonics cancel."""
     errors = case.errors()

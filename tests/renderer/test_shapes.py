@@ -14,15 +14,8 @@ ALL = SOLIDS | HARD_NEGATIVES
 # The handle of a cup is a second shell.
 SHELL_COUNTS = dict.fromkeys(ALL, 1) | {"cup": 2}
 SEEDS = range(2)
-# The volume of a tetrahedron is a sixth of the determinant of its edges.
-TETRAHEDRON = 1 / 6
 # Euler characteristic of a surface without holes or handles.
 SPHERE = 2
-
-
-def enclosed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Add up the signed tetrahedra between the origin and each face (divergence theorem)."""
-    return np.linalg.det(vertices[faces]).sum() * TETRAHEDRON
 
 
 def shells(mesh: Mesh) -> list[np.ndarray]:
@@ -49,7 +42,8 @@ def test_a_solid_has_closed_shells_with_faces_outward_and_fills_the_unit_box(nam
     for faces in parts:
         edge_count = 3 * len(faces) / 2
         assert len(np.unique(faces)) - edge_count + len(faces) == SPHERE
-        assert enclosed_volume(mesh.vertices, faces) > 1e-3
+        # Signed tetrahedra between the origin and each face (divergence theorem).
+        assert np.linalg.det(mesh.vertices[faces]).sum() / 6 > 1e-3
     assert mesh.face_areas().min() > 1e-6
     np.testing.assert_array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
     assert 0.8 < np.abs(mesh.vertices).max() < 1.05

@@ -141,12 +141,6 @@ def sheet_of(result: AttackResult) -> np.ndarray:
     return np.asarray(figure(result, 0))
 
 
-def random_images(size: int, seed: int) -> torch.Tensor:
-    """Return images of 8 bits, in which no pixel is as white as the paper."""
-    draws = torch.Generator().manual_seed(seed)
-    return torch.randint(0, 250, (1, 2, 3, size, size), generator=draws).float() / 255
-
-
 def shown(sheet: np.ndarray, view: int, column: int, size: int, lines: int) -> torch.Tensor:
     """Return the image (3, size, size) of a view in a column, which is enlarged by a whole number.
 

@@ -104,13 +104,6 @@ def brdf(
     return specular * fresnel(view_half_cosine) + ALBEDO * diffuse
 
 
-def glossy_pear(roughness: float, metallic: float) -> Mesh:
-    """Return a gray pear with gloss."""
-    pear = normalize(solid("pear"))
-    gray = replace(pear, corner_colors=np.full_like(pear.corner_colors, ALBEDO))
-    return Gloss(roughness, metallic).on(gray)
-
-
 def rendered(path: Path, mesh: Mesh) -> tuple[np.ndarray, Camera]:
     """Return the radiance (P, 3) of the pear's pixels in a scene, and the scene's camera."""
     scene = build_scene([(mesh, "pear")], SIZE, light=str(path), rasterizer="numpy")
@@ -153,7 +146,9 @@ def integrated(
 
 def require_close(path: Path, largest_error: float, roughness: float, metallic: float) -> None:
     """Require that both images agree and that hardly any lit pixel has a black channel."""
-    mesh = glossy_pear(roughness, metallic)
+    pear = normalize(solid("pear"))
+    gray = replace(pear, corner_colors=np.full_like(pear.corner_colors, ALBEDO))
+    mesh = Gloss(roughness, metallic).on(gray)
     image, camera = rendered(path, mesh)
     expected = integrated(path, mesh, camera, roughness, metallic)
     error = np.sqrt(np.square(image - expected).mean() / np.square(expected).mean())

@@ -144,19 +144,15 @@ def test_pixel_changes_are_added_last_and_clamped_and_keep_their_gradient_at_the
     assert torch.equal(gradient, torch.ones_like(pixels))
 
 
-def albedo_gradient(scene: Scene) -> Tensor:
-    """Return the gradient (3, 20, 3) of the sum of all images by the albedo."""
-    albedo = torch.zeros(3, 20, 3, dtype=torch.float64, requires_grad=True)
-    images = scene.render(replace(scene.conditions(EVERY), albedo=albedo), EVERY)
-    return torch.autograd.grad(images.sum(), albedo)[0]
-
-
 @pytest.mark.parametrize("bound", [0.0, 1.0])
 def test_colors_at_their_bounds_keep_their_gradient(make_scene, stone, bound):
     gradients = []
     for gray in (bound, 0.5):
         colors = np.full_like(stone.corner_colors, gray)
-        gradients.append(albedo_gradient(make_scene(mesh=replace(stone, corner_colors=colors))))
+        scene = make_scene(mesh=replace(stone, corner_colors=colors))
+        albedo = torch.zeros(3, 20, 3, dtype=torch.float64, requires_grad=True)
+        images = scene.render(replace(scene.conditions(EVERY), albedo=albedo), EVERY)
+        gradients += torch.autograd.grad(images.sum(), albedo)
     torch.testing.assert_close(gradients[0], gradients[1], rtol=0, atol=ROUNDING)
 
 

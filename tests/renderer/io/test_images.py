@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import PIL
 import pytest
+from oracles import linear_of, srgb_of
 from PIL import Image, ImageCms
 
 from renderer.errors import InputError
@@ -41,16 +42,10 @@ def to_d50(primaries: tuple[float, ...]) -> np.ndarray:
     return np.linalg.inv(BRADFORD) @ np.diag(gains) @ BRADFORD @ matrix
 
 
-def srgb_curve(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
 def stored(primaries: tuple[float, ...], gamma: float | None, color=COLOR) -> np.ndarray:
     """Return the 8-bit values that stand for an sRGB color with a gamma, or sRGB's curve (None)."""
-    encoded = np.array(color) / 255
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    there = np.linalg.solve(to_d50(primaries), to_d50(SRGB) @ linear)
-    values = srgb_curve(there) if gamma is None else there ** (1 / gamma)
+    there = np.linalg.solve(to_d50(primaries), to_d50(SRGB) @ linear_of(np.array(color) / 255))
+    values = srgb_of(there) if gamma is None else there ** (1 / gamma)
     return np.round(values * 255).astype(np.uint8)
 
 
@@ -87,9 +82,7 @@ def gamma_curve(gamma: float) -> bytes:
 
 def srgb_table() -> bytes:
     """Write sRGB's curve as a table of 1024 values."""
-    encoded = np.linspace(0, 1, 1024)
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    values = np.round(linear * 65535).astype(">u2").tobytes()
+    values = np.round(linear_of(np.linspace(0, 1, 1024)) * 65535).astype(">u2").tobytes()
     return b"curv" + bytes(4) + struct.pack(">I", 1024) + values
 
 
@@ -158,7 +151,7 @@ def test_a_profile_of_srgb_changes_no_bit(tmp_path, name):
 
 def test_a_gray_photograph_has_the_curve_of_its_profile(tmp_path):
     levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
-    expected = np.round(255 * srgb_curve((levels / 255) ** 1.8))
+    expected = np.round(255 * srgb_of((levels / 255) ** 1.8))
     for mode, space in (("L", b"GRAY"), ("LA", b"GRAY"), ("L", b"RGB ")):
         image = Image.fromarray(levels).convert(mode)
         image.save(tmp_path / "a.png", icc_profile=profile(space, gamma_curve(1.8)))
@@ -170,7 +163,7 @@ def test_a_gray_photograph_has_the_curve_of_its_profile(tmp_path):
 
 def test_lab_pixels_become_srgb(tmp_path):
     """In the memory of Pillow, a and b are shifted by 128."""
-    xyz = to_d50(SRGB) @ (((np.array(COLOR) / 255 + 0.055) / 1.055) ** 2.4) / D50
+    xyz = to_d50(SRGB) @ linear_of(np.array(COLOR) / 255) / D50
     root = np.cbrt(xyz)
     lab = [116 * root[1] - 16, 500 * (root[0] - root[1]), 200 * (root[1] - root[2])]
     pixel = (round(lab[0] * 2.55), round(lab[1]) + 128, round(lab[2]) + 128)
@@ -245,7 +238,7 @@ def test_linear_light_of_16_bits_is_refused_and_never_loses_its_dark_values(
             read_image(path, 8)
     else:
         stored_value = (pixels[0, 0] >> (depth - 8)) / 255
-        expected = 255 * srgb_curve(np.array(stored_value**gamma))
+        expected = 255 * srgb_of(np.array(stored_value**gamma))
         assert np.abs(read(path) - expected).max() <= 2
 
 

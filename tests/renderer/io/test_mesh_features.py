@@ -19,7 +19,6 @@ from renderer.io.meshes import load_mesh
 
 RED = (1.0, 0.0, 0.0)
 GREEN = (0.0, 1.0, 0.0)
-BLUE = (0.0, 0.0, 1.0)
 WHITE = (1.0, 1.0, 1.0)
 GRAY = (0.5, 0.5, 0.5)
 IGNORED = "ignored"

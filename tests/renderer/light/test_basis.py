@@ -22,11 +22,6 @@ PROJECTOR = Projector(3)
 ORDERS = [([SKY, LAMPS, PROJECTOR], [0, 9, 11]), ([LAMPS, SKY, PROJECTOR], [0, 2, 11])]
 
 
-def numbered_coefficients() -> torch.Tensor:
-    """Return coefficients (20, 3) whose values are their row numbers."""
-    return torch.arange(20.0)[:, None].expand(-1, 3)
-
-
 @pytest.mark.parametrize(("parts", "first_rows"), ORDERS)
 def test_the_parts_of_a_sum_have_their_coefficients_in_the_order_of_the_parts(parts, first_rows):
     found = SumBasis(tuple(parts)).lights
@@ -37,7 +32,7 @@ def test_the_parts_of_a_sum_have_their_coefficients_in_the_order_of_the_parts(pa
 
 @pytest.mark.parametrize(("parts", "first_rows"), ORDERS)
 def test_a_light_is_split_into_environment_light_and_local_lights(parts, first_rows):
-    coefficients = numbered_coefficients()
+    coefficients = torch.arange(20.0)[:, None].expand(-1, 3)
     split = split_light(SumBasis(tuple(parts)), coefficients)
     assert split.environment[0, 0] == first_rows[parts.index(SKY)]
     assert len(split.environment) == SKY.size

@@ -22,7 +22,6 @@ ROOT = Path(__file__).parents[3]
 FIT = ROOT / "renderer" / "light" / "skylight_fit.safetensors"
 EPS = torch.finfo(torch.float64).eps
 HORIZON = math.pi / 2
-LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
 # Matrix of IEC 61966-2-1.
 RGB_TO_XYZ = np.array(
     [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
@@ -90,13 +89,6 @@ def published_sky(
     return np.stack([x / y * luminance, luminance, (1 - x - y) / y * luminance], axis=1)
 
 
-def unit_vectors(zenith: ArrayLike, azimuth: ArrayLike) -> np.ndarray:
-    """Return the directions (..., 3) of zenith angles and azimuths in radians."""
-    x = np.sin(zenith) * np.cos(azimuth)
-    y = np.sin(zenith) * np.sin(azimuth)
-    return np.stack([x, y, np.cos(zenith)], axis=-1)
-
-
 def sky_parameters(*values: float) -> tuple[torch.Tensor, ...]:
     """Return the parameters of a sky as tensors that need gradients."""
     return tuple(torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in values)
@@ -110,7 +102,9 @@ def relative_error(approximate: torch.Tensor, exact: np.ndarray) -> float:
 
 def weighted_sky(angles: np.ndarray, sky: tuple[float, float, float]) -> np.ndarray:
     """Return radiance of the published sky times harmonics (N, 49 · 3) by angles (N, 2)."""
-    directions = unit_vectors(angles[:, 0], angles[:, 1])
+    zenith, azimuth = angles.T
+    horizontal = np.sin(zenith) * [np.cos(azimuth), np.sin(azimuth)]
+    directions = np.stack([*horizontal, np.cos(zenith)], axis=1)
     rgb = published_sky(directions, *sky) @ np.linalg.inv(RGB_TO_XYZ).T
     harmonics = basis(torch.from_numpy(directions), 6).numpy()
     solid_angle = np.sin(angles[:, :1])

@@ -70,11 +70,6 @@ def unit_vector(polar: float, azimuth: float = 0.0) -> np.ndarray:
 # Reference: the reflectance of glTF.
 
 
-def schlick_fresnel(f0: float, f90: float, cosine: np.ndarray) -> np.ndarray:
-    """Evaluate Schlick's approximation between the values at normal and grazing incidence."""
-    return f0 + (f90 - f0) * (1 - cosine) ** 5
-
-
 def dielectric_fresnel(cosine: np.ndarray) -> np.ndarray:
     """Evaluate Fresnel's equations for unpolarized light by Snell's law."""
     n = REFRACTIVE_INDEX
@@ -116,7 +111,7 @@ class Lobe:
     def _fresnel(self, cosine: np.ndarray) -> np.ndarray:
         if self.f0 is None:
             return dielectric_fresnel(cosine)
-        return schlick_fresnel(self.f0, self.f90, cosine)
+        return self.f0 + (self.f90 - self.f0) * (1 - cosine) ** 5  # by Schlick
 
 
 def hemisphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
