@@ -40,6 +40,7 @@ TRIMESH = trimesh.creation.icosahedron()
 CAMERA = renderer.OrthographicCamera(57.3, 28.6, 4.0)
 LIGHT = renderer.load_light("grace")
 LAMP = Lamps(((2.0, 2.0, 2.0),))
+INTRINSICS = np.array([[70.0, 0, 27], [0, 76, 39], [0, 0, 1]])
 CLASSES = ("orange", "other")
 COMPLEX = torch.ones(49, 3) * 1j
 OBJECTS = np.full((49, 3), None)
@@ -184,6 +185,15 @@ CAMERAS = [
     *by_name(partial(renderer.OrthographicCamera, 57.3, 0.0, 2.0), right=["x", NAN]),
     *by_name(partial(renderer.OrthographicCamera, 57.3, 0.0, 2.0), clip_range=[0.0, "far"]),
     *by_name(partial(renderer.PerspectiveCamera, 57.3, 0.0, 2.0), distance=[0, "far"]),
+    *by_name(
+        partial(
+            renderer.PinholeCamera.from_matrix, view=np.eye(4), intrinsics=INTRINSICS, size=SIZE
+        ),
+        view=[np.eye(3), 2 * np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])],
+        intrinsics=[np.eye(4), INTRINSICS + np.eye(3, k=1), INTRINSICS.T],
+        size=[0, 1.5],
+        convention=["blender"],
+    ),
     *by_name(renderer.ImageSettings, size=[16.5, True, 0], samples=[0, 65, 2.5, "8"]),
     *by_name(renderer.ImageSettings, encoding=["gamma", None]),
 ]
@@ -280,7 +290,13 @@ SCENES = [
     *by_name(scene, polar=[200.0, "top", NAN], azimuth=["east", 1000.0], fov=[200.0, "30", 0]),
     *by_name(scene, vertices=[2.5, -1, "many", None], ground=[[1, 2, 3], "wood", 0.5, [0.5, 0.5]]),
     *by_name(scene, projector=[Projector(), 16], lamps=[LAMP], samples=[0, 2.5, "2"]),
-    *by_name(scene, rasterizer=["gpu", 3]),
+    *by_name(scene, rasterizer=["gpu", 3], cameras=[[], ["above"]], normalize=[False, "no"]),
+    *by_name(partial(scene, cameras=renderer.orbit_cameras(3, 2.0)), views=[2]),
+    *calls_of(
+        "solid:orange",
+        lambda x: scene([augment.ObjectSettings("solid:orange", "orange", color=x)]),
+        [1.0, 0.0, 0.0],
+    ),
     *calls_of("pixels", lambda x: scene(projector=augment.ProjectorSettings(pixels=x)), 2.5, 0),
     *calls_of(
         "pattern",
@@ -342,6 +358,10 @@ def saved(**changed: Any) -> Any:
     return augment.save(small_result(), "out", **changed)
 
 
+def animated(path: str = "attack.gif", **changed: Any) -> Any:
+    return small_result().save_animation(path, **changed)
+
+
 STEPS = augment.StepSettings()
 ATTACKS = [
     *calls_of("norm", augment.StepSettings, "l3", 0.1, None, 2),
@@ -384,6 +404,7 @@ ATTACKS = [
     *calls_of("folder", lambda x: augment.save(small_result(), x), None, 3),
     *calls_of("file.txt", lambda x: augment.save(small_result(), x), "file.txt"),
     *by_name(saved, verify=["blender", 3]),
+    *by_name(animated, path=["attack.mp4"], frame_count=[1], example=[2], view=[2]),
     *calls_of("folder", augment.reload, None, 3),
     *calls_of("file.txt", augment.reload, "file.txt"),
     *calls_of("missing", augment.reload, "missing"),

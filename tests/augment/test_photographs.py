@@ -221,8 +221,7 @@ def test_the_gradient_of_the_gain_agrees_with_finite_differences():
 
 def test_shading_is_the_cosine_between_normal_and_light():
     shading = draw_shading(20, 64, generator(5))
-    assert shading.min() >= 0
-    assert shading.max() <= 1
+    assert 0 <= shading.min() <= shading.max() <= 1
     # A flat surface reflects at least the cosine of the largest angle, on average over the draws.
     assert math.cos(math.radians(60)) < float(shading.mean()) < 1
 

@@ -137,10 +137,9 @@ def vertex_gradient(
     by_first = []
     by_second = []
     for axis in AXES:
-        first_moves = _weighted_irradiance(view, weight, light, first=stepped(view.first, axis))
-        second_moves = _weighted_irradiance(view, weight, light, second=stepped(view.second, axis))
-        by_first.append(derivative(first_moves))
-        by_second.append(derivative(second_moves))
+        edges = [(stepped(view.first, axis), view.second), (view.first, stepped(view.second, axis))]
+        for slopes, moved in zip((by_first, by_second), edges, strict=True):
+            slopes.append(derivative(_weighted_irradiance(view, weight, light, *moved)))
     # Shape (G, 3). The first corner moves both edges backward.
     second_corner = np.stack(by_first, axis=1)
     third_corner = np.stack(by_second, axis=1)
@@ -152,15 +151,9 @@ def vertex_gradient(
 
 
 def _weighted_irradiance(
-    view: View,
-    weight: np.ndarray,
-    light: np.ndarray,
-    first: np.ndarray | None = None,
-    second: np.ndarray | None = None,
+    view: View, weight: np.ndarray, light: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> np.ndarray:
     """Compute the weighted sum (G,) of the colors of each face's irradiance, for other edges."""
-    first = view.first if first is None else first
-    second = view.second if second is None else second
     normals = unit(cross(first, second)) * view.side
     return (irradiance(normals, light) * weight).sum(axis=1)
 

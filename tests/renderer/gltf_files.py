@@ -1,14 +1,13 @@
 """Writer of the glTF files of the tests."""
 
 import base64
-import io
 import json
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from oracles import encoded
 
 from renderer.io.meshes import load_mesh
 from renderer.mesh import Mesh
@@ -59,6 +58,17 @@ class Gltf:
         self.tree["accessors"].append(accessor)
         return len(self.tree["accessors"]) - 1
 
+    def sparse(self, index: int, rows: np.ndarray, values: np.ndarray) -> None:
+        """Replace rows of an array by sparse values."""
+        self.tree["accessors"][index]["sparse"] = {
+            "count": len(rows),
+            "indices": {
+                "bufferView": self.view(rows.tobytes()),
+                "componentType": TYPES[rows.dtype.name],
+            },
+            "values": {"bufferView": self.view(values.tobytes())},
+        }
+
     def mesh(
         self, attributes: dict[str, Any], indices: np.ndarray | None = None, **entries: Any
     ) -> dict[str, Any]:
@@ -75,11 +85,9 @@ class Gltf:
 
     def texture(self, texels: np.ndarray, **sampler: int) -> dict[str, int]:
         """Append a texture, and return a reference to it."""
-        content = io.BytesIO()
-        Image.fromarray(texels).save(content, "PNG")
         for kind in ("images", "samplers", "textures"):
             self.tree.setdefault(kind, [])
-        view = self.view(content.getvalue())
+        view = self.view(encoded(texels))
         self.tree["images"].append({"bufferView": view, "mimeType": "image/png"})
         self.tree["samplers"].append(sampler)
         index = len(self.tree["textures"])

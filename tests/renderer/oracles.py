@@ -129,8 +129,29 @@ def linear_of(srgb: ArrayLike) -> np.ndarray:
     return np.where(srgb <= 0.04045, srgb / 12.92, curve)
 
 
+def encoded(texels: np.ndarray | Image.Image) -> bytes:
+    """Encode an image as .png."""
+    content = io.BytesIO()
+    image = texels if isinstance(texels, Image.Image) else Image.fromarray(texels)
+    image.save(content, "PNG")
+    return content.getvalue()
+
+
 def png_of(*color: int) -> bytes:
     """Encode an image of one color as .png."""
-    content = io.BytesIO()
-    Image.fromarray(np.full((2, 2, len(color)), color, dtype=np.uint8)).save(content, "PNG")
-    return content.getvalue()
+    return encoded(np.full((2, 2, len(color)), color, dtype=np.uint8))
+
+
+def smith_masking(cosine: ArrayLike, roughness: float) -> np.ndarray:
+    """Evaluate Smith's masking of one direction for GGX, by the appendix of glTF 2.0."""
+    cosine = np.asarray(cosine)
+    alpha_squared = roughness**4
+    return 2 * cosine / (cosine + np.sqrt(alpha_squared + (1 - alpha_squared) * cosine**2))
+
+
+def dielectric_fresnel(cosine: np.ndarray, index: float = 1.5) -> np.ndarray:
+    """Evaluate Fresnel's equations for unpolarized light by Snell's law."""
+    inside = np.sqrt(1 - (1 - cosine**2) / index**2)
+    across = (cosine - index * inside) / (cosine + index * inside)
+    along = (index * cosine - inside) / (index * cosine + inside)
+    return (across**2 + along**2) / 2

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import extended_precision as wide
 import hard_meshes as hard
@@ -52,17 +52,16 @@ FULL = {"degree": 20, "subdivisions": 8, "size": 4096, "slivers": 16}
 
 # Errors in units of ε by the name of the quantity.
 Errors = dict[str, float]
-Subject = TypeVar("Subject")
 
 
 @dataclass(frozen=True)
-class Case(Generic[Subject]):
+class Case:
     """Row of a table: the largest errors of all subjects, and a bound on them in units of ε."""
 
     name: str
     bound: float
-    measure: Callable[[Subject], Errors]
-    subjects: Iterable[Subject]
+    measure: Callable[[Any], Errors]
+    subjects: Iterable[Any]
 
     def errors(self) -> Errors:
         """Measure the largest errors of all subjects."""
@@ -145,7 +144,7 @@ class Setup:
 # ---------------------------------------------------------------------------- conditions
 
 
-def harmonics_cases(degree: int) -> Iterator[Case[Tensor]]:
+def harmonics_cases(degree: int) -> Iterator[Case]:
     directions = torch.from_numpy(np.random.default_rng(0).normal(size=(6, 3)))
     every_degree = partial(harmonics_errors, degrees=range(1, degree + 1))
     last_degree = partial(harmonics_errors, degrees=[degree])
@@ -187,7 +186,7 @@ def directions_near_poles() -> Tensor:
     return torch.stack([0.6 * angles, 0.8 * angles, poles], dim=1)
 
 
-def mesh_cases(subdivisions: int) -> Iterator[Case[Setup]]:
+def mesh_cases(subdivisions: int) -> Iterator[Case]:
     ball = hard.sphere()
     yield Case("dented sphere of 320 faces, radius 1", 8, all_errors, [Setup(ball)])
     yield from placement_cases(ball)
@@ -199,7 +198,7 @@ def mesh_cases(subdivisions: int) -> Iterator[Case[Setup]]:
     yield Case(f"{20 * 4**subdivisions:,} faces at 256²", 64, all_errors, large)
 
 
-def placement_cases(ball: Mesh) -> Iterator[Case[Setup]]:
+def placement_cases(ball: Mesh) -> Iterator[Case]:
     scaled = [moved(ball.vertices * 10.0**power) for power in (-6, -3, 3, 6)]
     yield Case("scaled by 10⁻⁶, 10⁻³, 10³ and 10⁶", 8, all_errors, scaled)
 
@@ -221,7 +220,7 @@ def placement_cases(ball: Mesh) -> Iterator[Case[Setup]]:
     yield Case(empty, 0, all_errors, unseen)
 
 
-def topology_cases(ball: Mesh) -> Iterator[Case[Setup]]:
+def topology_cases(ball: Mesh) -> Iterator[Case]:
     flat = Setup(hard.with_faces_without_area(ball))
     yield Case("three faces without area beside each", 12, all_errors, [flat])
 
@@ -244,7 +243,7 @@ def topology_cases(ball: Mesh) -> Iterator[Case[Setup]]:
     yield Case("a single triangle", 8, all_errors, [Setup(hard.TRIANGLE)])
 
 
-def thin_face_cases(count: int) -> Iterator[Case[Setup]]:
+def thin_face_cases(count: int) -> Iterator[Case]:
     double = [thin_faces(power, count, torch.float64) for power in (2, 4, 6, 8, 10, 12)]
     yield Case("height / edge of 10⁻² to 10⁻¹²", 8, all_errors, double)
     single = [thin_faces(power, count, torch.float32) for power in (4, 6, 12)]
@@ -259,7 +258,7 @@ def thin_faces(power: int, count: int, dtype: torch.dtype) -> Setup:
     return Setup(mesh, settings=settings, rasterizer=hard.Chart(), lift=exact, dtype=dtype)
 
 
-def light_cases(degree: int) -> Iterator[Case[Setup]]:
+def light_cases(degree: int) -> Iterator[Case]:
     scaled = [lit(random_light() * 10.0**power) for power in (-8, -4, 4, 8, 11)]
     yield Case("coefficients of 10⁻⁸ to 10¹¹", 8, all_errors, scaled)
     negative = [lit(-random_light().abs()), lit(ambient(-torch.ones(3)))]
@@ -279,7 +278,7 @@ def lit(light: Tensor) -> Setup:
     return Setup(rounded(hard.sphere(), torch.float32), light, dtype=torch.float32)
 
 
-def number_type_cases() -> Iterator[Case[Setup]]:
+def number_type_cases() -> Iterator[Case]:
     for dtype in DTYPES:
         bound = 1 if torch.finfo(dtype).bits == 16 else 8
         setup = Setup(rounded(hard.sphere(), dtype), dtype=dtype)
@@ -287,7 +286,7 @@ def number_type_cases() -> Iterator[Case[Setup]]:
         yield Case(str(dtype).removeprefix("torch."), bound, measure, [setup])
 
 
-def image_cases(size: int) -> Iterator[Case[Setup]]:
+def image_cases(size: int) -> Iterator[Case]:
     ball = hard.sphere()
     one_sample = Setup(ball, settings=ImageSettings(size=1, samples=1))
     many_samples = Setup(ball, settings=ImageSettings(size=1, samples=16))
@@ -311,7 +310,7 @@ def image_cases(size: int) -> Iterator[Case[Setup]]:
     yield Case(empty, 0, all_errors, unseen)
 
 
-def shadow_cases() -> Iterator[Case[Setup]]:
+def shadow_cases() -> Iterator[Case]:
     # The dents of this sphere shade each other.
     lumpy = hard.sphere(1, lowest=0.5)
     small_lumpy = replace(lumpy, vertices=1e-3 * lumpy.vertices)
@@ -331,9 +330,7 @@ def shadow_cases() -> Iterator[Case[Setup]]:
     yield Case("closed and lumpy, float64", 8, in_double, [Setup(lumpy)])
 
 
-def tables(
-    degree: int, subdivisions: int, size: int, slivers: int
-) -> dict[str, Iterator[Case[Any]]]:
+def tables(degree: int, subdivisions: int, size: int, slivers: int) -> dict[str, Iterator[Case]]:
     """Return the rows of each table by its title. `slivers` thin triangles are of each kind."""
     return {
         "Spherical harmonics": harmonics_cases(degree),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import corners_of, mesh_of
+from oracles import corners_of, mesh_of, patchwork
 
 from renderer.errors import InputError
 from renderer.mesh import Mesh, concatenate, normalize, refine, subdivide
@@ -101,30 +101,8 @@ def test_a_surface_of_zero_area_cannot_be_normalized():
         normalize(Mesh.plain(np.zeros((3, 3)), [[0, 1, 2]]))
 
 
-def height_field(cells: int = 3) -> Mesh:
-    """Create a rough surface over [-1, 1]² with two faces per cell, colors and uvs with seams."""
-    rng = np.random.default_rng(0)
-    ticks = np.linspace(-1, 1, cells + 1)
-    x, y = np.meshgrid(ticks, ticks, indexing="ij")
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    a = index[:-1, :-1].ravel()
-    b = index[1:, :-1].ravel()
-    c = index[1:, 1:].ravel()
-    d = index[:-1, 1:].ravel()
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    heights = rng.uniform(-0.3, 0.3, x.size)
-    small_texture = rng.integers(0, 256, (4, 4, 3), dtype=np.uint8)
-    large_texture = rng.integers(0, 256, (4, 8, 3), dtype=np.uint8)
-    return replace(
-        Mesh.plain(np.stack([x.ravel(), y.ravel(), heights], axis=1), faces),
-        corner_colors=rng.random((len(faces), 3, 3), dtype=np.float32),
-        corner_uvs=rng.random((len(faces), 3, 2), dtype=np.float32),
-        texture_ids=rng.integers(-1, 2, len(faces)).astype(np.int32),
-        textures=(small_texture, large_texture),
-    )
-
-
-SHEET = height_field()
+ICOSAHEDRON = trimesh.creation.icosahedron()
+SHEET = patchwork(ICOSAHEDRON.vertices, ICOSAHEDRON.faces[:13])
 MESHES = {
     "box": BOX_MESH,
     "cup": solid("cup"),
@@ -169,7 +147,7 @@ def test_colors_and_texture_coordinates_are_linear_on_the_original_faces():
     """Values are rounded to float32 at each of two subdivisions."""
     values = linear_values(SHEET).astype(np.float32)
     mesh = replace(SHEET, corner_colors=values[..., :3], corner_uvs=values[..., 3:])
-    finer = subdivide(mesh, 150)
+    finer = subdivide(mesh, 100)
     assert len(finer.faces) == 16 * len(SHEET.faces)
     found = np.concatenate([finer.corner_colors, finer.corner_uvs], axis=-1)
     assert_allclose(found, linear_values(finer), rtol=0, atol=2 * EPS32)

@@ -132,23 +132,3 @@ def test_a_mesh_behind_the_camera_is_refused():
         camera.project(points_around(behind))
     with pytest.raises(InputError, match=r"^cameras"):
         camera.normalized(behind, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("view", {"view": np.eye(3)}),
-        ("view", {"view": 2 * np.eye(4)}),
-        ("view", {"view": np.diag([1.0, 1.0, -1.0, 1.0])}),
-        ("intrinsics", {"intrinsics": np.eye(4)}),
-        ("intrinsics", {"intrinsics": [[70, 1, 27], [0, 76, 39], [0, 0, 1]]}),
-        ("intrinsics", {"intrinsics": INTRINSICS.T}),
-        ("size", {"size": 0}),
-        ("size", {"size": 1.5}),
-        ("convention", {"convention": "blender"}),
-    ],
-)
-def test_matrices_of_other_kinds_are_refused(name, arguments):
-    valid = {"view": np.eye(4), "intrinsics": INTRINSICS, "size": SIZE}
-    with pytest.raises(InputError, match=f"^{name}"):
-        PinholeCamera.from_matrix(**valid | arguments)

@@ -47,8 +47,7 @@ def test_a_solid_has_closed_shells_with_faces_outward_and_fills_the_unit_box(nam
     assert mesh.face_areas().min() > 1e-6
     np.testing.assert_array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
     assert 0.8 < np.abs(mesh.vertices).max() < 1.05
-    assert mesh.corner_colors.min() >= 0
-    assert mesh.corner_colors.max() <= 1
+    assert 0 <= mesh.corner_colors.min() <= mesh.corner_colors.max() <= 1
 
 
 @pytest.mark.parametrize("name", ALL)

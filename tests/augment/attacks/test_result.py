@@ -63,20 +63,6 @@ def test_an_animation_shows_the_images_from_before_to_after(result, tmp_path, su
     assert means[2] == pytest.approx((means[0] + means[4]) / 2, abs=0.02)
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("path", {"path": "attack.mp4"}),
-        ("frame_count", {"frame_count": 1}),
-        ("example", {"example": 2}),
-        ("view", {"view": 1}),
-    ],
-)
-def test_wrong_animations_are_refused(result, tmp_path, name, arguments):
-    with pytest.raises(renderer.InputError, match=f"^{name}"):
-        result.save_animation(**{"path": tmp_path / "attack.gif"} | arguments)
-
-
 def test_a_plot_shows_an_example_that_was_correct_and_is_fooled_with_its_true_class():
     """The first example is wrong before the attack, and the second one is not fooled."""
     names = ["orange", *(f"other {index}" for index in range(9))]

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -11,7 +10,6 @@ import augment
 import renderer
 from augment.augmentation_settings import VariationSettings
 from augment.scene.vary import vary
-from renderer.errors import InputError
 
 SIZE = 24
 PLACE = np.array([120.0, -40.0, 15.0])
@@ -115,18 +113,3 @@ def test_variations_keep_pinhole_cameras():
     assert isinstance(camera, renderer.PinholeCamera)
     assert camera.roll == scene.cameras[0][0].roll
     assert 20 <= camera.angle <= 40
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("normalize", {"normalize": False}),
-        ("normalize", {"normalize": "no", "cameras": renderer.orbit_cameras(1, 2.0)}),
-        ("cameras", {"cameras": []}),
-        ("cameras", {"cameras": ["above"]}),
-        ("views", {"cameras": renderer.orbit_cameras(3, 2.0), "views": 2}),
-    ],
-)
-def test_wrong_cameras_are_refused(name, arguments):
-    with pytest.raises(InputError, match=f"^{name}"):
-        augment.build_scene([("solid:cup", "cup")], SIZE, **arguments)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from oracles import dielectric_fresnel, smith_masking
 
 from augment.scene.build import build_scene
 from renderer.camera import Camera
@@ -27,29 +28,12 @@ HDRI = Path(__file__).parents[4] / "shared" / "data" / "hdri"
 SIZE = 32
 SETTINGS = ImageSettings(SIZE, 2)
 ALBEDO = 0.5
-REFRACTIVE_INDEX = 1.5
 AT_ONCE = 32  # samples in the quadrature, which bounds the memory
 ERRORS = {"city": 0.1, "forest": 0.1, "night": 0.1, "studio": 0.3}  # largest by map
 BLACK = 0.005  # largest fraction of the channels of lit pixels that are black
 METALLIC = {"varnish": 0.0, "metal": 1.0}
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*takes light of degree")
-
-
-def masking(cosine: np.ndarray, roughness: float) -> np.ndarray:
-    """Return Smith's masking of one direction, for the distribution GGX."""
-    alpha = roughness**2
-    root = np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2)
-    return 2 * cosine / (cosine + root)
-
-
-def fresnel(cosine: np.ndarray) -> np.ndarray:
-    """Return the unpolarized reflectance of a varnish, by Fresnel's equations."""
-    index = REFRACTIVE_INDEX
-    refracted = np.sqrt(1 - (1 - cosine**2) / index**2)
-    perpendicular = (cosine - index * refracted) / (cosine + index * refracted)
-    parallel = (index * cosine - refracted) / (index * cosine + refracted)
-    return (perpendicular**2 + parallel**2) / 2
 
 
 @cache
@@ -70,8 +54,10 @@ def varnish_reflectance(roughness: float) -> tuple[np.ndarray, np.ndarray]:
         across = np.sqrt(1 - cosine**2) * np.sqrt(1 - height**2) * np.cos(azimuth)
         facing = cosine * height + across
         leaving = 2 * facing * height - cosine
-        weight = fresnel(np.clip(facing, 0, 1)) * facing / (cosine * height)
-        weight = weight * masking(cosine, roughness) * masking(leaving.clip(1e-9), roughness)
+        weight = dielectric_fresnel(np.clip(facing, 0, 1)) * facing / (cosine * height)
+        weight = (
+            weight * smith_masking(cosine, roughness) * smith_masking(leaving.clip(1e-9), roughness)
+        )
         is_reflected = (leaving > 0) & (facing > 0)
         reflectance.append(np.where(is_reflected, weight, 0).mean())
     return cosines, np.array(reflectance)
@@ -92,7 +78,7 @@ def brdf(
     half_cosine = normals @ half.T
     view_half_cosine = half @ view
     distribution = alpha**2 / (half_cosine**2 * (alpha**2 - 1) + 1) ** 2
-    shadowing = masking(light_cosine, roughness) * masking(view_cosine, roughness)
+    shadowing = smith_masking(light_cosine, roughness) * smith_masking(view_cosine, roughness)
     specular = distribution * shadowing / (4 * light_cosine * view_cosine)
     if metallic:
         return specular * (ALBEDO + (1 - ALBEDO) * (1 - view_half_cosine) ** 5)
@@ -101,7 +87,7 @@ def brdf(
     entering = 1 - np.interp(light_cosine, cosines, reflectance)
     leaving = 1 - np.interp(view_cosine, cosines, reflectance)
     diffuse = entering * leaving / (1 - mean)
-    return specular * fresnel(view_half_cosine) + ALBEDO * diffuse
+    return specular * dielectric_fresnel(view_half_cosine) + ALBEDO * diffuse
 
 
 def rendered(path: Path, mesh: Mesh) -> tuple[np.ndarray, Camera]:

@@ -33,15 +33,6 @@ def test_a_mesh_without_colors_takes_the_given_one_which_a_metal_needs(plain_mes
         load_object(ObjectSettings(plain_mesh, "orange", gloss=metal))
 
 
-@pytest.mark.parametrize(
-    ("mesh", "color", "message"),
-    [("solid:orange", [1.0, 0.0, 0.0], "solid:orange"), ("solid:orange:x", None, "solid:orange:x")],
-)
-def test_colors_and_seeds_that_a_mesh_cannot_have_are_refused(mesh, color, message):
-    with pytest.raises(InputError, match=message):
-        load_object(ObjectSettings(mesh, "orange", color=color))
-
-
 def test_props_stand_on_the_objects_ground_shifted_and_turned():
     """A quarter turn takes x to y, and y to -x."""
     prop = PropSettings("solid:cup:1", [0.9, -0.2], scale=0.5, azimuth=90)

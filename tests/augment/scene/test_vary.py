@@ -539,8 +539,7 @@ def test_examples_in_any_order_have_the_same_effects_which_pass_a_gradient():
 def test_a_pattern_has_at_most_two_colors_and_its_brighter_one_is_full():
     patterns = draw_patterns(200, 24, generator(0))
     assert patterns.shape == (200, 3, 24, 24)
-    assert patterns.min() >= 0
-    assert patterns.max() <= 1
+    assert 0 <= patterns.min() <= patterns.max() <= 1
     color_counts = {pattern.flatten(1).unique(dim=1).shape[1] for pattern in patterns}
     assert color_counts == {1, 2}
     # A pattern of two halves may leave its bright half out of the image.

@@ -208,23 +208,15 @@ def read_tree(path: Path) -> dict:
 def gltf_projection(lens: dict) -> np.ndarray:
     """Return the projection matrix of a camera (glTF 2.0, section 3.10.3)."""
     kind = lens[lens["type"]]
-    near = kind["znear"]
-    far = kind["zfar"]
+    near, far = kind["znear"], kind["zfar"]
     depth_range = near - far
-    matrix = np.zeros((4, 4))
     if lens["type"] == "orthographic":
-        matrix[0, 0] = 1 / kind["xmag"]
-        matrix[1, 1] = 1 / kind["ymag"]
-        matrix[2, 2] = 2 / depth_range
+        matrix = np.diag([1 / kind["xmag"], 1 / kind["ymag"], 2 / depth_range, 1])
         matrix[2, 3] = (far + near) / depth_range
-        matrix[3, 3] = 1
         return matrix
     tangent = math.tan(kind["yfov"] / 2)
-    matrix[0, 0] = 1 / (kind["aspectRatio"] * tangent)
-    matrix[1, 1] = 1 / tangent
-    matrix[2, 2] = (far + near) / depth_range
-    matrix[2, 3] = 2 * far * near / depth_range
-    matrix[3, 2] = -1
+    matrix = np.diag([1 / (kind["aspectRatio"] * tangent), 1 / tangent, 0, 0])
+    matrix[2:, 2:] = [[(far + near) / depth_range, 2 * far * near / depth_range], [-1, 0]]
     return matrix
 
 

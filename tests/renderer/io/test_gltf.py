@@ -1,7 +1,6 @@
 """Features of glTF 2.0, compared with the formulas of its specification and with closed forms."""
 
 import base64
-import io
 import json
 import math
 from pathlib import Path
@@ -14,7 +13,7 @@ import torch
 import trimesh
 from gltf_files import SQUARE, SQUARE_FACES, SQUARE_UVS, Gltf
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import corners_of, srgb_of
+from oracles import corners_of, encoded, srgb_of
 from PIL import Image
 from scipy.spatial import KDTree
 
@@ -99,14 +98,9 @@ def test_arrays_may_be_interleaved_and_have_no_indices(tmp_path):
 def test_sparse_arrays_replace_rows_of_an_array_or_of_zeros(tmp_path, has_base):
     gltf = Gltf()
     index = gltf.array(np.float32([[9, 9, 9], [1, 0, 0], [9, 9, 9]]))
-    accessor = gltf.tree["accessors"][index]
     if not has_base:
-        del accessor["bufferView"]
-    accessor["sparse"] = {
-        "count": 2,
-        "indices": {"bufferView": gltf.view(np.uint16([0, 2]).tobytes()), "componentType": 5123},
-        "values": {"bufferView": gltf.view(np.float32([[3, 0, 0], [0, 3, 0]]).tobytes())},
-    }
+        del gltf.tree["accessors"][index]["bufferView"]
+    gltf.sparse(index, np.uint16([0, 2]), np.float32([[3, 0, 0], [0, 3, 0]]))
     gltf.mesh({"POSITION": index})
     expected = [[3, 0, 0], [float(has_base), 0, 0], [0, 3, 0]]
     assert_array_equal(triangle_corners(tmp_path, gltf), [expected])
@@ -416,13 +410,8 @@ def test_morph_targets_are_added_to_each_attribute(tmp_path):
     attributes = {"POSITION": POINTS[:3], "COLOR_0": colors, "NORMAL": np.float32([[0, 0, 1]] * 3)}
     primitive = gltf.mesh(attributes)
     sparse = gltf.array(np.float32([[0, 0, 0]] * 3))
-    accessor = gltf.tree["accessors"][sparse]
-    del accessor["bufferView"]
-    accessor["sparse"] = {
-        "count": 1,
-        "indices": {"bufferView": gltf.view(np.uint8([1]).tobytes()), "componentType": 5121},
-        "values": {"bufferView": gltf.view(np.float32([4, 0, 0]).tobytes())},
-    }
+    del gltf.tree["accessors"][sparse]["bufferView"]
+    gltf.sparse(sparse, np.uint8([1]), np.float32([4, 0, 0]))
     primitive["targets"] = [
         {
             "POSITION": gltf.array(np.float32([[0, 0, 1]] * 3)),
@@ -567,9 +556,8 @@ def test_a_text_file_reads_its_buffer_and_its_images_below_its_folder(tmp_path):
 @pytest.mark.parametrize("uri", ["../data.bin", "{folder}/data.bin", "file:///etc/passwd", "link"])
 def test_files_outside_of_the_folder_are_not_read(tmp_path, kind, uri):
     gltf = masked(hole(8, -1), "OPAQUE")
-    content = io.BytesIO()
-    Image.fromarray(hole(8, -1)).save(content, "PNG")
-    (tmp_path / "data.bin").write_bytes(gltf.buffer if kind == "buffers" else content.getvalue())
+    content = gltf.buffer if kind == "buffers" else encoded(hole(8, -1))
+    (tmp_path / "data.bin").write_bytes(content)
     folder = tmp_path / "mesh"
     folder.mkdir()
     (folder / "link").symlink_to(tmp_path / "data.bin")
@@ -598,10 +586,8 @@ def small_file_of_many_vertices(count: int, indices: np.ndarray | None) -> Gltf:
 
 def small_file_of_a_large_image() -> Gltf:
     gltf = Gltf()
-    content = io.BytesIO()
-    Image.new("L", (9000, 9000)).save(content, "PNG")
     texture = gltf.texture(np.zeros((1, 1), np.uint8))
-    gltf.tree["images"][0]["bufferView"] = gltf.view(content.getvalue())
+    gltf.tree["images"][0]["bufferView"] = gltf.view(encoded(Image.new("L", (9000, 9000))))
     return gltf.square(pbrMetallicRoughness={"baseColorTexture": texture})
 
 

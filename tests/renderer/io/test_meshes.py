@@ -1,7 +1,6 @@
 """Meshes from files of every format that the tests write, with their colors and textures."""
 
 import base64
-import io
 import json
 import math
 import os
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import corners_of, srgb_of
+from oracles import corners_of, encoded, srgb_of
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
@@ -51,13 +50,6 @@ end_header
 def assert_close(found: np.ndarray, expected: Any) -> None:
     """Compare values with float32 precision. The expected ones may be broadcast."""
     assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-6, atol=1e-6)
-
-
-def png(texture: np.ndarray = TEXTURE) -> bytes:
-    """Encode a texture as the bytes of a .png file."""
-    content = io.BytesIO()
-    Image.fromarray(texture).save(content, "PNG")
-    return content.getvalue()
 
 
 def write(path: Path, content: str | bytes) -> Path:
@@ -113,7 +105,7 @@ def faces_point_outward(corners: np.ndarray) -> bool:
 
 def load_square_obj(folder: Path, uvs: list[tuple[float, float]]) -> Mesh:
     """Load a textured square whose two faces have six texture coordinates."""
-    write(folder / "peel.png", png())
+    write(folder / "peel.png", encoded(TEXTURE))
     write(folder / "square.mtl", "newmtl peel\nKd 1.0 0.5 0.25\nmap_Kd peel.png\n")
     lines = [
         "mtllib square.mtl",
@@ -252,19 +244,19 @@ def test_the_texture_of_an_obj_is_found_by_the_names_that_any_system_writes(
     folder = tmp_path / "mesh"
     path = write_obj(folder, texture, library)
     (folder / location).parent.mkdir(exist_ok=True)
-    write(folder / location, png())
+    write(folder / location, encoded(TEXTURE))
     assert has_texture(load_mesh(path))
 
 
 def test_an_image_inside_of_a_gltf_is_read(tmp_path):
-    uri = "data:image/png;base64," + base64.b64encode(png()).decode()
+    uri = "data:image/png;base64," + base64.b64encode(encoded(TEXTURE)).decode()
     assert has_texture(load_mesh(write_gltf(tmp_path, {"uri": uri})))
 
 
 def test_names_and_comments_of_an_obj_may_be_latin_1(tmp_path):
     library = "# Müller\nnewmtl schäl\nmap_Kd peel.png\n"
     write(tmp_path / "peel.mtl", library.encode("latin-1"))
-    write(tmp_path / "peel.png", png())
+    write(tmp_path / "peel.png", encoded(TEXTURE))
     content = "# by Müller\nmtllib peel.mtl\n" + OBJ.replace("peel", "schäl")
     assert has_texture(load_mesh(write(tmp_path / "mesh.obj", content.encode("latin-1"))))
 
@@ -284,7 +276,7 @@ def require_refusal(path: Path) -> None:
     [
         lambda path: None,
         lambda path: path.write_bytes(b"GIF99"),
-        lambda path: path.write_bytes(png()[:-40]),
+        lambda path: path.write_bytes(encoded(TEXTURE)[:-40]),
         os.mkfifo,
     ],
     ids=["missing", "no image", "truncated", "a pipe"],
@@ -333,7 +325,7 @@ CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_gltf_that_cannot_be_read_correctly_is_refused(tmp_path, change):
     path = write_gltf(tmp_path)
-    write(tmp_path / "peel.png", png())
+    write(tmp_path / "peel.png", encoded(TEXTURE))
     tree = json.loads(path.read_text())
     CHANGES[change](tree)
     require_refusal(write(path, json.dumps(tree)))
@@ -354,5 +346,5 @@ UNUSABLE_FILES = {
 @pytest.mark.parametrize("name", UNUSABLE_FILES)
 def test_a_file_without_a_usable_surface_is_refused(tmp_path, name):
     write_obj(tmp_path)
-    write(tmp_path / "peel.png", png())
+    write(tmp_path / "peel.png", encoded(TEXTURE))
     require_refusal(write(tmp_path / name, UNUSABLE_FILES[name]))

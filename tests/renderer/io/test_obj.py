@@ -138,19 +138,17 @@ def test_all_material_libraries_are_read_and_the_first_definition_counts(tmp_pat
     assert face_colors(load(tmp_path, text, **libraries)) == [RED, RED, GREEN, GREEN]
 
 
-def test_the_name_of_a_material_may_have_blanks(tmp_path):
-    text = PLAIN.replace("red", "dark  red")
-    mesh = load(tmp_path, text, m=LIBRARY.replace("red", "dark  red"))
-    assert face_colors(mesh) == [RED, RED, GREEN, GREEN]
-
-
-def test_keywords_of_materials_may_be_in_upper_or_lower_case(tmp_path):
-    mesh = load(tmp_path, PLAIN, m=LIBRARY.replace("Kd", "kd").replace("newmtl", "NewMtl"))
-    assert face_colors(mesh) == [RED, RED, GREEN, GREEN]
-
-
-def test_only_materials_in_use_must_be_supported(tmp_path):
-    mesh = load(tmp_path, PLAIN, m=LIBRARY + "newmtl glass\nd 0.1\nmap_Kd missing.png")
+@pytest.mark.parametrize(
+    ("name", "library"),
+    [
+        ("dark  red", LIBRARY.replace("red", "dark  red")),
+        ("red", LIBRARY.replace("Kd", "kd").replace("newmtl", "NewMtl")),
+        ("red", LIBRARY + "newmtl glass\nd 0.1\nmap_Kd missing.png"),
+    ],
+    ids=["a name with blanks", "keywords in any case", "a material out of use"],
+)
+def test_the_materials_in_use_are_found_by_name(tmp_path, name, library):
+    mesh = load(tmp_path, PLAIN.replace("red", name), m=library)
     assert face_colors(mesh) == [RED, RED, GREEN, GREEN]
 
 

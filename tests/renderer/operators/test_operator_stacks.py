@@ -46,12 +46,22 @@ def operators_of(
     return TransferOperators(operators)
 
 
+def sparse_operators() -> TransferOperators:
+    """Build operators of a light whose entries are mostly zero."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("renderer.operators.build.SMALL_MATRIX_SIZE", 0)
+        operators = operators_of(basis=SumBasis((HARMONICS, Projector(16))))
+    assert all(operator.sparse is not None for operator in operators)
+    return operators
+
+
 SCENES: dict[str, Callable[[], TransferOperators]] = {
     "colors": operators_of,
     "sRGB": partial(operators_of, encoding="srgb"),
     "one color": partial(operators_of, PLAIN),
     "gloss": partial(operators_of, PLAIN, gloss=Gloss(0.5), encoding="srgb"),
     "projector": partial(operators_of, basis=SumBasis((HARMONICS, Projector(16)))),
+    "sparse": sparse_operators,
     "float32": partial(operators_of, dtype=torch.float32),
 }
 

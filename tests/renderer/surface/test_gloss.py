@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.polynomial import legendre
-from oracles import draw, draw_uniform
+from oracles import dielectric_fresnel, draw, draw_uniform, smith_masking
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
@@ -45,7 +45,6 @@ from renderer.visibility.fragments import build_fragments
 [NEARBY] = orbit_cameras(1, 2.2, fov=40.0)
 DOUBLE = torch.float64
 UP = torch.tensor([[0.0, 0, 1]], dtype=DOUBLE)
-REFRACTIVE_INDEX = 1.5
 # Metallic and specular_factor of surfaces: two dielectrics, a metal, and a mixture.
 GLOSSES = [(0.0, 1.0), (0.0, 0.4), (1.0, 1.0), (0.5, 0.7)]
 
@@ -70,15 +69,6 @@ def unit_vector(polar: float, azimuth: float = 0.0) -> np.ndarray:
 # Reference: the reflectance of glTF.
 
 
-def dielectric_fresnel(cosine: np.ndarray) -> np.ndarray:
-    """Evaluate Fresnel's equations for unpolarized light by Snell's law."""
-    n = REFRACTIVE_INDEX
-    inside = np.cos(np.arcsin(np.sqrt(1 - cosine**2) / n))
-    across = (cosine - n * inside) / (cosine + n * inside)
-    along = (n * cosine - inside) / (n * cosine + inside)
-    return (across**2 + along**2) / 2
-
-
 @dataclass(frozen=True)
 class Lobe:
     """A microfacet lobe by the appendix of glTF 2.0.
@@ -100,13 +90,9 @@ class Lobe:
         n_dot_h = half[:, 2]
         v_dot_h = np.clip(half @ view, 0, 1)
         distribution = alpha**2 / (np.pi * (n_dot_h**2 * (alpha**2 - 1) + 1) ** 2)
-        masking = self._masking(n_dot_l) * self._masking(np.array(cosine))
+        masking = smith_masking(n_dot_l, self.roughness) * smith_masking(cosine, self.roughness)
         fresnel = self._fresnel(v_dot_h)
         return np.pi * fresnel * distribution * masking / (4 * n_dot_l * cosine)
-
-    def _masking(self, cosine: np.ndarray) -> np.ndarray:
-        alpha_squared = self.roughness**4
-        return 2 * cosine / (cosine + np.sqrt(alpha_squared + (1 - alpha_squared) * cosine**2))
 
     def _fresnel(self, cosine: np.ndarray) -> np.ndarray:
         if self.f0 is None:
@@ -684,7 +670,7 @@ def test_the_highlight_of_varnish_over_black_looks_as_mitsubas(roughness):
         "type": "roughplastic",
         "distribution": "ggx",
         "alpha": roughness**2,
-        "int_ior": REFRACTIVE_INDEX,
+        "int_ior": 1.5,
         "diffuse_reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]},
     }
     light = positive_light(6)

@@ -163,8 +163,7 @@ def test_a_material_stays_in_its_norm_ball_and_physical(norm, radius):
         assert radius is None or distance.max() <= radius * (1 + 1e-9)
         gloss = problem.conditions(values, rows).gloss
         assert gloss[..., 0].min() >= MIN_ROUGHNESS
-        assert gloss.min() >= 0
-        assert gloss.max() <= 1
+        assert 0 <= gloss.min() <= gloss.max() <= 1
         assert gloss[0, 0, 1] == 0  # What is no metal becomes none.
 
 
