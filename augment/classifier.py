@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Self
 
 import numpy as np
@@ -12,19 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from augment.network import (
-    ChannelNormalization,
-    Function,
-    Network,
-    Remembered,
-    are_probabilities,
-    device_of,
-    light_settings,
-    normalization_of,
-    own_size,
-    say_inputs,
-    with_normalized_light,
-)
+from augment import network as wrappers
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
 from renderer import errors
 from renderer.errors import InputError
@@ -85,7 +74,7 @@ class OperatingPoint:
     negatives: int
 
 
-class LogitNetwork(Network):
+class LogitNetwork(wrappers.Network):
     """Network whose outputs are checked: a row of logits for each image, and no probabilities.
 
     Attributes:
@@ -123,29 +112,24 @@ class LogitNetwork(Network):
             shape = tuple(images.shape)
             raise InputError(f"{self.title} returned {returned} for images {shape}: {remedy}")
         if self.probability_rows is not None and len(logits):
-            are_suspicious = are_probabilities(logits)
-            self.probability_rows = self.probability_rows + len(logits) if are_suspicious else None
+            rows = self.probability_rows + len(logits)
+            self.probability_rows = rows if wrappers.are_probabilities(logits) else None
         # A network is refused only if all outputs so far look like probabilities.
         if (self.probability_rows or 0) >= MIN_PROBABILITY_ROWS:
-            raise InputError(
-                f"{self.title} returned probabilities (values in [0, 1] that sum to 1) instead of "
-                "logits: "
-                "remove the softmax of the network, or return the logarithms of the probabilities"
-            )
+            reason = f"{self.title} returned probabilities instead of logits"
+            raise InputError(f"{reason}: remove the softmax, or return their logarithms")
         return logits
 
     def _failure(self, images: Float[Tensor, "N 3 H W"], error: Exception) -> str:
         """Return the message of the error for a network that failed on images."""
         given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
-        reason = (
-            f"{self.title} fails on {given} ({type(error).__name__}: {errors.single_line(error)})"
-        )
+        kind = type(error).__name__
+        remedy = "give the size of its images, or use a network that takes such images"
         dtypes = {weight.dtype for weight in self.parameters() if weight.is_floating_point()}
         if dtypes and images.dtype not in dtypes:
             of_weights = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
-            remedy = f"convert it with network.to({images.dtype}), or use light in {of_weights}"
-            return f"{reason}: its weights are {of_weights}, {remedy}"
-        return f"{reason}: give the size of its images, or use a network that takes such images"
+            remedy = f"its weights are {of_weights}, convert it with network.to({images.dtype})"
+        return f"{self.title} fails on {given} ({kind}: {errors.single_line(error)}): {remedy}"
 
 
 class Classifier(LogitNetwork):
@@ -192,13 +176,12 @@ class Classifier(LogitNetwork):
         normalize_light: NormalizeLight = None,
     ):
         """Check the arguments, which the docstring of the class explains. Freeze the network."""
-        errors.require_kind(
-            "network", network, Callable, "a torch.nn.Module, or a function from images to logits"
-        )
+        expected = "a torch.nn.Module, or a function from images to logits"
+        errors.require_kind("network", network, Callable, expected)
         errors.require_whole(f"classifier {name}: size", size, 1, MAX_SIZE)
         names = as_class_names(f"classifier {name}: classes", classes)
         super().__init__(network, f"classifier {name}", len(names))
-        self.network = with_normalized_light(self.network, normalize_light)
+        self.network = wrappers.with_normalized_light(self.network, normalize_light)
         self.size = size
         self.classes = names
         self.name = name
@@ -208,11 +191,8 @@ class Classifier(LogitNetwork):
                 "each (for a network with a single output z, return the logits 0 and z)"
             )
         if len(set(self.classes)) < len(self.classes):
-            raise InputError(
-                f"classifier {name}: classes has {len(self.classes)} names, "
-                f"of which {len(set(self.classes))} are different: "
-                "give each class a name of its own, in the order of the logits"
-            )
+            reason = f"classifier {name}: classes has a name that occurs twice"
+            raise InputError(f"{reason}: give each class a name of its own")
         self.requires_grad_(False).eval()
 
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
@@ -231,46 +211,31 @@ class Classifier(LogitNetwork):
         """
         size = self.size
         if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
-            raise InputError(
-                f"images is {errors.describe(images)}: use floating-point RGB in [0, 1], such as "
-                "images / 255"
-            )
+            advice = "use floating-point RGB in [0, 1], such as images / 255"
+            raise InputError(f"images is {errors.describe(images)}: {advice}")
         images = errors.as_tensor("images", images)
         if images.shape[1:] != (3, size, size):
-            remedy = f"render at {size} pixels per side"
-            if images.shape == (3, size, size):
-                remedy = "give a batch, such as images[None]"
-            elif images.shape[1:] == (size, size, 3):
-                remedy = "put the channels first, such as images.permute(0, 3, 1, 2)"
-            raise InputError(
-                f"{self.title} takes images (N, 3, {size}, {size}), "
-                f"not {tuple(images.shape)}: {remedy}"
-            )
+            reason = f"takes images (N, 3, {size}, {size}), not {tuple(images.shape)}"
+            raise InputError(f"{self.title} {reason}: give a batch of this shape")
         logits = super().forward(images)
         # Check the range of the images after the call of the network. The check waits until the
         # GPU is idle.
         if len(images):
             low, high = torch.stack(torch.aminmax(images.detach())).tolist()
             if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
-                raise InputError(
-                    f"images has values from {low:g} to {high:g}: "
-                    "use RGB in [0, 1], without normalization (divide bytes by 255)"
-                )
+                advice = "use RGB in [0, 1], without normalization (divide bytes by 255)"
+                raise InputError(f"images has values from {low:g} to {high:g}: {advice}")
         if not logits.is_floating_point() or not logits.isfinite().all():
-            raise InputError(
-                f"{self.title} returned NaN or infinite logits: check the weights of the network"
-            )
+            raise InputError(f"{self.title} returned NaN or infinite logits: check its weights")
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
-            raise InputError(
-                f"{self.title} returned logits without a gradient: compute them in torch, "
-                "or choose optimizer='random_search'"
-            )
+            advice = "compute them in torch, or choose optimizer='random_search'"
+            raise InputError(f"{self.title} returned logits without a gradient: {advice}")
         return logits
 
     @property
     def normalized_light(self) -> NormalizedLightSettings | None:
         """Settings with which the light of images is normalized. None if it is not normalized."""
-        return light_settings(self.network)
+        return wrappers.light_settings(self.network)
 
     def normalizing_light(self, normalize_light: NormalizeLight = True) -> Classifier:
         """Return a classifier that first normalizes the light of images.
@@ -364,10 +329,8 @@ class Classifier(LogitNetwork):
 
 def as_class_names(name: str, classes: object) -> tuple[str, ...]:
     """Convert a list of names of classes to a tuple of strings."""
-    names = errors.as_list(
-        name, classes, str, "a list of the names of the classes, in the order of the logits"
-    )
-    return tuple(map(errors.composed, names))
+    expected = "a list of the names of the classes, in the order of the logits"
+    return tuple(map(errors.composed, errors.as_list(name, classes, str, expected)))
 
 
 def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
@@ -376,24 +339,22 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
     The name may be an index, also as text. `subject` starts the error, which suggests similar
     names.
     """
-    errors.require_kind("label", name, str | int, "the name of a class, or its index")
+    errors.require_kind("label", name, str | Integral, "the name of a class, or its index")
     text = errors.composed(str(name))
     names = [*map(errors.composed, classes)]
     if isinstance(name, str) and text in names:
         return names.index(text)
-    is_index = text.isascii() and text.isdecimal()
-    if is_index and int(text) < len(classes):
-        return int(text)
-    if is_index:
-        reason = f"the label {text} is not a class: indices go from 0 to {len(classes) - 1}"
-    elif isinstance(name, str) and names == [str(index) for index in range(len(classes))]:
-        reason = (
-            f"{name!r} is a name, but the classes have only indices: "
-            f"give an index from 0 to {len(classes) - 1}, or name the classes"
-        )
+    last = len(classes) - 1
+    if text.isascii() and text.isdecimal():
+        if int(text) <= last:
+            return int(text)
+        reason = f"the label {text} is not a class: indices go from 0 to {last}"
+    elif names == [*map(str, range(len(classes)))]:
+        advice = f"give an index from 0 to {last}, or name the classes"
+        reason = f"{text!r} is not a class, and the classes have only indices: {advice}"
     else:
         similar = nearest(text, classes)
-        reason = f"{name!r} is not a class of the model: choose one, such as {similar}"
+        reason = f"{text!r} is not a class of the model: choose one, such as {similar}"
     raise InputError(f"{subject}: {reason}")
 
 
@@ -404,9 +365,9 @@ def nearest(name: str, choices: Sequence[str]) -> str:
 
 def remembering(classifier: Classifier) -> Classifier:
     """Return a copy of a classifier that classifies each different image only once."""
-    if isinstance(classifier.network, Remembered):
+    if isinstance(classifier.network, wrappers.Remembered):
         return classifier
-    network = Remembered(classifier.network)
+    network = wrappers.Remembered(classifier.network)
     remembered = Classifier(network, classifier.size, classifier.classes, classifier.name)
     remembered.operating_points = classifier.operating_points
     return remembered
@@ -439,45 +400,40 @@ def as_classifier(
     so on by default. Mean and standard deviation are in units of `value_range`, the values of black
     and white. A `Classifier` only gets `normalize_light`.
     """
+    if size is not None:
+        errors.require_whole("size", size, 1, MAX_SIZE)
     if isinstance(network, Classifier):
         if classes is not None or normalization is not None or value_range != UNIT_RANGE:
-            raise InputError(
-                "classes, normalization and value_range are for a plain network: "
-                "leave them out, because the given Classifier already defines them"
-            )
+            given = "classes, normalization and value_range"
+            raise InputError(f"{given} are for a plain network: leave them out")
         if size not in (None, network.size):
-            raise InputError(
-                f"size={size} does not fit classifier {network.name}, "
-                f"which takes images of {network.size} pixels per side: use this size"
-            )
+            advice = f"use the size of its images, {network.size}"
+            raise InputError(f"size={size} does not fit classifier {network.name}: {advice}")
         return network.normalizing_light(normalize_light)
-    errors.require_kind(
-        argument, network, Callable, "a torch.nn.Module, a function to logits, or a Classifier"
-    )
+    expected = "a torch.nn.Module, a function to logits, or a Classifier"
+    errors.require_kind(argument, network, Callable, expected)
     names = None if classes is None else as_class_names("classes", classes)
     if isinstance(network, type):
         name = network.__name__
         raise InputError(f"{argument} is the class {name}: give a network, such as {name}(...)")
     require_evaluation_mode(network, argument)
-    device = device_of(network) if device is None else errors.as_device(device)
+    device = wrappers.device_of(network) if device is None else errors.as_device(device)
     function = _preprocessed(network, normalization, value_range).to(device)
     name = name or type(network).__name__
     if size is None:
-        known_size = own_size(network)
-        assumed = assumed_facts(known_size, normalization_of(function) or None)
+        known_size = wrappers.own_size(network)
+        assumed = assumed_facts(known_size, wrappers.normalization_of(function) or None)
         # timm records the size of the published weights, which need not be those of the network.
         published = getattr(network, "pretrained_cfg", {}).get("input_size", [USUAL_SIZE])
         size = known_size or published[-1]
-        say_inputs(name, function, size, assumed)
+        wrappers.say_inputs(name, function, size, assumed)
     shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device, dtype=dtype)
     images = shades.view(-1, 1, 1, 1).expand(-1, 3, size, size).contiguous()
     with torch.no_grad():
         count = LogitNetwork(function, argument)(images).shape[1]
     if names is not None and len(names) != count:
-        raise InputError(
-            f"classes has {len(names)} names, but the network returns {count} outputs: "
-            "give one name per output"
-        )
+        reason = f"classes has {len(names)} names, but the network returns {count} outputs"
+        raise InputError(f"{reason}: give one name per output")
     return Classifier(function, size, names or [*map(str, range(count))], name, normalize_light)
 
 
@@ -493,14 +449,9 @@ def require_evaluation_mode(network: object, argument: str) -> None:
         return
     # A module of torch.export has its own attribute `eval`, which raises an error.
     if "eval" in vars(network):
-        raise InputError(
-            f"{argument} is a module of torch.export, which has no eval(): save it by "
-            "torch.export.save, and give norm_balls.load_classifier('network.pt2', "
-            "trust_code=True)"
-        )
-    raise InputError(
-        f"{argument} is a network in training mode: call the method eval() of the network first"
-    )
+        advice = "save it by torch.export.save, and load it by nb.load_classifier"
+        raise InputError(f"{argument} is of torch.export, which has no eval(): {advice}")
+    raise InputError(f"{argument} is a network in training mode: call its method eval() first")
 
 
 def _preprocessed(
@@ -509,11 +460,10 @@ def _preprocessed(
     value_range: tuple[float, float],
 ) -> nn.Module:
     """Return a network that takes images in [0, 1], scales and normalizes them."""
-    module = network if isinstance(network, nn.Module) else Function(network)
+    module = network if isinstance(network, nn.Module) else wrappers.Function(network)
     mean, std = mean_and_std(normalization)
-    black, white = errors.as_list(
-        "value_range", value_range, float | int, "the values of black and white"
-    )
+    expected = "the values of black and white"
+    black, white = errors.as_list("value_range", value_range, float | int, expected)
     if not black < white:
         raise InputError(f"value_range is ({black}, {white}): give black before white")
     if normalization is None and (black, white) == UNIT_RANGE:
@@ -524,25 +474,21 @@ def _preprocessed(
         buffers = {name for name, _ in module.named_buffers() if name.rpartition(".")[2] in MEANS}
         found = sorted(kinds & NORMALIZING) + sorted(buffers)
         if found:
-            raise InputError(
-                f"normalization is given, and the network contains {found[0]}, so that images "
-                "would be normalized twice: leave normalization out"
-            )
-    if normalization == IMAGENET:
-        # Scaling the mean and the standard deviation of ImageNet to the range of the network is
-        # the same as normalizing values in [0, 1] with them.
-        black, white = UNIT_RANGE
-    if normalization is not None and not black <= min(mean) <= max(mean) <= white:
-        raise InputError(
-            f"normalization has the mean {tuple(mean)}, which is not between black, {black:g}, and "
-            f"white, {white:g}: give the mean in the units of value_range, or another value_range"
-        )
+            reason = f"normalization is given, but the network contains {found[0]}"
+            raise InputError(f"{reason}, which normalizes images again: leave normalization out")
+        if normalization == IMAGENET:
+            # Scaling the mean and the standard deviation of ImageNet to the range of the network
+            # is the same as normalizing values in [0, 1] with them.
+            black, white = UNIT_RANGE
+        if not black <= min(mean) <= max(mean) <= white:
+            reason = f"normalization has the mean {tuple(mean)}, outside of {black:g} to {white:g}"
+            raise InputError(f"{reason}: give it in the units of value_range")
     # A value x in [0, 1] becomes (black + span · x - mean) / std for the network. This is equal to
     # (x - scaled_mean) / scaled_std, which `ChannelNormalization` computes.
     span = white - black
     scaled_mean = [(value - black) / span for value in mean]
     scaled_std = [value / span for value in std]
-    return Network(module, [ChannelNormalization(scaled_mean, scaled_std)]).eval()
+    return wrappers.Network(module, [wrappers.ChannelNormalization(scaled_mean, scaled_std)]).eval()
 
 
 def mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequence[float]]:

@@ -24,15 +24,8 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from augment.classifier import (
-    USUAL_SIZE,
-    Classifier,
-    Normalization,
-    as_class_names,
-    as_classifier,
-    assumed_facts,
-    mean_and_std,
-)
+from augment import classifier as classifiers
+from augment.classifier import Classifier
 from augment.network import ARRAYS, Function, Network, normalization_of, own_size, unwrapped
 from renderer.errors import InputError, require_file, require_whole, single_line
 from renderer.settings import MAX_SIZE
@@ -81,13 +74,13 @@ class NetworkFacts:
 
     classes: tuple[str, ...] | None = None
     size: int | None = None
-    normalization: Normalization = None
+    normalization: classifiers.Normalization = None
 
 
 def as_facts(
     classes: Sequence[str] | str | Path | None = None,
     size: int | None = None,
-    normalization: Normalization = None,
+    normalization: classifiers.Normalization = None,
 ) -> NetworkFacts:
     """Check the classes, size and normalization that the user gives for a network.
 
@@ -97,11 +90,11 @@ def as_facts(
         require_file(classes, "give a text file with the name of a class in each line")
         lines = Path(classes).read_text(encoding="utf-8").splitlines()
         classes = [line.strip() for line in lines if line.strip()]
-    names = None if classes is None else as_class_names("classes", classes)
+    names = None if classes is None else classifiers.as_class_names("classes", classes)
     if size is not None:
         require_whole("size", size, 1, MAX_SIZE)
     if normalization is not None:
-        mean_and_std(normalization)
+        classifiers.mean_and_std(normalization)
     return NetworkFacts(names, size, normalization)
 
 
@@ -109,11 +102,8 @@ def require_no_facts(name: str, facts: NetworkFacts) -> None:
     """Check that the user gives no facts about a network that defines them itself."""
     for setting, value in vars(facts).items():
         if value is not None:
-            raise InputError(
-                f"{setting} cannot be set for {name}, because this network already defines "
-                f"{setting}: leave {setting} out",
-                setting,
-            )
+            reason = f"{setting} cannot be set for {name}, because this network already defines it"
+            raise InputError(f"{reason}: leave {setting} out", setting)
 
 
 def is_network_file(name: str) -> bool:
@@ -147,12 +137,9 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
     path = Path(name)
     require_file(path, "give the path of a file that contains a network")
     if not trust_code and (path.suffix.lower() == EXPORTED or is_torchscript(path)):
-        raise name_error(
-            path,
-            "is a program, which can run any code and overwrite your files: "
-            "set trust=true (trust_code=True in Python) if you made the file or trust its author, "
-            "otherwise ask for a state dict, safetensors or ONNX",
-        )
+        advice = "set trust=true (trust_code=True in Python) if you trust its author"
+        reason = f"is a program, which can run any code and overwrite your files: {advice}"
+        raise name_error(path, f"{reason}, otherwise ask for a state dict, safetensors or ONNX")
     readers = {EXPORTED: _read_exported, ONNX: read_onnx}
     try:
         content = readers.get(path.suffix.lower(), _read_torchscript)(path)
@@ -170,10 +157,11 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
         for module in network.modules():
             module.training = False
     size = facts.size or height or own_size(network)
-    classifier = as_classifier(
-        network, size or USUAL_SIZE, facts.classes, facts.normalization, name=name
+    given = size or classifiers.USUAL_SIZE, facts.classes, facts.normalization
+    classifier = classifiers.as_classifier(network, *given, name=name)
+    classifier.assumed = classifiers.assumed_facts(
+        size, normalization_of(classifier.network) or None
     )
-    classifier.assumed = assumed_facts(size, normalization_of(classifier.network) or None)
     _require_evaluation_outputs(classifier, name)
     return classifier
 
@@ -195,12 +183,10 @@ def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
 def _read_torchscript(path: Path) -> Content:
     """Read a file of TorchScript, which `torch.jit.save` wrote."""
     if not is_torchscript(path):
-        advice = advice_for_pickles(path)
-        if advice is None:
-            advice = (
-                "contains weights without their network: give its architecture and the weights, "
-                f"as in network=torchvision:resnet50 weights={path}"
-            )
+        advice = advice_for_pickles(path) or (
+            "contains weights without their network: give its architecture and the weights, "
+            f"as in network=torchvision:resnet50 weights={path}"
+        )
         raise name_error(path, f"cannot be loaded, because it {advice}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
@@ -374,12 +360,10 @@ def _state_dict(content: Any) -> Mapping[str, Tensor]:
     while isinstance(content, Mapping) and not all(
         isinstance(value, Tensor) for value in content.values()
     ):
-        inner_mappings = [
-            content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)
-        ]
-        if not inner_mappings:
+        inner = [content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)]
+        if not inner:
             raise TypeError(f"it contains no weights, but {', '.join(map(str, content))}")
-        content = inner_mappings[0]
+        content = inner[0]
     if not isinstance(content, Mapping):
         raise TypeError(f"it contains a value of type {type(content).__name__}")
     return content
@@ -399,9 +383,7 @@ def advice_for_pickles(path: Path) -> str | None:
     Its subject is the file. None stands for a file without a network.
     """
     if is_torchscript(path):
-        return (
-            f"is a TorchScript file, which contains its own network: set network={path} trust=true"
-        )
+        return f"is TorchScript, which contains its own network: set network={path} trust=true"
     try:
         names = torch.serialization.get_unsafe_globals_in_checkpoint(path)
     except Exception:  # `torch.save` did not write the file.
@@ -431,7 +413,6 @@ def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path
     try:
         unwrapped(classifier).load_state_dict(state)
     except (RuntimeError, ValueError) as error:
-        reason = textwrap.shorten(str(error), 300)
-        misfit = f"do not fit {classifier.name} ({reason})"
+        misfit = f"do not fit {classifier.name} ({textwrap.shorten(str(error), 300)})"
         raise weights_error(source, f"{misfit}: use weights of that network") from error
     return classifier

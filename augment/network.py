@@ -137,11 +137,8 @@ def with_normalized_light(network: nn.Module, value: NormalizeLight) -> nn.Modul
     if settings is None:
         return network
     if light_settings(network) is not None:
-        raise InputError(
-            "normalize_light is set, but the network normalizes light already: "
-            "remove normalize_light",
-            "normalize_light",
-        )
+        reason = "normalize_light is set, but the network normalizes light already"
+        raise InputError(f"{reason}: remove normalize_light", "normalize_light")
     return Network(network, [LightNormalization(settings)])
 
 
@@ -233,16 +230,13 @@ class Function(nn.Module):
             hook.remove()
         if in_training:
             self.takes = None
-            raise InputError(
-                f"the function calls a network in training mode ({in_training[0]}): "
-                "call the method eval() of the network first"
-            )
+            reason = f"the function calls a network in training mode ({in_training[0]})"
+            raise InputError(f"{reason}: call the method eval() of the network first")
         return scores
 
     def _first_call(self, images: Tensor) -> Any:
         """Compute the scores of images, and find out what the function takes."""
-        returned = None
-        failures = []
+        returned, failures = None, []
         for takes in (TENSORS, ARRAYS, DETACHED):
             try:
                 scores = self._call(images, takes)
@@ -453,8 +447,8 @@ def say_inputs(name: str, network: Any, size: int, assumed: Sequence[str] = ()) 
     text = f"network {name}: images of {size} × {size} pixels, "
     text += normalization_of(network) or "values in [0, 1], not normalized before the network"
     if assumed:
-        are = " and ".join(assumed) + (" is assumed" if len(assumed) == 1 else " are assumed")
-        text += f"; {are}: give {'it' if len(assumed) == 1 else 'them'} if the network needs others"
+        are = " are" if len(assumed) > 1 else " is"
+        text += f"; {' and '.join(assumed)}{are} assumed: give what the network needs"
     if rank() == 0:
         say_once(text)
 

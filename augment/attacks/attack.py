@@ -13,20 +13,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from augment import classifier as classifiers
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings, StepSettings
 from augment.attacks.adversary import final_images
 from augment.attacks.loop import minimize
 from augment.attacks.objective import NOISE_DRAWS, Criterion, Objective
 from augment.attacks.problem import build_problem, source_labels, warn_of_changed_light
 from augment.attacks.result import ZERO_GRADIENT, AttackResult
-from augment.classifier import (
-    UNIT_RANGE,
-    Classifier,
-    Normalization,
-    as_classifier,
-    class_index,
-    remembering,
-)
+from augment.classifier import UNIT_RANGE, Classifier, Normalization
 from augment.network import gradient_flags_kept
 from augment.progress import Phases, progress
 from augment.random_streams import generator
@@ -40,7 +34,7 @@ from renderer.light.files import PROBES, UNIFORM, load_light
 # `attack(..., target="least_likely")` makes the target the class with the lowest confidence
 # before the attack.
 LEAST_LIKELY = "least_likely"
-# `_with_random_camera` draws the polar angle of a camera from the range `POLAR`, in degrees, and
+# `_candidates` draws the polar angle of a camera from the range `POLAR`, in degrees, and
 # the width of the visible region from the range `WIDTH`, in world units.
 POLAR = (20.0, 100.0)
 WIDTH = (1.8, 3.5)
@@ -141,19 +135,12 @@ def attack(
     require_kind("settings", settings, AttackSettings | None, "nb.AttackSettings(...) or None")
     require_whole("seed", seed)
     require_flag("force", force)
-    size = scene.settings.size
-    lights = scene.lights
+    settings = settings or AttackSettings(lighting=StepSettings())
+    like = scene.lights
+    given = scene.settings.size, classes, normalization, value_range, like.device, "classifier"
     with gradient_flags_kept(classifier):
-        adapted = as_classifier(
-            classifier,
-            size,
-            classes,
-            normalization,
-            value_range,
-            lights.device,
-            "classifier",
-            normalize_light=normalize_light,
-            dtype=lights.dtype,
+        adapted = classifiers.as_classifier(
+            classifier, *given, normalize_light=normalize_light, dtype=like.dtype
         )
         return _attack(adapted, scene, target, settings, seed, force)
 
@@ -162,16 +149,11 @@ def _attack(
     classifier: Classifier,
     scene: Scene,
     target: str | int | Sequence[str | int] | None,
-    settings: AttackSettings | None,
+    settings: AttackSettings,
     seed: int,
     force: bool,
 ) -> AttackResult:
-    """Attack a classifier whose arguments have been checked. See `attack`.
-
-    A target of None accepts any misclassification, and settings of None change the light without a
-    limit.
-    """
-    settings = settings or AttackSettings(lighting=StepSettings())
+    """Attack a classifier whose arguments have been checked. See `attack`."""
     settings.require_parameters()
     has_gradients = classifier.is_differentiable(scene.lights)
     if settings.optimizer is None and not has_gradients:
@@ -184,7 +166,7 @@ def _attack(
         )
     if not has_gradients:
         # Classify each image once only, because a function without gradients may be slow.
-        classifier = remembering(classifier)
+        classifier = classifiers.remembering(classifier)
     scene = with_needed_degree(scene, settings.material)
     problem = build_problem(settings, scene)
     warn_of_changed_light(scene, problem.scene, stacklevel=4)
@@ -244,17 +226,13 @@ def require_clean_correct(
         return
     example, view = misclassified[0]
     item = scene.objects[scene.examples[example].object]
-    highest = logits[example, view].softmax(0).topk(min(5, len(classifier.classes)))
-    pairs = zip(highest.values.tolist(), highest.indices.tolist(), strict=True)
-    most_probable = ", ".join(
-        f"{classifier.classes[index]} {confidence:.1%}" for confidence, index in pairs
-    )
-    raise InputError(
-        f"force=False, and {len(misclassified)} of {source.numel()} images are not classified as "
-        f"their class before any attack (the first, of {item.name}, class {item.label!r}: "
-        f"{most_probable}): change the scene, or set force=True",
-        "force",
-    )
+    confidences = logits[example, view].softmax(0)
+    indices = confidences.topk(min(5, len(confidences))).indices.tolist()
+    most_probable = ", ".join(f"{classifier.classes[i]} {confidences[i]:.1%}" for i in indices)
+    count = f"{len(misclassified)} of {source.numel()} images are not classified as their class"
+    first = f"the first, of {item.name}, class {item.label!r}: {most_probable}"
+    advice = "change the scene, or set force=True"
+    raise InputError(f"force=False, and {count} ({first}): {advice}", "force")
 
 
 def target_labels(
@@ -277,19 +255,13 @@ def target_labels(
         advice = "the name or the index of a class, or one for each view"
         names = as_list("target", target, str | Integral, advice)
     if len(names) != view_count:
-        raise InputError(
-            f"target={names} names {len(names)} classes for {view_count} views of each example: "
-            "give one class for each view, and build the scene with shared=True"
-        )
+        advice = f"give one for each of the {view_count} views, in a scene with shared=True"
+        raise InputError(f"target={names} names {len(names)} classes: {advice}")
     labels = torch.empty_like(source)
     for view, name in enumerate(names):
-        # An integer of NumPy is no `int`.
-        known = name if isinstance(name, str) else int(name)
-        labels[:, view] = class_index(classifier.classes, known, f"target={name}")
+        labels[:, view] = classifiers.class_index(classifier.classes, name, f"target={name}")
     if torch.eq(labels, source).any():
-        raise InputError(
-            f"target={target} is the true class of an example: choose another target class"
-        )
+        raise InputError(f"target={target} is the true class of an example: choose another class")
     return labels
 
 
@@ -313,15 +285,11 @@ def find_scene(
     # `_confidences` returns 0 if an image is misclassified.
     if confidence > 0:
         return settings
-    highest = 0.0
-    best_settings = settings
+    highest, best_settings = 0.0, settings
     for candidate in progress(_candidates(settings, cameras, draws), "search for a scene"):
-        confidence, lit_candidate = _best_light(
-            build(candidate), candidate, attack_settings, classifier
-        )
+        confidence, lit = _best_light(build(candidate), candidate, attack_settings, classifier)
         if confidence > highest:
-            highest = confidence
-            best_settings = lit_candidate
+            highest, best_settings = confidence, lit
         if highest >= CONFIDENCE_TO_STOP:
             break
     return best_settings
@@ -339,32 +307,23 @@ def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Ite
         if index > 0:
             becomes_perspective = settings.fov is None and index % 2 == 1
             fov = FOV if becomes_perspective else settings.fov
-            candidate = _with_random_camera(replace(settings, fov=fov), draws)
+            polar, azimuth, width = torch.rand(3, generator=draws).tolist()
+            narrowest, widest = WIDTH
+            if fov is not None:
+                # Width of what a perspective camera sees at the origin if it is `CLOSEST` away. A
+                # smaller width would bring the camera closer.
+                closest_width = 2 * CLOSEST * math.tan(math.radians(fov) / 2)
+                narrowest, widest = max(narrowest, closest_width), max(widest, 2 * closest_width)
+            candidate = replace(
+                settings,
+                fov=fov,
+                polar=round(POLAR[0] + (POLAR[1] - POLAR[0]) * polar, 1),
+                azimuth=round(360 * azimuth, 1),
+                width=round(narrowest + (widest - narrowest) * width, 2),
+            )
         yield candidate
         if has_one_gray:
             yield replace(candidate, backgrounds=[LIGHT_GRAY])
-
-
-def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
-    """Return a copy of a scene's settings with a camera at a random place.
-
-    The field of view stays the same, or the camera stays orthographic.
-    """
-    polar, azimuth, width = torch.rand(3, generator=draws).tolist()
-    lowest_polar, highest_polar = POLAR
-    narrowest, widest = WIDTH
-    if settings.fov is not None:
-        # Width of what a perspective camera sees at the origin if it is `CLOSEST` away. A
-        # smaller width would bring the camera closer.
-        closest_width = 2 * CLOSEST * math.tan(math.radians(settings.fov) / 2)
-        narrowest = max(narrowest, closest_width)
-        widest = max(widest, 2 * closest_width)
-    return replace(
-        settings,
-        polar=round(lowest_polar + (highest_polar - lowest_polar) * polar, 1),
-        azimuth=round(360 * azimuth, 1),
-        width=round(narrowest + (widest - narrowest) * width, 2),
-    )
 
 
 def _best_light(
@@ -376,8 +335,7 @@ def _best_light(
     misclassified), and the settings that give it.
     """
     degree = harmonics_of(scene.basis).degree
-    candidates = []
-    coefficients = []
+    candidates, coefficients = [], []
     for name in dict.fromkeys([settings.light, *PROBES, UNIFORM]):
         light = load_light(name, degree)
         for factor in EXPOSURES:
@@ -411,9 +369,8 @@ def _confidences(
     images = problem.images(problem.start)
     labels = source_labels(scene, images.device, classifier)
     # Probability of each of the C classes in each view of each example, shape (E, V, C).
-    probabilities = (
-        Objective(classifier, Criterion(labels), attack_settings).logits(images).softmax(2)
-    )
+    objective = Objective(classifier, Criterion(labels), attack_settings)
+    probabilities = objective.logits(images).softmax(2)
     confidence = probabilities.gather(2, labels[..., None])[..., 0]
     is_correct = probabilities.argmax(2) == labels
     return (confidence * is_correct).view(groups, -1).amin(1)

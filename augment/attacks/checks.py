@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,9 @@ from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, as_list, requi
 
 # `check` repeats an attack with these multiples of its number of steps.
 GROWTH = (3, 10)
+# Masks of the examples for which an attack has succeeded: also with sensor noise, and without it.
+# The functions that add successes change them in place.
+Successes = Bool[Tensor, "2 E"]
 
 
 def check(result: AttackResult) -> dict[str, Any]:
@@ -73,32 +76,31 @@ def check(result: AttackResult) -> dict[str, Any]:
     is_clean = result.clean_correct
     # A successful example counts as one with a lower cost, even if its cost is higher.
     has_lower_cost = (minimum.cost < minimum.cost_before) | result.success_without_noise
-    is_no_success_before = ~result.success_before
-    cost_fell = _fraction(has_lower_cost[is_no_success_before])
+    cost_fell = has_lower_cost[~result.success_before]
 
-    random = Successes(result.success_before, result.success_before)
+    random = torch.stack([result.success_before] * 2)
     draws = generator(result.seed, "random search")
-    random.add_draws(result, partial(result.problem.sample, draws, minimum.values))
-    random_rate, random_rate_without_noise = random.rates(is_clean)
+    _add_draws(random, result, partial(result.problem.sample, draws, minimum.values))
     # The same examples are attacked again from their start, with more steps or queries.
-    found = Successes(result.success, result.success_without_noise)
-    rates = {result.settings.step_limit: found.rates(is_clean)}
+    found = torch.stack([result.success, result.success_without_noise])
+    success = _rates(found, is_clean)
+    rates = {result.settings.step_limit: success}
     for factor in GROWTH:
         longer = replace(result, settings=result.settings.with_budget(factor))
-        found.attack(longer, result.problem, result.problem.start.clone())
-        rates[longer.settings.step_limit] = found.rates(is_clean)
+        _attack_others(found, longer, result.problem, result.problem.start.clone())
+        rates[longer.settings.step_limit] = _rates(found, is_clean)
+    rates_by_steps = [
+        dict(zip(rates, column, strict=True)) for column in zip(*rates.values(), strict=True)
+    ]
     return {
         "cost_before": float(minimum.cost_before.mean()),
         "cost": float(minimum.cost.mean()),
-        "cost_fell": cost_fell if is_no_success_before.any() else 1.0,
+        "cost_fell": _fraction(cost_fell) if len(cost_fell) else 1.0,
         "zero_gradient": _fraction(minimum.zero_gradient),
-        "success": _fraction(result.success[is_clean]),
-        "success_without_noise": _fraction(result.success_without_noise[is_clean]),
+        **_named("success", success),
         "success_with_margin": _fraction(result.success_with_margin[is_clean]),
-        "random_search": random_rate,
-        "random_search_without_noise": random_rate_without_noise,
-        "success_by_steps": {steps: rate for steps, (rate, _) in rates.items()},
-        "success_by_steps_without_noise": {steps: rate for steps, (_, rate) in rates.items()},
+        **_named("random_search", _rates(random, is_clean)),
+        **_named("success_by_steps", rates_by_steps),
     }
 
 
@@ -143,20 +145,18 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     draws = generator(result.seed, "sweep")
     # Values that the attacks have reached, shape (E, D).
     values = result.problem.start.clone()
-    adversarial = Successes(result.success_before, result.success_before)
-    random = Successes(result.success_before, result.success_before)
+    adversarial, random = (torch.stack([result.success_before] * 2) for _ in range(2))
     rows = []
     for scale in progress(sorted(set(scales)), "radii"):
         parameters = result.settings.parameters.items()
         balls = {name: _scaled(settings, scale) for name, settings in parameters}
         scaled_settings = replace(result.settings, **balls)  # type: ignore[arg-type]
         problem = build_problem(scaled_settings, result.problem.scene)
-        adversarial.attack(result, problem, values)
-        random.add_draws(result, partial(problem.sample, draws))
+        _attack_others(adversarial, result, problem, values)
+        _add_draws(random, result, partial(problem.sample, draws))
         row: dict[str, Any] = {"radii": {name: ball.radius for name, ball in balls.items()}}
         for method, found in (("adversarial", adversarial), ("random", random)):
-            row[method] = found.with_noise[result.clean_correct].cpu()
-            row[f"{method}_without_noise"] = found.without_noise[result.clean_correct].cpu()
+            row |= _named(method, found[:, result.clean_correct].cpu())
         rows.append(row)
     return rows
 
@@ -228,22 +228,16 @@ def transfer(
 
     attacked = result.classifier
     images = result.images_in_views
-    classify = partial(_classify, result, _adversaries(result))
+    given = attacked.size, attacked.classes, normalization, value_range, images.device
+    examples = torch.nonzero(result.clean_correct & result.success)[:, 0]
+    classify = partial(_classify, result, examples, _adversaries(result, examples))
     rows = []
     for index, network in enumerate(networks):
         with gradient_flags_kept(network):
             classifier = network
             if not isinstance(network, Classifier):
-                classifier = as_classifier(
-                    network,
-                    attacked.size,
-                    attacked.classes,
-                    normalization,
-                    value_range,
-                    images.device,
-                    f"classifiers[{index}]",
-                    dtype=images.dtype,
-                )
+                name = f"classifiers[{index}]"
+                classifier = as_classifier(network, *given, name, dtype=images.dtype)
             resized = partial(_resized, size=classifier.size)
             rows.append({"network": classifier.name, **classify(classifier, resized)})
     for azimuth in azimuths:
@@ -264,90 +258,80 @@ def require_transferable(
     """
     for name in parameters:
         kind = parameter_class(name)
-        for argument, values, others, fits in (
-            ("azimuths", azimuths, "views", kind.fits_other_views),
-            ("meshes", objects, "meshes", kind.fits_other_meshes),
-        ):
+        needed = {"azimuths": (azimuths, kind.fits_other_views)}
+        needed["meshes"] = (objects, kind.fits_other_meshes)
+        for argument, (values, fits) in needed.items():
             if values and not fits:
-                raise InputError(
-                    f"{argument}: attacked {name} cannot be transferred to other {others}: "
-                    f"remove {argument}, or attack another parameter"
-                )
+                reason = f"{argument}: attacked {name} belongs to its own view or mesh"
+                raise InputError(f"{reason}: remove {argument}, or attack another parameter")
 
 
-@dataclass(frozen=True)
-class Successes:
-    """Masks of the examples for which an attack has succeeded, which the methods change in place.
+def _attack_others(
+    found: Successes, result: AttackResult, problem: SceneProblem, values: Values
+) -> None:
+    """Attack the examples without a success, from the given values, and add the successes.
 
-    Attributes:
-        with_noise: Whether each of the E examples meets the criterion, also with
-            sensor noise, shape (E,), bool.
-        without_noise: Whether each example meets the criterion without sensor
-            noise, shape (E,), bool.
+    The values become those that the attack reaches.
     """
-
-    with_noise: Bool[Tensor, " E"]
-    without_noise: Bool[Tensor, " E"]
-
-    def rates(self, is_counted: Bool[Tensor, " E"]) -> tuple[float, float]:
-        """Return the fractions of successes, with and without noise, among some examples."""
-        return _fraction(self.with_noise[is_counted]), _fraction(self.without_noise[is_counted])
-
-    def attack(self, result: AttackResult, problem: SceneProblem, values: Values) -> None:
-        """Attack the examples without a success, from the given values, and add the successes.
-
-        The values become those that the attack reaches.
-        """
-        examples = torch.nonzero(~self.with_noise)[:, 0]
-        if len(examples):
-            objective = result.objective().select(examples)
-            end = minimize(problem, objective, examples=examples, start=values[examples])
-            values[examples] = end.values
-            self._add(result, problem, end.values, examples, end.images)
-
-    def add_draws(self, result: AttackResult, draw: Callable[[], Tensor]) -> None:
-        """Search for successes of the other examples by random draws of the attack values.
-
-        An attack with gradients is compared with one draw for each step, another with draws that
-        show as many images to the classifier.
-        """
-        settings = result.settings
-        count = settings.max_steps
-        if not settings.uses_gradients:
-            count = max(1, settings.step_limit // result.objective().passes_per_candidate)
-        for _ in progress(range(count), "random search"):
-            examples = torch.nonzero(~self.with_noise)[:, 0]
-            if not len(examples):
-                break
-            values = draw()[examples]
-            with torch.no_grad():
-                images = result.problem.render(values, examples)
-            self._add(result, result.problem, values, examples, images)
-
-    def _add(
-        self,
-        result: AttackResult,
-        problem: SceneProblem,
-        values: Values,
-        examples: Examples,
-        images: Images,
-    ) -> None:
-        """Add the examples that meet the criterion with some attack values.
-
-        An example is first judged by its given images. If they meet the criterion, it is rendered
-        again with exact shadows and bounces, and these images decide, without and with sensor
-        noise.
-        """
+    examples = torch.nonzero(~found[0])[:, 0]
+    if len(examples):
         objective = result.objective().select(examples)
-        is_reached = objective.criterion.reached(objective.logits(images).argmax(2))
-        rows = torch.nonzero(is_reached)[:, 0]
-        if not len(rows):
-            return
+        end = minimize(problem, objective, examples=examples, start=values[examples])
+        values[examples] = end.values
+        _add(found, result, problem, end.values, examples, end.images)
+
+
+def _add_draws(found: Successes, result: AttackResult, draw: Callable[[], Tensor]) -> None:
+    """Search for successes of the other examples by random draws of the attack values.
+
+    An attack with gradients is compared with one draw for each step, another with draws that
+    show as many images to the classifier.
+    """
+    settings = result.settings
+    count = settings.max_steps
+    if not settings.uses_gradients:
+        count = max(1, settings.step_limit // result.objective().passes_per_candidate)
+    for _ in progress(range(count), "random search"):
+        examples = torch.nonzero(~found[0])[:, 0]
+        if not len(examples):
+            break
+        values = draw()[examples]
+        with torch.no_grad():
+            images = result.problem.render(values, examples)
+        _add(found, result, result.problem, values, examples, images)
+
+
+def _add(
+    found: Successes,
+    result: AttackResult,
+    problem: SceneProblem,
+    values: Values,
+    examples: Examples,
+    images: Images,
+) -> None:
+    """Add the examples that meet the criterion with some attack values.
+
+    An example is first judged by its given images. If they meet the criterion, it is rendered
+    again with exact shadows and bounces, and these images decide, without and with sensor noise.
+    """
+    objective = result.objective().select(examples)
+    is_reached = objective.criterion.reached(objective.logits(images).argmax(2))
+    rows = torch.nonzero(is_reached)[:, 0]
+    if len(rows):
         examples = examples[rows]
         final = final_images(problem, values[rows], examples, images[rows])
         _, fooled_in_views, without_noise = objective.select(rows).judge(final, examples)
-        self.without_noise[examples] |= without_noise
-        self.with_noise[examples] |= fooled_in_views.all(1)
+        found[:, examples] |= torch.stack([fooled_in_views.all(1), without_noise])
+
+
+def _rates(found: Successes, is_counted: Bool[Tensor, " E"]) -> list[float]:
+    """Return the fractions of successes, with and without noise, among some examples."""
+    return [_fraction(mask) for mask in found[:, is_counted]]
+
+
+def _named(name: str, pair: Iterable[Any]) -> dict[str, Any]:
+    """Name a value with sensor noise, and one without."""
+    return dict(zip((name, f"{name}_without_noise"), pair, strict=True))
 
 
 def _fraction(values: Tensor) -> float:
@@ -366,39 +350,44 @@ def _scaled(settings: StepSettings, scale: float) -> StepSettings:
     return replace(settings, radius=scale * settings.radius, step_size=scale * settings.step_size)
 
 
-def _adversaries(result: AttackResult) -> tuple[Examples, list[Adversary], list[Adversary]]:
-    """Collect the examples that were correct before an attack and for which it succeeded.
-
-    Return their indices, and the examples before and after the attack.
-    """
+def _adversaries(result: AttackResult, examples: Examples) -> list[Adversary]:
+    """Collect examples before an attack and then, in the same order, after it."""
     problem = result.problem
-    examples = torch.nonzero(result.clean_correct & result.success)[:, 0]
-
-    def state(values: Values) -> list[Adversary]:
-        conditions = problem.conditions(values, problem.all_examples)
-        adversaries = []
-        for example in examples.tolist():
-            images = result.images_in_views_before[example], result.images_in_views[example]
-            adversaries.append(Adversary.of(problem.scene, example, conditions, *images))
-        return adversaries
-
-    return examples, state(problem.start), state(result.minimum.values)
+    before, after = result.images_in_views_before, result.images_in_views
+    return [
+        Adversary.of(problem.scene, example, conditions, before[example], after[example])
+        for values in (problem.start, result.minimum.values)
+        for conditions in [problem.conditions(values, problem.all_examples)]
+        for example in examples.tolist()
+    ]
 
 
 def _classify(
     result: AttackResult,
-    adversaries: tuple[Examples, list[Adversary], list[Adversary]],
+    examples: Examples,
+    adversaries: Sequence[Adversary],
     classifier: Classifier,
     change: Callable[[Adversary], Adversary],
 ) -> dict[str, Any]:
-    """Change adversaries, render them before and after the attack, and classify the images."""
-    examples, *states = adversaries
-    before, after = ([change(adversary) for adversary in state] for state in states)
-    criterion = _criterion_for(classifier, result, examples, after)
+    """Change the adversaries of `_adversaries`, and classify their images.
+
+    The classifier may have the classes in another order, so classes are found by name.
+    """
+    changed = [change(adversary) for adversary in adversaries]
+    classes = result.classifier.classes
+    labels = [adversary.shown.label for adversary in changed[len(examples) :]]
+    names = [label if isinstance(label, str) else classes[label] for label in labels]
+    source = torch.tensor([*map(classifier.label, names)]).long()
+    criterion = result.criterion.select(examples)
+    target = criterion.target
+    if target is not None:
+        target = target.cpu().apply_(lambda index: classifier.label(classes[index]))
+    criterion = Criterion(source[:, None].expand(-1, criterion.view_count), target)
+    criterion = criterion.map(lambda tensor: tensor.to(examples.device))
     objective = Objective(classifier, criterion, result.settings, result.seed)
     if len(examples):
         images = []
-        for adversary in progress([*before, *after], "transfer"):
+        for adversary in progress(changed, "transfer"):
             images.append(adversary.render_views(result.problem.scene.rasterizer))
         images_before, images_after = torch.stack(images).to(result.images_in_views).chunk(2)
         logits_before = objective.logits(images_before)
@@ -416,35 +405,11 @@ def _classify(
     }
 
 
-def _criterion_for(
-    classifier: Classifier,
-    result: AttackResult,
-    examples: Examples,
-    adversaries: Sequence[Adversary],
-) -> Criterion:
-    """Return the source and target classes of the examples for another classifier.
-
-    The other classifier may have the classes in another order, so classes are found by name.
-    """
-    criterion = result.criterion.select(examples)
-    classes = result.classifier.classes
-    labels = [adversary.shown.label for adversary in adversaries]
-    names = [label if isinstance(label, str) else classes[label] for label in labels]
-    source = torch.tensor([*map(classifier.label, names)]).long()
-    target = criterion.target
-    if target is not None:
-        target = target.cpu().apply_(lambda index: classifier.label(classes[index]))
-    found = Criterion(source[:, None].expand(-1, criterion.view_count), target)
-    return found.map(lambda tensor: tensor.to(examples.device))
-
-
 def _resized(adversary: Adversary, size: int) -> Adversary:
     """Return a copy of an adversary whose images have another size."""
     if adversary.settings.size == size:
         return adversary
-    resize = partial(
-        F.interpolate, size=(size, size), mode="bilinear", antialias=True, align_corners=False
-    )
+    resize = partial(F.interpolate, size=(size, size), mode="bilinear", antialias=True)
     background = resize(adversary.background[None])[0].clamp(0, 1)
     pixels = None if adversary.pixels is None else resize(adversary.pixels)
     settings = replace(adversary.settings, size=size)

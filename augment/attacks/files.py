@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from augment.scene.objects import Conditions
 from renderer.errors import as_folder, as_list, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.files import atomic_write
-from renderer.io.images import Tile, draw_grid, tiles_of, write_image
+from renderer.io.images import draw_grid, tiles_of, write_image
 from renderer.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.rendering import light_sphere
 from renderer.visibility import Rasterizer
@@ -94,8 +93,11 @@ def save(
     require_renderers(verify)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"example_{example:03d}" for example in range(len(result.images_in_views))]
-    write = partial(_write_example, result, result.conditions)
-    lines = [write(example, path) for example, path in enumerate(progress(paths, "saving"))]
+    after = result.conditions
+    lines = [
+        _write_example(result, after, example, path)
+        for example, path in enumerate(progress(paths, "saving"))
+    ]
 
     images = result.images_in_views.cpu()
     versions = {
@@ -103,22 +105,19 @@ def save(
         "8 bits": to_unit(to_bytes(images)),
         f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY),
     }
-    rasterizer = result.problem.scene.rasterizer
     if verify:
-        rendered = []
-        for path in progress(paths, "rendering the saved files"):
-            rendered.append(render_again(path, verify, rasterizer))
+        rasterizer = result.problem.scene.rasterizer
+        shown_paths = progress(paths, "rendering the saved files")
+        rendered = [render_again(path, verify, rasterizer) for path in shown_paths]
         for name in verify:
             versions[name] = torch.stack([by_renderer[name] for by_renderer in rendered])
     for name, version in versions.items():
         numbers = _numbers_of_version(result, version.to(result.images_in_views))
-        for line, numbers_of_example in zip(lines, numbers, strict=True):
-            line["versions"][name] = numbers_of_example
+        for line, of_example in zip(lines, numbers, strict=True):
+            line["versions"][name] = of_example
 
-    all_lines = list(lines)
-    if checks is not None:
-        all_lines.append({"checks": checks, "warnings": warnings(checks)})
-    atomic_write(folder / LINES, "".join(json.dumps(line) + "\n" for line in all_lines))
+    last = [] if checks is None else [{"checks": checks, "warnings": warnings(checks)}]
+    atomic_write(folder / LINES, "".join(json.dumps(line) + "\n" for line in [*lines, *last]))
     return lines
 
 
@@ -180,18 +179,16 @@ def _numbers_of_version(
     logits, fooled_in_views, without_noise = judged
     is_counted = ~result.success_before
     differences = (images - result.images_in_views).abs().flatten(1)
-    numbers = []
-    for example, difference in enumerate(differences):
-        numbers.append(
-            {
-                "success": bool((fooled_in_views.all(1) & is_counted)[example]),
-                "success_without_noise": bool((without_noise & is_counted)[example]),
-                **predictions(logits[example], result.classifier.classes),
-                "largest_difference": float(difference.max()),
-                "mean_difference": float(difference.mean()),
-            }
-        )
-    return numbers
+    return [
+        {
+            "success": bool((fooled_in_views.all(1) & is_counted)[example]),
+            "success_without_noise": bool((without_noise & is_counted)[example]),
+            **predictions(logits[example], result.classifier.classes),
+            "largest_difference": float(difference.max()),
+            "mean_difference": float(difference.mean()),
+        }
+        for example, difference in enumerate(differences)
+    ]
 
 
 def render_again(
@@ -238,25 +235,19 @@ def figure(result: AttackResult, example: int) -> Image.Image:
         "initial": tiles_of(before, predicted_before, SIDE),
         "adversarial": tiles_of(after, predicted_after, SIDE),
         "difference": tiles_of((1 + scale * differences) / 2, captions, SIDE),
-        **_columns_of_light(result, example),
     }
+    lights = [
+        result.light(values, example) for values in (result.problem.start, result.minimum.values)
+    ]
+    (light_before, basis_before), (light_after, basis_after) = lights
+    if not torch.equal(light_before, light_after) or basis_before != basis_after:
+        cameras = result.problem.scene.cameras[example]
+        for title, (light, basis) in zip(
+            ("initial light", "adversarial light"), lights, strict=True
+        ):
+            balls = [light_sphere(light, SIDE, camera, basis) for camera in cameras]
+            columns[title] = tiles_of(balls)
     return draw_grid(list(zip(*columns.values(), strict=True)), list(columns))
-
-
-def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile]]:
-    """Draw a white ball in the light before and after an attack, as each camera sees it.
-
-    Return the two columns by their titles, or an empty dictionary if the attack did not change the
-    light.
-    """
-    light_before, basis_before = result.light(result.problem.start, example)
-    light_after, basis_after = result.light(result.minimum.values, example)
-    if torch.equal(light_before, light_after) and basis_before == basis_after:
-        return {}
-    cameras = result.problem.scene.cameras[example]
-    before = [light_sphere(light_before, SIDE, camera, basis_before) for camera in cameras]
-    after = [light_sphere(light_after, SIDE, camera, basis_after) for camera in cameras]
-    return {"initial light": tiles_of(before), "adversarial light": tiles_of(after)}
 
 
 def _captions(
@@ -271,9 +262,7 @@ def _captions(
     labels = result.criterion.source[example].tolist()
     captions = []
     for probabilities, label in zip(logits[example].softmax(1), labels, strict=True):
-        shown_classes = [int(probabilities.argmax())]
-        if label not in shown_classes:
-            shown_classes.append(label)
-        lines = [f"{probabilities[index]:.1%} {classes[index]}" for index in shown_classes]
-        captions.append(tuple(lines))
+        # A dictionary has each class once.
+        shown = dict.fromkeys([int(probabilities.argmax()), label])
+        captions.append(tuple(f"{probabilities[index]:.1%} {classes[index]}" for index in shown))
     return captions

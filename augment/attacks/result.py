@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from PIL import Image, ImageOps
+from PIL import ImageOps
 from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
@@ -313,8 +313,7 @@ class AttackResult(ShortRepr):
         require_whole("frame_count", frame_count, 2, MAX_FRAME_COUNT)
         start = self.problem.start
         change = self.minimum.values.to(start) - start
-        images = []
-        balls = []
+        images, balls = [], []
         for index in range(frame_count):
             values = start + index / (frame_count - 1) * change
             rendered = self.problem.images(values, self.problem.all_examples[[example]])
@@ -332,7 +331,15 @@ class AttackResult(ShortRepr):
         tiles = tiles_of(shown.cpu().float(), [(title,) for title in titles], SIDE)
         ball_tiles = tiles_of(balls, [("light",)] * frame_count, SIDE)
         pairs = zip(tiles, ball_tiles, strict=True)
-        first, *others = _with_equal_sizes([draw_grid([pair]) for pair in pairs])
+        frames = [draw_grid([pair]) for pair in pairs]
+        # All frames get the same size, by empty space at the right and the bottom.
+        width, height = (
+            max(sizes) for sizes in zip(*(frame.size for frame in frames), strict=True)
+        )
+        first, *others = (
+            ImageOps.expand(frame, (0, 0, width - frame.width, height - frame.height), PAPER)
+            for frame in frames
+        )
         times = [PAUSE, *[FRAME_TIME] * (frame_count - 2), PAUSE]
         write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
 
@@ -348,17 +355,6 @@ class AttackResult(ShortRepr):
         content = BytesIO()
         self.plot().savefig(content, format="png")
         return content.getvalue()
-
-
-def _with_equal_sizes(frames: list[Image.Image]) -> list[Image.Image]:
-    """Add empty space at the right and the bottom of frames, so that all have the same size."""
-    width = max(frame.width for frame in frames)
-    height = max(frame.height for frame in frames)
-    extended = []
-    for frame in frames:
-        border = (0, 0, width - frame.width, height - frame.height)
-        extended.append(ImageOps.expand(frame, border, PAPER))
-    return extended
 
 
 def _titles(logits: Float[Tensor, "N C"], classes: Sequence[str]) -> list[str]:
