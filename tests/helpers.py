@@ -4,7 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
+
+from augment.classifier import Classifier
 
 FRUIT = ["apple", "orange", "pear"]
 
@@ -15,6 +18,16 @@ def bright_or_dark(images: Tensor) -> Tensor:
     return torch.stack([3 * mean, 0.4 + 0 * mean], dim=1)
 
 
+def darker_than(limit: float, size: int = 8, name: str = "", scale: float = 100) -> Classifier:
+    """Make a classifier that takes images darker than a limit on average for an orange."""
+
+    def logits(images: Tensor) -> Tensor:
+        excess = scale * (images.mean((1, 2, 3)) - limit)
+        return torch.stack([-excess, excess], dim=1)
+
+    return Classifier(logits, size, ("orange", "other"), name or f"darker than {limit}")
+
+
 def colored_noise(labels: np.ndarray, rng: np.random.Generator, contrast: int) -> np.ndarray:
     """Draw noise images (N, 3, 16, 16) in which the channel of the label's number is brighter.
 
@@ -23,6 +36,15 @@ def colored_noise(labels: np.ndarray, rng: np.random.Generator, contrast: int) -
     images = rng.integers(0, 200, (len(labels), 3, 16, 16))
     images[np.arange(len(labels)), labels] += contrast
     return images.astype(np.uint8)
+
+
+def save_noise(
+    path: Path, rng: np.random.Generator, shape: tuple[int, int] = (20, 24), low=0, high=256
+) -> None:
+    """Save an image of noise of some 8-bit levels, and create its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = rng.integers(low, high, (*shape, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(path)
 
 
 def save_colored_noise(path: Path, rng: np.random.Generator, contrast: int) -> None:

@@ -83,9 +83,8 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
             for name, hint in hints().items():
                 if name in values and not _holds(values[name], hint):
                     where = f"{function.__module__}.{function.__qualname__}, {name}"
-                    raise AssertionError(
-                        f"{where}: {hint} is annotated, {_shape(values[name])} given"
-                    )
+                    given = type(values[name]), getattr(values[name], "shape", values[name])
+                    raise AssertionError(f"{where}: {hint} is annotated, {given} given")
         return result
 
     return checked
@@ -108,12 +107,3 @@ def _holds(value: Any, hint: Any) -> bool:
     if get_origin(hint) is tuple and isinstance(value, tuple) and Ellipsis not in get_args(hint):
         return all(map(_holds, value, get_args(hint)))
     return hint is not type(None) or value is None
-
-
-def _shape(value: Any) -> str:
-    shape = getattr(value, "shape", None)
-    return (
-        f"{type(value).__name__} {getattr(value, 'dtype', '')} {tuple(shape)}"
-        if shape is not None
-        else repr(value)[:80]
-    )

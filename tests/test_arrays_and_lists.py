@@ -13,31 +13,16 @@ import renderer
 from augment.progress import Phases
 from renderer import harmonics, skylight
 from renderer.camera import Camera
-from renderer.light.lamps import Lamps
 from tests.helpers import bright_or_dark
+from tests.tetrahedron import CAMERA, IMAGES, LAMP, LIGHT, MESH, SIZE, render
 
-SIZE = 8
-MESH = renderer.Mesh.plain(
-    [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]],
-    [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]],
-    color=(1.0, 0.5, 0.0),
-)
-CAMERA = renderer.OrthographicCamera(57.3, 28.6, 4.0)
-LIGHT = renderer.load_light("grace")
-LAMP = Lamps(((2.0, 2.0, 2.0),))
 OPERATOR = renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)
 COVERED = len(OPERATOR.pixels)
 SCENE = augment.build_scene([(MESH, "orange")], SIZE, views=2, light="uniform", samples=1)
-IMAGES = torch.rand(3, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
 LABELS = torch.tensor([1, 0])
 
 
 CLASSIFIER = augment.Classifier(bright_or_dark, SIZE, ["orange", "other"])
-
-
-def render(**changed: Any) -> Tensor:
-    given: dict[str, Any] = {"mesh": MESH, "cameras": CAMERA, "light": LIGHT, "size": SIZE}
-    return renderer.render(**given | {"samples": 1, **changed})
 
 
 def render_scene(scene: augment.Scene) -> Tensor:

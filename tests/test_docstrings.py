@@ -104,8 +104,3 @@ def markup_problems(docstring: str) -> str:
 def test_the_site_can_show_the_docstrings_of_public_names():
     problems = {name: markup_problems(text) for name, text in public_docstrings().items()}
     assert {name: problem for name, problem in problems.items() if problem} == {}
-
-
-def test_a_list_directly_below_a_line_is_a_problem_of_markup():
-    docstring = "Return two.\n\nReturns:\n    A tuple of\n    - the first, which is\n      long."
-    assert "Unexpected indentation" in markup_problems(docstring)

@@ -211,64 +211,27 @@ ATTACKS = {
 }
 
 SMALL = """
-data=shapes
-data.train_per_class=10
-data.test_per_class=4
-size=16
-model.depth=10
-model.width=1
-train.epochs=2
-train.batch_size=16
-train.precision=float32
-train.device=cpu
-train.threads=1
-renderer.rasterizer=numpy
-renderer.samples=2
-scene.backgrounds=[0.2,0.8]
+data=shapes data.train_per_class=10 data.test_per_class=4 size=16 model.depth=10 model.width=1
+train.epochs=2 train.batch_size=16 train.precision=float32 train.device=cpu train.threads=1
+renderer.rasterizer=numpy renderer.samples=2 scene.backgrounds=[0.2,0.8]
 """
 RUNS = {
     "demonstration": """
-experiment=paper
-compare=[none]
-model.dropout=0.0
-train.schedule=one_cycle
-augment.examples=4
-augment.attack.max_steps=3
-augment.attack.step_size=0.3
+experiment=paper compare=[none] model.dropout=0.0 train.schedule=one_cycle augment.examples=4
+augment.attack.max_steps=3 augment.attack.step_size=0.3
 """,
     "best": """
-experiment=best
-augment.examples=null
-augment.regenerate_every=30
-augment.random_light.radius=1.0
-scene.views=1
-meshes=['solid:orange',solid:orange:1]
-train.images_per_epoch=60
-train.ema_decay=0.8
+experiment=best augment.examples=null augment.regenerate_every=30 augment.random_light.radius=1.0
+scene.views=1 meshes=['solid:orange',solid:orange:1] train.images_per_epoch=60 train.ema_decay=0.8
 train.distillation_weight=1.0
 """,
     "harden": """
-experiment=harden
-augment=adversarial
-augment.examples=6
-augment.regenerate_every=30
-augment.init=random
-augment.warm_start=true
-+attack@augment.attack=[lighting,albedo]
-augment.attack.max_steps=3
-augment.vary.shift=0.1
-augment.vary.exposure=[0.5,1.5]
-augment.vary.camera.noise=0.02
-model.dropout=0.3
-train.epochs=3
-train.images_per_epoch=60
-train.augmentation=augmix
-train.ranking_weight=0.5
-train.label_smoothing=0.1
-train.ema_decay=0.8
-train.flips=alternating
-scene.views=1
-meshes=[solid:orange:0,solid:orange:1]
+experiment=harden augment=adversarial augment.examples=6 augment.regenerate_every=30
+augment.init=random augment.warm_start=true +attack@augment.attack=[lighting,albedo]
+augment.attack.max_steps=3 augment.vary.shift=0.1 augment.vary.exposure=[0.5,1.5]
+augment.vary.camera.noise=0.02 model.dropout=0.3 train.epochs=3 train.images_per_epoch=60
+train.augmentation=augmix train.ranking_weight=0.5 train.label_smoothing=0.1 train.ema_decay=0.8
+train.flips=alternating scene.views=1 meshes=[solid:orange:0,solid:orange:1]
 hard_negatives=[{mesh:'solid:ball:0',label:apple}]
 """,
 }

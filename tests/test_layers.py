@@ -33,16 +33,6 @@ def test_a_package_imports_no_package_above_it(package):
         assert imported_packages(module) & ALLOWED.keys() <= ALLOWED[package], module
 
 
-def test_only_one_module_imports_opengl():
-    users = [
-        path.relative_to(ROOT).as_posix()
-        for package in ALLOWED
-        for path in (ROOT / package).rglob("*.py")
-        if "moderngl" in imported_packages(path)
-    ]
-    assert users == ["renderer/visibility/opengl.py"]
-
-
 def modules() -> dict[str, Path]:
     """Map all modules of the packages to their files."""
     paths = [path for package in ALLOWED for path in (ROOT / package).rglob("*.py")]

@@ -1,6 +1,10 @@
-"""Each block of Python in the README, the guide and pretrained/ runs beside its files."""
+"""Each block of Python in the README, the guide and pretrained/ runs, and the first command."""
 
+import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -148,3 +152,31 @@ def test_training_loop_block_trains_on_data_and_renders():
     assert names["renders"].labels.eq(53).all()
     assert names["renders"].images.shape == (10, 3, 32, 32)
     assert not torch.equal(network[1].weight, before)
+
+
+def read_auc(folder: Path) -> float:
+    """Read the AUC on the photographs of the laboratory."""
+    summary = json.loads((folder / "laboratory" / "summary.json").read_text())
+    return summary["auc"]["value"]
+
+
+@pytest.mark.slow
+def test_the_demonstration_ends_with_a_table_of_the_effect_an_image_and_a_report(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
+    options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-m", "train"], check=True, **options)
+    lines = done.stdout.splitlines()
+    # The result fits on a screen.
+    assert len(lines) <= 20
+    page = Path(lines[-1].removeprefix("report: "))
+    folder = page.parent
+    *_, sheet = re.findall(r"^image: (.*)$", (folder / "train.log").read_text(), re.M)
+    assert Path(sheet).read_bytes().startswith(b"\x89PNG")
+    before = read_auc(folder / "before")
+    after = read_auc(folder)
+    assert after > before + 0.05
+    header, _, *rows = [line.split("|") for line in lines if line.startswith("|")]
+    column = [cell.strip() for cell in header].index("AUC")
+    printed = [row[column].strip() for row in rows]
+    assert printed == [f"{before:.3f}", f"{after:.3f}"]
+    assert "Examples of renders" in page.read_text()

@@ -26,25 +26,16 @@ from renderer import InputError, harmonics, skylight
 from renderer.errors import describe
 from renderer.light.lamps import Lamps, Projector
 from tests.helpers import bright_or_dark
+from tests.tetrahedron import CAMERA, IMAGES, LAMP, LIGHT, MESH, SIZE, render
 from train import load_run
 from train.commands.evaluate import evaluate
 
 NAN = math.nan
-SIZE = 8
-MESH = renderer.Mesh.plain(
-    [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]],
-    [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]],
-    color=(1.0, 0.5, 0.0),
-)
 TRIMESH = trimesh.creation.icosahedron()
-CAMERA = renderer.OrthographicCamera(57.3, 28.6, 4.0)
-LIGHT = renderer.load_light("grace")
-LAMP = Lamps(((2.0, 2.0, 2.0),))
 INTRINSICS = np.array([[70.0, 0, 27], [0, 76, 39], [0, 0, 1]])
 CLASSES = ("orange", "other")
 COMPLEX = torch.ones(49, 3) * 1j
 OBJECTS = np.full((49, 3), None)
-IMAGES = torch.rand(3, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
 BYTES = IMAGES * 255
 
 
@@ -80,25 +71,18 @@ def small_service(label: Any = 0, **options: Any) -> augment.AugmentationService
     return augment.AugmentationService.from_meshes([(MESH, label)], SIZE, **given)
 
 
+def shown_examples(examples: Any) -> Tensor:
+    return small_scene().render(small_scene().conditions(torch.arange(2)), examples)
+
+
 def service_of(**changed: Any) -> augment.AugmentationService:
-    given: dict[str, Any] = {
-        "scene": small_scene(),
-        "labels": [0, 0],
-        "seed": 0,
-        "phases": Phases(),
-    }
+    given: dict[str, Any] = {"scene": small_scene(), "labels": [0, 0], "seed": 0}
+    given["phases"] = Phases()
     return augment.AugmentationService(augment.AugmentationSettings(), **given | changed)
 
 
-def render(**changed: Any) -> Tensor:
-    given: dict[str, Any] = {
-        "mesh": MESH,
-        "cameras": CAMERA,
-        "light": LIGHT,
-        "size": SIZE,
-        "samples": 1,
-    }
-    return renderer.render(**given | changed)
+def regenerated(model: Any) -> Any:
+    return small_service().regenerate(model, 0)
 
 
 def operators(**changed: Any) -> list[renderer.TransferOperator]:
@@ -110,6 +94,10 @@ def scene(meshes: Any = ((MESH, "orange"),), size: Any = SIZE, **changed: Any) -
     return augment.build_scene(meshes, size, **{"samples": 1, "light": "uniform", **changed})
 
 
+def projected(**changed: Any) -> augment.Scene:
+    return scene(projector=augment.ProjectorSettings(**changed))
+
+
 def attack(classifier: Any = CLASSIFIER, **changed: Any) -> AttackResult:
     shown = changed.pop("scene") if "scene" in changed else small_scene()
     return augment.attack(classifier, shown, **changed)
@@ -117,6 +105,13 @@ def attack(classifier: Any = CLASSIFIER, **changed: Any) -> AttackResult:
 
 def mesh_of(**changed: Any) -> renderer.Mesh:
     return replace(MESH, **changed)
+
+
+def rendered_with(**changed: Any) -> Tensor:
+    return render(mesh=mesh_of(**changed))
+
+
+plain_mesh = partial(renderer.Mesh.plain, MESH.vertices)
 
 
 def calls_of(
@@ -144,31 +139,17 @@ RENDERING = [
     *by_name(render, light=["grace", MESH, 3.0, LIGHT * NAN]),
     *by_name(render, size=[16.5, True, 0]),
     *by_name(render, background=[255, "white", [0.1, 0.2]]),
-    *by_name(
-        render,
-        lights=[
-            LIGHT,
-            LAMP,
-            [(LAMP, LIGHT)],
-            [(LAMP, "white")],
-            [(LAMP,)],
-            [(LIGHT, LAMP)],
-            [(LAMP, [[NAN] * 3])],
-        ],
-    ),
+    *by_name(render, lights=[LIGHT, LAMP, [(LAMP, LIGHT)], [(LAMP,)], [(LAMP, [[NAN] * 3])]]),
     *by_name(render, vertices=[1.0, "x", MESH.vertices * NAN]),
     *by_name(render, albedo=[torch.full((4, 3), -5.0), 0.5, "red", torch.ones(4, 3) * NAN]),
     *by_name(render, albedo_scale=["2", -1.0, NAN], gloss=[0.3, (0.3, 0, 1)]),
     *by_name(render, samples=[0, 2.5, "2", 65], encoding=["sRGB", None, 3]),
     *by_name(render, normals=["Smooth", None], shadows=["no", 2], bounces=[1.5, -1, "2", 101]),
     *by_name(render, silhouettes=["yes"], rasterizer=["gpu", 3]),
-    *by_name(operators, mesh=["orange.glb"], cameras=[None, [], [1.0]], size=[16.5, True, 0]),
-    *by_name(operators, albedo_scale=["2", -1.0], gloss=[0.3, "shiny"], rasterizer=["gpu"]),
+    *by_name(operators, mesh=["orange.glb"], cameras=[None], size=[0], gloss=[0.3]),
     *calls_of("lights", lambda x: operator().image(x), "grace", LIGHT.T, LIGHT * NAN),
     *calls_of("lights", lambda x: operator().radiance(x), "grace", LIGHT[:9]),
-    *calls_of(
-        "background", lambda x: operator().image(LIGHT, x), 2.0, "white", torch.rand(3, 4, 4)
-    ),
+    *calls_of("background", lambda x: operator().image(LIGHT, x), 2.0, torch.rand(3, 4, 4)),
     *calls_of("radiance_gradient", lambda x: operator().light_gradient(x), "x", 1.0),
     *calls_of("device", lambda x: operator().to(x), "gpu", 3.5),
 ]
@@ -176,14 +157,12 @@ RENDERING = [
 CAMERAS = [
     *calls_of("views", lambda x: renderer.orbit_cameras(x, 2.0), 0, 2.5, "3"),
     *calls_of("width", lambda x: renderer.orbit_cameras(1, x), 0, "2", NAN),
-    *by_name(partial(renderer.orbit_cameras, 1, 2.0), polar=["60", NAN, 721.0]),
-    *by_name(partial(renderer.orbit_cameras, 1, 2.0), azimuth=["45", NAN, -721.0]),
+    *by_name(partial(renderer.orbit_cameras, 1, 2.0), polar=["60", 721.0], azimuth=[NAN, -721.0]),
     *by_name(partial(renderer.orbit_cameras, 1, 2.0), fov=[173.0, "30", 0, NAN]),
     *calls_of("polar", lambda x: renderer.OrthographicCamera(x, 0.0, 2.0), "up", NAN),
     *calls_of("azimuth", lambda x: renderer.OrthographicCamera(1.0, x, 2.0), "east", NAN),
     *calls_of("width", lambda x: renderer.OrthographicCamera(57.3, 0.0, x), 0.0, "wide", NAN),
-    *by_name(partial(renderer.OrthographicCamera, 57.3, 0.0, 2.0), right=["x", NAN]),
-    *by_name(partial(renderer.OrthographicCamera, 57.3, 0.0, 2.0), clip_range=[0.0, "far"]),
+    *by_name(partial(renderer.OrthographicCamera, 57.3, 0.0, 2.0), right=["x"], clip_range=[0.0]),
     *by_name(partial(renderer.PerspectiveCamera, 57.3, 0.0, 2.0), distance=[0, "far"]),
     *by_name(
         partial(
@@ -202,13 +181,7 @@ LIGHTS = [
     *calls_of("light", renderer.load_light, None, 3, "sunset"),
     *calls_of("missing.hdr", renderer.load_light, "missing.hdr"),
     *calls_of("degree", lambda x: renderer.load_light("grace", x), 2.5, -1, 41, "6"),
-    *calls_of(
-        "coefficients",
-        lambda x: renderer.save_light(Path("l.json"), x),
-        "x",
-        LIGHT[:9],
-        LIGHT * NAN,
-    ),
+    *calls_of("coefficients", lambda x: renderer.save_light("l.json", x), LIGHT[:9], LIGHT * NAN),
     *calls_of("basis", lambda x: renderer.save_light(Path("l.json"), LIGHT, x), "harmonics", 6),
     *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, 3, "light.png"),
     *by_name(partial(renderer.save_light, "l.exr", LIGHT), height=[0, 2.5, None]),
@@ -245,34 +218,17 @@ MESHES = [
     *calls_of("name", renderer.solid, "car", 3),
     *calls_of("seed", lambda x: renderer.solid("orange", x), -1, 1.5, "3"),
     *calls_of("vertices", lambda x: renderer.Mesh.plain(x, MESH.faces), "x", 3.0, np.ones((4, 2))),
-    *calls_of(
-        "faces",
-        lambda x: renderer.Mesh.plain(MESH.vertices, x),
-        "x",
-        [[0, 1, 9]],
-        [[0, 1, 2.5]],
-        [[0, 1]],
-    ),
-    *calls_of(
-        "color", lambda x: renderer.Mesh.plain(MESH.vertices, MESH.faces, x), "red", (1, 1), -0.1
-    ),
+    *calls_of("faces", plain_mesh, "x", [[0, 1, 9]], [[0, 1, 2.5]], [[0, 1]]),
+    *calls_of("color", partial(plain_mesh, MESH.faces), "red", (1, 1), -0.1),
     *calls_of("faces", lambda x: renderer.Mesh.plain(MESH.faces, x), MESH.vertices / 2),
     *by_name(mesh_of, vertices=["x", MESH.vertices[:, :2]], faces=[None, MESH.faces + 1]),
     *by_name(mesh_of, corner_colors=[None, MESH.faces], corner_uvs=[None, np.ones((4, 3))]),
     *by_name(mesh_of, normal_ids=[MESH.faces - 1, MESH.faces * 1.0, MESH.faces[1:]]),
     *by_name(mesh_of, texture_ids=[None, np.zeros(4, int), [0, 0]]),
     *by_name(mesh_of, textures=["a.png", [np.ones((4, 4, 3))], 3]),
-    *calls_of(
-        "corner_colors", lambda x: render(mesh=mesh_of(corner_colors=x)), MESH.corner_colors * 255
-    ),
-    *by_name(partial(renderer.Mesh.plain, MESH.vertices, MESH.faces), crease=[-1, "x"]),
-    *calls_of(
-        "gloss",
-        lambda x: render(mesh=mesh_of(gloss=x)),
-        0.3,
-        np.full((4, 3), 2.0),
-        renderer.Gloss(0.3),
-    ),
+    *by_name(rendered_with, corner_colors=[MESH.corner_colors * 255]),
+    *by_name(rendered_with, gloss=[0.3, np.full((4, 3), 2.0), renderer.Gloss(0.3)]),
+    *by_name(partial(plain_mesh, MESH.faces), crease=[-1, "x"]),
     *calls_of("roughness", lambda x: renderer.Gloss(x).on(MESH), "smooth", 2.0, NAN),
     *calls_of("metallic", lambda x: renderer.Gloss(0.3, x).on(MESH), "gold", 1.5, np.ones((4, 3))),
     *calls_of("specular_factor", lambda x: renderer.Gloss(0.3, 0.0, x).on(MESH), "full", 1.5),
@@ -297,28 +253,15 @@ SCENES = [
         lambda x: scene([augment.ObjectSettings("solid:orange", "orange", color=x)]),
         [1.0, 0.0, 0.0],
     ),
-    *calls_of("pixels", lambda x: scene(projector=augment.ProjectorSettings(pixels=x)), 2.5, 0),
-    *calls_of(
-        "pattern",
-        lambda x: scene(projector=augment.ProjectorSettings(pattern=x)),
-        2.0,
-        "missing.png",
-    ),
-    *calls_of(
-        "positions", lambda x: scene(lamps=augment.LampsSettings(positions=x)), 3, [], [[1, 2]]
-    ),
+    *by_name(projected, pixels=[2.5, 0], pattern=[2.0, "missing.png"]),
+    *calls_of("positions", lambda x: scene(lamps=augment.LampsSettings(x)), 3, [], [[1, 2]]),
     *calls_of("start", lambda x: scene(lamps=augment.LampsSettings(start=x)), [1, 2], None, NAN),
     *calls_of("mesh", lambda x: augment.ObjectSettings(x, "orange"), None, 3, ""),
     *calls_of("label", lambda x: scene([augment.ObjectSettings("solid:orange", x)]), None, 3),
     *calls_of("albedo_scale", lambda x: augment.ObjectSettings("solid:cup", "cup", x), "2", 0, NAN),
     *by_name(partial(augment.ObjectSettings, "solid:cup", "cup"), color=[0.5, [255, 0, 0], [0, 0]]),
     *by_name(partial(augment.ObjectSettings, "solid:cup", "cup"), gloss=["shiny"]),
-    *calls_of(
-        "props",
-        lambda x: scene([augment.ObjectSettings("solid:cup", "cup", props=x)]),
-        ["solid:cup"],
-        3,
-    ),
+    *by_name(partial(augment.ObjectSettings, "solid:cup", "cup"), props=[["solid:cup"], 3]),
     *calls_of("at", lambda x: augment.PropSettings("solid:cup", x), 3, "left", [1], [NAN, 0]),
     *calls_of("scale", lambda x: augment.PropSettings("solid:cup", [0, 0], x), 0, "big", NAN),
     *by_name(augment.VariationSettings, shift=[2.0, "far", NAN], scale=[2.0, [2, 1], None]),
@@ -331,21 +274,13 @@ SCENES = [
     *by_name(small_scene().changed, examples=[[], None, [3]], objects=[[MESH], None, []]),
     *by_name(small_scene().changed, settings=[None, 8]),
     *calls_of("light", lambda x: renderer.light_sphere(x, 8), "grace", 96),
-    *calls_of(
-        "photograph", lambda x: renderer.fit_scene(x, torch.ones(8, 8), MESH), "photo.jpg", BYTES[0]
-    ),
+    *calls_of("photograph", lambda x: renderer.fit_scene(x, torch.ones(8, 8), MESH), BYTES[0]),
     *calls_of("mask", lambda x: renderer.fit_scene(IMAGES[0], x, MESH), "mask.png", BYTES[0, 0]),
     *calls_of("seed", lambda x: scene([(f"solid:orange:{x}", "orange")]), "x"),
     *calls_of("images", CLASSIFIER, IMAGES[0], IMAGES.permute(0, 2, 3, 1)),
     *calls_of("alone", attack, lambda x: {"logits": bright_or_dark(x)}),
     *calls_of("conditions", lambda x: small_scene().render(x, torch.arange(2)), None),
-    *calls_of(
-        "examples",
-        lambda x: small_scene().render(small_scene().conditions(torch.arange(2)), x),
-        None,
-        [0, 9],
-        torch.arange(1),
-    ),
+    *calls_of("examples", shown_examples, None, [0, 9], torch.arange(1)),
 ]
 
 
@@ -362,6 +297,8 @@ def animated(path: str = "attack.gif", **changed: Any) -> Any:
 
 
 STEPS = augment.StepSettings()
+lit = partial(augment.AttackSettings, lighting=STEPS)
+forced = partial(attack, force=True)
 ATTACKS = [
     *calls_of("norm", augment.StepSettings, "l3", 0.1, None, 2),
     *calls_of("radius", lambda x: augment.StepSettings("l2", x), "big", -1, NAN),
@@ -371,28 +308,15 @@ ATTACKS = [
     *by_name(augment.SkylightSettings, zenith=["noon"]),
     *by_name(augment.AttackSettings, lighting=[0.1, True], pose=[augment.StepSettings(), 10.0]),
     *by_name(augment.AttackSettings, material=[0.3], skylight=[augment.StepSettings()]),
-    *by_name(partial(augment.AttackSettings, lighting=STEPS), max_steps=[2.5, -1]),
-    *by_name(partial(augment.AttackSettings, lighting=STEPS), restarts=[1.5, -1]),
-    *by_name(partial(augment.AttackSettings, lighting=STEPS), margin=["x", -1, NAN]),
-    *by_name(partial(augment.AttackSettings, lighting=STEPS), quantized=["yes", 8]),
-    *by_name(partial(augment.AttackSettings, lighting=STEPS), allow_negative=["no"]),
-    *by_name(partial(augment.AttackSettings, lighting=STEPS), backtracking=["no"], eot=[3, None]),
-    *by_name(partial(augment.AttackSettings, lighting=STEPS), batch_size=[0, 2.5]),
+    *by_name(lit, max_steps=[2.5, -1], restarts=[1.5, -1], margin=["x", -1, NAN]),
+    *by_name(lit, quantized=["yes", 8], allow_negative=["no"], backtracking=["no"]),
+    *by_name(lit, eot=[3, None], batch_size=[0, 2.5]),
     *calls_of("classifier", attack, None, LINEAR, small_scene),
     *by_name(attack, scene=[None], settings=[{"lighting": STEPS}], force=["yes"]),
-    *by_name(partial(attack, force=True), target=[3, "pear", ["other", "other"], 0.5, LIGHT]),
-    *by_name(partial(attack, force=True), seed=["x", 1.5, -1]),
+    *by_name(forced, target=[3, "pear", ["other", "other"], 0.5, LIGHT], seed=["x", 1.5, -1]),
     *calls_of("attack", lambda x: attack(settings=x), augment.AttackSettings()),
-    *calls_of(
-        "orange",
-        lambda x: attack(x, force=True),
-        augment.Classifier(bright_or_dark, SIZE, ["lemon", "pear"]),
-    ),
-    *calls_of(
-        "classifier",
-        lambda x: attack(x, force=True),
-        augment.Classifier(bright_or_dark, 16, CLASSES),
-    ),
+    *calls_of("orange", forced, augment.Classifier(bright_or_dark, SIZE, ["lemon", "pear"])),
+    *calls_of("classifier", forced, augment.Classifier(bright_or_dark, 16, CLASSES)),
     *calls_of("result", augment.check, None),
     *calls_of("result", lambda x: augment.success_by_radius(x, [1.0]), None),
     *calls_of("scales", lambda x: augment.success_by_radius(small_result(), x), 0.5, ["x"], [-1]),
@@ -415,6 +339,10 @@ def half_network() -> augment.Classifier:
     return augment.Classifier(network.half(), SIZE, CLASSES)
 
 
+def with_classes(classes: Any) -> augment.Classifier:
+    return augment.Classifier(bright_or_dark, SIZE, classes)
+
+
 def returning(value: Any) -> augment.Classifier:
     return augment.Classifier(lambda images: value, SIZE, CLASSES)
 
@@ -424,9 +352,6 @@ DIRECT = [
     *by_name(small_scene().changed, camera_effects=[3, "blur"]),
     *by_name(scene, backgrounds=[[True]]),
     *calls_of("textured", lambda x: renderer.Gloss(0.3, textured=x).on(MESH), "yes"),
-    *calls_of(
-        "classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), {"orange", "other"}
-    ),
     *calls_of("degree", harmonics.quadrature, "x", 2.5, -1),
     *calls_of("height", lambda x: harmonics.equirectangular(x, 8), "x", 0, 4.5),
     *calls_of("examples", lambda x: small_scene().conditions(x), "all", [9], 0),
@@ -439,22 +364,16 @@ DIRECT = [
 CLASSIFIERS = [
     *calls_of("function", lambda x: augment.Classifier(x, SIZE, CLASSES), None, 3),
     *calls_of("size", lambda x: augment.Classifier(bright_or_dark, x, CLASSES), 16.5, 0),
-    *calls_of(
-        "classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), 3, [], ["a", "a"], [0, 1]
-    ),
+    *calls_of("classes", with_classes, 3, [], ["a", "a"], [0, 1], {"orange", "other"}),
     *calls_of("images", CLASSIFIER, BYTES, BYTES.to(torch.uint8), "x"),
     *calls_of("images", CLASSIFIER, IMAGES[0], [[1], [2, 3]]),
     *calls_of("logits", augment.Classifier(probabilities, SIZE, CLASSES), IMAGES),
     *calls_of("logits", returning(torch.tensor([[0.2, 0.8]] * 3)), IMAGES),
-    *calls_of("logits", returning(torch.full((3, 2), NAN)), IMAGES),
-    *calls_of("logits", returning(torch.ones(3, 5)), IMAGES),
     *calls_of("logits", returning((torch.ones(3, 2), None)), IMAGES),
     *calls_of("float16", half_network(), IMAGES),
     *calls_of("float64", augment.Classifier(LINEAR, SIZE, CLASSES), IMAGES.double()),
-    *calls_of(
-        "logits", lambda x: attack(augment.Classifier(x, SIZE, CLASSES), force=True), probabilities
-    ),
-    *calls_of("float16", lambda x: attack(x, force=True), half_network()),
+    *calls_of("logits", forced, augment.Classifier(probabilities, SIZE, CLASSES)),
+    *calls_of("float16", forced, half_network()),
     *calls_of("label", CLASSIFIER.label, 3, None, 0.5),
     *calls_of("pear", CLASSIFIER.label, "pear"),
     *calls_of("operating point", CLASSIFIER.detect, IMAGES),
@@ -469,6 +388,7 @@ CLASSIFIERS = [
     *calls_of("size", lambda x: augment.build_scene([("solid:orange", "orange")], x), CLASSIFIER),
 ]
 
+of_meshes = augment.AugmentationService.from_meshes
 SERVICES = [
     *calls_of("mode", augment.AugmentationSettings, "all", None, 3),
     *calls_of("folder", lambda x: augment.AugmentationSettings("folder", x), None, 3),
@@ -486,32 +406,16 @@ SERVICES = [
         TrainingAttackSettings(albedo=STEPS),
     ),
     *calls_of("amplitude", RandomLightSettings, 0, "x", NAN),
-    *calls_of(
-        "meshes", lambda x: augment.AugmentationService.from_meshes(x, SIZE), [(MESH,)], [MESH], 3
-    ),
+    *calls_of("meshes", lambda x: of_meshes(x, SIZE), [(MESH,)], [MESH], 3),
     *calls_of("label", small_service, "orange", 1.5, None),
-    *calls_of("size", lambda x: augment.AugmentationService.from_meshes([(MESH, 0)], x), 16.5, 0),
+    *calls_of("size", lambda x: of_meshes([(MESH, 0)], x), 16.5, 0),
     *by_name(small_service, settings=[{"mode": "random"}], seed=["x", 1.5, -1]),
     *calls_of("label", lambda x: small_service(x).regenerate(LINEAR, 0), 2),
-    *calls_of("model", lambda x: small_service().regenerate(x, 0), None, 3),
-    *calls_of("model", lambda x: small_service().regenerate(x, 0), nn.Flatten(0), nn.Linear(5, 2)),
-    *calls_of(
-        "logits", lambda x: small_service().regenerate(x, 0), nn.Sequential(LINEAR, nn.Softmax(1))
-    ),
+    *calls_of("model", regenerated, None, 3, nn.Flatten(0), nn.Linear(5, 2)),
+    *calls_of("logits", regenerated, nn.Sequential(LINEAR, nn.Softmax(1))),
     *calls_of("number", lambda x: small_service().regenerate(LINEAR, x), "x", 1.5, -1),
     *calls_of("state", lambda x: small_service().load_state_dict(x), {}, None, 3),
     *calls_of("state", lambda x: small_service().load_state_dict(x.state_dict()), LINEAR),
-    *calls_of(
-        "state",
-        lambda x: x.load_state_dict(small_service(light="uniform").state_dict()),
-        small_service(),
-    ),
-    *calls_of(
-        "state", lambda x: x.load_state_dict(small_service(label=1).state_dict()), small_service()
-    ),
-    *calls_of(
-        "state", lambda x: x.load_state_dict(small_service(width=3.0).state_dict()), small_service()
-    ),
 ]
 
 
@@ -532,18 +436,8 @@ SCORES = [
     *calls_of("by", lambda x: evaluated(by=x), "mesh", "color"),
 ]
 
-CALLS = [
-    *DIRECT,
-    *RENDERING,
-    *CAMERAS,
-    *LIGHTS,
-    *MESHES,
-    *SCENES,
-    *ATTACKS,
-    *CLASSIFIERS,
-    *SERVICES,
-    *SCORES,
-]
+CALLS = [*DIRECT, *RENDERING, *CAMERAS, *LIGHTS, *MESHES, *SCENES, *ATTACKS, *CLASSIFIERS]
+CALLS += [*SERVICES, *SCORES]
 
 
 @pytest.fixture(scope="module")
@@ -584,14 +478,7 @@ def test_whole_numbers_of_numpy_are_sizes(size):
 
 def test_numbers_of_any_kind_are_factors_and_fields_of_cameras():
     expected = render(albedo_scale=0.5, cameras=renderer.OrthographicCamera(57.0, 115.0, 4.0))
-    for kind in (
-        int,
-        np.float32,
-        np.float64,
-        np.int64,
-        torch.tensor,
-        lambda value: np.array([value]),
-    ):
+    for kind in (int, np.float32, np.int64, torch.tensor, lambda value: np.array([value])):
         camera = renderer.OrthographicCamera(kind(57.0), kind(115.0), kind(4.0))
         assert torch.equal(render(albedo_scale=np.float32(0.5), cameras=camera), expected)
 
@@ -648,8 +535,24 @@ def test_a_state_is_restored_into_the_same_scene_alone():
     assert torch.equal(resumed.regenerate(LINEAR, 1).images, service.regenerate(LINEAR, 1).images)
     longer = replace(MESH, vertices=MESH.vertices * [1.0, 1.0, 1.5])
     others = [{"meshes": [(longer, 0)]}, {"light": 1.5 * LIGHT}, {"backgrounds": [0.1] * 5}]
+    others += [{"meshes": [(MESH, 1)]}, {"light": "uniform"}, {"width": 3.0}]
     for changed in others:
         given: dict[str, Any] = {"meshes": [(MESH, 0)], "size": SIZE, "views": 1, "samples": 1}
         other = augment.AugmentationService.from_meshes(**given | changed)
         with pytest.raises(InputError, match="another scene"):
             other.load_state_dict(state)
+
+
+def test_an_error_counts_the_images_of_all_meshes_as_those_of_all():
+    """Both views of the orange and one of the two of the pear are misclassified, in one light."""
+
+    def contrasts(images: Tensor) -> Tensor:
+        return 30 * (images.mean((2, 3)) - 0.3)
+
+    meshes = [("solid:orange", "pear"), ("solid:pear", "pear"), ("solid:lemon", "pear")]
+    shown = augment.build_scene(meshes, 16, views=2)
+    images = shown.render(shown.conditions(torch.arange(len(shown))), torch.arange(len(shown)))
+    wrong = (contrasts(images.flatten(0, 1)).argmax(1) != 2).sum()
+    classifier = augment.Classifier(contrasts, 16, ["orange", "apple", "pear"])
+    with pytest.raises(InputError, match=rf"\b{wrong} of 6 images are not classified"):
+        augment.attack(classifier, shown)

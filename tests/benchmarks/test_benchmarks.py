@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from benchmarks import (
     common,
-    gpu,
     gradient_free,
     lights,
     relit_photographs,
@@ -24,6 +22,7 @@ from benchmarks import (
 )
 from renderer.operators import shadows as precomputed
 from renderer.visibility import choose
+from tests.helpers import save_noise
 
 PNG_SIGNATURE = b"\x89PNG"
 
@@ -63,12 +62,7 @@ def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
     for row in panel_rows:
         assert math.isfinite(float(row["image_error"]))
         assert math.isfinite(float(row["gradient_error"]))
-    panels = {row["panel"] for row in panel_rows}
-    assert len(panels) == 4
-    for panel in panels:
-        in_panel = [row for row in panel_rows if row["panel"] == panel]
-        assert any(row["front"] == "True" for row in in_panel)
-        assert sum(row["pnb-train"] == "True" for row in in_panel) == 1
+    assert len({row["panel"] for row in panel_rows}) == 4
     assert (tmp_path / "renderer_pareto.png").read_bytes().startswith(PNG_SIGNATURE)
 
 
@@ -179,13 +173,6 @@ def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, 
     assert len(read(path)) == 2
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU")
-def test_the_gpus_questions_are_refused_without_one(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        gpu.main([])
-    assert capsys.readouterr().err.count("error: torch finds no GPU here") == 1
-
-
 def test_optimizers_are_compared_at_equal_forward_passes(capsys, monkeypatch):
     pytest.importorskip("cma")
     monkeypatch.setattr(gradient_free, "FRUIT", ("orange",))
@@ -199,8 +186,7 @@ def test_optimizers_are_compared_at_equal_forward_passes(capsys, monkeypatch):
 def test_relit_photographs_are_scored_for_each_network(tmp_path, capsys):
     rng = np.random.default_rng(0)
     for index in range(0, 50, 5):
-        pixels = rng.integers(0, 256, (40, 40, 3)).astype(np.uint8)
-        Image.fromarray(pixels).save(tmp_path / f"{index:03d}_thing.png")
+        save_noise(tmp_path / f"{index:03d}_thing.png", rng, (40, 40))
     none, best = "run:pretrained/none", "run:pretrained/best"
     arguments = [str(tmp_path), none, best, f"--control={none}", "--slides=2", "--passes=3"]
     relit_photographs.main(arguments)

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
-import augment
 from benchmarks import normalized_light as benchmark
+from tests.helpers import darker_than
 
 SIZE = 8
 
@@ -33,16 +32,6 @@ def renders(tmp_path) -> Path:
     return tmp_path
 
 
-def brightness_classifier(name: str, size: int) -> augment.Classifier:
-    """Make a classifier that takes dark images for an orange."""
-
-    def logits(images: torch.Tensor) -> torch.Tensor:
-        excess = 10 * (images.mean((1, 2, 3)) - 0.9)
-        return torch.stack([-excess, excess], dim=1)
-
-    return augment.Classifier(logits, SIZE, ["orange", "other"], name)
-
-
 def test_the_splits_share_no_object_pattern_or_map():
     names = {}
     for split in (benchmark.VALIDATION, benchmark.TEST):
@@ -56,7 +45,8 @@ def test_the_splits_share_no_object_pattern_or_map():
 
 
 def test_normalized_light_ranks_images_whose_contrast_tells_the_class(renders, monkeypatch, capsys):
-    monkeypatch.setattr(benchmark, "load", brightness_classifier)
+    load = lambda name, size: darker_than(0.9, SIZE, name, scale=10)  # noqa: E731
+    monkeypatch.setattr(benchmark, "load", load)
     monkeypatch.setattr(benchmark, "CANDIDATES", {"level": (0.6, 0.9)})
     benchmark.main(["choose", "--renders", str(renders)])
     chosen = capsys.readouterr().out

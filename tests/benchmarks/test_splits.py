@@ -9,24 +9,17 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from PIL import Image
 from torchvision.models import squeezenet1_1
 
 from augment.network import normalize_light
 from augment.scene import patterns
 from augment.settings import NormalizedLightSettings
 from benchmarks import splits
+from tests.helpers import save_noise
 
 # Patterns, lights and meshes of training.
 TRAINING = {
-    "stripes",
-    "checkers",
-    "spots",
-    "half",
-    "solid",
-    "grace",
-    "eucalyptus",
-    "st_peters",
+    *("stripes", "checkers", "spots", "half", "solid", "grace", "eucalyptus", "st_peters"),
     *splits.TRAINED,
 }
 # Number of setups in each part of a split, instead of up to 240.
@@ -47,7 +40,7 @@ def data(tmp_path, monkeypatch) -> None:
     for folder in ("meshes", "hdri", "photos/orange", "photos/apple", "packages"):
         Path(folder).mkdir(parents=True)
     write_photographs(rng)
-    save_noise(Path("packages/astronaut.png"), rng)
+    save_noise(Path("packages/astronaut.png"), rng, (8, 8))
     ball = trimesh.creation.icosphere(1)
     for name in (*splits.OUTSIDE, *splits.TRAINED):
         folder = "packages" if name.endswith(".obj") else "meshes"
@@ -67,14 +60,9 @@ def write_photographs(rng: np.random.Generator) -> None:
         rows.append([f"{label}/{number}.png", label, f"tag{number // 8}"])
     rows[-1][2] = splits.EXCLUDED_SOURCES[0]
     for path, _, _ in rows:
-        save_noise(Path("photos", path), rng)
+        save_noise(Path("photos", path), rng, (8, 8))
     with open("photos/photos.csv", "w", newline="") as file:
         csv.writer(file).writerows([["path", "class", "source_tag"], *rows])
-
-
-def save_noise(path: Path, rng: np.random.Generator) -> None:
-    """Write an image of 8 × 8 random pixels."""
-    Image.fromarray(rng.integers(0, 256, (8, 8, 3), np.uint8)).save(path)
 
 
 @pytest.fixture

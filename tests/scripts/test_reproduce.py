@@ -91,15 +91,6 @@ def first_of_sweep(word: str) -> str:
     return word.split(",")[0] if word.startswith(swept) else word
 
 
-@pytest.mark.parametrize(("command", "device"), [("cpu", "cpu"), ("gpu", "cuda")])
-def test_the_training_speed_is_measured_first(tmp_path, command, device):
-    _, [first_call, *_], _ = reproduce(tmp_path, command, **INPUTS)
-    assert first_call[:3] == ["-m", "benchmarks.training", "speed"]
-    options = dict(zip(first_call[3::2], first_call[4::2], strict=True))
-    assert options["--data"] == "cifar100.npz"
-    assert options["--device"] == device
-
-
 @pytest.mark.parametrize(
     ("command", "tables"),
     [

@@ -20,34 +20,20 @@ from renderer import export_mesh, save_light, solid
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import probe
 from renderer.light.lamps import Lamps
-from tests.helpers import save_colored_noise
+from tests.helpers import save_colored_noise, save_noise
 
 ROOT = Path(__file__).parents[2]
 MAX_SECONDS = 300  # A process that should end is killed after this time.
 RENDERER = ("renderer.rasterizer=numpy", "renderer.samples=1")
 TRAINING = (
-    "experiment=paper",
-    "data=npz",
-    "data.path=data.npz",
-    "data.validation=0.3",
-    "compare=[]",
-    "photos=photographs",
-    "model.depth=10",
-    "model.width=1",
-    "model.dropout=0.3",
-    "train.batch_size=16",
-    "train.precision=float32",
-    "train.device=cpu",
-    "train.threads=1",
-    "train.learning_rate=0.02",
-    "train.cache=null",
-    "augment.examples=4",
-    "augment.attack.max_steps=2",
-    "meshes=[mesh.obj]",
-    "scene.backgrounds=[0.2,0.8]",
-    *RENDERER,
+    *("experiment=paper", "data=npz", "data.path=data.npz", "data.validation=0.3", "compare=[]"),
+    *("photos=photographs", "model.depth=10", "model.width=1", "model.dropout=0.3"),
+    *("train.batch_size=16", "train.precision=float32", "train.device=cpu", "train.threads=1"),
+    *("train.learning_rate=0.02", "train.cache=null", "augment.examples=4"),
+    *("augment.attack.max_steps=2", "meshes=[mesh.obj]", "scene.backgrounds=[0.2,0.8]", *RENDERER),
 )
 
+PHOTOGRAPHS = ("photographs/orange", "photographs/apple", "photographs/other_tomato")
 Process = subprocess.Popen[str]
 
 
@@ -56,19 +42,11 @@ def write_data(folder: Path) -> None:
     rng = np.random.default_rng(0)
     # The accuracy changes for many epochs, because the contrast is so low.
     save_colored_noise(folder / "data.npz", rng, contrast=8)
-    write_images(folder / "images", ("apple", "orange"), rng)
-    write_images(folder / "photographs", ("orange", "apple", "other_tomato"), rng)
+    for name in ("images/apple", "images/orange", *PHOTOGRAPHS):
+        for number in range(3):
+            save_noise(folder / name / f"{number}.png", rng)
     write_sources(folder / "photographs")
     write_textured_mesh(folder)
-
-
-def write_images(folder: Path, classes: tuple[str, ...], rng: np.random.Generator) -> None:
-    """Write three images of noise of each class."""
-    for name in classes:
-        (folder / name).mkdir(parents=True)
-        for number in range(3):
-            pixels = rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)
-            Image.fromarray(pixels).save(folder / name / f"{number}.png")
 
 
 def write_sources(folder: Path) -> None:

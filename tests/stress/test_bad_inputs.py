@@ -335,10 +335,6 @@ end_header
 """
 LARGE = {"dtype": "F32", "shape": [10**13], "data_offsets": [0, 4]}
 DEEP = {"depth": 10**9, "width": 1, "dropout": 0, "classes": ["a"]}
-YAML_BOMB = "a: &a [1, 1, 1]\n" + "".join(
-    f"{letter}: &{letter} [{', '.join(9 * [f'*{before}'])}]\n"
-    for before, letter in zip("abcdefgh", "bcdefghi", strict=True)
-)
 FORGED: list[tuple[str, str, str | bytes | Callable[[Path], object]]] = [
     ("mesh.obj", "vertex 10¹²", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 1000000000000\n"),
     ("mesh.ply", "10¹² vertices", PLY.format(10**12, "0 0 0")),
@@ -372,7 +368,6 @@ FORGED: list[tuple[str, str, str | bytes | Callable[[Path], object]]] = [
         safetensors(__metadata__={"architecture": json.dumps(DEEP)}),
     ),
     ("finished/config.yaml", "code", f"a: !!python/object/apply:os.system ['touch {CODE_RAN}']\n"),
-    ("finished/config.yaml", "aliases of 9⁸ items", YAML_BOMB),
 ]
 INSTEAD: dict[str, Callable[[Path], object]] = {
     "a folder": Path.mkdir,

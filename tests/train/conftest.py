@@ -8,34 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from tests.helpers import save_colored_noise
+from tests.helpers import save_colored_noise, save_noise
 from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.run_config import write_config
 from train.settings import ExperimentSettings
 
 TINY = [
-    "data=npz",
-    "model.depth=10",
-    "model.width=1",
-    "model.dropout=0.3",
-    "train.epochs=3",
-    "train.batch_size=16",
-    "train.learning_rate=0.05",
-    "train.precision=float32",
-    "train.device=cpu",
-    "train.threads=1",
-    "photos=null",
+    *("data=npz", "model.depth=10", "model.width=1", "model.dropout=0.3", "train.epochs=3"),
+    *("train.batch_size=16", "train.learning_rate=0.05", "train.precision=float32"),
+    *("train.device=cpu", "train.threads=1", "photos=null"),
     "seed=7",  # The attack moves the lights in every epoch with this seed.
-    "augment.examples=4",
-    "augment.warm_start=true",
-    "augment.attack.max_steps=3",
-    "augment.attack.step_size=0.3",
-    "scene.backgrounds=[0.2,0.8]",
-    "renderer.rasterizer=numpy",
-    "renderer.samples=2",
+    *("augment.examples=4", "augment.warm_start=true", "augment.attack.max_steps=3"),
+    *("augment.attack.step_size=0.3", "scene.backgrounds=[0.2,0.8]"),
+    *("renderer.rasterizer=numpy", "renderer.samples=2"),
 ]
 
 
@@ -53,10 +40,8 @@ def photos(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("photos")
     rng = np.random.default_rng(1)
     for name, count in [("orange", 3), ("apple", 2), ("other_tomato", 2)]:
-        (folder / name).mkdir()
         for number in range(count):
-            pixels = rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)
-            Image.fromarray(pixels).save(folder / name / f"{number}.png")
+            save_noise(folder / name / f"{number}.png", rng)
     return folder
 
 

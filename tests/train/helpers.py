@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-import numpy as np
 import torch
-from PIL import Image
 
 from train.checkpoints import save
 from train.networks import WideResNet, describe
@@ -23,20 +21,8 @@ def save_untrained_network(folder: Path, size: int) -> None:
     save(folder / BEST, {"model": network.state_dict(), "architecture": architecture})
 
 
-def save_noise(path: Path, size: int, rng: np.random.Generator) -> None:
-    """Save a square image of noise, and create its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pixels = rng.integers(0, 256, (size, size, 3)).astype(np.uint8)
-    Image.fromarray(pixels).save(path)
-
-
 def read_markdown(text: str) -> dict[str, list[list[str]]]:
-    """Read the tables of a Markdown text.
-
-    Returns:
-        Rows of cells, the header first, by the heading or line before each
-        table. The key of a table without one is "".
-    """
+    """Read the rows of cells of each table by the heading or line before it, or by ""."""
     tables = {}
     title = ""
     for paragraph in text.split("\n\n"):

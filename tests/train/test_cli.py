@@ -31,6 +31,7 @@ SMALL = [
     *("augment.attack.max_steps=2", "scene.backgrounds=[0,1]", "renderer.rasterizer=numpy"),
     "renderer.samples=2",
 ]
+RESUME = "train.resume=true"
 
 
 @pytest.fixture
@@ -85,20 +86,30 @@ def test_a_training_of_two_methods_ends_with_their_table_and_records_its_command
         (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs the command sbatch"),
         (["--multirun", "seed=0,0"], "the sweep has two runs with the same settings"),
         (["--multirun", "out=a", "seed=0,1"], "out="),
+        (["out=empty", RESUME], "out=PATH/empty holds no run"),
+        (["out=nowhere", RESUME], "out=PATH/nowhere holds no run"),
+        ([RESUME], "out=PATH/runs/"),
+        (["out=attack", RESUME], "out=PATH/attack holds no run"),
+        (["out=damaged", RESUME], "PATH/damaged/config.yaml is damaged"),
     ],
-    ids=lambda given: given[-1] if isinstance(given, list) else "",
+    ids=str,
 )
 def test_a_mistake_is_an_error_in_one_line(call, capsys, monkeypatch, tmp_path, arguments, start):
     monkeypatch.setenv("PATH", str(tmp_path))
     (tmp_path / "file").touch()
-    (tmp_path / "odd" / "train.log").mkdir(parents=True)
+    for name in ("empty", "attack", "damaged", "odd/train.log"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "attack" / "config.yaml").write_text("label: orange\nattack: {}")
+    (tmp_path / "damaged" / "config.yaml").write_text("[")
+    unchanged = "*" if RESUME in arguments else "config.yaml"
+    before = sorted(tmp_path.rglob(unchanged))
     assert call("train", *arguments) == USER_ERROR
     error = capsys.readouterr().err.replace(str(tmp_path), "PATH")
     # A command that loads for seconds says so in a line before.
     lines = [line for line in error.splitlines() if not line.startswith("loading ")]
     assert len(lines) == 1
     assert lines[0].startswith(f"error: {start}")
-    assert not list(tmp_path.rglob("config.yaml"))
+    assert sorted(tmp_path.rglob(unchanged)) == before
 
 
 def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(
@@ -158,32 +169,6 @@ def test_a_stopped_run_is_resumed_by_its_folder_alone(
         assert resumed_state["epoch"] == 2
         assert content_hash(resumed_state["model"]) == content_hash(whole_state["model"])
         assert (stopped / method / "photographs" / "summary.json").is_file()
-
-
-@pytest.mark.parametrize(
-    ("overrides", "start"),
-    [
-        (["out=empty"], "out=empty holds no run"),
-        (["out=nowhere"], "out=nowhere holds no run"),
-        ([], "out=runs/"),
-        (["out=attack"], "out=attack holds no run"),
-        (["out=damaged"], "damaged/config.yaml is damaged"),
-    ],
-    ids=str,
-)
-def test_nothing_is_written_to_a_folder_without_a_run(call, capsys, tmp_path, overrides, start):
-    for name in ("empty", "attack", "damaged"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "attack" / "config.yaml").write_text("label: orange\nattack: {}")
-    (tmp_path / "damaged" / "config.yaml").write_text("[")
-    before = sorted(tmp_path.rglob("*"))
-    assert call("train", *overrides, "train.resume=true") == USER_ERROR
-    error = capsys.readouterr().err.replace(f"{tmp_path}/", "")
-    # A command that loads for seconds says so in a line before.
-    lines = [line for line in error.splitlines() if not line.startswith("loading ")]
-    assert len(lines) == 1
-    assert lines[0].startswith(f"error: {start}")
-    assert sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.parametrize(

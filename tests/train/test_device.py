@@ -48,18 +48,6 @@ def test_threads_are_no_more_than_the_containers_quota_of_cores(
         assert most_threads() == expected
 
 
-def test_threads_are_no_more_than_the_cores_that_the_process_is_bound_to(tmp_path, monkeypatch):
-    monkeypatch.setattr(device, "THREADS", 64)
-    monkeypatch.setattr(device, "QUOTA", tmp_path / "cpu.max")
-    before = os.sched_getaffinity(0)
-    try:
-        os.sched_setaffinity(0, {min(before)})
-        assert most_threads() == 1
-    finally:
-        os.sched_setaffinity(0, before)
-    assert most_threads() == len(before)
-
-
 def test_the_same_training_gets_the_same_threads_and_a_small_one_gets_one(monkeypatch):
     monkeypatch.setattr(device, "most_threads", lambda: 6)
     tiny = WideResNet(3, 10, 1, dropout=0.0)

@@ -142,17 +142,12 @@ def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of
 @pytest.mark.slow
 def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_path):
     """The command of the README; the second call goes on where SIGTERM stopped the first."""
-    small = [
-        *("model.depth=10", "model.width=1", "train.batch_size=16", "renderer.samples=2"),
-        "augment.examples=10",
-    ]
-    small += ["meshes=['solid:orange','solid:pear']", "hard_negatives=[]", "scene.views=1"]
-    data = ["data=npz", f"data.path={tiny_npz}", "photos=null", "compare=[]"]
     overrides = [
-        "experiment=paper",
-        *small,
-        *data,
-        *("train.device=cpu", "train.epochs=20", "train.checkpoint_every=1000"),
+        *("experiment=paper", "data=npz", f"data.path={tiny_npz}", "photos=null", "compare=[]"),
+        *("model.depth=10", "model.width=1", "train.batch_size=16", "renderer.samples=2"),
+        *("augment.examples=10", "scene.views=1", "hard_negatives=[]"),
+        *("meshes=['solid:orange','solid:pear']", "train.device=cpu", "train.epochs=20"),
+        "train.checkpoint_every=1000",
     ]
     start = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "-m", "train"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -195,14 +190,3 @@ def test_a_signal_is_noted_never_swallowed_and_hides_no_error(ended, expected):
             interruption.stop()
     assert ended != "asked" or stopped.value.code == 128 + signal.SIGINT
     assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)] == before
-
-
-def test_a_signal_that_is_ignored_stays_so():
-    """nohup ignores SIGHUP, and a shell ignores SIGINT in background processes."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with SignalHandler() as interruption:
-            signal.raise_signal(signal.SIGINT)
-            assert not interruption.requested()
-    finally:
-        signal.signal(signal.SIGINT, before)

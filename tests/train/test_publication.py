@@ -161,8 +161,3 @@ def test_the_results_are_those_of_the_page(name):
     assert errors.value == pytest.approx(float(false_positive_rate), abs=3e-3)
     assert results["photographs/recall"].value == pytest.approx(float(recall), abs=5e-3)
     assert results["photographs/auc"].value == pytest.approx(float(auc.split()[0]), abs=1e-3)
-
-
-def test_an_unknown_name_is_refused_with_the_known_ones():
-    with pytest.raises(nb.InputError, match="adversarial, best, none, random"):
-        nb.load("bset")

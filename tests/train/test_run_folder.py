@@ -70,14 +70,10 @@ def test_a_damaged_file_is_one_sentence_that_names_it(tmp_path, file, content):
 
 
 def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
-    here, there = (
-        decisive_settings(tiny("photos=${out}/images", *overrides))
-        for overrides in (
-            ["out=here"],
-            ["out=there/a", "sweep=x", "train.resume=true", "train.cache=null"],
-        )
-    )
-    assert here == there
+    photos = "photos=${out}/images"
+    here = decisive_settings(tiny(photos, "out=here"))
+    elsewhere = ("out=there/a", "sweep=x", "train.resume=true", "train.cache=null")
+    assert decisive_settings(tiny(photos, *elsewhere)) == here
     assert here["photos"] == "<run>/images"
     assert here["augment.attack.max_steps"] == 3
 

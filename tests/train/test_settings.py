@@ -58,13 +58,6 @@ def attacked_parameters(*overrides: str) -> dict:
     return train_command.read(overrides).augment.attack.parameters
 
 
-def test_training_attacks_the_lighting_by_default():
-    parameters = attacked_parameters("augment.attack.step=sign", "augment.attack.step_size=0.1")
-    assert list(parameters) == ["lighting"]
-    assert parameters["lighting"].step == "sign"
-    assert parameters["lighting"].step_size == 0.1
-
-
 def test_training_takes_the_parameters_of_the_attack_command():
     expected = attack_command.read(["attack=[geometry,lighting]"]).attack.parameters
     assert attacked_parameters("attack@augment.attack=[geometry,lighting]") == expected
@@ -77,15 +70,11 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["data=npz", "data.pth=x"], "data.pth is not a setting: did you mean data.path?"),
         (["data=mnist"], "data=mnist is not a choice"),
         (["attack@augment.attack=[lightning]"], "attack=lightning is not a choice"),
-        (["meshes=[~/a.obj]"], "LexerNoViableAltException: meshes=[~/a.obj]"),
-        (["seed=0,1"], "Ambiguous value for argument 'seed=0,1'"),
         (["~seed"], "~seed: a setting cannot be removed"),
         (["out="], "out is empty"),
         (["data=npz"], "data.path is not set"),
-        (["train=3"], "train: "),
         (["train.epochs=abc"], "train.epochs: Value 'abc'"),
         (["scene.ground=[a]"], "scene.ground[0]"),
-        (["compare=[[none]]"], "compare is"),
         (["scene.meshes=[a]"], "scene.meshes is not a setting: did you mean meshes?"),
         (["seed=-1"], "seed=-1 must be at least 0"),
         (["augment.attack.geometry.radius=1"], "augment.attack.geometry is null"),
@@ -95,7 +84,6 @@ def test_training_takes_the_parameters_of_the_attack_command():
         ),
         (["attack@augment.attack=[pose]"], "renderer.silhouettes=false"),
         (["scene.projector.pixels=abc"], "scene.projector.pixels is 'abc'"),
-        (["scene.projector={pixls: 8}"], "scene.projector.pixls is not a setting"),
         (["photos={renders: /x}"], "photos has the name 'renders'"),
         (["augment=folder"], "augment.folder is None"),
     ],
@@ -123,12 +111,8 @@ def test_a_part_of_a_projector_is_set_alone_or_in_a_mapping():
     assert parts.scene.projector == whole.scene.projector
 
 
-TWO_CLASSES = [
-    "label=[orange,pear]",
-    "meshes=['solid:orange','solid:pear']",
-    "scene.views=1",
-    "augment.examples=null",
-]
+TWO_CLASSES = ["label=[orange,pear]", "meshes=['solid:orange','solid:pear']"]
+TWO_CLASSES += ["scene.views=1", "augment.examples=null"]
 
 
 @pytest.mark.parametrize(
@@ -140,12 +124,7 @@ TWO_CLASSES = [
             ["hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
             "hard_negatives[0] is solid:orange, which is of the positive class orange",
         ),
-        (
-            ["hard_negatives=[{mesh: 'solid:lemon', label: 1}]", "augment.examples=6"],
-            "hard_negatives[0]",
-        ),
         (["hard_negatives=[a/Orange.glb]", "augment.examples=6"], "hard_negatives[0]"),
-        (["hard_negatives=[{mesh: 'solid:orange'}]", "augment.examples=6"], "positive class"),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["label=null"], "label is not set: set it to the class of the meshes, one of the 3 class"),
         (["label=ornage"], "'ornage' is not a class of the model"),
@@ -153,14 +132,6 @@ TWO_CLASSES = [
         ([*TWO_CLASSES, "label=[orange,pear,orange]"], "a list of several, each once"),
         (["label=[orange,apple]"], "label=['orange', 'apple'] has no mesh of apple"),
         ([*TWO_CLASSES, "meshes=[a.glb,'solid:pear']"], "meshes[0] has no class"),
-        (
-            [
-                *TWO_CLASSES,
-                "label=[orange,pear,apple]",
-                "hard_negatives=['solid:fruit','solid:apple']",
-            ],
-            "label=['orange', 'pear', 'apple'] has no mesh of apple",
-        ),
         (
             [
                 *TWO_CLASSES,

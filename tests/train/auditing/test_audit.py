@@ -16,6 +16,7 @@ from augment.scene.objects import Conditions, load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.light.files import load_light
+from tests.helpers import darker_than
 from train.auditing import audit, lights
 from train.auditing.audit import run_audit
 from train.auditing.lights import (
@@ -33,16 +34,6 @@ from train.results.tables import fraction
 from train.settings import LABORATORY
 
 CLASSES = ("orange", "other")
-
-
-def darker_than(limit: float, size: int = 8) -> augment.Classifier:
-    """Make a classifier that takes images darker than a limit on average for an orange."""
-
-    def logits(images: torch.Tensor) -> torch.Tensor:
-        excess = 100 * (images.mean((1, 2, 3)) - limit)
-        return torch.stack([-excess, excess], dim=1)
-
-    return augment.Classifier(logits, size, CLASSES, f"darker than {limit}")
 
 
 def guessing() -> augment.Classifier:
@@ -119,19 +110,6 @@ def test_views_that_are_recognized_as_they_are_stay_so(views):
     plain = find_plain_views(darker_than(1.0), views)
     assert plain.recognized == plain.recognized_as_given == views.count
     assert plain.apply_to(views) == views
-
-
-def test_a_classifier_that_recognizes_nothing_is_not_attacked_with_success(
-    views, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(lights, "STEPS", 3)
-    monkeypatch.setattr(lights, "SIZES", (1.0,))
-    monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(10.0,)))
-    blind = darker_than(-1.0)
-    assert find_plain_views(blind, views).recognized == 0
-    counts = success_by_light(blind, views, "lamps", tmp_path)
-    assert counts["correct"] == 0
-    assert counts["adversarial"] == [0]
 
 
 @pytest.fixture

@@ -13,7 +13,6 @@ from PIL import Image
 
 from renderer.io.meshes import load_mesh
 from renderer.light.files import load_light
-from train.cli import USER_ERROR
 
 PRETRAINED = Path(__file__).parents[3] / "pretrained"
 SMALL = [
@@ -173,28 +172,3 @@ def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_othe
     for line in (own, still, same):
         assert line["predicted"] == predicted
         assert line["hits"] == line["n"] == len(predicted)
-
-
-MISTAKES = [
-    (["network=resnet18"], "network=resnet18"),
-    (["transfer.networks=[resnet18]"], "transfer.networks=resnet18"),
-    (["transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "'paer' is not a class"),
-    (["attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry"),
-    (["attack=pixels", "transfer.azimuths=[3]"], "azimuths: attacked pixels"),
-    (["attack=[]"], "attack: "),
-    (["attack=lighting+skylight"], "lighting and skylight"),
-    (["reload=absent"], "absent/adversary.json does not exist"),
-]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"), MISTAKES, ids=[" ".join(arguments) for arguments, _ in MISTAKES]
-)
-def test_a_mistake_is_an_error_in_one_line(run, tmp_path, capsys, arguments, message):
-    assert run(*arguments) == USER_ERROR
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.startswith("error: ")
-    assert printed.err.count("\n") == 1
-    assert message in printed.err
-    assert not (tmp_path / "out").exists()

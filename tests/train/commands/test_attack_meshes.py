@@ -21,13 +21,8 @@ from train.commands.attack import attacks, overrides
 
 def configured(*arguments: str) -> AttackExperimentSettings:
     """Read the real configuration with small sizes and additional overrides."""
-    small = [
-        "renderer.rasterizer=numpy",
-        "renderer.shadows=false",
-        "attack.max_steps=8",
-        "attack.margin=0",
-    ]
-    return attack_command.read([*small, *arguments])
+    small = ["renderer.rasterizer=numpy", "renderer.shadows=false", "attack.max_steps=8"]
+    return attack_command.read([*small, "attack.margin=0", *arguments])
 
 
 def by_color(classes: tuple[str, ...] = ("orange", "lime", "sky")) -> Classifier:
@@ -42,14 +37,8 @@ def attacked(*arguments: str, classifier: Classifier | None = None) -> AttackRes
 
 
 def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
-    result = attacked(
-        "scene.views=3",
-        "scene.backgrounds=[0.2,0.6]",
-        "scene.polar=90",
-        "scene.azimuth=30",
-        "attack.allow_negative=true",
-        "attack.max_steps=0",
-    )
+    scene = "scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "scene.azimuth=30"
+    result = attacked(*scene, "attack.allow_negative=true", "attack.max_steps=0")
     cameras = []
     for camera in orbit_cameras(3, 2.0, 90.0, 30.0):
         cameras += [(camera,), (camera,)]
@@ -117,15 +106,9 @@ def test_a_rasterizer_that_does_not_start_is_an_error_of_its_key(monkeypatch, ti
         (["attack.restarts=2"], "restarts draws from the norm-balls"),
         (["target=[lime]", "scene.views=2", "attack.shared=true"], "names 1 classes for 2 views"),
         (["meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"meshes\[0\]"),
-        (
-            ["meshes=[{mesh: a, props: [solid:cup]}]"],
-            r"^meshes\[0\]\.props\[0\] is 'solid:cup'",
-        ),
+        (["meshes=[{mesh: a, props: [solid:cup]}]"], r"^meshes\[0\]\.props\[0\] is 'solid:cup'"),
         (["meshes=[{mesh: a, props: [{mesh: b}]}]"], r"meshes\[0\].*at is not set"),
-        (
-            ["meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"],
-            r"props\[0\]\.at=\[1\]: give 2 numbers",
-        ),
+        (["meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"], r"props\[0\]\.at=\[1\]"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

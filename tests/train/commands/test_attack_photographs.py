@@ -10,7 +10,7 @@ from PIL import Image
 from renderer.errors import InputError
 from scripts.attack import list_parameters
 from scripts.attack import main as attack
-from tests.helpers import bright_or_dark
+from tests.helpers import bright_or_dark, save_noise
 from train.auditing.relit import PICTURE_COUNT, read_relit
 from train.commands.attack import run
 from train.results.predictions import RELIT
@@ -28,9 +28,7 @@ def photographs(tmp_path_factory):
     rng = np.random.default_rng(0)
     for index in range(12):
         path = folder / f"part_{index % 2}" / f"{index}.png"
-        path.parent.mkdir(exist_ok=True)
-        pixels = rng.integers(0, 2 * (20 + 2 * index), (20, 24, 3))
-        Image.fromarray(pixels.astype(np.uint8)).save(path)
+        save_noise(path, rng, high=2 * (20 + 2 * index))
     return folder
 
 
@@ -93,8 +91,3 @@ def test_pictures_show_the_photograph_and_its_lights(out, photographs):
 def test_relighting_needs_photographs_alone(words):
     with pytest.raises(InputError, match="relighting"):
         settings_of(*words)
-
-
-def test_earlier_results_are_not_replaced(out, photographs):
-    with pytest.raises(InputError, match="overwrite"):
-        run(settings_of("attack=relighting", f"unlabeled={photographs}", f"out={out}"))

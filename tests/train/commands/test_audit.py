@@ -72,13 +72,6 @@ def test_nothing_is_written_without_a_folder(options, tmp_path, monkeypatch):
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_hard_negative_of_the_class_itself_is_refused(options):
-    negatives = ["solid:apple", "solid:orange:1"]
-    options |= {"laboratory": None}
-    with pytest.raises(nb.InputError, match=r"hard_negatives\[1\]"):
-        nb.audit(Brightness().eval(), ["solid:orange"], hard_negatives=negatives, **options)
-
-
 def counts_of(report: nb.AuditReport) -> tuple:
     """Return the numbers of the attack of an audit."""
     attack = report.network.attacks["lighting"]

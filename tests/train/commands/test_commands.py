@@ -12,11 +12,11 @@ import torch
 import renderer
 from renderer.errors import InputError
 from renderer.io.images import read_image
-from tests.train.helpers import save_noise, save_untrained_network
+from tests.helpers import save_noise
+from tests.train.helpers import save_untrained_network
 from train import console
 from train.checkpoints import load_run
 from train.cli import USER_ERROR
-from train.command_settings import LabSettings
 from train.commands.experiment import logged_to
 from train.commands.fit import grab_cut
 from train.results.store import trained_labels
@@ -24,6 +24,7 @@ from train.run_folder import LOCK, sole_writer
 
 EVALUATE = ["evaluate", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
 EVALUATE_CLASSIFIER = [*EVALUATE, "run=null"]
+ATTACK = ["attack", "network=run:pretrained/none", "device=cpu", "renderer.rasterizer=numpy"]
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def here(tmp_path) -> Path:
     save_untrained_network(tmp_path / "1.10", size=64)
     rng = np.random.default_rng(0)
     for name in ("orange", "other_\udcff"):
-        save_noise(tmp_path / "2024" / name / "a.png", 64, rng)
+        save_noise(tmp_path / "2024" / name / "a.png", rng, (64, 64))
     (tmp_path / "file").touch()
     return tmp_path
 
@@ -64,7 +65,7 @@ class TestEvaluationWithoutALabel:
     """60 bottles in a folder without class folders were scored as oranges."""
 
     def test_needs_one_for_a_folder_without_class_folders(self, call, here, capsys):
-        save_noise(here / "bottles" / "a.png", 64, np.random.default_rng(0))
+        save_noise(here / "bottles" / "a.png", np.random.default_rng(0), (64, 64))
         words = [*EVALUATE[:2], "photos=bottles", *EVALUATE[3:]]
         assert call(*words) == USER_ERROR
         assert "give classes or label" in capsys.readouterr().err
@@ -75,7 +76,7 @@ class TestEvaluationWithoutALabel:
     def test_takes_the_class_of_the_run_or_else_those_with_a_folder(
         self, call, here, capsys, monkeypatch, recorded
     ):
-        save_noise(here / "2024" / "fig" / "a.png", 64, np.random.default_rng(0))
+        save_noise(here / "2024" / "fig" / "a.png", np.random.default_rng(0), (64, 64))
         if recorded:
             monkeypatch.setattr("train.commands.evaluate.trained_labels", lambda run: ["orange"])
         assert call(*EVALUATE, "out=scores") == 0
@@ -89,13 +90,6 @@ class TestEvaluationWithoutALabel:
 )
 def test_published_networks_record_what_they_were_trained_for(name, labels):
     assert trained_labels(Path("pretrained", name)) == labels
-
-
-def test_a_laboratory_of_other_meshes_needs_a_label():
-    assert LabSettings(out="lab").label == "orange"
-    assert LabSettings(out="lab", meshes=["can.glb"], label="can").label == "can"
-    with pytest.raises(InputError, match=r"^label is not set"):
-        LabSettings(out="lab", meshes=["can.glb"])
 
 
 MISTAKES = [
@@ -114,20 +108,28 @@ MISTAKES = [
     (["compare", "runs=[2024]"], "runs: 2024 holds no run"),
     (["compare", "--multirun"], "--multirun"),
     (["lab", "out=file/out"], "out=file/out"),
+    (["attack", "network=resnet18"], "network=resnet18"),
+    ([*ATTACK, "transfer.networks=[resnet18]"], "transfer.networks=resnet18"),
+    ([*ATTACK, "transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "'paer' is not a class"),
+    ([*ATTACK, "attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry"),
+    ([*ATTACK, "attack=pixels", "transfer.azimuths=[3]"], "azimuths: attacked pixels"),
+    ([*ATTACK, "attack=[]"], "attack: "),
+    ([*ATTACK, "attack=lighting+skylight"], "lighting and skylight"),
+    ([*ATTACK, "reload=absent"], "absent/adversary.json does not exist"),
 ]
 
 
 @pytest.mark.parametrize(
-    ("command", "start"), MISTAKES, ids=[" ".join([c[0], *c[-2:]]) for c, _ in MISTAKES]
+    ("command", "message"), MISTAKES, ids=[" ".join([c[0], *c[-2:]]) for c, _ in MISTAKES]
 )
 def test_a_mistake_is_an_error_in_one_line_before_anything_is_written(
-    call, here, capsys, command, start
+    call, here, capsys, command, message
 ):
     before = sorted(here.rglob("*"))
     assert call(*command) == USER_ERROR
     printed = capsys.readouterr()
     assert printed.out == ""
-    assert printed.err.startswith(f"error: {start}")
+    assert printed.err.startswith("error: ") and message in printed.err
     assert printed.err.count("\n") == 1
     assert sorted(here.rglob("*")) == before
 

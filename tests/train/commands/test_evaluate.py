@@ -73,8 +73,3 @@ def test_files_are_written_only_if_a_folder_is_given_and_the_network_is_left_as_
     assert network.weight.requires_grad and not network.training
     nb.evaluate(network, photographs, out="scores", **OPTIONS)
     assert (tmp_path / "scores" / "summary.json").is_file()
-
-
-def test_folders_of_other_names_than_the_classes_are_explained(photographs):
-    with pytest.raises(nb.InputError, match="classes"):
-        nb.evaluate(Brightness().eval(), photographs, size=SIZE, value_range=(0, 255))

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from PIL import Image
 from torch import nn
 
 import norm_balls as nb
 from augment.classifier import OperatingPoint
+from tests.helpers import save_noise
 from tests.runs import completed_run
 from train.__main__ import main
 
@@ -53,13 +53,10 @@ def network() -> nn.Sequential:
 @pytest.fixture
 def photographs(tmp_path) -> Path:
     """Write 20 images of noise, and return their folder."""
-    folder = tmp_path / "photographs"
-    folder.mkdir()
-    draws = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     for index in range(20):
-        pixels = draws.integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{index}.png")
-    return folder
+        save_noise(tmp_path / "photographs" / f"{index}.png", rng, (SIZE, SIZE))
+    return tmp_path / "photographs"
 
 
 def harden(

@@ -2,40 +2,81 @@
 
 import argparse
 import json
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
 from PIL import Image
-from torch import nn
+from torch import Tensor, nn
 from torchvision.models import mobilenet_v3_small
 
 import augment
 from renderer.errors import InputError
 from renderer.image import to_bytes
 from tests.runs import completed_run
-from tests.train.own_networks import (
-    CLASSES,
-    MEAN,
-    NAME,
-    SIZE,
-    STD,
-    renders,
-    trained_network,
-    trained_weights,
-)
 from train.__main__ import main as train_command
 from train.checkpoints import load_run
 from train.networks import build_network
 from train.training.inputs import load_initial
 from train.training.run import _network_shape
 
+NAME = "mobilenet_v3_small"
+SIZE = 32
+CLASSES = (
+    *("Apple", "ball", "bottle", "cup", "lemon", "mushroom", "Orange", "pear", "plate"),
+    "Sweet pepper",
+)
+MEAN = torch.tensor((0.485, 0.456, 0.406)).view(3, 1, 1)
+STD = torch.tensor((0.229, 0.224, 0.225)).view(3, 1, 1)
 OWN = [
     *(f"network=torchvision:{NAME}", "weights=mine.pth", "classes=classes.txt", f"size={SIZE}"),
     "device=cpu",
 ]
 # Sums of some thousand products in another order.
 ROUNDING = {"rtol": 1e-4, "atol": 1e-4}
+
+
+@cache
+def renders() -> Tensor:
+    """Return an image of each class in uniform light, shape (10, 3, 32, 32)."""
+    images = []
+    for name in CLASSES:
+        item = (f"solid:{name.lower().replace(' ', '_')}:0", name)
+        scene = augment.build_scene([item], SIZE, samples=1)
+        example = torch.arange(1)
+        images.append(scene.render(scene.conditions(example), example)[0])
+    return torch.cat(images)
+
+
+@cache
+def trained_weights() -> dict[str, Tensor]:
+    """Fit the last layer of a network of torchvision to the images; return its state dict.
+
+    The other layers are random. The logits of an image are 10 for its class, and otherwise 0.
+    """
+    torch.manual_seed(0)
+    network = mobilenet_v3_small(num_classes=len(CLASSES))
+    images = (renders() - MEAN) / STD
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.momentum = None  # The statistics are those of the images.
+    with torch.no_grad():
+        network(images)
+        features = network.eval().features(images).mean((2, 3))
+        hidden = network.classifier[:3](features).double()
+        ones = torch.ones(len(images), 1)
+        weights = torch.linalg.pinv(torch.cat([hidden, ones], dim=1)).T * 10
+        network.classifier[3].weight.copy_(weights[:, :-1])
+        network.classifier[3].bias.copy_(weights[:, -1])
+    return network.state_dict()
+
+
+def trained_network() -> nn.Module:
+    """Return the trained network in evaluation mode. It takes normalized images."""
+    network = mobilenet_v3_small(num_classes=len(CLASSES))
+    network.load_state_dict(trained_weights())
+    return network.eval()
 
 
 @pytest.fixture
@@ -50,7 +91,7 @@ def here(tmp_path) -> Path:
     return tmp_path
 
 
-def normalized_logits(network: nn.Module, images: torch.Tensor) -> torch.Tensor:
+def normalized_logits(network: nn.Module, images: Tensor) -> Tensor:
     with torch.no_grad():
         return network.eval()((images - MEAN) / STD)
 
@@ -73,10 +114,8 @@ def test_a_state_dict_of_ten_classes_gives_the_networks_own_logits(here):
     "wrap",
     [
         lambda state: {"state_dict": state, "epoch": 3, "optimizer": {"state": {}}},
-        lambda state: {
-            "model": state,
-            "args": argparse.Namespace(batch_size=32),
-        },  # The training scripts of torchvision save such a file.
+        # The training scripts of torchvision save such a file.
+        lambda state: {"model": state, "args": argparse.Namespace(batch_size=32)},
         lambda state: {f"module.{key}": value for key, value in state.items()},
         lambda state: {
             "model_state_dict": {f"module._orig_mod.{key}": value for key, value in state.items()}
@@ -112,13 +151,9 @@ def test_names_and_weights_of_different_numbers_of_classes_are_counted_in_the_er
 
 def test_an_attack_finds_the_class_by_its_name_or_index(call, here):
     for label in ("Orange", CLASSES.index("Orange")):
-        words = [
-            f"label={label}",
-            "attack.max_steps=1",
-            "attack.checks=false",
-            "attack.verify=null",
-        ]
+        words = [f"label={label}", "attack.max_steps=1", "attack.checks=false"]
         scene = ["meshes=solid:orange:0", "renderer.shadows=false", f"out={label}"]
+        scene.append("attack.verify=null")
         assert call("attack", *OWN, *words, *scene) == 0
         (line,) = (here / str(label) / "0_solid_orange_0" / "attack.jsonl").read_text().splitlines()
         assert json.loads(line)["label"] == ["Orange"]

@@ -16,7 +16,7 @@ from augment.scene import patterns
 from augment.scene.patterns import LAB_PATTERNS, draw_lab_pattern
 from renderer.errors import InputError
 from renderer.mesh import Mesh
-from renderer.solids import HARD_NEGATIVES, SOLIDS, solid
+from renderer.solids import SOLIDS, solid
 from train.command_settings import LabSettings
 from train.data.photographs import find_photographs, load_photographs
 from train.laboratory import laboratory as lab
@@ -114,13 +114,6 @@ def test_each_setup_shows_an_object_of_each_of_several_classes_and_one_other(tmp
     for setup in ("0", "1"):
         shown = [Path(row["path"]) for row in rows(tmp_path) if row["setup"] == setup]
         assert sorted(path.parent.name for path in shown) == ["orange", "other_lemon", "pear"]
-
-
-@pytest.mark.parametrize("name", ["orange", "pear", *HARD_NEGATIVES])
-def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_another_thing(name):
-    expected = name if name in SOLIDS else f"other_{name}"
-    label, *_ = lab.read_subject(f"solid:{name}:1", 0)
-    assert label == expected
 
 
 @pytest.mark.parametrize(

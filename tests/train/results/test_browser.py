@@ -5,10 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from PIL import Image
 
-import augment
+from tests.helpers import darker_than
 from train.auditing import audit, lights
 from train.auditing.audit import run_audit
 from train.command_settings import AuditSettings
@@ -50,16 +49,6 @@ LOWEST_CONTRAST = """([needed, neededIfLarge]) => {
 }"""
 
 
-def darker_than(limit: float, name: str) -> augment.Classifier:
-    """Make a classifier that takes images darker than a limit on average for an orange."""
-
-    def logits(images: torch.Tensor) -> torch.Tensor:
-        excess = 20 * (images.mean((1, 2, 3)) - limit)
-        return torch.stack([-excess, excess], dim=1)
-
-    return augment.Classifier(logits, 8, CLASSES, name)
-
-
 @pytest.fixture(scope="module")
 def page(tmp_path_factory) -> Path:
     """Audit two classifiers with light from all around alone, on four images."""
@@ -78,8 +67,8 @@ def page(tmp_path_factory) -> Path:
         out=str(folder / "out"),
     )
     networks = {
-        "classifier": darker_than(0.52, "original"),
-        "hardened": darker_than(0.45, "hardened"),
+        "classifier": darker_than(0.52, name="original", scale=20),
+        "hardened": darker_than(0.45, name="hardened", scale=20),
     }
     kind = lights.KINDS["lighting"]._replace(radii=(0.1, 3.0))
     with pytest.MonkeyPatch.context() as patch:

@@ -213,16 +213,6 @@ def draw_ranks(seed: int) -> tuple[list[str], np.ndarray]:
     return names.tolist(), generator.integers(1, 9, 60)
 
 
-def test_means_over_classes_are_the_mean_of_the_means():
-    names, ranks = draw_ranks(0)
-    means = []
-    for name in sorted({*names}):
-        own_ranks = [rank for other, rank in zip(names, ranks, strict=True) if other == name]
-        means.append(sum(rank == 1 for rank in own_ranks) / len(own_ranks))
-    ((value,),) = class_means(ranks[None] == 1, names, np.ones((1, 60)))
-    assert value == pytest.approx(np.mean(means))
-
-
 def test_means_over_drawn_classes_count_repeated_images():
     names, ranks = draw_ranks(1)
     hits = np.stack([ranks <= 1, ranks <= 5])

@@ -15,22 +15,10 @@ import pytest
 
 ROOT = Path(__file__).parents[3]
 PAGES = (
-    "index",
-    "quickstart",
-    "guide",
-    "tour",
-    "networks",
-    "conventions",
-    "results",
-    "accuracy-and-speed",
-    "changelog",
-    "contributing",
-    "auto_gallery/index",
-    "auto_gallery/attacks/lighting",
-    "api/index",
-    "api/rendering",
-    "api/generated/norm_balls.render",
-    "api/generated/norm_balls.AttackSettings",
+    *("index", "quickstart", "guide", "tour", "networks", "conventions", "results"),
+    *("accuracy-and-speed", "changelog", "contributing", "auto_gallery/index"),
+    *("auto_gallery/attacks/lighting", "api/index", "api/rendering"),
+    *("api/generated/norm_balls.render", "api/generated/norm_balls.AttackSettings"),
 )
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from PIL import Image
 from torch import Tensor, nn
 from torchvision.models import get_model
 
@@ -15,6 +14,7 @@ from augment.network import normalize_light
 from augment.settings import NormalizedLightSettings
 from augment.sources import load_classifier
 from renderer.errors import InputError
+from tests.helpers import save_noise
 from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.checkpoints import load_run
@@ -50,11 +50,9 @@ def photos(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("photos")
     rng = np.random.default_rng(0)
     for name in ("orange", "lemon"):
-        (folder / name).mkdir()
         for number in range(16):
-            brightness = 150 * (number % 2)
-            pixels = rng.integers(0, 100, (40, 36, 3)) + brightness
-            Image.fromarray(pixels.astype(np.uint8)).save(folder / name / f"{number}.png")
+            dark = 150 * (number % 2)
+            save_noise(folder / name / f"{number}.png", rng, (40, 36), dark, dark + 100)
     return folder
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from augment.random_streams import generator
 from renderer.image import to_unit
+from tests.helpers import save_noise
 from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.checkpoints import load
@@ -33,8 +33,8 @@ def photographs(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("photographs")
     rng = np.random.default_rng(0)
     for number in range(24):
-        pixels = rng.integers(0, 100, (40, 36, 3)) + 150 * (number % 2)
-        Image.fromarray(pixels.astype(np.uint8)).save(folder / f"{number}.png")
+        dark = 150 * (number % 2)
+        save_noise(folder / f"{number}.png", rng, (40, 36), dark, dark + 100)
     return folder
 
 

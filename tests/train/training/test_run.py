@@ -164,14 +164,6 @@ def test_a_second_signal_acts_at_once(tiny, tmp_path, monkeypatch):
     assert not checkpoints.exists(tmp_path)
 
 
-def test_a_run_scores_the_network_in_memory_and_reads_no_checkpoint_back(
-    tiny, tmp_path, monkeypatch
-):
-    run = loaded_run(tiny(*WITHOUT_RENDERS), tmp_path)
-    monkeypatch.setattr(checkpoints, "load", Mock(side_effect=AssertionError))
-    assert run.train()["test/epoch"] == 1
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
