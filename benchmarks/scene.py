@@ -24,7 +24,7 @@ from renderer.light.basis import DEGREE, Harmonics
 from renderer.light.files import probe
 from renderer.light.harmonics import basis
 from renderer.mesh import Mesh
-from renderer.mitsuba_scene import DIFFERENTIABLE, load, mitsuba, mitsuba_map, shape
+from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
@@ -373,7 +373,7 @@ class MitsubaStep:
     """
 
     def __init__(self, view: View, parameter: str):
-        with mitsuba(DIFFERENTIABLE) as module:
+        with mitsuba("llvm_ad_rgb") as module:
             import drjit
         drjit.set_thread_count(1)
         self.drjit = drjit

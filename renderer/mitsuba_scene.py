@@ -55,8 +55,6 @@ SAMPLES = 256
 # Default variant of Mitsuba. It does not need the library
 # LLVM, and renders the same bits with any number of threads.
 VARIANT = "scalar_rgb"
-# Variant of Mitsuba that computes gradients. It needs the library LLVM.
-DIFFERENTIABLE = "llvm_ad_rgb"
 # XML tag in a Mitsuba scene file for a value of each Python type.
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}
 # Types of objects in a Mitsuba scene file, such as an envmap, by their XML tag.

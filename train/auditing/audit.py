@@ -224,7 +224,10 @@ class _Plan:
         searched = (networks[CLASSIFIER], self.attacked_views)
         _write_json(path, lambda: asdict(lights.find_plain_views(*searched)))
         plain = lights.PlainViews(**read_json(path))
-        views, attacked_views = map(plain.apply_to, (self.views, self.attacked_views))
+        views, attacked_views = (
+            replace(views, light=plain.light, exposure=plain.exposure, size=plain.size)
+            for views in (self.views, self.attacked_views)
+        )
         environments = (views, self.environments, self.random_light_count)
         for key, network in networks.items():
             results = out / key

@@ -403,10 +403,6 @@ class PlainViews:
     n: int
     recognized_as_given: int
 
-    def apply_to(self, views: Views) -> Views:
-        """Return a copy of views with the light, the exposure and the size of this result."""
-        return replace(views, light=self.light, exposure=self.exposure, size=self.size)
-
 
 def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
     """Find the plain light, exposure and size at which a classifier recognizes most views.

@@ -78,7 +78,10 @@ def fit(settings: FitSettings) -> None:
     write_image(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
     # The three channels of the mask are equal, so the first one is enough.
     is_object = read_image(out / "mask.png", ATTACKED_SIZE)[0] > MIN_COVERAGE
-    error = relative_error(rendered[:, is_object], photograph[:, is_object], settings.encoding)
+    # Relative root mean square error in linear RGB.
+    linear = decode(photograph[:, is_object].double(), settings.encoding)
+    difference = decode(rendered[:, is_object].double(), settings.encoding) - linear
+    error = float(difference.norm() / linear.norm())
     overlap = found.scene.overlap
     print(f"outlines overlap by {overlap:.1%}; the object's pixels differ by {error:.1%}")
     if overlap < MIN_OVERLAP or error > MAX_ERROR:
@@ -131,18 +134,6 @@ def render_attacked(
     images = shown.render(shown.conditions(first_example), first_example)
     # `images` has one example and one view, shape (1, 1, 3, size, size).
     return shown.backgrounds[0], images[0, 0]
-
-
-def relative_error(
-    rendered: Float[torch.Tensor, "3 N"], photograph: Float[torch.Tensor, "3 N"], encoding: str
-) -> float:
-    """Compute the relative root mean square error of rendered pixels, in linear RGB.
-
-    It is RMS(rendered - photograph) / RMS(photograph) after decoding ("srgb" or "linear").
-    """
-    expected = decode(photograph.double(), encoding)
-    difference = decode(rendered.double(), encoding) - expected
-    return float(difference.norm() / expected.norm())
 
 
 def read_file(path: str) -> UInt8[np.ndarray, "H W 3"]:

@@ -260,7 +260,8 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
             f"{mean('test/accuracy'):.1%} on {images}."
         )
         is_rendered = OmegaConf.select(runs[0].config, "data.name") == "shapes"
-        if is_rendered and not any(map(_is_scored_on_photographs, runs)):
+        folders = [images_folder(run, name) for run in runs for name in run.photographs]
+        if is_rendered and all(folder and first_screen.is_laboratory(folder) for folder in folders):
             sentence += (
                 " These are renders. No photographs were scored (setting photos), so the "
                 "price on photographs is unknown."
@@ -274,12 +275,6 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
             f"and {mean('test/relit_agreement_before'):.1%} before."
         )
     return sentences
-
-
-def _is_scored_on_photographs(run: RunSummary) -> bool:
-    """Return whether a run has scores on other images than renders of pnb-lab."""
-    folders = [images_folder(run, name) for name in run.photographs]
-    return any(folder is None or not first_screen.is_laboratory(folder) for folder in folders)
 
 
 def _first_screen(groups: Mapping[str, Scored]) -> first_screen.FirstScreen | None:
