@@ -251,7 +251,7 @@ def checks_architecture(path: Path) -> Iterator[None]:
         reason = textwrap.shorten(single_line(error), LONGEST_REASON)
         raise InputError(
             f"checkpoint {path} is from another architecture ({reason}): "
-            "use the model settings of the training run that wrote the checkpoint",
+            "use the model settings of the training run that wrote the checkpoint"
         ) from error
 
 

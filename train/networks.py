@@ -240,11 +240,7 @@ def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Mo
 
 
 def describe(
-    network: nn.Module,
-    classes: Sequence[str],
-    size: int,
-    encoding: str,
-    **shape: Any,
+    network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any
 ) -> dict[str, Any]:
     """Describe a network by the arguments with which `build_network` builds it again.
 

@@ -171,9 +171,7 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
 
 
 def require_same_run(
-    folder: Path,
-    settings: ExperimentSettings,
-    finished: bool = False,
+    folder: Path, settings: ExperimentSettings, finished: bool = False
 ) -> DictConfig:
     """Check that the training run in a folder has the settings and input files of a command.
 
@@ -191,10 +189,7 @@ def require_same_run(
 
 
 def require_same(
-    folder: Path,
-    settings: Any,
-    elsewhere: str,
-    is_permitted: Callable[[str, Any, Any], bool],
+    folder: Path, settings: Any, elsewhere: str, is_permitted: Callable[[str, Any, Any], bool]
 ) -> DictConfig:
     """Check that an earlier command wrote a folder with the same settings and input files.
 

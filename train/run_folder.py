@@ -50,7 +50,7 @@ def opened_text(path: Path) -> Iterator[str]:
         yield path.read_text(encoding="utf-8")
     except Exception as error:
         raise InputError(
-            f"{path} is damaged or of another kind ({single_line(error)}): use another run",
+            f"{path} is damaged or of another kind ({single_line(error)}): use another run"
         ) from error
 
 
@@ -185,6 +185,6 @@ def writable_folder(folder: str | Path, key: str) -> Path:
             file.write(bytes(TEST_SIZE))
     except OSError as error:
         raise InputError(
-            f"{key}={path} cannot be written to ({error.strerror}): choose another folder",
+            f"{key}={path} cannot be written to ({error.strerror}): choose another folder"
         ) from error
     return path

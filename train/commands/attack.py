@@ -193,12 +193,7 @@ def attacks(
     def start(scene: Scene, force: bool) -> AttackResult:
         with keyed("attack", **keys_of("attack", settings.attack)):
             return attack(
-                classifier,
-                scene,
-                settings.target,
-                settings.attack,
-                seed=settings.seed,
-                force=force,
+                classifier, scene, settings.target, settings.attack, seed=settings.seed, force=force
             )
 
     if adversary is not None:
@@ -251,9 +246,7 @@ def build_attacked(
 
 
 def load_targets(
-    settings: AttackExperimentSettings,
-    attacked: Classifier,
-    device: torch.device,
+    settings: AttackExperimentSettings, attacked: Classifier, device: torch.device
 ) -> dict[str, Sequence[Any]]:
     """Load the other classifiers and meshes with which successful attacks are tested.
 

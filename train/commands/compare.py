@@ -19,8 +19,7 @@ class CompareSettings(Settings):
     exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
     by: str = setting("source", "Groups of the tables.", choices=GROUPS)
     photos: str = setting(
-        "photographs",
-        "Sub-folder of the scores to compare: its name in `photos`.",
+        "photographs", "Sub-folder of the scores to compare: its name in `photos`."
     )
 
     def __post_init__(self) -> None:

@@ -161,12 +161,12 @@ def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height w
     except Exception as error:
         raise InputError(
             f"mask={path} cannot be read ({single_line(error)}): save white "
-            "where the object is and black elsewhere",
+            "where the object is and black elsewhere"
         ) from error
     if levels.shape != (height, width):
         raise InputError(
             f"mask={path} has {levels.shape[1]} × {levels.shape[0]} pixels, but the photograph has "
-            f"{width} × {height}: give a mask of the same size",
+            f"{width} × {height}: give a mask of the same size"
         )
     return levels
 

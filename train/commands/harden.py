@@ -29,11 +29,7 @@ from train.cli import read_settings
 from train.results.overwrite import require_new_run
 from train.results.page import report_of
 from train.run_folder import folder_or_temporary, sole_writer
-from train.settings import (
-    DataSettings,
-    ExperimentSettings,
-    TrainingSceneSettings,
-)
+from train.settings import DataSettings, ExperimentSettings, TrainingSceneSettings
 from train.train_settings import TrainSettings
 from train.training.inputs import initial_of, load_data
 from train.training.run import Run

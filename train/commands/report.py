@@ -13,8 +13,7 @@ class ReportSettings(Settings):
     """Settings of the command pnb-report, which writes an HTML page about runs and attacks."""
 
     runs: list[str] = setting(
-        REQUIRED,
-        "Folders of runs, sweeps and attacks. Folders below them count, too.",
+        REQUIRED, "Folders of runs, sweeps and attacks. Folders below them count, too."
     )
     out: str | None = setting(
         None,

@@ -76,9 +76,7 @@ class Material(Parameter):
         # The metallic factor of an object is attacked only if the object is metallic.
         used_mask[:, METALLIC] &= self._average_gloss[:, METALLIC] > 0
         super().__init__(
-            settings,
-            start=start[scene.object_of],
-            used_mask=used_mask[scene.object_of],
+            settings, start=start[scene.object_of], used_mask=used_mask[scene.object_of]
         )
 
     def _read_materials(self, scene: Scene) -> None:

@@ -144,8 +144,7 @@ def _movable_objects(scene: Scene) -> list[_MovableObject]:
         stands_on_ground = item.own is not None
         movable_objects.append(
             _MovableObject(
-                object_mask=object_mask,
-                ground_height=item.lowest if stands_on_ground else None,
+                object_mask=object_mask, ground_height=item.lowest if stands_on_ground else None
             )
         )
     return movable_objects

@@ -80,8 +80,7 @@ def test_a_gpu_attacks_as_a_cpu_does_to_rounding(attacked, by_color, parameters)
 
 
 @pytest.mark.parametrize(
-    ("target", "labels"),
-    [("lime", [1, 1]), (["sky", "lime"], [2, 1]), ("least_likely", None)],
+    ("target", "labels"), [("lime", [1, 1]), (["sky", "lime"], [2, 1]), ("least_likely", None)]
 )
 def test_a_target_is_one_class_for_all_views_or_one_for_each(attacked, target, labels):
     result = attacked("lighting", SHARED | TWO_BACKGROUNDS, target=target, max_steps=1)

@@ -10,13 +10,7 @@ from torch import Tensor
 
 import augment
 from augment.attacks.loop import minimize
-from augment.attacks.objective import (
-    NO_CLASS,
-    NOISE_DRAWS,
-    Criterion,
-    Objective,
-    add_sensor_noise,
-)
+from augment.attacks.objective import NO_CLASS, NOISE_DRAWS, Criterion, Objective, add_sensor_noise
 from augment.attacks.result import AttackResult
 from augment.augmentation_settings import TrainingAttackSettings
 from augment.service import Renders

@@ -15,13 +15,7 @@ from PIL import Image
 
 import renderer
 from renderer.errors import InputError
-from renderer.io.files import (
-    TEMPORARY,
-    atomic_write,
-    remove_unfinished,
-    replacing,
-    write_numbers,
-)
+from renderer.io.files import TEMPORARY, atomic_write, remove_unfinished, replacing, write_numbers
 from renderer.io.images import write_image
 from renderer.light.environment import read_panorama, write_map
 from renderer.light.harmonics import equirectangular

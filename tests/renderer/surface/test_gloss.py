@@ -457,10 +457,7 @@ def reflected_fraction(beam: np.ndarray, gloss: SampleGloss) -> float:
     views = torch.from_numpy(directions)
     count = len(views)
     surface: Any = SimpleNamespace(
-        gloss=gloss,
-        normals=UP.expand_as(views),
-        toward=views,
-        points=0 * views,
+        gloss=gloss, normals=UP.expand_as(views), toward=views, points=0 * views
     )
     paths = LightPaths(
         point=torch.arange(count),
