@@ -208,7 +208,7 @@ class AugmentationSettings(Settings):
         if not self.attack.parameters:
             raise InputError("attack changes nothing: name a parameter to attack", "attack")
         if self.mode == "folder" and not self.folder:
-            raise self.wrong("folder", "is missing: mode=folder needs a folder of images")
+            raise self.wrong("folder", "is not set: mode=folder needs a folder of images")
         parameters = self.attack.parameters if "random" in (self.mode, self.init) else {}
         for name, steps in parameters.items():
             if name != "lighting" and steps.radius is None:

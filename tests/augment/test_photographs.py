@@ -157,7 +157,7 @@ def test_photographs_of_another_size_are_an_error(photographs):
     from augment.classifier import as_classifier
 
     classifier = as_classifier(HueNetwork().eval(), SIZE, None)
-    with pytest.raises(InputError, match="16 pixels"):
+    with pytest.raises(InputError, match="use the size of its images, 16"):
         attack_photographs(classifier, photographs[:, :, :8, :8])
 
 

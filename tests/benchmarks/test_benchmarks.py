@@ -33,6 +33,7 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
     monkeypatch.setattr(common, "MIN_TIMED_SECONDS", 0.0)
     monkeypatch.setattr(renderer, "DEGREES", (2, 6))
@@ -109,6 +110,7 @@ def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples(samples, c
         )
 
 
+@pytest.mark.slow
 def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
     cases = {name: lights.LOCAL_LIGHTS[name] for name in ("harmonics", "3 lamps")}
     monkeypatch.setattr(lights, "LOCAL_LIGHTS", cases)
@@ -173,6 +175,7 @@ def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, 
     assert len(read(path)) == 2
 
 
+@pytest.mark.slow
 def test_optimizers_are_compared_at_equal_forward_passes(capsys, monkeypatch):
     pytest.importorskip("cma")
     monkeypatch.setattr(gradient_free, "FRUIT", ("orange",))
@@ -183,6 +186,7 @@ def test_optimizers_are_compared_at_equal_forward_passes(capsys, monkeypatch):
     assert [row.split("|")[1] for row in rows] == ["gradient", "random search", "CMA-ES"]
 
 
+@pytest.mark.slow
 def test_relit_photographs_are_scored_for_each_network(tmp_path, capsys):
     rng = np.random.default_rng(0)
     for index in range(0, 50, 5):

@@ -72,6 +72,7 @@ def small(monkeypatch, tmp_path) -> list[str]:
 SHORT = ["--examples", "2", "--steps", "2"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("script", "arguments", "row_count", "column_count"),
     [

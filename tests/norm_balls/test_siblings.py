@@ -41,6 +41,7 @@ def test_a_script_named_train_uses_the_library(folder):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_notebook_beside_such_modules_uses_the_library(folder):
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(USE)])
     context = {"metadata": {"path": str(folder)}}
@@ -58,6 +59,7 @@ def test_a_foreign_module_that_was_imported_first_is_named(tmp_path, name):
     assert str(tmp_path / name) in last_line
 
 
+@pytest.mark.slow
 def test_packages_of_the_library_that_were_imported_before_stay(folder):
     code = "import renderer, norm_balls as nb; assert nb.render is renderer.render"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -105,6 +105,7 @@ def runs(tiny, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_does_not_depend_on_the_number_of_its_processes(runs):
     first, other = (checkpoints.load(runs / name / run_folder.LAST) for name in ("one", "two"))
     torch.testing.assert_close(other["model"], first["model"], rtol=1e-3, atol=1e-5)  # float32

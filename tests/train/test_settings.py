@@ -85,7 +85,7 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["attack@augment.attack=[pose]"], "renderer.silhouettes=false"),
         (["scene.projector.pixels=abc"], "scene.projector.pixels is 'abc'"),
         (["photos={renders: /x}"], "photos has the name 'renders'"),
-        (["augment=folder"], "augment.folder is None"),
+        (["augment=folder"], "augment.folder=None is not set"),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",
 )

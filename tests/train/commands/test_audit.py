@@ -79,7 +79,7 @@ def counts_of(report: nb.AuditReport) -> tuple:
 
 
 @pytest.mark.filterwarnings("ignore:.*deprecated")
-@pytest.mark.parametrize("suffix", ["pt2", pytest.param("pt", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("suffix", ["pt", pytest.param("pt2", marks=pytest.mark.slow)])
 def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index(options, tmp_path, suffix):
     """The numbers are those of the mesh's file and of the network itself, by name."""
     network = Brightness().eval()
