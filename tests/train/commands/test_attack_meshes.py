@@ -104,7 +104,7 @@ def test_a_rasterizer_that_does_not_start_is_an_error_of_its_key(monkeypatch, ti
     ("arguments", "message"),
     [
         (["attack.restarts=2"], "restarts draws from the norm-balls"),
-        (["target=[lime]", "scene.views=2", "attack.shared=true"], "names 1 classes: give one for each of the 2 views"),
+        (["target=[lime]", "scene.views=2", "attack.shared=true"], "one for each of the 2 views"),
         (["meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"meshes\[0\]"),
         (["meshes=[{mesh: a, props: [solid:cup]}]"], r"^meshes\[0\]\.props\[0\] is 'solid:cup'"),
         (["meshes=[{mesh: a, props: [{mesh: b}]}]"], r"meshes\[0\].*at is not set"),
