@@ -123,7 +123,8 @@ def run_audit(
             # A path below pretrained/ is found from any working folder.
             photographs = published(Path(str(settings.unlabeled)))
             attack = RelightingSettings(passes=relit.PASSES)
-            options = {"seed": settings.seed, "limit": settings.scale(relit.PHOTOGRAPH_COUNT)}
+            count = settings.scale(relit.PHOTOGRAPH_COUNT)
+            options: dict[str, Any] = {"seed": settings.seed, "limit": count}
             for key, network in networks.items():
                 write = partial(relit.attack_folder, network, photographs, attack, **options)
                 _write_folder(out / key / relit.RELIT_FOLDER, write)
