@@ -486,15 +486,6 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
         )
 
 
-def has_memory(needed: int, device: torch.device) -> bool:
-    """Return whether a number of bytes is free on a device.
-
-    It is True, too, if the amount of free memory is unknown.
-    """
-    free = free_memory(device)
-    return free is None or needed <= free
-
-
 def free_memory(device: torch.device) -> int | None:
     """Return the free bytes of a GPU, the machine or the container, or None if unknown."""
     if device.type == "cuda":

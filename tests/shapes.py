@@ -65,7 +65,7 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
         return function
     signature = inspect.signature(function)
     is_constructor = function.__name__ == "__init__"
-    calls_left = itertools.chain(range(CHECKED_CALLS), itertools.repeat(None))
+    calls = itertools.count()
 
     @functools.cache
     def hints() -> dict[str, Any]:
@@ -79,7 +79,7 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
         result = function(*args, **kwargs)
-        if next(calls_left) is None:
+        if next(calls) >= CHECKED_CALLS:
             return result
         # Tests make wrong objects on purpose: their user refuses them.
         if is_constructor and "tests" in sys._getframe(1).f_globals["__name__"]:

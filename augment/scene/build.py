@@ -305,9 +305,10 @@ class Smoothest(NamedTuple):
     def affordable_degree(self, pixels: int) -> int:
         """Return the degree of lighting that the surface needs, as far as memory permits."""
         degree = max(DEGREE, self.degree)
-        cpu = torch.device("cpu")
-        bytes_per_value = OPERATOR_BYTES * pixels
-        while degree > DEGREE and not errors.has_memory(bytes_per_value * (degree + 1) ** 2, cpu):
+        free = errors.free_memory(torch.device("cpu"))
+        # An unknown amount of free memory counts as enough.
+        limit = math.inf if free is None else free
+        while degree > DEGREE and OPERATOR_BYTES * pixels * (degree + 1) ** 2 > limit:
             degree -= 1
         return degree
 
