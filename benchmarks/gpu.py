@@ -4,7 +4,7 @@
 
 The answer to each question is a few lines of JSON. A line compares one way with
 another, and the two take turns. The command first runs the tests of
-tests/train/system/test_gpu.py, and then measures. If a question fails, its line
+tests/train/test_gpu.py, and then measures. If a question fails, its line
 has the error, and the command continues with the next question. Meshes, data
 and networks are the project's own. If there are several GPUs, `training` runs
 on one and on all of them. --device cpu rehearses the questions that need no
@@ -152,8 +152,18 @@ def tests(device: str) -> Iterator[Row]:
     Yields:
         A row with pytest's exit status and the end of its output.
     """
-    file = ROOT / "tests" / "train" / "system" / "test_gpu.py"
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(file)]
+    file = ROOT / "tests" / "train" / "test_gpu.py"
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:benchmark",
+        str(file),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     yield {
         "question": "tests",

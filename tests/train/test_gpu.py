@@ -45,8 +45,8 @@ def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, ema_decay):
     """Between two batches, what synchronizes raises an error. Making a batch may synchronize."""
     training_batches = loop.training_batches
 
-    def watched(images, **options):
-        for index, batch in enumerate(training_batches(images, **options)):
+    def watched(*arguments):
+        for index, batch in enumerate(training_batches(*arguments)):
             # The first steps compile, which waits for the GPU.
             torch.cuda.set_sync_debug_mode("error" if index > 3 else "default")
             try:
