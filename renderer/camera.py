@@ -274,11 +274,7 @@ class Camera(ABC):
         return torch.stack([x, y, w]).T, nearness
 
     def _camera_coordinates(self, points: Float[Tensor, "V 3"]) -> Float[Tensor, "3 V"]:
-        """Convert points from world axes to the axes right, up and back of the camera.
-
-        The result is differentiable with respect to the points, and with respect
-        to fields of the camera that are tensors. The coordinates are measured from the pivot.
-        """
+        """Convert points to the axes right, up and back of the camera, from the pivot."""
         angles = (self.polar, self.azimuth, self.roll)
         polar, azimuth, roll = (tensor_like(in_radians(angle), points) for angle in angles)
         center = [self.center_x, self.center_y, self.center_z]

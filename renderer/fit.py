@@ -207,10 +207,9 @@ def fit_scene(
 def _plausible_cameras(
     target: _Target, mask: Float[Tensor, "size size"], fov: float | None
 ) -> list[Camera]:
-    """Search all directions for a few cameras, one of which should be near the best camera.
+    """Search all directions for up to `KEPT_CAMERAS` different cameras, the best one first.
 
-    There are at most `KEPT_CAMERAS` different ones, the best one first. A `fov` (degrees) of None
-    means no perspective.
+    A `fov` of None means no perspective.
     """
     mesh = target.mesh
     radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
@@ -423,10 +422,7 @@ class _Target(NamedTuple):
         return camera_of(found.x)
 
     def fit_final_light(self, camera: Camera) -> FittedScene:
-        """Fit the light for the final camera, and compute how well the render fits.
-
-        Only the pixels that the object covers completely count.
-        """
+        """Fit the light to fully covered pixels, and compute how well the render fits."""
         _, light, coverage = self.fit_light(camera, WHOLE_PIXEL, FINAL_GRID)
         image = render(self.mesh, camera, light, self.size, self.gray, **self.options)
         rendered = decode(image, self.options["encoding"]).flatten(1)
@@ -495,9 +491,8 @@ def _nonnegative_light(
 def _nearest_in_cone(point: NDArray[Any], constraints: NDArray[Any]) -> NDArray[Any]:
     """Find the nearest point whose dot product with each of N vectors is not negative.
 
-    Only few of the vectors limit the result. The problem is first solved with
-    some of them. Vectors whose dot product with the solution is negative are
-    added until there are none. The result is the same as with all vectors.
+    Few vectors limit the result, so some are used first, and violated ones are added until none is
+    left.
     """
     constraint_count = constraints.shape[1]
     is_used = np.arange(constraint_count) % FIRST_DIRECTION_STEP == 0
@@ -514,10 +509,7 @@ def _nearest_in_cone(point: NDArray[Any], constraints: NDArray[Any]) -> NDArray[
 
 @cache
 def _radiance_rows(grid: int) -> NDArray[Any]:
-    """Compute the matrix that maps a light to its radiance above the smallest allowed radiance.
-
-    The smallest allowed radiance is `MIN_RADIANCE_RATIO` times the mean radiance of the light.
-    """
+    """Compute the matrix from a light to its radiance minus `MIN_RADIANCE_RATIO` times the mean."""
     directions, _ = sphere(grid)
     rows = basis(torch.from_numpy(directions), DEGREE).numpy()
     # The product of column 0 and coefficient 0 is the mean radiance of the light. Reducing the
@@ -527,11 +519,7 @@ def _radiance_rows(grid: int) -> NDArray[Any]:
 
 
 def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Camera:
-    """Change the width and the shift of a camera so that the mesh is as large as the mask.
-
-    The bounding box of the mesh in the image gets the center and the area of the bounding box of
-    the mask. The direction is kept. A perspective camera also gets another distance.
-    """
+    """Give the mesh's bounding box in the image the center and the area of that of the mask."""
     # Bounding boxes in image coordinates from -1 to 1, with x to the right and y up.
     points = camera.project(mesh.vertices[np.unique(mesh.faces)])[:, :2]
     mesh_low = points.min(0)

@@ -335,10 +335,7 @@ def _local_emitters(
 
 
 def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_scale: float) -> Scene:
-    """Write a part of a mesh as files for Mitsuba, such as part_0.ply and texture_0.png.
-
-    Return its entry for a Mitsuba scene.
-    """
+    """Write a part to files such as part_0.ply and texture_0.png, and return its Mitsuba entry."""
     import trimesh
 
     # A surface whose metallic value and specular factor are 0 is matte.

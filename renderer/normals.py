@@ -155,19 +155,12 @@ class _AreaVectors(torch.autograd.Function):
 
 
 def _length(vectors: Vectors) -> Float[Tensor, " N"]:
-    """Compute the lengths of N vectors.
-
-    torch.norm would be fifty times slower along an axis of length three.
-    """
+    """Compute lengths; torch.norm would be fifty times slower along an axis of length three."""
     return vectors.square().sum(0).sqrt()
 
 
 def _cross(u: Vectors, v: Vectors) -> Vectors:
-    """Compute the cross products of N pairs of vectors.
-
-    Unlike torch.linalg.cross, this function gives exactly zero for parallel
-    vectors, because it does not fuse multiplications and additions.
-    """
+    """Compute u × v without fused operations, which gives exactly zero for parallel vectors."""
     return torch.stack(_components(u, v))
 
 
@@ -179,11 +172,7 @@ def _components(u: Any, v: Any) -> list[Any]:
 
 
 def _exact_cross(a: Vectors, b: Vectors, c: Vectors) -> Vectors:
-    """Compute (b - a) × (c - a) for the corners of N triangles, almost without rounding errors.
-
-    The rounding errors of differences (Knuth 1969) and of products (Dekker 1971)
-    are computed and added back.
-    """
+    """Compute (b - a) × (c - a), and add the rounding errors (Knuth 1969, Dekker 1971) back."""
     u, u_error = _difference(b, a)
     v, v_error = _difference(c, a)
     # The components of u × v, with the rounding errors of the products added back.
@@ -195,10 +184,7 @@ def _exact_cross(a: Vectors, b: Vectors, c: Vectors) -> Vectors:
 
 
 def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute a - b, and the rounding error of this difference (Knuth 1969).
-
-    The error is the exact difference minus the rounded one.
-    """
+    """Compute a - b, and the exact minus the rounded difference (Knuth 1969)."""
     rounded = a - b
     # `negative_b` would be -b without rounding, and both errors would be 0.
     negative_b = rounded - a
@@ -208,11 +194,7 @@ def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute a · b, and the rounding error of this product (Dekker 1971).
-
-    The binary digits of each factor are split into an upper and a lower half. Products of two
-    halves have no rounding error. The error is the exact product minus the rounded one.
-    """
+    """Compute a · b, and the exact minus the rounded product, from exact halves (Dekker 1971)."""
     rounded = a * b
     a_high, a_low = _halves(a)
     b_high, b_low = _halves(b)
@@ -223,10 +205,7 @@ def _product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _halves(numbers: Tensor) -> tuple[Tensor, Tensor]:
-    """Split numbers into the upper and the lower half of their binary digits (Dekker 1971).
-
-    Upper and lower halves add up to exactly the given numbers.
-    """
+    """Split numbers into halves of their binary digits that add up exactly (Dekker 1971)."""
     scaled = _SPLITTER * numbers
     # Both subtractions round away the lower half of the digits.
     high = scaled - (scaled - numbers)
@@ -321,10 +300,7 @@ def _groups_of_file(
 
 
 def _neighbors(faces: np.ndarray) -> Int[np.ndarray, "2 N"]:
-    """Return the pairs of corners at one vertex whose faces share an edge that ends there.
-
-    Corner c of face f has the number 3 f + c.
-    """
+    """Return pairs of corners 3 f + c at one vertex whose faces f share an edge that ends there."""
     # Side 3 f + s leads from corner s of face f to the next corner.
     start = faces.ravel()
     end = faces[:, [1, 2, 0]].ravel()

@@ -248,11 +248,7 @@ def fit_photograph(
 
 
 def _turned_to_mesh(camera: Camera) -> Camera:
-    """Return a copy of a camera at the same place that looks at the center of the mesh.
-
-    The center of the mesh is the origin. A perspective camera is turned if it does not show the
-    origin in the center of its image. An orthographic camera is shifted.
-    """
+    """Turn a perspective camera, or shift another one, toward the mesh's center, the origin."""
     if not isinstance(camera, PerspectiveCamera):
         return replace(camera, right=0.0, up=0.0)
     x, y, z = camera.eye()[:3].tolist()

@@ -209,10 +209,7 @@ def render(
 
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
-    """Split a local light for `render` into its basis and its coefficients.
-
-    A light without coefficients is white and at full power.
-    """
+    """Split a light into basis and coefficients, which are white at full power by default."""
     pair = light if isinstance(light, tuple) else (light, None)
     if len(pair) != 2:
         raise InputError(f"lights has the entry {errors.describe(pair)}: give {_LOCAL_LIGHTS}")
@@ -420,11 +417,7 @@ def _recolored(mesh: Mesh, albedo: Float[Tensor, " ..."], encoding: str) -> Mesh
 def _sample_albedo(
     mesh: Mesh, view: Fragments, albedo: Float[Tensor, " ..."] | None, encoding: str
 ) -> Float[Tensor, "S 3"]:
-    """Compute the linear albedo at the samples of an image that show a mesh.
-
-    `albedo` is linear, with one row per face, or the only texture. None uses the colors of
-    the mesh.
-    """
+    """Compute linear albedo from linear rows per face, the only texture, or (None) the mesh."""
     if albedo is not None and albedo.shape == mesh.faces.shape:
         return face_albedo(albedo, view)
     return surface_albedo(mesh, view, encoding, None if albedo is None else [albedo])

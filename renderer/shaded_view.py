@@ -115,20 +115,14 @@ class ShadedView:
         return self._sum(self.fragments, has_indirect=True)
 
     def _indirect_radiance(self) -> Float[Tensor, "3 P"] | None:
-        """Compute the radiance that shadows and bounces add to the P covered pixels.
-
-        It is negative in shadows, and None without environment light or without both effects.
-        """
+        """Compute the radiance of bounces and shadows (negative), or None if nothing is added."""
         environment = self.light.environment
         if environment is None or self.indirect is None:
             return None
         return self.indirect(self.albedo, environment)
 
     def _sum(self, fragments: Fragments, has_indirect: bool) -> Float[Tensor, "3 P"]:
-        """Add up the radiance from all lights, with that of shadows and bounces or without.
-
-        `fragments` may assign the samples to other pixels.
-        """
+        """Add up the radiance of all lights; `fragments` may assign samples to other pixels."""
         # Autograd adds up gradients in the reverse of this order, so another order would change the
         # last bits of gradients.
         summands: list[Tensor | None] = []
@@ -156,11 +150,7 @@ class ShadedView:
     def _radiance_with_silhouettes(
         self, camera: Camera, background: Float[Tensor, "3 pixels"]
     ) -> PixelRadiance:
-        """Compute radiance whose gradients include the movement of silhouettes and surfaces.
-
-        The background is linear. Uncovered pixels into which silhouettes may move follow
-        the covered ones.
-        """
+        """Compute radiance of covered pixels, then of those that silhouettes may enter."""
         fragments = self.fragments
         # Each sample becomes a pixel of a finer image, so that it is shaded alone.
         finer_fragments = replace(fragments.by_sample(), camera=camera)
@@ -186,11 +176,7 @@ class ShadedView:
         )
 
     def _divide_among_samples(self, pixel_radiance: Float[Tensor, "3 P"]) -> Float[Tensor, "3 S"]:
-        """Divide the radiance of each pixel among its samples, in proportion to their albedo.
-
-        The radiance of shadows and bounces is only known for whole pixels, but
-        the gradients of silhouettes need the radiance of each sample.
-        """
+        """Divide radiance that is known for whole pixels among samples by their albedo."""
         sample_to_pixel = self.fragments.sample_to_pixel
         sample_albedo = self.albedo.detach().T
         zeros = pixel_radiance.new_zeros(pixel_radiance.shape)

@@ -204,8 +204,5 @@ def _nearest_in_box_and_sphere(values: Rows, low: Any, high: Any, ball: Ball) ->
 
 
 def _squared_norm(offsets: Rows) -> Tensor:
-    """Compute the squared L2 norm of each row of a batch.
-
-    All axes but the first one have size 1, so that the result broadcasts.
-    """
+    """Compute the squared L2 norm of each row, which broadcasts: all other axes have size 1."""
     return offsets.square().sum(tuple(range(1, offsets.dim())), keepdim=True)

@@ -107,10 +107,7 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
 
 
 def _require_memory(file: GltfFile, nodes: list[int]) -> None:
-    """Check that the faces that the nodes show fit into the memory, before arrays are read.
-
-    A small file can show one mesh very often, or declare an array of zeros.
-    """
+    """Check that the faces fit into memory, since a small file can show one mesh very often."""
     needed = 0
     for index in nodes:
         node = file.tree["nodes"][index]
@@ -157,10 +154,7 @@ def _read_part(
 def _attributes(
     file: GltfFile, primitive: dict[str, Any], weights: tuple[float, ...], uv_name: str
 ) -> dict[str, np.ndarray]:
-    """Read the attributes of the vertices of a primitive, with its morph targets (3.7.2.2).
-
-    Attributes that nothing uses, such as other texture coordinates, are not read.
-    """
+    """Read the vertex attributes that are used of a primitive, with morph targets (3.7.2.2)."""
     accessors = [file.entry("accessors", index) for index in primitive["attributes"].values()]
     is_compressed = DRACO in primitive.get("extensions", {})
     if is_compressed and not all("bufferView" in accessor for accessor in accessors):
@@ -427,10 +421,7 @@ def _halve(
 
 
 def _cut(values: np.ndarray, faces: np.ndarray, excess: Float[np.ndarray, " V"]) -> _Surface:
-    """Keep the parts of faces where a function that is linear in each face is not negative.
-
-    Its values at the vertices are `excess`.
-    """
+    """Keep the parts of faces where `excess`, which is linear in each face, is not negative."""
     is_kept = excess[faces] >= 0
     count = is_kept.sum(axis=1)
     is_whole, is_cut = count == 3, (count == 1) | (count == 2)

@@ -170,10 +170,7 @@ class GltfFile:
     # Nodes
 
     def _trees(self) -> tuple[list[int], dict[int, np.ndarray]]:
-        """Return the nodes without a parent, and the poses of all nodes.
-
-        The nodes are in an order in which parents come before their children.
-        """
+        """Return the nodes without a parent, and the poses of all nodes, parents first."""
         nodes = self.tree.get("nodes", [])
         children = [child for node in nodes for child in node.get("children", [])]
         # With two parents, 40 nodes could stand for 2^40 copies of a mesh.
@@ -459,10 +456,7 @@ def _specular_factor(extensions: dict[str, Any]) -> float:
 def _specular_glossiness(
     material: Material, file: GltfFile, model: dict[str, Any], gloss: bool
 ) -> Material:
-    """Read the values of a material of the extension KHR_materials_pbrSpecularGlossiness.
-
-    Its diffuse albedo is diffuse · (1 - max(specular)).
-    """
+    """Read KHR_materials_pbrSpecularGlossiness: its albedo is diffuse · (1 - max(specular))."""
     material = _with_color(material, file, model, "diffuse")
     specular = _factor(model, "specularFactor", 3)
     glossiness = np.array(model.get("glossinessFactor", 1.0))

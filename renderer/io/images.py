@@ -429,10 +429,7 @@ def _apply_profile(profile: bytes, image: Image.Image) -> Image.Image:
 # The limit is for folders in which each file has a profile of its own.
 @lru_cache(maxsize=32)
 def _transform(profile: bytes, mode: str) -> ImageCms.ImageCmsTransform | None:
-    """Build the transform from an ICC profile to sRGB. It is None for sRGB or a damaged profile.
-
-    A warning tells of a damaged profile. Because of the cache, it does so once.
-    """
+    """Build the transform to sRGB, None for sRGB or, with one warning, for a damaged profile."""
     try:
         opened = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         space = opened.profile.xcolor_space.strip()

@@ -362,11 +362,7 @@ def _add_material(tree: _Tree, mesh: Mesh, texture_id: int, gloss: list[float]) 
 
 
 def _gltf_camera(camera: Camera) -> dict[str, Any]:
-    """Describe a camera as glTF does.
-
-    The principal point of a perspective camera in glTF is the image center. If the camera has
-    another one, the image in glTF is larger and contains the image of the camera.
-    """
+    """Describe a camera as glTF does: its image is larger if the principal point is off-center."""
     planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):
         # Half of the width and of the height that the image shows at a depth
@@ -386,11 +382,10 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
 def _split_vertices(
     faces: Int[np.ndarray, "F 3"], corner_values: Float[np.ndarray, "F 3 D"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Repeat vertices until all face corners at a vertex have the same values.
+    """Repeat vertices until all face corners at a vertex have the same values, as in a file.
 
-    In a mesh, two faces may have different colors at the same vertex. In a file,
-    each vertex has only one color, one normal and so on. The result is the original vertex (N,)
-    and the values (N, D) of each new vertex, and the faces with new indices.
+    The results are the original vertex (N,) and the values (N, D) of each new vertex, and the
+    faces.
     """
     # Corners with the same key become one new vertex. The key
     # of a corner is its original vertex, followed by its

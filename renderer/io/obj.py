@@ -152,11 +152,7 @@ def _vertices(lines: _Lines, file: MeshFile) -> tuple[np.ndarray, np.ndarray | N
 
 
 def _polygons(lines: dict[str, _Lines]) -> tuple[np.ndarray, np.ndarray]:
-    """Parse the P faces with C corners.
-
-    Return the indices (C, 3) of the position, uv and normal of each corner, or -1, and the number
-    of corners (P,) of each face.
-    """
+    """Parse P faces into position, uv and normal indices (C, 3), -1 for none, and sizes (P,)."""
     sizes, text = lines["f"].words()
     indices = _corners(text.split())
     for column, keyword in enumerate(("v", "vt", "vn")):

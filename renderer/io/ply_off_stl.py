@@ -282,10 +282,7 @@ def _different_rows(
 
 
 def _cast(values: Any, item: _Property) -> Any:
-    """Convert values to the types in the header, and refuse whole numbers that would change.
-
-    An ASCII file may have values of other types.
-    """
+    """Convert ASCII values to the types in the header, but refuse to change whole numbers."""
     if isinstance(values, _Lists):
         lengths = _cast(values.lengths, _Property("", item.length_type))
         numbers = _cast(values.numbers, _Property("", item.type))

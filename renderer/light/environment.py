@@ -177,10 +177,7 @@ def write_map(path: str | Path, radiance: Float[Tensor, "H W 3"]) -> None:
 
 
 def _write_image(path: Path, texels: Float[Tensor, "H W 3"], file_format: str) -> None:
-    """Write an image with OpenImageIO.
-
-    A temporary file is written first and then renamed, so a reader never sees a part of the file.
-    """
+    """Write a temporary file and rename it, so that a reader never sees a part of an image."""
     image = _openimageio().ImageBuf(texels.contiguous().numpy())
     with replacing(path) as temporary:
         # The data type "unknown" keeps the float32 values of the image.
@@ -201,10 +198,9 @@ def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]:
-    """Read an environment map from an .hdr or .exr file.
+    """Read the texels, the names of the channels, and the 8 chromaticities of an environment map.
 
-    The results are the texels, the names of the channels, and the chromaticities of red, green,
-    blue and white, 8 numbers. A cropped, mirrored or rotated image raises `InputError`.
+    A cropped, mirrored or rotated image raises `InputError`.
     """
     image = _openimageio().ImageBuf(str(path))
     # Call `read` first, because `get_pixels` ends the process if it cannot read the file.
@@ -257,8 +253,8 @@ def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
 def _in_rec709(radiance: Float[np.ndarray, "H W 3"], chromaticities: Sequence[float]) -> np.ndarray:
     """Convert radiance of any primaries to Rec. 709.
 
-    A negative channel that this makes becomes 0. Chromaticities are CIE x and y
-    of red, green, blue and white.
+    A negative channel that this makes becomes 0. Chromaticities are CIE x and y of red, green, blue
+    and white.
     """
     matrix = to_rec709(chromaticities, adapt=False)
     if matrix is None:
@@ -278,10 +274,7 @@ def _in_rec709(radiance: Float[np.ndarray, "H W 3"], chromaticities: Sequence[fl
 
 
 def _to_rgbe_precision(radiance: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-    """Round radiance to the nearest values that an .hdr file (format RGBE) can store.
-
-    OpenImageIO would round all values down, which darkens and tints the light.
-    """
+    """Round radiance to RGBE; OpenImageIO rounds down, which darkens and tints the light."""
     radiance = radiance.clamp(min=0)
     # RGBE stores all three channels of a texel with the exponent of the largest channel.
     _, exponent = torch.frexp(radiance.amax(dim=-1, keepdim=True))
@@ -291,10 +284,7 @@ def _to_rgbe_precision(radiance: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3
 
 
 def _color_channels(names: Sequence[str]) -> list[int]:
-    """Find the red, green and blue channel of an image by the names of its channels.
-
-    Names are "CHANNEL" or "LAYER.CHANNEL". A gray image has three equal indices.
-    """
+    """Find red, green and blue by names such as "R" or "LAYER.R"; gray repeats its index."""
     keys = [name.casefold().rpartition(".")[::2] for name in names]
     # OpenImageIO lists the layer without a name first. The loop therefore prefers it.
     for layer, _ in keys:
@@ -312,10 +302,7 @@ def _color_channels(names: Sequence[str]) -> list[int]:
 
 
 def _openimageio() -> ModuleType:
-    """Import OpenImageIO, and limit its threads and the size of the images that it reads.
-
-    The import takes long, so it happens only if an image is read or written.
-    """
+    """Import OpenImageIO, which takes long, and limit its threads and the size of images."""
     import OpenImageIO
 
     # OpenImageIO's threads would compete with torch's threads.

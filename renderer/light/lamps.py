@@ -351,10 +351,9 @@ class Lamps(LocalBasis):
     def _disc_points(self, positions: Float[Tensor, "L 3"]) -> Float[Tensor, "_ L _ 3"]:
         """Choose points on disc lamps, to which shadow rays are cast.
 
-        There are several sets of points. The points of a set represent equal areas
-        of the disc. They lie on Vogel's spiral (1979), which is rotated by another
-        angle in each set. Positions and points are in world axes, and the result has the axes: set,
-        lamp, point of the set, coordinate.
+        Each of several sets lies on Vogel's spiral (1979), rotated by another angle, with one point
+        for equal areas. Positions and points are in world axes; the axes are: set, lamp, point,
+        coordinate.
         """
         # Tensors have one row for each set and one column for each point.
         set_index, point_index = torch.arange(POINT_SETS)[:, None], torch.arange(POINTS_PER_SET)
@@ -380,11 +379,7 @@ class Lamps(LocalBasis):
         normals: Float[Tensor, "... 3"],
         positions: Float[Tensor, "... 3"],
     ) -> Float[Tensor, " ..."]:
-        """Compute the irradiance of surface points from lamps with a coefficient of 1.
-
-        It is 0 or negative if the surface faces away from the lamp, or if the point is
-        behind a disc.
-        """
+        """Compute irradiance for a coefficient of 1, at most 0 behind the surface or a disc."""
         squared_distance = to_lamp.square().sum(-1)
         irradiance = (to_lamp * normals).sum(-1) / squared_distance**1.5
         if not self.radius:

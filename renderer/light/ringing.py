@@ -309,10 +309,9 @@ def highlight_error(degree: int, roughness: float) -> float:
 def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degrees"]:
     """Compute by which factor a highlight multiplies SH coefficients of each degree of a light.
 
-    The highlight is the specular lobe of a metal for a camera that looks along
-    the surface normal. The lobe is symmetric about the normal, so the factor of
-    degree l is the integral of the lobe times the Legendre polynomial P_l. Factors are
-    divided by that of degree 0, and at least MIN_AMPLITUDE.
+    The highlight is the specular lobe of a metal seen along the normal. The factor of degree l is
+    the integral of the lobe times the Legendre polynomial P_l, relative to degree 0, and at least
+    MIN_AMPLITUDE.
     """
     normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     node_count = 2**9 + 4 * degree

@@ -150,12 +150,10 @@ def _library_fit() -> Tensor:
 def _as_parameters(
     zenith: Tensor | float, azimuth: Tensor | float, turbidity: Tensor | float
 ) -> list[Tensor]:
-    """Check the parameters of a sky, and convert them to tensors.
+    """Convert the parameters of a sky to tensors, and degrees to radians before rounding.
 
-    The tensors get the dtype and the device of the first floating-point tensor
-    among turbidity, zenith and azimuth. Without such a tensor, they are float64.
-    Angles are converted to radians before they are rounded to this dtype. Angles are given
-    in degrees. The results are in the order of the arguments.
+    The dtype and the device are those of the first floating-point tensor among turbidity, zenith
+    and azimuth, or else float64.
     """
     value_by_name = {"turbidity": turbidity, "zenith": zenith, "azimuth": azimuth}
     floating = []

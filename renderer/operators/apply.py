@@ -284,10 +284,7 @@ class TransferOperator:
         is_unclamped: PixelValues,
         clamped_values: PixelValues,
     ) -> Lights:
-        """Convert the gradient of a loss from the images of `_images` to the lights.
-
-        The last two arguments are the last two results of `_images`.
-        """
+        """Convert a gradient from images to lights, with the last two results of `_images`."""
         pixel_index = self.pixels.expand(is_unclamped.shape)
         # `gather` is faster than `index_select`, most of all for three axes.
         pixel_gradient = image_gradient.flatten(-2).gather(-1, pixel_index)
@@ -365,11 +362,9 @@ class TransferOperator:
     def _prepare_background(
         self, background: float | Tensor, lights: Lights
     ) -> tuple[Tensor, Tensor]:
-        """Convert a background to images, and compute what it adds to the covered pixels.
+        """Convert a background to images, and to what it adds to partly covered pixels.
 
-        In a pixel that the mesh covers partly, the background is visible, too. The
-        result for a gray value and a single light is cached for the next call,
-        because optimizations call `image` many times with the same background.
+        The result for a gray value and a single light is cached, because optimizations repeat it.
         """
         key = (background, lights.dtype, lights.device)
         is_kept = isinstance(background, float | int) and lights.ndim <= 2
@@ -424,11 +419,7 @@ class TransferOperator:
 
     @cached_property
     def _channels(self) -> list[Tensor]:
-        """Channels of `transfer`, shape (K, P) each.
-
-        One is shared by all colors. A second one of specular reflection is added to all. Three
-        are those of the colors.
-        """
+        """Channels (K, P) of `transfer`: 1 of all colors, 2 with one of gloss, or 1 per color."""
         return list(self.transfer)
 
     @cached_property
@@ -438,11 +429,7 @@ class TransferOperator:
 
     @cached_property
     def _placement(self) -> Tensor:
-        """Matrix that writes the K used coefficients to their places among all coefficients.
-
-        All other places become exactly 0. The matrix has one row for each
-        coefficient, and one column for each used coefficient.
-        """
+        """Matrix that writes the K used coefficients among all others, which become exactly 0."""
         return torch.eye(self.basis.size).to(self.transfer)[:, self.nonzero]
 
 

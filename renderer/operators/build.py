@@ -169,10 +169,7 @@ def _environment_rows(
     dtype: torch.dtype,
     transport: Transport | None,
 ) -> tuple[Int[Tensor, " K"], Float[Tensor, "_ K P"]]:
-    """Compute the rows of the transfer matrix for environment light, shadows and bounces.
-
-    The first result is the indices of their coefficients.
-    """
+    """Compute the coefficients and the transfer rows of environment light, shadows and bounces."""
     all_coefficients = torch.arange(basis.size)
     if surface.gloss is None:
         coefficients = basis.nonzero

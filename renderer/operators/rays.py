@@ -248,10 +248,7 @@ class Rays:
 
     @cached_property
     def _outermost(self) -> Tensor:
-        """Positions of the H vertices on the convex hull of the mesh, float64, shape (H, 3).
-
-        If all vertices lie in a plane, there is no hull, and all vertices are returned.
-        """
+        """Positions (H, 3) of the convex hull's vertices, or of all if they lie in a plane."""
         # Only imported when it is needed, because the import takes long.
         from scipy.spatial import ConvexHull, QhullError
 
@@ -322,8 +319,8 @@ def sphere(count: int) -> Float[Tensor, "count 3"]:
 def _shuffled(count: int) -> Int[Tensor, " count"]:
     """Return a random permutation of 0 to count - 1, which is the same in every call.
 
-    The directions of `sphere` are sorted by z. In this shuffled order, each sample
-    of a pixel gets ray directions from all over the sphere.
+    The directions of `sphere` are sorted by z. In this shuffled order, each sample of a pixel gets
+    ray directions from all over the sphere.
     """
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))
 

@@ -117,11 +117,7 @@ def _samples_of_textures(
 
 
 def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tuple[Tensor, Tensor]]:
-    """Find the four texels around each of N points, and their weights for interpolation.
-
-    The pairs of weight and index (row · width + column) are for the upper left, upper
-    right, lower left and lower right texel.
-    """
+    """Find (weight, row · width + column) of the upper left and right, then the lower texels."""
     u, v = uvs
     # The coordinate v points up, but row 0 of the texture is at the top.
     rows = _neighbors(1 - v, texture.height)
@@ -134,11 +130,7 @@ def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tup
 
 
 def _neighbors(coordinate: Float[Tensor, " N"], count: int) -> list[tuple[Tensor, Tensor]]:
-    """Find the two columns of texels, or the two rows, between which each of N points lies.
-
-    Columns and rows are both called lines. The pairs of index and weight are for the line before
-    and the line after a point. Indices are whole floating-point numbers in [0, count).
-    """
+    """Find (index in [0, count), weight) of the texel row or column before and after points."""
     # Position in units of lines. The center of line i has the position i.
     position = coordinate * count - 0.5
     before = position.floor()
@@ -438,8 +430,7 @@ class _Charts:
 def _pack(sizes: Int[np.ndarray, "N 2"]) -> tuple[np.ndarray, tuple[int, int]]:
     """Place N rectangles in rows on a sheet that is about square, the highest ones first.
 
-    Sizes are columns and rows. The results are the column and row of the top left corner of each
-    rectangle, and the columns and rows of the sheet.
+    Sizes are (columns, rows). The results are the top left corners, and the size of the sheet.
     """
     order = np.argsort(-sizes[:, 1], kind="stable")
     widths, heights = sizes[order].T

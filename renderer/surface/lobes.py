@@ -193,11 +193,7 @@ def _sine_exponents(orders: Tensor) -> Tensor:
 
 @cache_tensors
 def _functions_and_orders(degree: int) -> tuple[Tensor, Tensor]:
-    """Find the index of the lobe function and the order of each harmonic, shape (K,) each.
-
-    The harmonic of degree l and order m has the index l² + l + m. The lobe
-    function c_l|m| has the index l (l + 1) / 2 + |m|.
-    """
+    """Find the index l (l + 1) / 2 + |m| of c_l|m|, and the order m, for each harmonic."""
     l = bands(degree)
     m = torch.arange(len(l)) - l * (l + 1)
     function_of_harmonic = l * (l + 1) // 2 + m.abs()
@@ -218,11 +214,7 @@ def _complex_powers(x: Tensor, y: Tensor, degree: int) -> Tensor:
 
 
 def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
-    """Rotate functions on the sphere, one per column, about the z-axis, from x toward y.
-
-    A rotation by the angle a mixes only the SH coefficients u_m and u_-m of the
-    orders m and -m in a band: u'_m = cos(ma) u_m - sin(ma) u_-m.
-    """
+    """Rotate SH coefficients u about z by a, x to y: u'_m = cos(ma) u_m - sin(ma) u_-m."""
     degree = math.isqrt(len(coefficients)) - 1
     _, order = _functions_and_orders(degree)
     order = order.to(coefficients.device)
@@ -240,11 +232,7 @@ def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
 
 
 def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
-    """Rotate functions on the sphere, one per column, by a matrix of SH coefficients.
-
-    A rotation does not mix coefficients of different degrees. The matrix is zero outside one block
-    per degree on its diagonal, so only the blocks are multiplied.
-    """
+    """Rotate SH coefficients by a matrix, which has only one block per degree on its diagonal."""
     degrees = range(math.isqrt(len(coefficients)))
     slices = [slice(l * l, (l + 1) * (l + 1)) for l in degrees]
     return torch.cat([rotation[b, b].to(coefficients) @ coefficients[b] for b in slices])
@@ -330,11 +318,7 @@ def coat_mean(roughness: Tensor) -> Tensor:
 
 
 def _coat_coefficients() -> Tensor:
-    """Return the Chebyshev coefficients of the reflected fraction E(μ) of a dielectric coat.
-
-    E(μ) is a sum of products of a Chebyshev polynomial in the roughness and one
-    in the cosine μ (see `coat_albedo`).
-    """
+    """Return the Chebyshev coefficients of E in roughness and cosine (see `coat_albedo`)."""
     # The reflected fraction E(μ) is the integral of the lobe (reflectance times the cosine
     # n·l) over all directions l of light. This is √(4π) times the SH coefficient of degree 0
     # of the lobe. The table contains π times this coefficient.
@@ -370,10 +354,7 @@ def _chebyshev(argument: Tensor, count: int) -> Tensor:
 
 
 def _nodes_and_interpolation(count: int) -> tuple[Tensor, Tensor]:
-    """Return the zeros of a Chebyshev polynomial, and the matrix from values there to coefficients.
-
-    The degree of the polynomial is `count`.
-    """
+    """Return the zeros of T_count, and the matrix from values there to coefficients."""
     steps = torch.arange(count, dtype=torch.float64) + 0.5
     nodes = (math.pi * steps / count).cos()
     return nodes, torch.linalg.inv(_chebyshev(nodes, count).T)

@@ -147,11 +147,7 @@ def glossy_radiance(
 def _coat_irradiance(
     normals: Float[Tensor, "3 S"], light: Float[Tensor, "K 3"], gloss: SampleGloss
 ) -> Float[Tensor, "3 S"]:
-    """Compute the irradiance that the dielectric coat reflects at S samples.
-
-    The coat is a transparent layer on a diffuse layer. The reflected irradiance
-    does not reach the diffuse layer.
-    """
+    """Compute the irradiance that the coat reflects and does not pass to the diffuse layer."""
     degree = min(harmonics.degree_of(light), harmonics.DIFFUSE_DEGREE)
     # Coefficients of higher degrees are ignored, because they hardly change the irradiance.
     light = light[: (degree + 1) ** 2]
@@ -296,16 +292,10 @@ class _Irradiance(torch.autograd.Function):
 def _evaluate_polynomial(
     light: Float[Tensor, "K 3"], directions: Float[Tensor, "3 N"]
 ) -> tuple[Tensor, Tensor]:
-    """Compute the irradiance and its gradient at N unit normals n.
+    """Compute the irradiance (3 colors, N), and its gradient (3 components, 3 colors, N).
 
-    The irradiance is c + a · n + p(n). The constant c comes from the harmonics of
-    degree 0, and the linear function a · n from those of degree 1. On the unit
-    sphere, the harmonics of the even degrees from 2 on are together one
-    homogeneous polynomial p(n) of degree d. Its gradient ∇p is a sum over the J
-    monomials of degree d - 1. All other degrees do not change the irradiance.
-
-    The irradiance has the shape (3 colors, N), and the gradient (3 components, 3 colors, N). Only
-    its tangential component is the derivative.
+    The irradiance is the polynomial c + a · n + p(n) of `_gradient_of_light` at N unit normals n.
+    Only the tangential component of its gradient is the derivative.
     """
     light_degree = math.isqrt(len(light)) - 1
     degree = _even_degree(light_degree)
@@ -355,11 +345,7 @@ def _gradient_of_light(degree: int, dtype: torch.dtype, device: torch.device) ->
 
 
 def _even_degree(degree: int) -> int:
-    """Return the degree of the polynomial of all harmonics with an even degree from 2 on.
-
-    Harmonics above `harmonics.DIFFUSE_DEGREE` are ignored, because they hardly
-    change the irradiance of a diffuse surface.
-    """
+    """Return the highest even degree that counts, at least 2 (see `harmonics.DIFFUSE_DEGREE`)."""
     highest = min(degree, harmonics.DIFFUSE_DEGREE)
     return max(highest - highest % 2, 2)
 
@@ -384,11 +370,7 @@ def _gradients(degree: int) -> Tensor:
 
 
 def _diffuse_basis(directions: Float[Tensor, "3 N"], degree: int) -> tuple[list[int], Tensor]:
-    """Compute the irradiance of N diffuse surfaces from each spherical harmonic.
-
-    The results are the ascending indices of the M harmonics that change the irradiance, and
-    the irradiance for a coefficient of 1, shape (M, N).
-    """
+    """Compute the ascending indices of the M harmonics that count, and their irradiance (M, N)."""
     nonzero = harmonics.nonzero_coefficients(degree).tolist()
     factors = harmonics.lambertian_factors(degree).to(directions)[nonzero, None]
     return nonzero, torch.stack(harmonics.evaluate_harmonics(directions, nonzero)) * factors

@@ -319,11 +319,7 @@ def _distribute(
     weights: Float[Tensor, "3 S"],
     corner_rows_shape: Sequence[int],
 ) -> Float[Tensor, "_ G"]:
-    """Add up values at S samples for each corner of the faces that the samples show.
-
-    Each value is multiplied by the barycentric weight of the corner at the sample. The rows of the
-    result are D sums for the first corners, then D for the second and D for the third ones.
-    """
+    """Add up values times barycentric weights at corners, in the layout of `corner_rows`."""
     corner_rows = values.new_zeros(corner_rows_shape)
     for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights.to(values)):
         # Values times weights. Rows are pairs of corner and value, columns are samples.
@@ -376,10 +372,7 @@ def _fragments_of_view(
     faces: Int[np.ndarray, "F 3"],
     settings: ImageSettings,
 ) -> Fragments:
-    """Create the `Fragments` of one view from the face at each sample of its image.
-
-    `depths` is None without perspective, and a sample without a face has the index -1.
-    """
+    """Create fragments from face indices (-1: no face) and depths (None: no perspective)."""
     size = settings.size
     samples = settings.samples
     resolution = len(face_ids)
@@ -420,12 +413,7 @@ def _fragments_of_view(
 
 
 def _compact(values: Int[np.ndarray, " S"], limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the distinct values of an array, and the index of each entry among them.
-
-    The result equals that of np.unique with return_inverse=True. This function
-    is faster, because it does not sort. All values are whole numbers in [0, limit), and the
-    distinct values are ascending.
-    """
+    """Do what np.unique with inverse does, for numbers in [0, limit) and faster without sorting."""
     # Convert the indices once here. Otherwise, each of the two lookups would convert them.
     values = values.astype(np.intp)
     is_present = np.zeros(limit, dtype=bool)

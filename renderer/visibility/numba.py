@@ -60,11 +60,7 @@ _njit: Callable[..., Any] = partial(numba.njit, nogil=True, error_model="numpy")
 
 
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function with numba for arguments of the types TYPES.
-
-    The machine code is stored in a file, so that the next process need not
-    compile the function again.
-    """
+    """Compile a function for TYPES, and store the code in a file for the next process."""
     # numba may raise any exception if its cache is read-only or damaged.
     try:
         return _njit(TYPES, cache=True)(function)
@@ -121,11 +117,7 @@ def _crossing(x: int, y: int, to_x: int, to_y: int, row_y: int, bits: int) -> in
 def _draw(
     positions: Any, depths: Any, faces: Any, closed: bool, bits: int, ids: Any, nearest: Any
 ) -> None:
-    """Draw the faces of one view into an image of face indices, in place.
-
-    Faces are drawn in ascending order. If two faces have the same depth at a
-    sample, the face with the lower index therefore stays.
-    """
+    """Draw faces in place in ascending order, so that at equal depth the lower index stays."""
     x = positions[0]
     y = positions[1]
     resolution = len(ids)

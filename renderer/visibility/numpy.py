@@ -187,13 +187,10 @@ def _edges(
 ) -> tuple[Int[np.ndarray, "3 _"], Int[np.ndarray, " T"]]:
     """Compute the lines through the edges of T triangles.
 
-    The corners are called top, middle and bottom by their position in the image.
-    The first edge leads from the top to the bottom corner, the second one from the
-    top to the middle corner, and the third one from the middle to the bottom
-    corner. A row of samples crosses an edge at the column
-    -(slope · row + constant) / height. The results are slope, constant and height of the first
-    edges, then of the second and the third ones; and the first row of samples at or below the
-    middle corners.
+    By row, the corners are top, middle and bottom; the edges lead from top to bottom, from top to
+    middle, and from middle to bottom. A row of samples crosses an edge at the column -(slope · row
+    + constant) / height. The results are slope, constant and height of all first, second and third
+    edges, and the first row of samples at or below the middle corners.
     """
     x, y = triangles
     # Sort the corners by y. For this, one integer per corner holds y in its high 32 bits
@@ -217,11 +214,7 @@ def _edges(
 def _planes(
     triangles: Int[np.ndarray, "2 3 T"], depths: Float[np.ndarray, "3 T"]
 ) -> Float[np.ndarray, "5 T"]:
-    """Compute the depth of T triangles as a linear function of column and row.
-
-    The rows are the column, the row and the depth of the first corner, and the slopes of
-    the depth per column and per row.
-    """
+    """Compute rows: column, row and depth of the first corner, and depth per column and per row."""
     (ax, bx, cx), (ay, by, cy) = triangles
     depth_a, depth_b, depth_c = depths
     to_b = depth_b - depth_a

@@ -84,10 +84,7 @@ def device() -> str:
 
 @contextmanager
 def _context() -> Iterator[moderngl.Context]:
-    """Create an OpenGL context for a `with` block, and check that it draws correctly.
-
-    Without an EGL device, or if the driver fails or renders wrong indices, it raises `InputError`.
-    """
+    """Yield an OpenGL context; without EGL, or if it draws wrong, `InputError` is raised."""
     # Triton must be loaded before the driver, because a process that loads Triton second
     # crashes.
     with suppress(ImportError):

@@ -132,10 +132,7 @@ class _ZerosWithGradient(torch.autograd.Function):
     def forward(
         ctx: Any, positions: Float[Tensor, "V 3"], view: _MovingView
     ) -> Float[Tensor, "3 _"]:
-        """Create the zeros, and store the view and the positions for `backward`.
-
-        The positions are homogeneous, (x w, y w, w).
-        """
+        """Create the zeros, and store the view and the homogeneous positions (x w, y w, w)."""
         ctx.save_for_backward(positions)
         ctx.view = view
         pixel_count = len(view.fragments.pixels) + len(view.uncovered_pixels)
@@ -362,10 +359,7 @@ class _Silhouettes:
         return Crossings(*(torch.from_numpy(np.concatenate(pair, axis=-1)) for pair in both))
 
     def crossings_along(self, axis: int) -> tuple[np.ndarray, ...]:
-        """Find where visible silhouettes pass between samples that are neighbors along an axis.
-
-        `axis` is X for neighbors in a row, and the arrays are those of `Crossings`, in order.
-        """
+        """Find the arrays of `Crossings` between neighbors in a row (`axis` is X) or column."""
         resolution = len(self.sample_grid)
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
@@ -473,10 +467,7 @@ def _cut_edges(
 def _silhouette_edges(
     places: Float[np.ndarray, "2 V"], faces: Int[np.ndarray, "F 3"]
 ) -> Int[np.ndarray, "2 N"]:
-    """Find the edges of a mesh whose faces all lie on the same side of the edge in the image.
-
-    The result has the vertices at both ends of each edge.
-    """
+    """Find the vertices of edges whose faces all lie on one side of the edge in the image."""
     ends, edge_of_side, face_count = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
     # Positions (x, y) of the corners a, b and c of all faces, shape (F,) each.
     (ax, bx, cx), (ay, by, cy) = places.take(faces.T, axis=1)
