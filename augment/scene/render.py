@@ -23,11 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.progress import progress
 from augment.scene.objects import Conditions, SceneObject
+from augment.scene.truth import COVERED
 from renderer.camera import Camera
 from renderer.errors import require_memory
 from renderer.image import background_term
@@ -357,6 +358,31 @@ class DirectRenderer:
             rays = self._rays_among(object_index)
             self._local_views[key] = LocalLightView(rays, mesh, fragments, self.settings)
         return self._local_views[key]
+
+    def mask(
+        self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"] | None = None
+    ) -> tuple[Bool[Tensor, "size size"], float]:
+        """Find the pixels that an object without its props and its table covers to COVERED or more.
+
+        Return also the fraction of the object that its props and its table do not hide. `vertices`
+        None are those of the unmoved object.
+        """
+        item = self.objects[object_index]
+        positions = item.mesh.vertices
+        if vertices is not None:
+            positions = vertices.detach().cpu().double().numpy()
+        counts = []
+        for faces in (item.mesh.faces, item.mesh.faces[item.own_faces]):
+            shown = (positions, faces, [camera], self.settings, self.rasterizer)
+            [fragments] = build_fragments(*shown)
+            own = item.own_faces[fragments.faces.numpy()][fragments.sample_to_seen_face.numpy()]
+            pixels = fragments.pixels[fragments.sample_to_pixel][torch.from_numpy(own)]
+            counts.append(torch.bincount(pixels, minlength=self.settings.size**2))
+            if item.own is None:
+                break
+        fraction = float(counts[0].sum() / counts[-1].sum().clamp(min=1))
+        is_covered = counts[0] >= COVERED * self.settings.samples**2
+        return is_covered.view(self.settings.size, self.settings.size), fraction
 
     def radiance(
         self,

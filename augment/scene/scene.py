@@ -16,6 +16,7 @@ from torch import Tensor
 from augment.progress import progress
 from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.render import DirectRenderer, Layer, OperatorRenderer
+from augment.scene.truth import Truth, boxes_of
 from renderer import errors
 from renderer.camera import Camera
 from renderer.errors import InputError
@@ -348,6 +349,40 @@ class Scene:
         if conditions.pixels is not None:
             images = clamp(images + conditions.pixels)
         return images
+
+    @torch.no_grad()
+    def truth(
+        self,
+        index_of: Callable[[str | int], int],
+        examples: Int[Tensor, " A"] | None = None,
+        conditions: Conditions | None = None,
+    ) -> Truth:
+        """Find class, box and mask of the objects in the V views of examples.
+
+        Args:
+            index_of: Function from the label of an object to the index of its class, such as
+                `Classifier.label`.
+            examples: Indices of the A examples. None for all.
+            conditions: Shape and pose of the A examples. None for those of the scene.
+
+        Returns:
+            The truth, with one object for each example.
+        """
+        rows = torch.arange(len(self)) if examples is None else self._as_examples(examples)
+        if conditions is None:
+            conditions = self.conditions(rows)
+        size = self.settings.size
+        masks = torch.zeros(len(rows), self.views, 1, size, size, dtype=torch.bool)
+        visible = torch.zeros(len(rows), self.views, 1)
+        for row, example in enumerate(rows.tolist()):
+            index = self.examples[example].object
+            vertices = conditions.row(row, self.mesh(example)).vertices
+            for view, camera in enumerate(self.cameras_under(conditions, row, example)):
+                found = self._direct_renderer.mask(index, camera.fixed(), vertices)
+                masks[row, view, 0], visible[row, view, 0] = found
+        labels = torch.tensor([index_of(self.labels[example]) for example in rows.tolist()])
+        truth = (labels[:, None, None].expand(-1, self.views, 1), boxes_of(masks), masks, visible)
+        return Truth(*(part.to(self.lights.device) for part in truth))
 
     def _as_examples(self, examples: object, count: int | None = None) -> Int[Tensor, " A"]:
         """Convert indices of examples to an integer tensor on the device of the lights.

@@ -1,0 +1,50 @@
+"""What the images of a scene show: the class, mask, box and visible fraction of each object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+# Label of an entry of `Truth` without an object, in images with fewer objects than others.
+NO_OBJECT = -1
+# A pixel belongs to an object that covers at least this fraction of it.
+COVERED = 0.5
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Labels, boxes and masks of the O objects in each of the V views of E examples.
+
+    The first object of an example is the one that an attack is about. Sizes are in pixels, and the
+    origin is the upper left corner of the image.
+
+    Attributes:
+        labels: Indices of classes. NO_OBJECT stands for no object.
+        boxes: Left, top, right and bottom side of the box of the visible part. 0 without one.
+        masks: Pixels of which the object covers at least half.
+        visible: Fraction of the object that no other object hides, in [0, 1].
+    """
+
+    labels: Int[Tensor, "E V O"]
+    boxes: Float[Tensor, "E V O 4"]
+    masks: Bool[Tensor, "E V O H W"]
+    visible: Float[Tensor, "E V O"]
+
+
+def boxes_of(masks: Bool[Tensor, "... H W"]) -> Float[Tensor, "... 4"]:
+    """Return the smallest boxes that contain masks: left, top, right and bottom, in pixels.
+
+    The box of an empty mask is 0.
+    """
+    sides = []
+    for is_used in (masks.any(-2), masks.any(-1)):
+        count = is_used.shape[-1]
+        first = is_used.int().argmax(-1)
+        end = count - is_used.flip(-1).int().argmax(-1)
+        sides.append((first, end))
+    (left, right), (top, bottom) = sides
+    boxes = torch.stack([left, top, right, bottom], dim=-1).float()
+    return boxes * masks.any(-1).any(-1, keepdim=True)
