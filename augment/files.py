@@ -167,10 +167,7 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
 
 
 def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
-    """Raise InputError if the logits of an image are random or change with the other images.
-
-    They do in a network that was exported in training mode, on which `eval()` has no effect.
-    """
+    """Raise InputError if logits are random or depend on other images (exported training mode)."""
     levels = torch.linspace(0, 1, 3 * 3 * classifier.size**2)
     images = levels[torch.randperm(len(levels), generator=torch.Generator().manual_seed(0))]
     images = images.view(3, 3, classifier.size, classifier.size)

@@ -461,9 +461,8 @@ def _attack_slide(
 ) -> None:
     """Attack a batch of photographs with one slide each, and record what is found in the result.
 
-    First, each photograph is shown in the light of its slide. If it keeps its class, random
-    search and gradient descent look for factors of the slide that change the class. Each photograph
-    has random numbers of its own, which do not depend on the other photographs.
+    If a photograph keeps its class in the light of its slide, random search and gradient descent
+    look for factors of the slide that change it. Each photograph has random numbers of its own.
     """
     settings = result.settings
     indices = rows.tolist()
@@ -511,11 +510,7 @@ def _attack_slide(
 def _draw_lights(
     photographs: UInt8[Tensor, "N 3 size size"], rows: Sequence[int], slide: int, seed: int
 ) -> ProjectedLight:
-    """Draw the random light of a projector on some photographs.
-
-    The light on a photograph depends on the index of the photograph, on `slide` and on the seed,
-    but not on the other photographs.
-    """
+    """Draw random projector light that depends on row, slide and seed, not on other photographs."""
     size = photographs.shape[-1]
     streams = [generator(seed, "light", row, slide) for row in rows]
     lights = [draw_projected_light(1, size, draws, photographs) for draws in streams]

@@ -313,9 +313,8 @@ class AugmentationService:
     ) -> Renders:
         """Select the next images of a folder in place of renders, and classify some of them.
 
-        The images are shown in passes through the folder, each in another random order. A selection
-        may begin in one pass and end in another. `number` tells how many selections were made
-        before.
+        Each pass through the folder has another random order, and a selection may begin in one pass
+        and end in another. `number` selections were made before.
         """
         count, image_count = len(self), len(images)
         # Imagine all passes one after the other. The first selected image is at this position.
@@ -404,10 +403,7 @@ class AugmentationService:
     def _gather(
         self, part: Shaped[Tensor, "A ..."], shard: Int[Tensor, " A"]
     ) -> Shaped[Tensor, "E ..."]:
-        """Collect what all processes have computed, each for some of the E examples.
-
-        `shard` has the index of each of this process's examples among all E.
-        """
+        """Collect from all processes what each computed for its `shard` of the E examples."""
         return distributed.all_gather_rows(part, shard, len(self.labels), self.world_size)
 
     def _attack_criterion(self) -> Criterion:
@@ -461,11 +457,7 @@ class AugmentationService:
 
 
 def _describe_scene(scene: Scene) -> list[object]:
-    """Return a description of a scene that is the same on all machines, to be hashed.
-
-    It contains texts, whole numbers and rounded numbers about objects, cameras, backgrounds and
-    lights.
-    """
+    """Return texts and rounded numbers about a scene that are the same on all machines."""
     objects = []
     for item in scene.objects:
         counts = (len(item.mesh.vertices), len(item.mesh.faces))
@@ -517,11 +509,7 @@ def select_examples_to_log(
 
 
 def _changes(problem: SceneProblem, values: Float[Tensor, "E D"]) -> dict[str, float]:
-    """Compute by how much an attack changed the light, the vertices and other conditions.
-
-    A diagnostic such as "light_change" is the L2 norm of the change, averaged over the examples.
-    Unchanged conditions are left out.
-    """
+    """Compute the mean L2 norm of the change of each condition, such as "light_change"."""
     before = problem.conditions(problem.start, problem.all_examples)
     after = problem.conditions(values, problem.all_examples)
     changes = {}

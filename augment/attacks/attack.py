@@ -296,11 +296,7 @@ def find_scene(
 
 
 def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Iterator[Settings]:
-    """Yield copies of the settings of a scene with different cameras and backgrounds.
-
-    If the only background is a gray value, each camera is used twice: with this
-    background and with a light gray one.
-    """
+    """Yield settings with other cameras, each also on light gray if the only background is gray."""
     has_one_gray = len(settings.backgrounds) == 1 and not isinstance(settings.backgrounds[0], str)
     for index in range(cameras):
         candidate = settings
@@ -329,11 +325,7 @@ def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Ite
 def _best_light(
     scene: Scene, settings: Settings, attack_settings: AttackSettings, classifier: Classifier
 ) -> tuple[float, Settings]:
-    """Find the light and the exposure in which a classifier recognizes a scene best.
-
-    Return the confidence (the lowest probability of the true class in all images, or 0 if one is
-    misclassified), and the settings that give it.
-    """
+    """Return the highest confidence in a scene in any light and exposure, and its settings."""
     degree = harmonics_of(scene.basis).degree
     candidates, coefficients = [], []
     for name in dict.fromkeys([settings.light, *PROBES, UNIFORM]):
@@ -359,11 +351,9 @@ def _best_light(
 def _confidences(
     scene: Scene, attack_settings: AttackSettings, classifier: Classifier, groups: int = 1
 ) -> Float[Tensor, " groups"]:
-    """Compute how surely a classifier recognizes each group of examples before an attack.
+    """Compute the confidence in each group of E / groups successive examples before an attack.
 
-    The confidence of an image is the probability of its true class, or 0 if the image is
-    misclassified. The confidence of a group is the lowest one of its images. Each group has
-    E / groups successive examples.
+    It is the lowest probability of the true class in its images, or 0 if one is misclassified.
     """
     problem = build_problem(attack_settings, scene)
     images = problem.images(problem.start)

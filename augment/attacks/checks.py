@@ -269,10 +269,7 @@ def require_transferable(
 def _attack_others(
     found: Successes, result: AttackResult, problem: SceneProblem, values: Values
 ) -> None:
-    """Attack the examples without a success, from the given values, and add the successes.
-
-    The values become those that the attack reaches.
-    """
+    """Attack the examples without a success, and add the successes and the values reached."""
     examples = torch.nonzero(~found[0])[:, 0]
     if len(examples):
         objective = result.objective().select(examples)
@@ -369,10 +366,7 @@ def _classify(
     classifier: Classifier,
     change: Callable[[Adversary], Adversary],
 ) -> dict[str, Any]:
-    """Change the adversaries of `_adversaries`, and classify their images.
-
-    The classifier may have the classes in another order, so classes are found by name.
-    """
+    """Change adversaries, and classify their images by class names, since orders may differ."""
     changed = [change(adversary) for adversary in adversaries]
     classes = result.classifier.classes
     labels = [adversary.shown.label for adversary in changed[len(examples) :]]

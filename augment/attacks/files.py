@@ -170,11 +170,7 @@ def _write_example(
 def _numbers_of_version(
     result: AttackResult, images: Float[Tensor, "E V 3 size size"]
 ) -> list[dict[str, Any]]:
-    """Classify another version of the attacked images, such as renders of Mitsuba.
-
-    Return a dictionary for each example: its successes, predictions, and differences from the
-    images of the result.
-    """
+    """Return successes, predictions and differences of another version for each example."""
     judged = result.objective().judge(images, result.problem.all_examples)
     logits, fooled_in_views, without_noise = judged
     is_counted = ~result.success_before

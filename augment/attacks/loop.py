@@ -163,8 +163,7 @@ def _minimize_group(
 ) -> Minimum:
     """Attack E examples from one or more initial values, until they succeed.
 
-    Further initial values are used for the examples that have not succeeded, or whose success does
-    not survive sensor noise, unless their share of the queries is less than one evaluation.
+    Further values are for examples that fail, or fail with sensor noise, while queries remain.
     """
     settings = objective.settings
     result = minimize_from(start, optimizer, objective, examples)

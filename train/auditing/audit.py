@@ -350,10 +350,7 @@ def _write_json(path: Path, measure: Callable[..., Mapping[str, Any]], *argument
 
 
 def _write_folder(folder: Path, write: Callable[[Path], object]) -> None:
-    """Write a result of the audit to a folder, unless the folder exists.
-
-    The result is written to FOLDER.part, which is renamed when it is complete.
-    """
+    """Write a result to FOLDER.part and rename it when complete, unless FOLDER exists."""
     if not folder.exists():
         unfinished = folder.with_name(f"{folder.name}.part")
         shutil.rmtree(unfinished, ignore_errors=True)

@@ -150,10 +150,7 @@ def _evaluate(runs: Mapping[str, RunSummary], images: str) -> compare.Evaluation
 
 
 def _slider(networks: Sequence[AuditedNetwork]) -> dict[str, Any] | None:
-    """Choose the attack that the slider of the report shows, the first that succeeds.
-
-    "network" and "light" of the result are titles. None if no attack succeeds.
-    """
+    """Choose the first attack that succeeds for the slider of the report, with titles, or None."""
     for network in networks:
         for kind, counts in network.counts.items():
             if "slider" in counts:
@@ -166,11 +163,7 @@ def _slider(networks: Sequence[AuditedNetwork]) -> dict[str, Any] | None:
 def _first_screen(
     networks: Sequence[AuditedNetwork], images: str | None, folders: Mapping[str, Path], plain: str
 ) -> first_screen.FirstScreen:
-    """Make the top of the report: its headline, main numbers and sentences.
-
-    With two networks and test images, it compares the scores of the networks.
-    Otherwise it describes the first network.
-    """
+    """Make the top of the report from two networks' scores, or else from the first network."""
     if images is None:
         return screen_of_one(networks[0], plain, Metrics())
     evaluations = _evaluate({network.name: network.run for network in networks}, images)
@@ -312,10 +305,7 @@ def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:
 def _worst(
     networks: Sequence[AuditedNetwork], folders: Mapping[str, Path]
 ) -> dict[str, list[Picture]]:
-    """Make two galleries of each network: its WORST misses and its WORST false alarms.
-
-    The caption of an image has the predictions of all networks.
-    """
+    """Make galleries of each network's WORST misses and false alarms, with all predictions."""
 
     def draw(images: str, row: int) -> Picture:
         texts = []

@@ -139,10 +139,7 @@ def _write_attack(
     settings: AttackExperimentSettings,
     targets: Mapping[str, Any],
 ) -> tuple[str, list[str]]:
-    """Check the result of the attack on one mesh, and write it to a folder.
-
-    Return a sentence that says whether the attack succeeded, and lines about other results.
-    """
+    """Check and write the attack on one mesh, and return its success and further lines."""
     details = []
     if scene != settings.scene:
         changes = overrides(scene, settings.scene)

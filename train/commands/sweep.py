@@ -144,10 +144,7 @@ def run_in_sweep(config: DictConfig) -> None:
 
 
 def _run(config: DictConfig, folder: Path) -> None:
-    """Train, score and export one run. If it has a checkpoint, the training is resumed.
-
-    If it fails, the reason is written to failed.txt.
-    """
+    """Train (or resume), score and export one run; the reason of a failure goes to failed.txt."""
     job = HydraConfig.get()
     # Hydra's joblib launcher trains several runs at once. Their lines on the terminal
     # then start with the number of the run.

@@ -255,10 +255,7 @@ def _has_class_folders(
 
 
 def _read_table(table: Path) -> dict[PurePosixPath, Row]:
-    """Read the table photos.csv, which has the source and the object of each photograph.
-
-    It is empty if the file is missing.
-    """
+    """Read photos.csv (source and object of each photograph), empty if it is missing."""
     rows: dict[PurePosixPath, Row] = {}
     if not os.path.lexists(table):
         return rows

@@ -149,10 +149,7 @@ def _render(
 def _render_solid(
     name: str, settings: ImageSettings, draws: torch.Generator
 ) -> UInt8[Tensor, "_ 3 size size"]:
-    """Render a random solid for each pair of a random camera and a random background.
-
-    Each image has another light.
-    """
+    """Render a random solid in another light for each pair of random camera and background."""
     mesh = solid(name, int(torch.randint(2**31, (1,), generator=draws)))
     polar, azimuth, width = torch.rand(3, CAMERAS, generator=draws, dtype=torch.float64).tolist()
     cameras = [

@@ -194,10 +194,7 @@ def _between(limits: Sequence[float], rng: np.random.Generator) -> float:
 
 
 def _from_angles(azimuth: float, elevation: float, distance: float) -> Float[np.ndarray, " 3"]:
-    """Convert spherical to Cartesian coordinates, with z up.
-
-    `azimuth` is the angle from +x toward +y in degrees, and `elevation` that above z = 0.
-    """
+    """Convert azimuth (from +x to +y) and elevation (above z = 0), in degrees, to x, y and z."""
     turn, rise = math.radians(azimuth), math.radians(elevation)
     x, y = math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn)
     return distance * np.array([x, y, math.sin(rise)])

@@ -66,10 +66,7 @@ def format_attack(
 
 
 def _success(result: AttackResult) -> str:
-    """Write on how many examples an attack succeeds.
-
-    Only examples that are classified correctly before the attack count.
-    """
+    """Write on how many of the examples classified correctly before an attack it succeeds."""
     clean = result.clean_correct
     rate = _success_rate(result.success[clean])
     if rate.n == 0:

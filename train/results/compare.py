@@ -405,10 +405,7 @@ def format_table(runs: Sequence[RunSummary]) -> str:
 
 
 def _format_tables(tables: Sequence[Table]) -> str:
-    """Write tables as Markdown, with an empty line between them.
-
-    A table without rows, and a column without known values, are left out.
-    """
+    """Write tables as Markdown, without empty tables and columns of unknown values."""
     return "\n\n".join(str(table.without_unknown_columns) for table in tables if table.rows)
 
 

@@ -398,9 +398,8 @@ class Pooled(ShortRepr):
     def _by_content(self, names: Iterable[Any]) -> dict[str, Pool]:
         """Collect the predictions for the images of each mesh, or of each class.
 
-        The ROC curve of a mesh of a positive class compares the images of this
-        mesh with all negatives. The ROC curve of another mesh compares all
-        positives with the images of this mesh. The same holds for classes.
+        The ROC curve of a positive mesh compares its images with all negatives, and that of another
+        mesh all positives with its images. The same holds for classes.
         """
         pools = {}
         for name, group in group_rows(self.all.predictions, names).items():

@@ -154,10 +154,7 @@ def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
 
 
 def _sha256(script: str) -> str:
-    """Return the SHA-256 of a script in base64.
-
-    The content security policy of a page lets the browser run the script with this hash.
-    """
+    """Return the base64 SHA-256 with which a content security policy allows a script."""
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 

@@ -243,10 +243,7 @@ def _read(folder: Path) -> RunSummary | None:
 
 
 def _read_run(folder: Path) -> RunSummary:
-    """Read a finished run, and the scores of the network with whose weights it began.
-
-    The field `before` is None if the run began with random weights.
-    """
+    """Read a finished run; `before` is None if it began with random weights."""
     # Each line of metrics.jsonl is an epoch. The last line has the final scores.
     *epochs, scores = read_metrics(folder)
     config = read_config(folder / CONFIG)
@@ -504,10 +501,7 @@ def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
 
 
 def _walk(folder: Path) -> Iterator[Path]:
-    """Yield a folder and all folders below it that hold a run, an attack or scores.
-
-    Sub-folders with the scores of a run are left out, because the run includes these scores.
-    """
+    """Yield a folder and those below with a run, an attack or scores, except scores of a run."""
     files_of_run = {run_folder.METRICS, run_folder.FAILURE, run_folder.LAST, run_folder.BEST}
     files_of_others = {LINES, SUMMARY, PUBLISHED}
     for root, subfolders, file_names in os.walk(folder):

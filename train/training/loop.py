@@ -299,10 +299,7 @@ class Trainer:
             )
 
     def _save(self) -> None:
-        """Write the checkpoint last.pt, and best.pt if there is a new best network.
-
-        The former last.pt is renamed to previous.pt. Only the first process writes.
-        """
+        """Write last.pt (the former becomes previous.pt), and best.pt, in the first process."""
         if self._epoch_state:
             self._require_finite(float(self._epoch_state.sums[0]), self.epoch + 1)
         with self.phases("input_output"):

@@ -202,10 +202,7 @@ class Run:
         console.warning(change, *both, settings.schedule, *rates)
 
     def _score_initial(self, model: MixedPrecision) -> dict[str, float]:
-        """Score the initial network on the test images and on photographs.
-
-        If the data have no labels, the predictions of the initial network become their labels.
-        """
+        """Score the initial network, whose predictions become labels if the data have none."""
         predictions = self._predict(model, self.data.test)
         self._initial_predictions = predictions
         if not self.data.labeled:
@@ -275,10 +272,7 @@ class Run:
         return scores
 
     def _interpolate(self) -> None:
-        """Interpolate between the weights before and after the training, and write best.pt.
-
-        Weights that an earlier process of the run interpolated stay as they are.
-        """
+        """Write best.pt with weights between before and after, unless it has been interpolated."""
         trainer = self.trainer
         if INTERPOLATION in trainer.best or trainer.initial is None:
             return
