@@ -509,7 +509,7 @@ def select_examples_to_log(
 
 
 def _changes(problem: SceneProblem, values: Float[Tensor, "E D"]) -> dict[str, float]:
-    """Compute the mean L2 norm of the change of each condition, such as "light_change"."""
+    """Compute the L2 norm of each change, such as "light_change", averaged over the examples."""
     before = problem.conditions(problem.start, problem.all_examples)
     after = problem.conditions(values, problem.all_examples)
     changes = {}

@@ -160,7 +160,7 @@ def _length(vectors: Vectors) -> Float[Tensor, " N"]:
 
 
 def _cross(u: Vectors, v: Vectors) -> Vectors:
-    """Compute u × v without fused operations, which gives exactly zero for parallel vectors."""
+    """Compute u × v unfused, unlike torch.linalg.cross: it is exactly zero for parallel vectors."""
     return torch.stack(_components(u, v))
 
 
@@ -194,7 +194,11 @@ def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute a · b, and the exact minus the rounded product, from exact halves (Dekker 1971)."""
+    """Compute a · b, and the rounding error of this product (Dekker 1971).
+
+    The binary digits of each factor are split into an upper and a lower half. Products of two
+    halves have no rounding error. The error is the exact product minus the rounded one.
+    """
     rounded = a * b
     a_high, a_low = _halves(a)
     b_high, b_low = _halves(b)

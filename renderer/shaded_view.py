@@ -150,7 +150,11 @@ class ShadedView:
     def _radiance_with_silhouettes(
         self, camera: Camera, background: Float[Tensor, "3 pixels"]
     ) -> PixelRadiance:
-        """Compute radiance of covered pixels, then of those that silhouettes may enter."""
+        """Compute radiance whose gradients include the movement of silhouettes and surfaces.
+
+        The background is linear. Uncovered pixels into which silhouettes may move follow the
+        covered ones.
+        """
         fragments = self.fragments
         # Each sample becomes a pixel of a finer image, so that it is shaded alone.
         finer_fragments = replace(fragments.by_sample(), camera=camera)
@@ -176,7 +180,11 @@ class ShadedView:
         )
 
     def _divide_among_samples(self, pixel_radiance: Float[Tensor, "3 P"]) -> Float[Tensor, "3 S"]:
-        """Divide radiance that is known for whole pixels among samples by their albedo."""
+        """Divide the radiance of each pixel among its samples, in proportion to their albedo.
+
+        Radiance of shadows and bounces is only known for whole pixels, but the gradients of
+        silhouettes need that of each sample.
+        """
         sample_to_pixel = self.fragments.sample_to_pixel
         sample_albedo = self.albedo.detach().T
         zeros = pixel_radiance.new_zeros(pixel_radiance.shape)

@@ -419,7 +419,11 @@ class TransferOperator:
 
     @cached_property
     def _channels(self) -> list[Tensor]:
-        """Channels (K, P) of `transfer`: 1 of all colors, 2 with one of gloss, or 1 per color."""
+        """Channels of `transfer`, shape (K, P) each.
+
+        One is shared by all colors. A second one of specular reflection is added to all. Three are
+        those of the colors.
+        """
         return list(self.transfer)
 
     @cached_property

@@ -117,7 +117,11 @@ def _samples_of_textures(
 
 
 def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tuple[Tensor, Tensor]]:
-    """Find (weight, row · width + column) of the upper left and right, then the lower texels."""
+    """Find the four texels around each of N points, and their weights for interpolation.
+
+    The pairs of weight and index (row · width + column) are for the upper left, upper right, lower
+    left and lower right texel.
+    """
     u, v = uvs
     # The coordinate v points up, but row 0 of the texture is at the top.
     rows = _neighbors(1 - v, texture.height)

@@ -214,7 +214,11 @@ def _edges(
 def _planes(
     triangles: Int[np.ndarray, "2 3 T"], depths: Float[np.ndarray, "3 T"]
 ) -> Float[np.ndarray, "5 T"]:
-    """Compute rows: column, row and depth of the first corner, and depth per column and per row."""
+    """Compute the depth of T triangles as a linear function of column and row.
+
+    The rows are the column, the row and the depth of the first corner, and the slopes of the depth
+    per column and per row.
+    """
     (ax, bx, cx), (ay, by, cy) = triangles
     depth_a, depth_b, depth_c = depths
     to_b = depth_b - depth_a
