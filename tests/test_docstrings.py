@@ -25,7 +25,6 @@ FUNCTIONS = [name for name, value in PUBLIC.items() if isinstance(value, Functio
 
 
 def modules_with_examples() -> list[str]:
-    """List the names of the modules whose text has an example."""
     names = []
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):

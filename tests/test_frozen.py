@@ -22,7 +22,6 @@ import json
 import os
 import platform
 import re
-import signal
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -40,7 +39,6 @@ import augment
 import renderer
 from augment.attack_settings import EOTSettings
 from augment.scene.objects import Conditions
-from renderer.light.files import directional
 from renderer.light.skylight import coefficients as skylight
 
 RECORDS = Path(__file__).with_name("frozen.json")
@@ -74,17 +72,12 @@ class RenderCase:
 
 ALL_LEAVES = ("light", "vertices", "albedo")
 RENDERS = {
-    "flat_linear": RenderCase("orange:0", ABOVE, "grace", {"normals": "flat", "samples": 1}),
-    "smooth_srgb_perspective": RenderCase(
-        "apple:1", NEAR, "eucalyptus", {"encoding": "srgb", "samples": 3}
-    ),
     "compiled": RenderCase("lemon:2", RING, "st_peters", {"rasterizer": "numba"}),
     "shadows": RenderCase("pear:0", ASIDE, "environment", {"shadows": True}),
     "bounces": RenderCase(
         "cup:0", NEAR, "uniform", {"bounces": 2, "normals": "flat", "encoding": "srgb"}
     ),
     "sky": RenderCase("mushroom:3", RING, "skylight", {"albedo_scale": 0.7, "background": 0.1}),
-    "subdivided": RenderCase("table:0+2000", ABOVE, "lamp", {"normals": "flat", "samples": 3}),
     "exported": RenderCase("bottle:1.glb", ASIDE, "grace", {"encoding": "srgb"}),
     "textured": RenderCase("tent", NEAR, "grace", {"encoding": "srgb"}, ("light", "albedo")),
     "flat_gradients": RenderCase("sweet_pepper:0", ABOVE, "grace", {"normals": "flat"}, ALL_LEAVES),
@@ -125,8 +118,6 @@ DISCS = augment.LampsSettings(
 
 @dataclass(frozen=True)
 class SceneCase:
-    """A call of `build_scene`."""
-
     meshes: list[Any]
     views: int
     options: dict[str, Any]
@@ -169,9 +160,6 @@ ATTACKS = {
     "lighting_l2": AttackCase(
         {"lighting": StepSettings("l2", 0.8, step_size=0.3)}, settings={"quantized": True}
     ),
-    "lighting_signed": AttackCase(
-        {"lighting": StepSettings(step_size=0.3)}, settings={"allow_negative": True, "margin": 0.0}
-    ),
     "skylight": AttackCase(
         {"skylight": augment.SkylightSettings(zenith=30.0, step_size=0.3)}, {"normals": "smooth"}
     ),
@@ -180,11 +168,6 @@ ATTACKS = {
     ),
     "lamps": AttackCase({"lamps": StepSettings(step_size=2.0)}, {"lamps": LAMPS, "shadows": True}),
     "places": AttackCase({"positions": StepSettings("l2", 1.0, step_size=0.3)}, {"lamps": DISCS}),
-    "geometry": AttackCase(
-        {"geometry": StepSettings("linf", 0.02, "sign", 0.01)},
-        {"normals": "smooth", "shadows": True},
-        {"backtracking": True},
-    ),
     "albedo": AttackCase(
         {"albedo": StepSettings("linf", 0.2, "sign", 0.03)},
         {"shadows": True, "ground": [0.5, 0.4, 0.3]},
@@ -199,9 +182,6 @@ ATTACKS = {
         },
         {"views": 3, "shared": True, "fov": 35.0},
         {"backtracking": True},
-    ),
-    "targeted": AttackCase(
-        {"lighting": StepSettings(step="raw", step_size=0.5)}, {"views": 2}, target="pear"
     ),
     "expectation": AttackCase(
         {"lighting": StepSettings("linf", 0.1, "sign", 0.04)},
@@ -219,11 +199,6 @@ RUNS = {
     "demonstration": """
 experiment=paper compare=[none] model.dropout=0.0 train.schedule=one_cycle augment.examples=4
 augment.attack.max_steps=3 augment.attack.step_size=0.3
-""",
-    "best": """
-experiment=best augment.examples=null augment.regenerate_every=30 augment.random_light.radius=1.0
-scene.views=1 meshes=['solid:orange',solid:orange:1] train.images_per_epoch=60 train.ema_decay=0.8
-train.distillation_weight=1.0
 """,
     "harden": """
 experiment=harden augment=adversarial augment.examples=6 augment.regenerate_every=30
@@ -339,29 +314,10 @@ def test_attack(name, verify):
     )
 
 
-@pytest.mark.parametrize("name", ["demonstration/none", "demonstration", "best", "harden"])
+@pytest.mark.parametrize("name", ["demonstration/none", "demonstration", "harden"])
 def test_weights(name, trained, verify):
     run, _, compared = name.partition("/")
     verify(*weights(trained(run) / compared))
-
-
-@pytest.mark.slow
-def test_weights_of_a_stopped_and_resumed_run(trained, call, monkeypatch, tmp_path, verify):
-    initial = f"network={trained('demonstration')}"
-    arguments = [*SMALL.split(), *RUNS["harden"].split(), initial, f"out={tmp_path}/run"]
-    with monkeypatch.context() as patch:
-
-        def save_and_stop(*arguments):
-            patch.undo()
-            torch.save(*arguments)
-            signal.raise_signal(signal.SIGTERM)
-
-        patch.setattr(torch, "save", save_and_stop)
-        assert call("train", *arguments) == 128 + signal.SIGTERM
-    stopped = digest(weights(tmp_path / "run"))
-    assert call("train", *arguments, "train.resume=true") == 0
-    assert digest(weights(tmp_path / "run")) != stopped
-    verify(*weights(tmp_path / "run"), case="test_weights[harden]")
 
 
 @pytest.fixture
@@ -387,19 +343,17 @@ def trained(call, monkeypatch, tmp_path_factory) -> Callable[[str], Path]:
 
 @pytest.fixture
 def verify(request) -> Callable[..., None]:
-    """Return a function that compares a hash of tensors with the recorded one, or records it.
-
-    The hash is that of this test, unless another case is named.
-    """
+    """Return a function that compares a hash of tensors with the recorded one, or records it."""
     records = json.loads(RECORDS.read_text()) if RECORDS.exists() else {}
     recording = os.environ.get("RECORD_FROZEN")
     if not recording and fingerprint() not in records:
         command = "RECORD_FROZEN=1 python -m pytest tests/test_frozen.py"
         pytest.skip(f"nothing is recorded for {fingerprint()}: {command}")
 
-    def compare(*tensors: Tensor, case: str = request.node.name) -> None:
+    def compare(*tensors: Tensor) -> None:
+        case = request.node.name
         assert all(tensor.isfinite().all() for tensor in tensors)
-        if recording and case == request.node.name:
+        if recording:
             records.setdefault(fingerprint(), {})[case] = digest(tensors)
             RECORDS.write_text(json.dumps(records, indent=1, sort_keys=True) + "\n")
         recorded = records[fingerprint()].get(case)
@@ -463,7 +417,6 @@ def digest(tensors: Iterable[Tensor]) -> str:
 
 
 def weights(folder: Path) -> list[Tensor]:
-    """Read the weights of the checkpoints of a run, in order."""
     tensors = []
     for name in ("best.pt", "last.pt"):
         state = torch.load(folder / name, weights_only=True)["model"]
@@ -480,7 +433,6 @@ def gradients(images: Tensor, leaves: list[Tensor]) -> list[Tensor]:
 
 
 def classifier() -> augment.Classifier:
-    """Make a network with random weights that predicts the first class, with a small margin."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = nn.Sequential(
@@ -498,7 +450,6 @@ def classifier() -> augment.Classifier:
 
 
 def textured_tent() -> renderer.Mesh:
-    """Make a roof of two rectangles with a texture of noise."""
     vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 0, 0.8], [-1, 0, 0.8], [1, 1, 0], [-1, 1, 0]])
     plain = renderer.Mesh.plain(vertices, [[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5]])
     uvs = (vertices[plain.faces][..., :2] + 1) / 2
@@ -514,18 +465,16 @@ def textured_tent() -> renderer.Mesh:
 def mesh_named(name: str, folder: Path) -> renderer.Mesh:
     """Make a mesh by its name.
 
-    NAME:SEED is a solid. NAME:SEED+N subdivides it into N faces or more.
-    NAME:SEED.glb writes it to a file and reads the file. tent is a textured roof.
+    NAME:SEED is a solid. NAME:SEED.glb writes it to a file and reads the file. tent is a
+    textured roof.
     """
     if name == "tent":
         return textured_tent()
-    kind, seed, change = re.fullmatch(r"(\w+):(\d+)(.*)", name).groups()
+    kind, seed = name.removesuffix(".glb").split(":")
     mesh = renderer.solid(kind, int(seed))
-    if change == ".glb":
+    if name.endswith(".glb"):
         renderer.export_mesh(mesh, folder / "mesh.glb")
         return renderer.load_mesh(folder / "mesh.glb")
-    if change:
-        return renderer.subdivide(mesh, int(change))
     return mesh
 
 
@@ -535,8 +484,6 @@ def light_named(name: str, folder: Path) -> Tensor:
         polar = torch.tensor(0.9).rad2deg()
         azimuth = torch.tensor(2.0).rad2deg()
         return 0.02 * skylight(polar, azimuth, torch.tensor(3.5))
-    if name == "lamp":
-        return directional(torch.tensor([0.48, 0.6, 0.64]), torch.tensor([1.0, 0.9, 0.7]))
     if name == "environment":
         radiance = np.random.default_rng(4).gamma(0.3, size=(16, 32, 3))
         np.save(folder / "map.npy", radiance.astype(np.float32))

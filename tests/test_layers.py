@@ -5,6 +5,7 @@ import importlib
 import re
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -34,12 +35,12 @@ def test_a_package_imports_no_package_above_it(package):
 
 
 def modules() -> dict[str, Path]:
-    """Map all modules of the packages to their files."""
     paths = [path for package in ALLOWED for path in (ROOT / package).rglob("*.py")]
     names = [path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".") for path in paths]
     return dict(zip((name.removesuffix(".__init__") for name in names), paths, strict=True))
 
 
+@cache
 def imported_modules() -> dict[str, set[str]]:
     """Map each module to what it imports of the packages, also in functions and for types."""
     known = modules()
@@ -86,7 +87,6 @@ def test_no_folder_of_a_package_imports_one_that_imports_it(package):
 
 
 def folder_of(module: str) -> str:
-    """Return the folder of a module below its package, or the module if it has none."""
     parts = module.split(".")
     return ".".join(parts[:2])
 

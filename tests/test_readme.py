@@ -155,7 +155,6 @@ def test_training_loop_block_trains_on_data_and_renders():
 
 
 def read_auc(folder: Path) -> float:
-    """Read the AUC on the photographs of the laboratory."""
     summary = json.loads((folder / "laboratory" / "summary.json").read_text())
     return summary["auc"]["value"]
 

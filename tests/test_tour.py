@@ -17,7 +17,6 @@ def tour() -> nbformat.NotebookNode:
 
 
 def outputs_of(tour: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
-    """List the outputs of all cells."""
     outputs = []
     for cell in tour.cells:
         outputs += cell.get("outputs", [])

@@ -28,7 +28,6 @@ PNG_SIGNATURE = b"\x89PNG"
 
 
 def read(path: Path) -> list[dict[str, str]]:
-    """Read the rows of a CSV file."""
     with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
@@ -132,7 +131,6 @@ def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
 
 
 def save_random_data(path: Path) -> None:
-    """Write a data set of random images in two classes, as data=npz reads it."""
     rng = np.random.default_rng(0)
     arrays = {"classes": np.array(["other", "orange"])}
     for split in ("train", "test"):

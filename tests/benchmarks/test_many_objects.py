@@ -1,6 +1,5 @@
 """Networks are scored on objects that no training shows. Intervals are over objects and setups."""
 
-import csv
 import zipfile
 from pathlib import Path
 
@@ -8,13 +7,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from PIL import Image
 from torch import nn
 
 from augment.classifier import Classifier
 from augment.scene import patterns
-from benchmarks import many_objects, splits
-from train.data.photo import TABLE
+from benchmarks import many_objects
 from train.results.tables import Estimate, fraction
 
 CLASSES = ["orange", "lemon", "packet"]
@@ -67,16 +64,6 @@ def test_the_splits_share_only_the_objects_of_the_training():
         assert trained.isdisjoint(item["label"] for item in split[many_objects.UNTRAINED])
     patterns = many_objects.PATTERNS
     assert set(patterns["validation"]).isdisjoint(patterns[many_objects.TEST])
-
-
-def test_a_hard_slide_has_two_complementary_saturated_colors_and_black():
-    slide = many_objects.draw_slide(np.random.default_rng(0), has_stripes=False)
-    colors = {color for _, color in slide.getcolors()}
-    black = (0, 0, 0)
-    assert black in colors
-    first, second = colors - {black}
-    # The values of complementary saturated colors add up to white.
-    assert np.allclose(np.add(first, second), 255, atol=1)
 
 
 def one_group(values, setups=None, objects=None) -> many_objects.ScoredGroup:
@@ -149,36 +136,3 @@ def test_weights_between_two_networks_of_one_layer_give_logits_between():
     between = many_objects.interpolate(*networks, 0.25)
     expected = 0.75 * networks[0](images) + 0.25 * networks[1](images)
     torch.testing.assert_close(between(images), expected)
-
-
-def test_photographs_count_as_right_by_the_number_in_their_name(tmp_path):
-    classifiers = {
-        "original": Classifier(lambda images: images[:, :, 0, 0], 4, CLASSES),
-        "other": Classifier(lambda images: -images[:, :, 0, 0], 4, CLASSES),
-    }
-    for name, color in (("0_a", (200, 100, 0)), ("1_b", (200, 100, 0)), ("002_c", (0, 100, 200))):
-        Image.new("RGB", (4, 4), color).save(tmp_path / f"{name}.png")
-    table = many_objects.photograph_table(classifiers, sorted(tmp_path.iterdir()), 4)
-    assert [row[1][:6] for row in table.rows] == ["2 of 3", "0 of 3"]
-    assert [row[2][:6] for row in table.rows] == ["3 of 3", "0 of 3"]
-
-
-def test_each_look_at_the_test_split_is_recorded(monkeypatch, tmp_path, capsys):
-    folder = tmp_path / "test" / "objects" / "patterns"
-    (folder / "orange").mkdir(parents=True)
-    Image.new("RGB", (4, 4), (200, 100, 0)).save(folder / "orange" / "a.png")
-    (folder / TABLE).write_text("path,setup,mesh\norange/a.png,0,ball\n")
-    log = tmp_path / "log.csv"
-    log.write_text("date,commit,table,network,weights,parts,images\n")
-    monkeypatch.setattr(splits, "LOG", log)
-    right = Classifier(nn.Sequential(nn.AvgPool2d(4), nn.Flatten()), 4, CLASSES)
-    networks = {"original": [right], "hardened": [right, right]}
-    monkeypatch.setattr(many_objects, "load_networks", lambda options: networks)
-    words = ["score", "original", "--objects", str(tmp_path), "--split", "test"]
-    with pytest.raises(SystemExit):
-        many_objects.main(words)
-    many_objects.main([*words, "--network-size", "4", "--table", "many"])
-    rows = list(csv.DictReader(log.read_text().splitlines()))
-    assert [row["network"] for row in rows] == ["original", "hardened/0", "hardened/1"]
-    assert {row["table"] for row in rows} == {"many"}
-    assert "1.000" in capsys.readouterr().out

@@ -94,12 +94,6 @@ def test_a_script_appends_records_whose_table_has_all_rows(
     assert {row.count(" | ") for row in (header, line, *rows)} == {column_count - 1}
 
 
-def test_the_success_in_norm_balls_is_drawn(tmp_path):
-    figure = tmp_path / "figure.png"
-    table.main([str(RECORDS / "norm_balls.jsonl"), "--figure", str(figure)])
-    assert figure.read_bytes().startswith(PNG_SIGNATURE)
-
-
 @pytest.mark.slow  # Two processes import everything.
 def test_adversaries_are_found_and_rendered_again_by_the_attack_script(tmp_path, capsys):
     out = tmp_path / "records.jsonl"

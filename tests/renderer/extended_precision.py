@@ -30,12 +30,10 @@ LONG_DOUBLE_DIGITS = 25
 
 
 def extended(values: ArrayLike) -> np.ndarray:
-    """Convert values to long doubles."""
     return np.asarray(values, dtype=np.longdouble)
 
 
 def exact(values: ArrayLike) -> np.ndarray:
-    """Convert values to 256-bit numbers, in an array of objects."""
     return _to_exact(values)
 
 
@@ -45,7 +43,6 @@ _exact_imaginary_part = np.frompyfunc(lambda number: number.imag, 1, 1)
 
 
 def is_exact(values: np.ndarray) -> bool:
-    """Return whether an array holds 256-bit numbers."""
     return values.dtype == object
 
 
@@ -328,7 +325,6 @@ def derivative(values: np.ndarray) -> np.ndarray:
 
 
 def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Compute the cross products (3, N) of vectors (3, N)."""
     x = u[1] * v[2] - u[2] * v[1]
     y = u[2] * v[0] - u[0] * v[2]
     z = u[0] * v[1] - u[1] * v[0]

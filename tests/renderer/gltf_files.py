@@ -59,7 +59,6 @@ class Gltf:
         return len(self.tree["accessors"]) - 1
 
     def sparse(self, index: int, rows: np.ndarray, values: np.ndarray) -> None:
-        """Replace rows of an array by sparse values."""
         self.tree["accessors"][index]["sparse"] = {
             "count": len(rows),
             "indices": {
@@ -107,7 +106,6 @@ class Gltf:
         return json.dumps(self.tree | {"buffers": [{"byteLength": len(self.buffer), "uri": uri}]})
 
     def glb(self) -> bytes:
-        """Return the chunks of a .glb file."""
         text = json.dumps(self.tree | {"buffers": [{"byteLength": len(self.buffer)}]}).encode()
         text += b" " * (-len(text) % 4)
         chunks = struct.pack("<I4s", len(text), b"JSON") + text
@@ -115,7 +113,6 @@ class Gltf:
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
     def write(self, path: Path) -> Path:
-        """Write the file as .glb or .gltf, and return its path."""
         path.write_bytes(self.glb() if path.suffix == ".glb" else self.text().encode())
         return path
 

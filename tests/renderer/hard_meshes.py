@@ -135,8 +135,4 @@ def non_manifold() -> Mesh:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Scale vectors (N, 3) to unit length."""
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-TRIANGLE = painted([[-0.9, -0.8, 0.1], [0.8, -0.5, 0.3], [0.1, 0.9, -0.2]], [[0, 1, 2]])

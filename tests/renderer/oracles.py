@@ -97,7 +97,6 @@ def patchwork(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> Mesh:
 
 
 def mesh_of(shape: trimesh.Trimesh, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
-    """Convert a shape of trimesh to a mesh of one color."""
     return Mesh.plain(shape.vertices, shape.faces, color)
 
 
@@ -130,7 +129,6 @@ def linear_of(srgb: ArrayLike) -> np.ndarray:
 
 
 def encoded(texels: np.ndarray | Image.Image) -> bytes:
-    """Encode an image as .png."""
     content = io.BytesIO()
     image = texels if isinstance(texels, Image.Image) else Image.fromarray(texels)
     image.save(content, "PNG")
@@ -138,7 +136,6 @@ def encoded(texels: np.ndarray | Image.Image) -> bytes:
 
 
 def png_of(*color: int) -> bytes:
-    """Encode an image of one color as .png."""
     return encoded(np.full((2, 2, len(color)), color, dtype=np.uint8))
 
 

@@ -167,7 +167,6 @@ def first_hits(mesh: Mesh, directions: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def view_of_torus(mesh: Mesh, rasterizer: str) -> Fragments:
-    """Rasterize a mesh for CAMERA with 64 × 64 samples."""
     settings = ImageSettings(64, 1)
     [view] = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose(rasterizer))
     return view

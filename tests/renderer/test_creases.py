@@ -49,15 +49,6 @@ def test_a_can_has_flat_lids_and_a_round_side():
     assert len(np.unique(CAN.normal_ids)) == 2 * 48 * 2 + 2
 
 
-def test_the_image_of_a_lid_has_one_color():
-    light = nb.load_light("grace")
-    camera = nb.OrthographicCamera(0.0, 20.0, 0.6)
-    image = nb.render(CAN, camera, light, 16, rasterizer="numpy")
-    torch.testing.assert_close(image, image[:, :1, :1].expand_as(image))
-    flat = nb.render(CAN, camera, light, 16, rasterizer="numpy", normals="flat")
-    torch.testing.assert_close(image, flat)
-
-
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize(("angle", "is_sharp"), [(0, 0), (39.9, 0), (40, 0), (40.1, 1), (170, 1)])
 @pytest.mark.parametrize("sign", [1, -1])
@@ -188,18 +179,6 @@ def test_joined_and_selected_meshes_keep_their_normals():
 def test_round_solids_have_no_sharp_edge(name):
     mesh = nb.solid(name, 3)
     assert is_same_partition(mesh.normal_ids, mesh.faces)
-
-
-@pytest.mark.parametrize("normals", ["smooth", "flat"])
-@pytest.mark.parametrize("name", ["cup", "bottle", "table", "apple"])
-def test_a_file_has_the_normals_of_the_mesh(name, normals, tmp_path):
-    mesh = nb.normalize(nb.solid(name, 1))
-    nb.export_mesh(mesh, tmp_path / "mesh.glb", normals, first=len(mesh.faces))
-    loaded = nb.load_mesh(tmp_path / "mesh.glb")
-    assert_array_equal(corners_of(loaded), corners_of(mesh))
-    # Flat normals that differ by less than a degree become one.
-    tolerance = 1e-2 if normals == "flat" else 1e-6
-    assert_allclose(loaded.corner_normals, mesh.written_normals(normals), atol=tolerance)
 
 
 def test_moved_vertices_keep_the_sharp_edges_of_the_mesh():

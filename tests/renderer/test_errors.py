@@ -39,7 +39,6 @@ SETTINGS = ImageSettings(2, 2)
 
 
 def corner_albedo(corner_colors: Tensor) -> Tensor:
-    """Compute the albedo of the mesh with other corner colors."""
     return surface_albedo(replace(MESH, corner_colors=corner_colors.numpy()), FRAGMENTS, "srgb")
 
 

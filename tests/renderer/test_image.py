@@ -15,12 +15,10 @@ KNEE = 0.0031308
 
 
 def pixel(*rgb: float) -> Tensor:
-    """Return one pixel with several channels, shape (channels, 1)."""
     return torch.tensor(rgb, dtype=torch.float64)[:, None]
 
 
 def one(value: float) -> Tensor:
-    """Return one pixel with one channel, shape (1, 1)."""
     return pixel(value)
 
 

@@ -42,13 +42,11 @@ def moved_box(offset: float, scale: float = 1.0, faces: np.ndarray = BOX.faces) 
 
 
 def weld(mesh: Mesh) -> Mesh:
-    """Merge vertices at the same position."""
     vertices, ids = np.unique(mesh.vertices, axis=0, return_inverse=True)
     return Mesh.plain(vertices, ids.reshape(-1)[mesh.faces])
 
 
 def with_faces(*faces: np.ndarray) -> Mesh:
-    """Return the vertices of the box with other faces."""
     return Mesh.plain(BOX.vertices, np.concatenate(faces))
 
 

@@ -68,7 +68,6 @@ def ball() -> Mesh:
 
 
 def can() -> Mesh:
-    """Return a can, whose lids are flat and whose side is round."""
     return mesh_of(trimesh.creation.cylinder(0.8, 1.2), (0.5, 0.4, 0.3))
 
 
@@ -101,8 +100,7 @@ def test_a_mitsuba_map_equals_the_light_in_every_direction(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("make_mesh", "encoding", "normals"),
-    [(ball, "linear", "smooth"), (ball, "srgb", "flat"), (can, "linear", "smooth")],
+    ("make_mesh", "encoding", "normals"), [(ball, "srgb", "flat"), (can, "linear", "smooth")]
 )
 def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, encoding, normals):
     """Inside the silhouette, the mean error is below half of 1/255, and the root mean square

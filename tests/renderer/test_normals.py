@@ -29,7 +29,6 @@ def dented(shape: trimesh.Trimesh) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def torus() -> trimesh.Trimesh:
-    """Return a coarse torus."""
     return trimesh.creation.torus(1, 0.3, 6, 5)
 
 
@@ -43,7 +42,6 @@ def test_derivatives_on_a_mesh_are_central_differences(function, shape):
 
 
 def exact_cross_product(u: list[Fraction], v: list[Fraction]) -> list[Fraction]:
-    """Compute the cross product of two vectors."""
     return [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
 
 

@@ -38,7 +38,6 @@ Process = subprocess.Popen[str]
 
 
 def write_data(folder: Path) -> None:
-    """Write data.npz, class folders, photographs and the textured mesh.obj."""
     rng = np.random.default_rng(0)
     # The accuracy changes for many epochs, because the contrast is so low.
     save_colored_noise(folder / "data.npz", rng, contrast=8)
@@ -132,7 +131,6 @@ def end(process: Process) -> tuple[int, str, str]:
 
 @pytest.fixture(scope="session")
 def data(tmp_path_factory) -> Path:
-    """Return a folder with everything that a training run reads."""
     folder = tmp_path_factory.mktemp("data")
     write_data(folder)
     return folder

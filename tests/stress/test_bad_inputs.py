@@ -136,7 +136,6 @@ def bytes_changed(draw: st.DrawFn, good: bytes) -> bytes:
 
 @st.composite
 def arrays_changed(draw: st.DrawFn, good: bytes) -> bytes:
-    """Change the type or the shape of one array of an .npz file."""
     arrays = dict(np.load(io.BytesIO(good)))
     name = draw(st.sampled_from(sorted(arrays)))
     edit = draw(st.sampled_from(ARRAY_EDITS))
@@ -203,7 +202,6 @@ def by_command(file: str, folder: Path, capfd) -> str | None:
 
 
 def time_out(*_) -> None:
-    """Fail with an exception that no reader handles."""
     pytest.fail("a file was read for minutes")
 
 
@@ -239,7 +237,6 @@ def outcome(corpus, tmp_path, capfd) -> Callable[[str, Callable[[Path], object]]
 
 
 def require_finite(result: Any) -> None:
-    """Check that every float in tensors, arrays and nested fields is finite."""
     if isinstance(result, torch.Tensor | np.ndarray):
         values = torch.as_tensor(result)
         assert not values.is_floating_point() or values.isfinite().all()

@@ -162,7 +162,6 @@ def half(data, tmp_path_factory) -> Path:
 
 
 def flip(content: bytes) -> bytes:
-    """Flip all bits of 16 bytes in the middle."""
     middle = len(content) // 2
     flipped = bytes(255 - value for value in content[middle : middle + 16])
     return content[:middle] + flipped + content[middle + 16 :]

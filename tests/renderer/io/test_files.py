@@ -53,12 +53,10 @@ def full_disk(max_bytes: int = 1024) -> Iterator[None]:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Return the contents of all files in a folder by name."""
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
 def permissions(path: Path) -> int:
-    """Return the permission bits of a file."""
     return stat.S_IMODE(path.stat().st_mode)
 
 

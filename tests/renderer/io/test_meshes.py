@@ -53,7 +53,6 @@ def assert_close(found: np.ndarray, expected: Any) -> None:
 
 
 def write(path: Path, content: str | bytes) -> Path:
-    """Write text or bytes to a file, and return its path."""
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     return path
 
@@ -66,12 +65,10 @@ def write_obj(folder: Path, texture: str = "peel.png", library: str = "peel.mtl"
 
 
 def write_ply(folder: Path) -> Path:
-    """Write a textured triangle as .ply, without the texture."""
     return write(folder / "mesh.ply", PLY)
 
 
 def textured_material() -> PBRMaterial:
-    """Return a material with the texture."""
     return PBRMaterial(baseColorTexture=Image.fromarray(TEXTURE))
 
 
@@ -89,7 +86,6 @@ def write_gltf(folder: Path, image: dict[str, Any] | None = None) -> Path:
 
 
 def has_texture(mesh: Mesh) -> bool:
-    """Return whether a mesh has the texture and no other."""
     return len(mesh.textures) == 1 and np.array_equal(mesh.textures[0], TEXTURE)
 
 
@@ -131,13 +127,6 @@ def test_the_corners_of_an_obj_at_a_seam_have_their_own_texture_coordinates(tmp_
     assert_close(mesh.corner_uvs.reshape(6, 2), uvs)
 
 
-def test_an_obj_has_its_texture_and_its_diffuse_color(tmp_path):
-    mesh = load_square_obj(tmp_path, [(0.5, 0.5)] * 6)
-    assert has_texture(mesh)
-    assert_array_equal(mesh.texture_ids, [0, 0])
-    assert_close(mesh.corner_colors, [1, 0.5, 0.25])
-
-
 def test_an_stl_is_white_and_its_corners_are_joined(tmp_path):
     """The format repeats a vertex in each of its faces."""
     box = trimesh.creation.box()
@@ -165,26 +154,9 @@ def fruit_and_leaf() -> trimesh.Scene:
     return scene
 
 
-@pytest.fixture
-def fruit_mesh(tmp_path) -> Mesh:
-    """Load the scene from a .glb file."""
+def test_the_parts_of_a_glb_scene_have_their_materials_and_texture_coordinates(tmp_path):
     fruit_and_leaf().export(tmp_path / "scene.glb")
-    return load_mesh(tmp_path / "scene.glb")
-
-
-def test_the_parts_of_a_glb_scene_are_placed_with_z_up(fruit_mesh):
-    """A point (x, y, z) of the file becomes (x, -z, y)."""
-    is_fruit = fruit_mesh.texture_ids == 0
-    boxes = [(is_fruit, [0, 0, 0], [2, 1, 1]), (~is_fruit, [1, -3, 2], [0.2, 0.6, 0.4])]
-    for mask, center, size in boxes:
-        corners = corners_of(fruit_mesh)[mask]
-        assert len(corners) == 12
-        assert_close(corners.max(axis=(0, 1)), np.array(center) + np.array(size) / 2)
-        assert_close(corners.min(axis=(0, 1)), np.array(center) - np.array(size) / 2)
-        assert faces_point_outward(corners)
-
-
-def test_the_parts_of_a_glb_scene_have_their_materials_and_texture_coordinates(fruit_mesh):
+    fruit_mesh = load_mesh(tmp_path / "scene.glb")
     is_fruit = fruit_mesh.texture_ids == 0
     assert has_texture(fruit_mesh)
     assert_array_equal(fruit_mesh.corner_colors[is_fruit], np.ones((12, 3, 3)))
@@ -265,7 +237,6 @@ def test_names_and_comments_of_an_obj_may_be_latin_1(tmp_path):
 
 
 def require_refusal(path: Path) -> None:
-    """Check that a file is refused by its name."""
     with pytest.raises(InputError, match=re.escape(path.name)):
         load_mesh(path)
 
@@ -302,12 +273,10 @@ def test_a_damaged_or_unknown_image_inside_of_a_gltf_is_refused(tmp_path, image)
 
 
 def base_color(tree: dict[str, Any]) -> dict[str, Any]:
-    """Return the entries of the color of the material."""
     return tree["materials"][0]["pbrMetallicRoughness"]
 
 
 def uv_accessor(tree: dict[str, Any]) -> dict[str, Any]:
-    """Return the accessor of the texture coordinates."""
     return tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"]]
 
 

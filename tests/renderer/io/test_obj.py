@@ -46,7 +46,6 @@ def load(folder: Path, text: str | bytes, **files: str | bytes) -> Mesh:
 
 
 def face_colors(mesh: Mesh) -> list[tuple[float, ...]]:
-    """Return the color of the first corner of each face."""
     return [tuple(colors) for colors in mesh.corner_colors[:, 0].tolist()]
 
 

@@ -1,4 +1,4 @@
-"""Binary .ply files, triangle strips, and polygons in all formats that have polygons."""
+"""Binary .ply files, polygons and triangle strips."""
 
 import struct
 from pathlib import Path
@@ -10,7 +10,6 @@ from oracles import corners_of
 
 from renderer.errors import InputError
 from renderer.io.meshes import load_mesh
-from tests.renderer.io.test_polygons import shoelace, star_shaped
 
 NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 CODES = dict(zip((*NAMES, "uint8", "int32", "float64"), "bBhHiIfdBid", strict=True))
@@ -147,38 +146,3 @@ def test_triangle_strips_are_unrolled_with_alternating_orientation(tmp_path, for
         {tuple(np.roll(VERTICES[face], turn, axis=0).ravel()) for turn in range(3)}
         for face in expected
     ]
-
-
-@pytest.mark.parametrize("suffix", ["obj", "ply", "off"])
-def test_random_polygons_have_the_area_of_the_shoelace_formula(tmp_path, suffix):
-    rng = np.random.default_rng(0)
-    polygons = [star_shaped(rng) for _ in range(60)]
-    areas = [shoelace(polygon) for polygon in polygons]
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2]
-    vertices = np.concatenate(
-        [polygon @ turn + [9 * index, 0, 0] for index, polygon in enumerate(polygons)]
-    )
-    ends = np.cumsum([len(polygon) for polygon in polygons])
-    faces = [range(end - len(polygon), end) for end, polygon in zip(ends, polygons, strict=True)]
-    if suffix == "obj":
-        lines = [f"v {x} {y} {z}" for x, y, z in vertices]
-        lines += ["f " + " ".join(str(index + 1) for index in face) for face in faces]
-    else:
-        counts = f"{len(vertices)} {len(faces)} 0"
-        header = f"""ply
-format ascii 1.0
-element vertex {len(vertices)}
-property double x
-property double y
-property double z
-element face {len(faces)}
-property list uchar int vertex_indices
-end_header"""
-        lines = [header] if suffix == "ply" else ["OFF", counts]
-        lines += [f"{x} {y} {z}" for x, y, z in vertices]
-        lines += [" ".join(map(str, [len(face), *face])) for face in faces]
-    path = tmp_path / f"mesh.{suffix}"
-    path.write_text("\n".join(lines))
-    mesh = load_mesh(path)
-    sizes = np.array([len(polygon) for polygon in polygons])
-    assert_allclose(np.add.reduceat(mesh.face_areas(), np.cumsum(sizes - 2) - sizes + 2), areas)

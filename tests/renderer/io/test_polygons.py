@@ -7,7 +7,6 @@ from renderer.io.mesh_file import triangulate
 
 
 def shoelace(points: np.ndarray) -> float:
-    """Compute the area of a counter-clockwise polygon (N, 2) by the shoelace formula."""
     x, y = points.T
     return float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
 

@@ -17,7 +17,6 @@ from renderer.errors import InputError
 
 
 def affine(linear: np.ndarray, translation: list[float]) -> np.ndarray:
-    """Return the matrix (4, 4) of a linear map (3, 3) and a translation."""
     matrix = np.eye(4)
     matrix[:3, :3] = linear
     matrix[:3, 3] = translation
@@ -25,7 +24,6 @@ def affine(linear: np.ndarray, translation: list[float]) -> np.ndarray:
 
 
 def rotation(vector: list[float]) -> np.ndarray:
-    """Return the matrix (3, 3) of a rotation vector."""
     return Rotation.from_rotvec(vector).as_matrix()
 
 
@@ -103,7 +101,6 @@ def arm_file(weights: np.ndarray | None = None, joints: Any = (1, 2, 0, 0)) -> G
 
 
 def transform(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Apply an affine matrix (4, 4) to points (V, 3)."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 

@@ -75,18 +75,6 @@ def test_nonzero_coefficients_are_those_of_the_bands_0_and_1_and_of_even_bands()
     assert found == [index for l in bands for index in range(l * l, (l + 1) ** 2)]
 
 
-def test_the_bands_above_the_diffuse_degree_change_the_irradiance_of_a_beam_by_a_sixtieth():
-    """A beam at an angle θ gives a surface Σ (2l + 1) / 4π A_l P_l(cos θ).
-
-    The exact value is cos θ, or 0 behind the surface.
-    """
-    cosines = np.linspace(-1, 1, 2001)
-    l = np.arange(DIFFUSE_DEGREE + 1)
-    factors = lambertian_factors(DIFFUSE_DEGREE)[l**2].numpy()
-    series = np.polynomial.legendre.legval(cosines, (2 * l + 1) / (4 * math.pi) * factors)
-    assert np.abs(series - cosines.clip(0)).max() < 1 / 60
-
-
 def test_constants_that_are_first_computed_in_inference_mode_serve_training_later():
     """The constants are cached, and autograd cannot save tensors of that mode."""
     with torch.inference_mode():

@@ -2,7 +2,6 @@
 
 import math
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from renderer.light.nonnegative import TOLERANCE, nearest_nonnegative, project_n
 from renderer.light.ringing import nonnegative_window
 from renderer.vectors import Ball
 
-HDRI = Path(__file__).parents[4] / "shared/data/hdri"
 GRACE = load_light("grace").double()
 
 
@@ -104,7 +102,7 @@ def test_scipy_finds_no_nearer_light_also_in_a_ball(norm):
     assert expected - 1e-5 <= distance <= 1.03 * expected
 
 
-@pytest.mark.parametrize("radius", [0.3, 0.6, 3.0])
+@pytest.mark.parametrize("radius", [0.3, 3.0])
 def test_the_result_in_a_sphere_satisfies_the_conditions_of_optimality(radius):
     """With a multiplier λ, the result x is nearest to c + (v - c) / (1 + λ) without the sphere.
 
@@ -128,13 +126,13 @@ def test_the_result_in_a_sphere_satisfies_the_conditions_of_optimality(radius):
 
 
 def assert_nowhere_negative(lights: Tensor) -> None:
-    """Check the radiance of lights (N, 49, 3) at dense directions."""
     radiance = torch.einsum("dk,nkc->ndc", DENSE, lights)
     assert (radiance.amin(1) >= -TOLERANCE * radiance.abs().amax(1)).all()
 
 
-@pytest.mark.parametrize("amplitude", [0.02, 3.0])
-@pytest.mark.parametrize(("norm", "radius"), [("linf", 0.1), ("l2", 0.01), ("l2", 100.0)])
+@pytest.mark.parametrize(
+    ("amplitude", "norm", "radius"), [(3.0, "linf", 0.1), (0.02, "l2", 0.01), (3.0, "l2", 100.0)]
+)
 def test_the_nearest_light_in_a_ball_is_there_and_nowhere_negative(amplitude, norm, radius):
     assert_nowhere_negative(nearest_nonnegative(random_lights(2, amplitude)))
     target = random_lights(1, amplitude)
@@ -213,7 +211,6 @@ def irradiance_at_normals(degree: int) -> Tensor:
 
 
 def rms_irradiance_error(found: Tensor, given: Tensor, degree: int) -> Tensor:
-    """Return the root mean square of the irradiance error over all normals, shape (3,)."""
     _, shares = quadrature(20)
     error = irradiance_at_normals(degree) @ (found.double() - given.double())
     return (shares @ error.square()).sqrt()
@@ -238,22 +235,13 @@ def require_physical(given: Tensor, degree: int) -> None:
 
 
 def slow(*values: object) -> list:
-    """Return test parameters that are marked slow."""
     return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
 @pytest.mark.parametrize("name", POWERS)
-@pytest.mark.parametrize("degree", [0, 1, 2, 3, 6, *slow(4, 9, 12, 15, 19, 20)])
+@pytest.mark.parametrize("degree", [0, 1, 2, 6, *slow(3, 4, 9, 12, 15, 19, 20)])
 def test_physical_light_keeps_the_mean_and_no_window_has_a_smaller_error(name, degree):
     require_physical(concentrated_light(name, degree), degree)
-
-
-@pytest.mark.realdata
-@pytest.mark.skipif(not HDRI.is_dir(), reason="without ../shared/data")
-@pytest.mark.parametrize("name", ["night", *slow("city", "forest", "studio")])
-@pytest.mark.parametrize("degree", [2, 6, *slow(12, 19, 20)])
-def test_a_real_map_made_physical_keeps_its_mean_and_its_irradiance(name, degree):
-    require_physical(load_light(str(HDRI / f"{name}.npy"), degree), degree)
 
 
 @pytest.mark.parametrize("degree", [2, *slow(6)])

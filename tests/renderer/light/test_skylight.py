@@ -27,7 +27,7 @@ RGB_TO_XYZ = np.array(
     [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
 )
 # Zenith angle of the sun and its azimuth in radians, and the turbidity.
-SKIES = [(0.0, 0.0, 2.0), (0.9, -2.0, 3.0), (1.5, 100.0, 4.0), (HORIZON, 0.7, 10.0)]
+SKIES = [(0.9, -2.0, 3.0), (HORIZON, 0.7, 10.0)]
 by_quadrature = fit_skylight.coefficients_by_quadrature
 
 
@@ -90,12 +90,10 @@ def published_sky(
 
 
 def sky_parameters(*values: float) -> tuple[torch.Tensor, ...]:
-    """Return the parameters of a sky as tensors that need gradients."""
     return tuple(torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in values)
 
 
 def relative_error(approximate: torch.Tensor, exact: np.ndarray) -> float:
-    """Return the L2 norm of the error relative to that of the exact values."""
     error = np.asarray(approximate) - exact
     return float(np.linalg.norm(error) / np.linalg.norm(exact))
 
@@ -127,13 +125,6 @@ def test_quadrature_agrees_with_adaptive_cubature_of_the_published_formula(sky):
         points=[(zenith, azimuth)] if is_sun_inside else [],
     )
     assert relative_error(by_quadrature(*sky), result.estimate.reshape(49, 3)) < 2e-8
-
-
-@pytest.mark.parametrize("sky", SKIES)
-def test_errors_of_the_quadrature_are_as_documented(sky):
-    exact = by_quadrature(*sky, nodes=96)
-    assert relative_error(by_quadrature(*sky, nodes=24), exact) < 1e-5
-    assert relative_error(by_quadrature(*sky, nodes=48), exact) < 2e-8
 
 
 def test_errors_of_the_fit_are_as_documented():
@@ -175,15 +166,3 @@ def test_the_azimuth_rotates_the_light_counterclockwise(azimuth):
     expected = rotate(coefficients(0.8, 0.0, 3.0), torch.from_numpy(matrix))
     found = coefficients(0.8, azimuth, 3.0)
     torch.testing.assert_close(found, expected, rtol=0, atol=100 * 60 * EPS)
-
-
-@pytest.mark.parametrize("sky", [(1e-4, 0.0, 2.5), (0.7, 0.0, 3.0), (HORIZON - 1e-4, 0.0, 4.0)])
-def test_gradients_are_finite_differences(sky):
-    """A projection of unit length has the error bounds of the norm of the coefficients."""
-    weights = torch.from_numpy(np.random.default_rng(0).normal(size=(49, 3)))
-    weights /= weights.norm()
-
-    def projection(*parameters: torch.Tensor) -> torch.Tensor:
-        return (weights * coefficients(*parameters)).sum()
-
-    assert torch.autograd.gradcheck(projection, sky_parameters(*sky), rtol=1e-5, atol=1e-5)

@@ -39,7 +39,6 @@ lamps_and_discs = pytest.mark.parametrize("basis", [LAMPS, DISCS], ids=["lamps",
 
 
 def ball(subdivisions: int = 2) -> Mesh:
-    """Return a convex mesh."""
     shape = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.9)
     return mesh_of(shape, ORANGE)
 
@@ -57,7 +56,6 @@ def ball_on_a_table() -> Mesh:
 def operator_of(
     mesh: Mesh, basis: Basis, size: int = SIZE, samples: int = SAMPLES
 ) -> TransferOperator:
-    """Build the float64 operator of the camera."""
     [operator] = build_operators(
         mesh,
         [CAMERA],
@@ -70,7 +68,6 @@ def operator_of(
 
 
 def canvas(operator: TransferOperator, light: Tensor) -> np.ndarray:
-    """Return the linear radiance of all pixels, shape (size, size, 3)."""
     size = operator.settings.size
     image = torch.zeros(3, size**2, dtype=torch.float64)
     image[:, operator.pixels] = operator.radiance(light)
@@ -213,14 +210,12 @@ def test_derivatives_by_vertices_and_albedo_are_finite_differences(basis, normal
 def irradiance_of_lamp(
     position: list[float], radius: float, points: Tensor, normals: Tensor
 ) -> Tensor:
-    """Compute the irradiance (N,) of a lamp of power 1 without occlusion."""
     paths = Lamps((tuple(position),), radius=radius).connect(points, normals)
     total = torch.zeros(len(points), dtype=torch.float64)
     return total.index_add(0, paths.point, paths.irradiance)
 
 
 def random_surfaces() -> tuple[Tensor, Tensor]:
-    """Draw points (500, 3) and unit normals (500, 3)."""
     return draw(500, 3), torch.nn.functional.normalize(draw(500, 3, seed=1))
 
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.image import decode, encode
-from renderer.light.harmonics import nonzero_coefficients
 from renderer.mesh import Mesh
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
@@ -29,13 +28,11 @@ SIZE = 6
 def operator_of(
     mesh: Mesh, camera: Camera, settings: ImageSettings, dtype: torch.dtype = torch.float32
 ) -> TransferOperator:
-    """Build the operator of one view."""
     [operator] = build_operators(mesh, [camera], settings, choose("numpy"), dtype=dtype)
     return operator
 
 
 def square(half: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:
-    """Return a square that faces up, with a given half of its width."""
     corners = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     return Mesh.plain(corners + center, [[0, 1, 2], [0, 2, 3]])
 
@@ -51,11 +48,10 @@ def test_the_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
 
 @dataclass(frozen=True)
 class Layout:
-    """A mesh whose operator has one or three channels."""
+    """A mesh, and the samples in each row of a pixel."""
 
     mesh: Mesh
     samples: int
-    channels: int
 
     def operator(self, encoding: str = "linear") -> TransferOperator:
         settings = ImageSettings(SIZE, self.samples, encoding)
@@ -66,19 +62,12 @@ COARSE_BALL = trimesh.creation.icosphere(subdivisions=1)
 FINE_BALL = trimesh.creation.icosphere(subdivisions=2)
 DENTED = patchwork(FINE_BALL.vertices, FINE_BALL.faces)
 LAYOUTS = {
-    "one color": Layout(mesh_of(COARSE_BALL, (0.8, 0.4, 0.1)), 3, 1),
-    "one sample per pixel": Layout(DENTED, 1, 1),
-    "mixed albedos": Layout(DENTED, 3, 3),
-    "outside of the image": Layout(square(0.1, center=(20, 0, 0)), 2, 1),
+    "one color": Layout(mesh_of(COARSE_BALL, (0.8, 0.4, 0.1)), 3),
+    "one sample per pixel": Layout(DENTED, 1),
+    "mixed albedos": Layout(DENTED, 3),
+    "outside of the image": Layout(square(0.1, center=(20, 0, 0)), 2),
 }
 all_layouts = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-
-
-@all_layouts
-def test_the_transfer_has_one_channel_if_each_pixel_has_one_albedo(layout):
-    operator = layout.operator()
-    assert operator.transfer.shape == (layout.channels, 31, len(operator.pixels))
-    assert operator.transfer.dtype == torch.float64
 
 
 @all_layouts
@@ -114,21 +103,7 @@ def test_the_gradient_by_the_light_is_a_central_difference(layout):
     assert float((gradient * step).sum()) == pytest.approx(expected, abs=1e-11)
 
 
-@all_layouts
-def test_the_bands_that_no_diffuse_surface_reflects_have_no_gradient(layout):
-    """These are the bands 3 and 5, with 18 coefficients."""
-    operator = layout.operator()
-    gradient = operator.light_gradient(draw(3, len(operator.pixels)))
-    is_reflected = torch.zeros(49, dtype=torch.bool)
-    is_reflected[nonzero_coefficients(6)] = True
-    assert (~is_reflected).sum() == 18
-    assert not gradient[~is_reflected].any()
-    is_visible = len(operator.pixels) > 0
-    assert bool(gradient[is_reflected].all()) == is_visible
-
-
 def background_of(kind: str, batch: tuple[int, ...]) -> float | Tensor:
-    """Return a background for a batch of lights."""
     images = draw(*batch, 3, SIZE, SIZE, seed=3).abs().clamp(max=1)
     if kind == "gray":
         return 0.3
@@ -203,14 +178,6 @@ def test_an_image_shows_the_current_values_of_a_background(gray):
     operator.image(DARK, background)
     memory[...] = gray
     assert operator.image(DARK, background)[0, 0, 0] == np.float32(gray)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_an_image_has_the_number_type_of_the_light(dtype):
-    operator = operator_of(square(0.5), ABOVE, ImageSettings(SIZE, 2))
-    image = operator.image(DARK.to(dtype), 0.75)
-    assert image.dtype == dtype
-    assert image[0, 0, 0] == 0.75
 
 
 def test_a_change_of_an_image_does_not_change_the_next_one():

@@ -33,14 +33,12 @@ UNIT_UVS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def view(mesh: Mesh, size: int, samples: int = 1, camera: OrthographicCamera = ABOVE) -> Fragments:
-    """Rasterize a mesh for one camera."""
     settings = ImageSettings(size, samples)
     [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("numpy"))
     return fragments
 
 
 def random_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
-    """Draw a texture, uint8, shape (height, width, 3)."""
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 

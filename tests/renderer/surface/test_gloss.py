@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
-from renderer.light.basis import Basis, Harmonics, LightPaths, LocalBasis, SplitLight
+from renderer.light.basis import Basis, Harmonics, LocalBasis, SplitLight
 from renderer.light.files import load_light
 from renderer.light.harmonics import bands, basis, lambertian_factors
 from renderer.light.lamps import Lamps, Projector
@@ -32,7 +31,7 @@ from renderer.microfacets import reflectance
 from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
-from renderer.operators.rays import LocalLightView, Rays, path_reflectance
+from renderer.operators.rays import LocalLightView, Rays
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shaded_view import ShadedView
@@ -60,7 +59,6 @@ def toward(cosine: float) -> Tensor:
 
 
 def unit_vector(polar: float, azimuth: float = 0.0) -> np.ndarray:
-    """Return the direction (3,) of a polar angle and an azimuth in radians."""
     x = math.sin(polar) * math.cos(azimuth)
     y = math.sin(polar) * math.sin(azimuth)
     return np.array([x, y, math.cos(polar)])
@@ -136,43 +134,6 @@ def half_hemisphere() -> tuple[np.ndarray, np.ndarray]:
 
 
 # Lobes
-
-
-@pytest.mark.parametrize(("roughness", "tolerance"), [(0.2, 0.004), (0.5, 0.004), (1.0, 0.003)])
-@pytest.mark.parametrize("view_count", [1, 3], ids=["one view", "three views"])
-def test_lobes_are_the_projected_reflectance_of_gltf(roughness, tolerance, view_count):
-    """The error is the L2 norm up to degree 6, relative to that of the whole lobe.
-
-    The normal is arbitrary. It is seen from one side at a time or from three at
-    once.
-    """
-    directions, solid_angles = hemisphere(int(45 / roughness))
-    turn = torch.linalg.qr(draw(3, 3)).Q
-    harmonics = basis(torch.from_numpy(directions) @ turn.T, 6)
-    cosines = [0.95, 0.6, 0.25]
-    views = torch.cat([toward(cosine) for cosine in cosines]).split(view_count)
-
-    def project(lobe: Lobe, cosine: float) -> Tensor:
-        """Project a lobe times the cosine of the light onto harmonics."""
-        values = lobe.reflectance(cosine, directions) * directions[:, 2] * solid_angles
-        return torch.from_numpy(values) @ harmonics
-
-    metal = SampleGloss(double(roughness), double(1.0), double(1.0))
-    varnish = SampleGloss(double(roughness), double(0.0), double(1.0))
-    cases = [
-        (metal, "colored", Lobe(roughness, 1, 0), Lobe(roughness, 1)),
-        (metal, "white", Lobe(roughness, 0, 1), Lobe(roughness, 0.04)),
-        (varnish, "white", Lobe(roughness), Lobe(roughness)),
-    ]
-    for gloss, part, lobe, whole_lobe in cases:
-        found = []
-        for seen in views:
-            normals = (UP @ turn.T).expand_as(seen)
-            colored, white, frame = gloss.specular_transfer(normals, seen @ turn.T, 6)
-            found.append(frame.to_world(colored if part == "colored" else white).T)
-        for cosine, row in zip(cosines, torch.cat(found), strict=True):
-            scale = project(whole_lobe, cosine).norm()
-            assert (row - project(lobe, cosine)).norm() <= tolerance * scale
 
 
 COSINES = [1e-3, 0.02, 0.07, 0.2, 0.37, 0.6, 0.9, 0.99, 1 - 1e-5]
@@ -266,7 +227,7 @@ def test_lobes_and_roughness_gradients_are_those_of_quadrature_in_float32(degree
         require_close(tangents, slope[:, row], 0.02)
 
 
-@pytest.mark.parametrize("roughness", [0.2, 0.3, 0.55])
+@pytest.mark.parametrize("roughness", [0.2, 0.55])
 def test_an_image_does_not_depend_on_whether_the_roughness_is_differentiable(roughness):
     """A number and a tensor give equal images. One roughness per face differs by rounding."""
     mesh = normalize(solid("pear"))
@@ -402,7 +363,6 @@ FLOOR = Mesh.plain(
 def operators_of(
     mesh: Mesh, cameras: Sequence[Camera], settings: ImageSettings, light_basis: Basis, gloss: Gloss
 ) -> list[TransferOperator]:
-    """Build the float64 operators of views with gloss."""
     return build_operators(
         mesh, cameras, settings, choose("numpy"), basis=light_basis, dtype=DOUBLE, gloss=gloss
     )
@@ -433,7 +393,7 @@ FLOOR_VIEWS = [
 ]
 
 
-@pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
+@pytest.mark.parametrize("roughness", [0.2, 1.0])
 @pytest.mark.parametrize(("metallic", "specular_factor"), GLOSSES)
 def test_lamps_and_projectors_are_reflected_as_by_kulla_and_conty(
     roughness, metallic, specular_factor
@@ -449,37 +409,6 @@ def test_lamps_and_projectors_are_reflected_as_by_kulla_and_conty(
         # A lamp of power 16 has the irradiance 1 at a distance of 4.
         assert view.reflectance(lamp, 16.0, gloss) == pytest.approx(expected, rel=2e-3)
         assert view.reflectance(projector, 1.0, gloss) == pytest.approx(expected, rel=2e-3)
-
-
-def reflected_fraction(beam: np.ndarray, gloss: SampleGloss) -> float:
-    """Integrate the fraction of a beam that a white surface reflects into all directions."""
-    directions, solid_angles = half_hemisphere()
-    views = torch.from_numpy(directions)
-    count = len(views)
-    surface: Any = SimpleNamespace(
-        gloss=gloss, normals=UP.expand_as(views), toward=views, points=0 * views
-    )
-    paths = LightPaths(
-        point=torch.arange(count),
-        function=torch.zeros(count, dtype=torch.int64),
-        source=torch.from_numpy(beam).expand_as(views),
-        irradiance=views.new_ones(count),
-    )
-    values = path_reflectance(surface, views.new_ones(count, 3), paths)
-    measure = torch.from_numpy(directions[:, 2] * solid_angles) / math.pi
-    return float(values[:, 0] @ measure)
-
-
-@pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
-@pytest.mark.parametrize("polar", [0.0, 1.2, 1.5, 1.55])
-def test_a_beam_is_reflected_with_no_more_than_its_energy_and_by_varnish_with_all(roughness, polar):
-    beam = unit_vector(polar, math.pi)
-    for metallic, specular_factor in GLOSSES:
-        gloss = SampleGloss(double(roughness), double(metallic), double(specular_factor))
-        fraction = reflected_fraction(beam, gloss)
-        assert fraction <= 1 + 1e-4
-        if metallic == 0:
-            assert fraction >= 1 - 2e-3
 
 
 class FloorUnderSky:
@@ -504,8 +433,10 @@ class FloorUnderSky:
         self.harmonics = basis(directions, 6)[:, self.ZONAL]
 
 
-@pytest.mark.parametrize("roughness", [0.2, 1.0])
-@pytest.mark.parametrize(("metallic", "specular_factor"), GLOSSES)
+@pytest.mark.parametrize(
+    ("roughness", "metallic", "specular_factor"),
+    [(0.2, 0.0, 1.0), (1.0, 0.0, 0.4), (0.2, 1.0, 1.0), (1.0, 0.5, 0.7)],
+)
 def test_environment_light_is_reflected_reciprocally_with_no_more_than_its_energy(
     roughness, metallic, specular_factor
 ):
@@ -605,7 +536,6 @@ def our_radiance(mesh: Mesh, light: Tensor, gloss: Gloss, shadows: bool = False)
 
 
 def canvas(operator: TransferOperator, light: Tensor) -> Tensor:
-    """Return the radiance of all pixels, shape (3, size, size)."""
     size = operator.settings.size
     image = light.new_zeros(3, size * size)
     image[:, operator.pixels] = operator.radiance(light)
@@ -613,7 +543,6 @@ def canvas(operator: TransferOperator, light: Tensor) -> Tensor:
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Return the L2 norm of the error relative to that of the expected image."""
     return float((found - expected).norm() / expected.norm())
 
 
@@ -676,8 +605,7 @@ def test_the_highlight_of_varnish_over_black_looks_as_mitsubas(roughness):
     assert relative_error(found, mitsuba_radiance(BALL, light, varnish, 256)) < 0.04
 
 
-@pytest.mark.parametrize(("roughness", "largest_error"), [(0.25, 0.2), (0.5, 0.1)])
-def test_no_highlight_shines_through_the_wall_of_a_cup(roughness, largest_error):
+def test_no_highlight_shines_through_the_wall_of_a_cup():
     """The rays in 512 directions leave an error. Without shadows it is much larger.
 
     Neither image contains the reflection of the cup in itself.
@@ -685,13 +613,13 @@ def test_no_highlight_shines_through_the_wall_of_a_cup(roughness, largest_error)
     cup = normalize(solid("cup"))
     white_cup = replace(cup, corner_colors=np.ones_like(cup.corner_colors))
     light = positive_light(6)
-    gloss = Gloss(roughness, metallic=1.0)
-    surface = {"type": "twosided", "material": rough_mirror(roughness)}
+    gloss = Gloss(0.5, metallic=1.0)
+    surface = {"type": "twosided", "material": rough_mirror(0.5)}
     expected = mitsuba_radiance(white_cup, light, surface, 64)
     shadowed = our_radiance(white_cup, light, gloss, shadows=True)
-    assert relative_error(shadowed, expected) < largest_error
+    assert relative_error(shadowed, expected) < 0.1
     unshadowed = our_radiance(white_cup, light, gloss)
-    assert relative_error(unshadowed, expected) > 2 * largest_error
+    assert relative_error(unshadowed, expected) > 0.2
 
 
 def test_the_highlight_of_a_lamp_is_mitsubas():
@@ -729,7 +657,6 @@ class GlossyView:
         self.upstream = 0.3 + 0.5 * draw_uniform(3, len(self.view.pixels), seed=9)
 
     def start(self) -> dict[str, Tensor]:
-        """Return a value of each parameter."""
         face_count = len(self.mesh.faces)
         sample_count = len(self.view.sample_to_seen_face)
         shapes = {
@@ -746,7 +673,6 @@ class GlossyView:
         return {"environment": positive_light(6), "vertices": vertices, **uniform}
 
     def total(self, values: dict[str, Tensor]) -> Tensor:
-        """Return the weighted sum of the radiance at fixed visibility."""
         gloss = Gloss(values["roughness"], values["metallic"], values["specular_factor"])
         vertices = values["vertices"]
         view = ShadedView(
@@ -762,8 +688,11 @@ class GlossyView:
         return (view.radiance() * self.upstream).sum()
 
 
-@pytest.mark.parametrize("normals", ["smooth", "flat"])
-@pytest.mark.parametrize("camera", [CAMERA, NEARBY], ids=["orthographic", "perspective"])
+@pytest.mark.parametrize(
+    ("normals", "camera"),
+    [("flat", CAMERA), ("smooth", NEARBY)],
+    ids=["flat, orthographic", "smooth, perspective"],
+)
 def test_derivatives_by_all_parameters_are_finite_differences(normals, camera):
     """Each parameter is moved along a random direction.
 
@@ -783,9 +712,7 @@ def test_derivatives_by_all_parameters_are_finite_differences(normals, camera):
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-13), name
 
 
-@pytest.mark.parametrize(
-    "options", [{"normals": "flat"}, {"shadows": True}, {"bounces": 2}], ids=str
-)
+@pytest.mark.parametrize("options", [{"normals": "flat", "shadows": True}, {"bounces": 2}], ids=str)
 def test_an_operator_gives_the_images_of_render(options):
     mesh = normalize(solid("cup"))
     light = positive_light(6).float()

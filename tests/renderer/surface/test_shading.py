@@ -150,10 +150,7 @@ class Scene:
 
 SCENES = {
     "closed": Scene(dented_icosahedron()),
-    "closed, smooth": Scene(dented_icosahedron(), smooth=True),
     "closed, partly sharp": Scene(dented_icosahedron(crease=50), smooth=True),
-    "open, from in front": Scene(dented_icosahedron(13), smooth=True),
-    "open, from behind": Scene(dented_icosahedron(13), BEHIND),
     "open, from behind, smooth": Scene(dented_icosahedron(13), BEHIND, smooth=True),
     "one sample per pixel": Scene(dented_icosahedron(), size=9, samples=1),
     "from close by": Scene(dented_icosahedron(), CLOSE),
@@ -204,7 +201,6 @@ class Image:
 
 
 def move(inputs: Sequence[Tensor], steps: Sequence[Tensor], distance: float) -> list[Tensor]:
-    """Move inputs along steps by a distance."""
     return [tensor.detach() + distance * step for tensor, step in zip(inputs, steps, strict=True)]
 
 

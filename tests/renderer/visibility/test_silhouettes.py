@@ -71,7 +71,6 @@ def smooth_weights(size: int) -> Tensor:
 
 
 def smooth_sums(image: Tensor) -> Tensor:
-    """Compute the three sums (3,) of an image."""
     return (smooth_weights(image.shape[-1]) * image).sum((1, 2, 3))
 
 
@@ -97,7 +96,6 @@ def differences(image: ChangedImage, directions: Tensor, samples: int, step: flo
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Divide the norm of the error of all values by the norm of the values."""
     return float((found - expected).norm() / expected.norm())
 
 
@@ -166,15 +164,11 @@ def test_gradients_by_vertices_are_differences_of_new_images_of_a_few_pixels():
     assert relative_error(found, expected) < 0.02
 
 
-@pytest.mark.parametrize(
-    "camera", [FAR, NEAR, TURNED], ids=["orthographic", "perspective", "pinhole"]
-)
+@pytest.mark.parametrize("camera", [FAR, TURNED], ids=["orthographic", "pinhole"])
 def test_gradients_by_the_camera_are_differences_of_new_images(camera):
     names = ["polar", "azimuth", "width", "right", "up"]
-    if isinstance(camera, PerspectiveCamera):
-        names.append("distance")
     if isinstance(camera, PinholeCamera):
-        names += ["roll", "center_x", "center_y", "center_z"]
+        names += ["distance", "roll", "center_x", "center_y", "center_z"]
         names += ["principal_right", "principal_up", "pixel_aspect"]
     image = moved_camera(named_mesh("pear"), camera, names)
     directions = torch.eye(len(names), dtype=torch.float64)
@@ -183,10 +177,9 @@ def test_gradients_by_the_camera_are_differences_of_new_images(camera):
     assert relative_error(found, expected) < 0.02
 
 
-@pytest.mark.parametrize("camera", [FAR, NEAR], ids=["orthographic", "perspective"])
-def test_gradients_by_the_camera_include_the_movement_of_highlights(camera):
+def test_gradients_by_the_camera_include_the_movement_of_highlights():
     metal = renderer.Gloss(0.5, 1.0)
-    image = moved_camera(named_mesh("pear"), camera, ["polar", "azimuth"], metal)
+    image = moved_camera(named_mesh("pear"), NEAR, ["polar", "azimuth"], metal)
     directions = torch.eye(2, dtype=torch.float64)
     found = derivatives(image, directions, samples=8)
     # A smaller turn moves outlines across too few samples.
@@ -198,7 +191,6 @@ def test_gradients_by_the_camera_include_the_movement_of_highlights(camera):
 
 
 def square(half: float, height: float) -> renderer.Mesh:
-    """Create a square with sides of 2 · half at a height, parallel to the ground."""
     corners = [
         [-half, -half, height],
         [half, -half, height],
@@ -265,7 +257,6 @@ def colored_plane(cells: int) -> tuple[renderer.Mesh, Tensor]:
 
 
 def triangle_areas(points: Tensor, faces: Tensor) -> Tensor:
-    """Compute the areas of triangles seen from above."""
     a, b, c = points[faces, :2].unbind(1)
     first_edge = b - a
     second_edge = c - a
@@ -361,12 +352,10 @@ def test_local_light_and_shadows_move_with_the_outline(lit_by_a_lamp):
 
 
 def box(low: list[float], high: list[float]) -> renderer.Mesh:
-    """Create a box between two corners."""
     return mesh_of(trimesh.creation.box(bounds=[low, high]))
 
 
 def table() -> list[renderer.Mesh]:
-    """Create a board and four legs."""
     parts = [box([-0.9, -0.9, 0.3], [0.9, 0.9, 0.45])]
     for x in (-0.7, 0.7):
         for y in (-0.7, 0.7):
