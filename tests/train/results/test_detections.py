@@ -1,0 +1,155 @@
+"""Tests of the scores of detections against closed forms and the evaluation of COCO."""
+
+import contextlib
+import io
+
+import numpy as np
+import pytest
+
+from train.results import detections
+from train.results.detections import Found, Marked
+
+BOX = np.array([[10.0, 10, 30, 30]])
+
+
+def _found(boxes, labels, scores):
+    return Found(np.reshape(boxes, (-1, 4)).astype(float), np.array(labels, int), np.array(scores))
+
+
+def _marked(boxes, labels, is_crowd=None):
+    is_crowd = np.zeros(len(labels), bool) if is_crowd is None else np.array(is_crowd)
+    return Marked(np.reshape(boxes, (-1, 4)).astype(float), np.array(labels, int), is_crowd)
+
+
+def _random_image(rng, class_count=3):
+    """Draw objects, some of them crowds, and detections near and far from them."""
+    count = rng.integers(0, 5)
+    low = rng.uniform(0, 60, (count, 2))
+    boxes = np.hstack([low, low + rng.uniform(5, 40, (count, 2))])
+    labels = rng.integers(0, class_count, count)
+    near = np.repeat(boxes, 3, axis=0) + rng.normal(0, 3, (3 * count, 4))
+    low = rng.uniform(0, 60, (4, 2))
+    far = np.hstack([low, low + rng.uniform(5, 40, (4, 2))])
+    near[:, 2:] = np.maximum(near[:, 2:], near[:, :2] + 1)
+    guesses = np.concatenate([np.repeat(labels, 3), rng.integers(0, class_count, 4)])
+    scores = rng.uniform(0, 1, len(guesses)).round(2)
+    found = _found(np.vstack([near, far]), guesses, scores)
+    return found, _marked(boxes, labels, rng.random(count) < 0.2)
+
+
+@pytest.mark.ecosystem
+@pytest.mark.parametrize("seed", range(5))
+def test_recall_and_average_precision_are_those_of_coco(seed):
+    pytest.importorskip("pycocotools")
+    from pycocotools.coco import COCO
+    from pycocotools.cocoeval import COCOeval
+
+    rng = np.random.default_rng(seed)
+    pairs = [_random_image(rng) for _ in range(12)]
+    annotations, results = [], []
+    for image, (found, marked) in enumerate(pairs):
+        for box, label, crowd in zip(marked.boxes, marked.labels, marked.is_crowd, strict=True):
+            size = box[2:] - box[:2]
+            entry = {"id": len(annotations) + 1, "image_id": image, "category_id": int(label)}
+            entry |= {"bbox": [*box[:2], *size], "area": size.prod(), "iscrowd": int(crowd)}
+            annotations.append(entry)
+        for box, label, score in zip(found.boxes, found.labels, found.scores, strict=True):
+            entry = {"image_id": image, "category_id": int(label), "score": score}
+            results.append(entry | {"bbox": [*box[:2], *(box[2:] - box[:2])]})
+    with contextlib.redirect_stdout(io.StringIO()):
+        coco = COCO()
+        coco.dataset = {
+            "images": [{"id": image} for image in range(len(pairs))],
+            "categories": [{"id": label, "name": str(label)} for label in range(3)],
+            "annotations": annotations,
+        }
+        coco.createIndex()
+        evaluation = COCOeval(coco, coco.loadRes(results), "bbox")
+        evaluation.evaluate()
+        evaluation.accumulate()
+    matches = detections.match_images(*zip(*pairs, strict=True), range(3))
+    every = np.ones((1, len(pairs)))
+    for label in range(3):
+        precision = evaluation.eval["precision"][0, :, label, 0, 2].mean()
+        recall = evaluation.eval["recall"][0, label, 0, 2]
+        assert matches[label].average_precision(every) == pytest.approx(precision, abs=1e-12)
+        assert matches[label].recall(0.0, every) == pytest.approx(recall, abs=1e-12)
+
+
+def test_average_precision_of_three_detections_is_that_of_the_definition():
+    # Ranks: right, false, right. Of two objects: precision 1 up to recall 0.5, then 2 / 3.
+    boxes = [BOX[0], BOX[0] + 100, BOX[0] + 200]
+    found = _found(boxes, [0, 0, 0], [0.9, 0.8, 0.7])
+    matches = detections.match_images([found], [_marked([boxes[0], boxes[2]], [0, 0])], [0])
+    expected = (51 * 1 + 50 * 2 / 3) / 101
+    assert matches[0].average_precision(np.ones((1, 1))) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("boxes", "labels", "scores", "expected"),
+    [
+        ([BOX, BOX], [0, 0], [0.5, 0.9], [detections.NO_OBJECT, 0]),
+        ([BOX], [1], [0.9], [detections.NO_OBJECT]),
+        ([[10, 10, 30, 50]], [0], [0.9], [0]),
+        ([[10, 10, 30, 50.1]], [0], [0.9], [detections.NO_OBJECT]),
+        ([BOX + 100, BOX + 100], [0, 0], [0.9, 0.8], [detections.CROWD, detections.CROWD]),
+    ],
+    ids=["a second one", "another class", "IoU of one half", "less", "crowd"],
+)
+def test_an_object_has_at_most_one_detection_of_its_class(boxes, labels, scores, expected):
+    marked = _marked([BOX, [[90, 90, 150, 150]]], [0, 0], [False, True])
+    found = _found(boxes, labels, scores)
+    assert detections.match(found, marked, 0.5).tolist() == expected
+
+
+def test_numbers_of_two_images_are_the_counted_ones():
+    found = [_found([BOX, BOX + 50], [0, 0], [0.9, 0.5]), _found([BOX, BOX], [0, 1], [0.3, 0.6])]
+    marked = [_marked([BOX], [0]), _marked([BOX], [0])]
+    matches = detections.match_images(found, marked, [0, 1])
+    metrics = detections.score([matches[0]], threshold=0.4)
+    assert metrics.n == 2
+    assert metrics.recall.value == 0.5
+    assert metrics.false_per_image.value == pytest.approx(0.5)
+    both = detections.score([*matches.values()], threshold=0.4)
+    assert both.false_per_image.value == pytest.approx(1.0)
+    assert both.ap50.value == metrics.ap50.value
+    assert detections.score([matches[1]], 0.4).ap50.value is None
+
+
+def test_objects_of_the_same_photograph_add_nothing_to_its_interval():
+    def recall(copies):
+        shifts = 50 * np.arange(copies)[:, None]
+        image = [_found(BOX + shifts, [0] * copies, [0.9] * copies), _found([], [], [])]
+        matches = detections.match_images(
+            image * 9, [_marked(BOX + shifts, [0] * copies)] * 18, [0]
+        )
+        return detections.score([matches[0]], 0.4).recall
+
+    assert recall(4) == recall(1)
+    assert recall(1).low == pytest.approx(1 - recall(1).high)
+    assert 0.2 < recall(1).low < 0.35
+
+
+def test_no_false_detection_has_an_upper_limit_like_the_rule_of_three():
+    empty = [_found([], [], [])] * 100
+    matches = detections.match_images(empty, [_marked([], [])] * 100, [0])
+    metrics = detections.score([matches[0]], 0.4)
+    assert metrics.false_per_image.value == 0
+    assert 0.03 < metrics.false_per_image.high < 0.05
+    assert metrics.recall.value is None
+
+
+def test_mean_iou_is_that_of_the_confusion_matrix():
+    rng = np.random.default_rng(0)
+    masks, predicted = rng.integers(0, 3, (2, 4, 5, 6))
+    masks[0, 0] = detections.UNSCORED
+    mean, by_class = detections.mean_iou(predicted, masks, 4)
+    is_scored = masks != detections.UNSCORED
+    confusion = np.zeros((4, 4))
+    np.add.at(confusion, (masks[is_scored], predicted[is_scored]), 1)
+    shared = np.diag(confusion)[:3]
+    expected = shared / (confusion.sum(0) + confusion.sum(1) - np.diag(confusion))[:3]
+    assert by_class[:3] == pytest.approx(expected)
+    assert np.isnan(by_class[3])
+    assert mean.value == pytest.approx(expected.mean())
+    assert mean.low < mean.value < mean.high

@@ -1,0 +1,289 @@
+"""Scores of detections and of segmentations: recall, AP50, false detections and mIoU.
+
+Everything is computed on plain arrays. Boxes have the columns left, top, right and bottom, in any
+unit. Detections are matched as the evaluation of COCO does.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from train.results.intervals import Units, leave_out
+from train.results.tables import Estimate
+
+# What the intervals are over.
+PHOTOGRAPHS = "photographs"
+# Index of the object of a detection: it is of no object, or of a crowd, which does not count.
+NO_OBJECT, CROWD = -1, -2
+# Recalls at which the average precision averages the precision, as COCO does.
+RECALLS = np.linspace(0, 1, 101)
+# Pixels of this class in a mask are not scored.
+UNSCORED = 255
+
+
+@dataclass(frozen=True)
+class Found:
+    """Detections of a network in one image."""
+
+    boxes: Float[np.ndarray, "N 4"]
+    labels: Int[np.ndarray, " N"]
+    scores: Float[np.ndarray, " N"]
+
+
+@dataclass(frozen=True)
+class Marked:
+    """Objects of one image. A detection of a crowd is neither right nor false."""
+
+    boxes: Float[np.ndarray, "M 4"]
+    labels: Int[np.ndarray, " M"]
+    is_crowd: Bool[np.ndarray, " M"]
+
+
+def box_overlaps(
+    found: Float[np.ndarray, "N 4"],
+    boxes: Float[np.ndarray, "M 4"],
+    is_crowd: Bool[np.ndarray, " M"],
+) -> Float[np.ndarray, "N M"]:
+    """Compute intersection over union or, of crowds, over the area of the detection."""
+    low = np.maximum(found[:, None, :2], boxes[None, :, :2])
+    high = np.minimum(found[:, None, 2:], boxes[None, :, 2:])
+    shared = (high - low).clip(0).prod(-1)
+    areas, others = ((item[:, 2:] - item[:, :2]).prod(-1) for item in (found, boxes))
+    whole = np.where(is_crowd, areas[:, None], areas[:, None] + others - shared)
+    return np.divide(shared, whole, out=np.zeros_like(shared), where=whole > 0)
+
+
+def match(found: Found, marked: Marked, iou: float) -> Int[np.ndarray, " N"]:
+    """Return the index of the object of each detection, NO_OBJECT or CROWD.
+
+    The detections choose in descending order of their scores. Each takes the object of its class
+    with the largest overlap, of those that no other has taken and whose overlap is at least `iou`.
+    """
+    overlaps = box_overlaps(found.boxes, marked.boxes, marked.is_crowd)
+    is_free = (overlaps >= iou) & (found.labels[:, None] == marked.labels)
+    objects = np.full(len(found.scores), NO_OBJECT)
+    for row in np.argsort(-found.scores, kind="stable"):
+        candidates = np.where(is_free[row] & ~marked.is_crowd, overlaps[row], -1)
+        if candidates.max(initial=-1) >= 0:
+            objects[row] = candidates.argmax()
+            is_free[:, objects[row]] = False
+        elif (is_free[row] & marked.is_crowd).any():
+            objects[row] = CROWD
+    return objects
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Detections and objects of one class, or of several, in a number of images.
+
+    Attributes:
+        image_count: Number of images.
+        image: Index of the image of each detection. The detections are in descending order.
+        score: Score of each detection.
+        is_right: Whether a detection is of an object.
+        object_image: Index of the image of each object.
+        object_score: Score of the detection of each object. −inf without one.
+    """
+
+    image_count: int
+    image: Int[np.ndarray, " N"]
+    score: Float[np.ndarray, " N"]
+    is_right: Bool[np.ndarray, " N"]
+    object_image: Int[np.ndarray, " M"]
+    object_score: Float[np.ndarray, " M"]
+
+    def select(self, is_chosen: Bool[np.ndarray, " image_count"]) -> "Matches":
+        """Return the matches in some of the images, whose indices then count these alone."""
+        index = np.cumsum(is_chosen) - 1
+        rows, objects = is_chosen[self.image], is_chosen[self.object_image]
+        return Matches(
+            int(is_chosen.sum()),
+            index[self.image[rows]],
+            self.score[rows],
+            self.is_right[rows],
+            index[self.object_image[objects]],
+            self.object_score[objects],
+        )
+
+    def recall(self, threshold: float, counts: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
+        """Compute the fraction of the objects that are detected with at least a score.
+
+        `counts` says how often each image counts. The recall of no object is NaN.
+        """
+        weights = counts[:, self.object_image]
+        with np.errstate(invalid="ignore"):
+            return (weights * (self.object_score >= threshold)).sum(-1) / weights.sum(-1)
+
+    def false_per_image(
+        self, threshold: float, counts: Float[np.ndarray, "k n"]
+    ) -> Float[np.ndarray, " k"]:
+        """Compute the number of detections per image that have a score, but no object."""
+        is_false = (self.score >= threshold) & ~self.is_right
+        return counts[:, self.image[is_false]].sum(-1) / counts.sum(-1)
+
+    def average_precision(self, counts: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
+        """Compute the average precision of one class, as COCO does. That of no object is NaN."""
+        return np.array([self._average_precision(row) for row in counts])
+
+    def _average_precision(self, counts: Float[np.ndarray, " n"]) -> float:
+        """Compute the average precision if each image counts so often."""
+        object_count = counts[self.object_image].sum()
+        if not object_count:
+            return np.nan
+        weights = counts[self.image]
+        right = np.cumsum(weights * self.is_right)
+        # A detection in an image that counts 0 times may come first.
+        precision = right / np.maximum(np.cumsum(weights), np.spacing(1))
+        highest = np.maximum.accumulate(precision[::-1])[::-1]
+        places = np.searchsorted(right / object_count, RECALLS, side="left")
+        return float(np.append(highest, 0)[places].mean())
+
+
+def match_images(
+    found: Sequence[Found], marked: Sequence[Marked], labels: Sequence[int], iou: float = 0.5
+) -> dict[int, Matches]:
+    """Match the detections in all images, and return the matches of each class."""
+    rows = [match(*pair, iou) for pair in zip(found, marked, strict=True)]
+    matches = {}
+    for label in labels:
+        detections, objects = [np.empty((3, 0))], [np.empty((2, 0))]
+        for image, (item, truth, of_image) in enumerate(zip(found, marked, rows, strict=True)):
+            is_counted = (item.labels == label) & (of_image != CROWD)
+            scores, own = item.scores[is_counted], of_image[is_counted]
+            is_right = own != NO_OBJECT
+            detections.append(np.stack([np.full(len(scores), image), scores, is_right]))
+            score_of_object = np.full(len(truth.labels), -np.inf)
+            score_of_object[own[is_right]] = scores[is_right]
+            is_object = (truth.labels == label) & ~truth.is_crowd
+            of_objects = score_of_object[is_object]
+            objects.append(np.stack([np.full(len(of_objects), image), of_objects]))
+        matches[label] = _sorted(len(found), np.hstack(detections), np.hstack(objects))
+    return matches
+
+
+def join(matches: Sequence[Matches]) -> Matches:
+    """Join the matches of several classes in the same images."""
+    detections = [np.stack([item.image, item.score, item.is_right]) for item in matches]
+    objects = [np.stack([item.object_image, item.object_score]) for item in matches]
+    return _sorted(matches[0].image_count, np.hstack(detections), np.hstack(objects))
+
+
+def _sorted(image_count: int, detections: np.ndarray, objects: np.ndarray) -> Matches:
+    """Sort detections by descending score. The rows of both arrays are those of `Matches`."""
+    image, score, is_right = detections[:, np.argsort(-detections[1], kind="stable")]
+    return Matches(
+        image_count, image.astype(int), score, is_right > 0, objects[0].astype(int), objects[1]
+    )
+
+
+@dataclass(frozen=True)
+class DetectionMetrics:
+    """Metrics of the detections of a class, or of all classes, with 95% intervals.
+
+    Attributes:
+        n: Number of objects.
+        recall: Fraction of the objects that are detected with a score of at least the threshold.
+        ap50: Average precision at an IoU of 0.5. For all classes, the mean of the classes that
+            have objects.
+        false_per_image: Detections per image that have such a score, but no object.
+    """
+
+    n: int
+    recall: Estimate
+    ap50: Estimate
+    false_per_image: Estimate
+
+
+def score(matches: Sequence[Matches], threshold: float) -> DetectionMetrics:
+    """Score the detections of one class, or of several, with intervals over images."""
+    joined = join(matches)
+    shown = [item for item in matches if len(item.object_score)]
+
+    def mean_precision(counts: np.ndarray) -> np.ndarray:
+        values = np.stack([item.average_precision(counts) for item in shown])
+        is_known = np.isfinite(values)
+        with np.errstate(invalid="ignore"):
+            return np.where(is_known, values, 0).sum(0) / is_known.sum(0)
+
+    def false_odds(counts: np.ndarray) -> np.ndarray:
+        # As odds, a number per image is in [0, 1). Its interval is then one of the logarithm.
+        number = joined.false_per_image(threshold, counts)
+        return number / (1 + number)
+
+    recall, precision = Estimate(), Estimate()
+    if shown:
+        groups = _groups(joined)
+        recall = estimate(partial(joined.recall, threshold), groups)
+        precision = estimate(mean_precision, groups)
+    odds = estimate(false_odds, [np.arange(joined.image_count)])
+    ends = (None if end is None else end / (1 - end) for end in (odds.value, odds.low, odds.high))
+    false_detections = Estimate(*ends, odds.over)
+    return DetectionMetrics(len(joined.object_score), recall, precision, false_detections)
+
+
+def _groups(matches: Matches) -> list[np.ndarray]:
+    """Divide images into those with and without objects, of which each is left out by itself.
+
+    A rare class then has an interval over the few images that show it.
+    """
+    has_object = np.zeros(matches.image_count, bool)
+    has_object[matches.object_image] = True
+    others = np.flatnonzero(~has_object)
+    if len(others) < 2:
+        return [np.arange(matches.image_count)]
+    return [np.flatnonzero(has_object), others]
+
+
+def estimate(
+    statistic: Callable[[np.ndarray], np.ndarray], groups: Sequence[np.ndarray]
+) -> Estimate:
+    """Compute a statistic in [0, 1] with its 95% interval over images.
+
+    The groups have the indices of all images. The interval is unknown if a group has one image, or
+    if the statistic is unknown without some images.
+    """
+
+    def of_groups(*counts: np.ndarray) -> np.ndarray:
+        weights = np.ones((max(map(len, counts)), sum(map(len, groups))))
+        for images, of_images in zip(groups, counts, strict=True):
+            weights[:, images] = of_images
+        return statistic(weights)[None]
+
+    units = Units([np.arange(len(images)) for images in groups], PHOTOGRAPHS)
+    (result,) = leave_out(of_groups, units)
+    if min(map(len, groups)) < 2 or not all(np.isfinite(item).all() for item in result.without):
+        return Estimate(float(result.value))
+    return result.estimate
+
+
+def mean_iou(
+    predicted: Sequence[Int[np.ndarray, "H W"]],
+    masks: Sequence[Int[np.ndarray, "H W"]],
+    class_count: int,
+) -> tuple[Estimate, list[float]]:
+    """Compute the mean IoU over classes, with its interval over images, and that of each class.
+
+    The IoU of a class is computed from the pixels of all images. It is NaN, and does not count, if
+    no pixel has or is given the class. Pixels of the class UNSCORED are left out.
+    """
+    counted = np.empty((3, len(masks), class_count))
+    for row, (image, mask) in enumerate(zip(predicted, masks, strict=True)):
+        is_scored = mask != UNSCORED
+        guess, truth = image[is_scored], mask[is_scored]
+        for kind, values in enumerate((truth[guess == truth], guess, truth)):
+            counted[kind, row] = np.bincount(values.ravel(), minlength=class_count)[:class_count]
+    both, guesses, truths = counted
+
+    def by_class(counts: np.ndarray) -> np.ndarray:
+        shared = counts @ both
+        with np.errstate(invalid="ignore"):
+            return shared / (counts @ (guesses + truths) - shared)
+
+    def mean(counts: np.ndarray) -> np.ndarray:
+        return np.nanmean(by_class(counts), axis=-1)
+
+    every_image = np.arange(len(masks))
+    return estimate(mean, [every_image]), by_class(np.ones((1, len(masks))))[0].tolist()
