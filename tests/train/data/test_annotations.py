@@ -1,0 +1,192 @@
+"""Tests of photographs with boxes, in the forms of COCO and YOLO."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image, ImageOps
+
+from renderer.errors import InputError
+from train.data.annotations import LETTERBOX, STRETCH, fit, fit_batches, read_annotations
+
+# A white rectangle in a black image of 80 × 40 pixels: left, top, right and bottom.
+BOX = (20, 8, 60, 24)
+
+
+def _draw(path, size=(80, 40), box=BOX, orientation=1):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.zeros((size[1], size[0], 3), np.uint8)
+    pixels[box[1] : box[3], box[0] : box[2]] = 255
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.fromarray(pixels).save(path, exif=exif)
+
+
+def _bounds(pixels):
+    """Return the box of the white pixels of an image (H, W)."""
+    rows, columns = (np.flatnonzero((pixels > 200).any(axis)) for axis in (1, 0))
+    return [columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]
+
+
+def _write_coco(file, names=("a.png",), size=(80, 40), box=BOX, **changes):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    images = [{"id": 7 + index, "file_name": name} for index, name in enumerate(names)]
+    if size:
+        images = [image | {"width": size[0], "height": size[1]} for image in images]
+    bbox = [box[0], box[1], box[2] - box[0], box[3] - box[1]]
+    content = {
+        "images": images,
+        "categories": [{"id": 3, "name": "cat"}, {"id": 90, "name": "dog"}],
+        "annotations": [
+            {"id": index, "image_id": image["id"], "category_id": 90, "bbox": bbox, "iscrowd": 0}
+            for index, image in enumerate(images)
+        ],
+    }
+    file.write_text(json.dumps(content | changes))
+
+
+def test_labels_of_coco_are_those_of_categories_with_gaps(tmp_path):
+    _draw(tmp_path / "a.png")
+    _write_coco(tmp_path / "labels.json")
+    read = read_annotations(tmp_path)
+    assert read.classes == ("cat", "dog")
+    assert read.photographs[0].labels.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("file", "image", "name"),
+    [
+        ("a.json", "a.png", "a.png"),
+        ("a.json", "plain/a.png", "plain/a.png"),
+        ("a.json", "plain/a.png", "a.png"),
+        ("annotations/a.json", "val/a.png", "a.png"),
+        ("a.json", "images/a.png", "..\\elsewhere\\images\\a.png"),
+    ],
+)
+def test_images_of_coco_are_found_in_subfolders(tmp_path, file, image, name):
+    _draw(tmp_path / image)
+    _write_coco(tmp_path / file, [name])
+    (photograph,) = read_annotations(tmp_path / file).photographs
+    assert photograph.path == tmp_path / image
+
+
+def test_missing_images_of_coco_are_named_and_ambiguous_ones_refused(tmp_path):
+    _draw(tmp_path / "a.png")
+    _write_coco(tmp_path / "a.json", ["a.png", "b.png"])
+    read = read_annotations(tmp_path / "a.json")
+    assert [len(read.photographs), *read.missing] == [1, "b.png"]
+    _draw(tmp_path / "one" / "b.png")
+    _draw(tmp_path / "two" / "b.png")
+    with pytest.raises(InputError, match=r"b\.png, which may be"):
+        read_annotations(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("is_stored", [False, True], ids=["upright size", "stored size"])
+def test_boxes_fit_photographs_that_a_camera_has_turned(tmp_path, orientation, is_stored):
+    _draw(tmp_path / "a.png", orientation=orientation)
+    with Image.open(tmp_path / "a.png") as image:
+        upright = np.array(ImageOps.exif_transpose(image))[..., 0]
+    height, width = upright.shape
+    if is_stored and (width, height) != (80, 40):
+        _write_coco(tmp_path / "a.json")
+    else:
+        _write_coco(tmp_path / "a.json", size=(width, height), box=[*map(int, _bounds(upright))])
+    (photograph,) = read_annotations(tmp_path).photographs
+    fitted = fit(photograph, (height, width), LETTERBOX)
+    assert fitted.boxes[0].tolist() == _bounds(fitted.pixels[0]) == _bounds(upright)
+
+
+@pytest.mark.parametrize("how", [LETTERBOX, STRETCH])
+@pytest.mark.parametrize(("size", "border"), [((80, 80), 1 / 2), ((40, 120), 1 / 3)])
+def test_boxes_follow_the_pixels_to_the_size_of_the_network(tmp_path, how, size, border):
+    _draw(tmp_path / "a.png")
+    _write_coco(tmp_path / "a.json")
+    fitted = fit(read_annotations(tmp_path).photographs[0], size, how)
+    assert fitted.pixels.shape == (3, *size)
+    shown = np.array([_bounds(fitted.pixels[0])], float)
+    assert fitted.to_photograph(shown)[0] == pytest.approx(BOX, abs=1.1)
+    gray = (fitted.pixels[0] == 114).mean()
+    assert gray == pytest.approx(border if how == LETTERBOX else 0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("image", "label", "names"),
+    [
+        ("images/val/a.png", "labels/val/a.txt", "data.yaml"),
+        ("a.png", "a.txt", "classes.txt"),
+        ("images/a.png", "images/a.txt", "labels/classes.txt"),
+        ("a.png", "labels/a.txt", "obj.names"),
+    ],
+)
+def test_boxes_of_yolo_are_fractions_of_the_sides(tmp_path, image, label, names):
+    _draw(tmp_path / image)
+    _draw(tmp_path / image.replace("a.", "empty."))
+    text = {"data.yaml": "names: {0: cat, 1: dog}\n"}.get(names, "cat\ndog\n")
+    box = "1 0.5 0.4 0.5 0.4\n"
+    polygon = "0 0.25 0.2 0.75 0.2 0.75 0.6 0.25 0.6\n"
+    for path, content in ((names, text), (label, box + polygon)):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(content)
+    read = read_annotations(tmp_path)
+    assert read.classes == ("cat", "dog")
+    marked, empty = read.photographs
+    assert marked.labels.tolist() == [1, 0]
+    assert fit(marked, (40, 80), LETTERBOX).boxes == pytest.approx(np.array([BOX, BOX]))
+    assert len(empty.boxes) == 0
+
+
+@pytest.mark.parametrize(
+    "line", ["2 .5 .5 .1 .1", "0 40 20 10 10", "0 .5 .5 .1", "cat .5 .5 .1 .1", "0 nan 0 0 0"]
+)
+def test_a_wrong_line_of_yolo_is_refused_by_its_number(tmp_path, line):
+    _draw(tmp_path / "a.png")
+    (tmp_path / "classes.txt").write_text("cat\ndog\n")
+    (tmp_path / "a.txt").write_text(f"0 0.5 0.5 0.1 0.1\n{line}\n")
+    with pytest.raises(InputError, match=r"line 2 of .*a\.txt"):
+        read_annotations(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"annotations": [{"image_id": 8, "category_id": 90, "bbox": [0, 0, 1, 1]}]}, "image_id 8"),
+        ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [0, 0, 1, 1]}]}, "category_id"),
+        ({"annotations": [{"image_id": 7, "category_id": 3, "bbox": [0, 0, -1, 1]}]}, "bbox"),
+        ({"annotations": [{"image_id": 7, "category_id": 3}]}, "no key 'bbox'"),
+        ({"images": []}, "image_id 7"),
+    ],
+)
+def test_a_wrong_coco_file_is_refused_in_one_sentence(tmp_path, changes, message):
+    _draw(tmp_path / "a.png")
+    _write_coco(tmp_path / "a.json", **changes)
+    with pytest.raises(InputError, match=message):
+        read_annotations(tmp_path / "a.json")
+
+
+def test_boxes_of_an_image_with_another_aspect_ratio_are_refused(tmp_path):
+    _draw(tmp_path / "a.png")
+    _write_coco(tmp_path / "a.json", size=(80, 80))
+    with pytest.raises(InputError, match="80 × 40 pixels, but its annotation says 80 × 80"):
+        [*fit_batches(read_annotations(tmp_path).photographs, (8, 8), LETTERBOX, 2)]
+
+
+def test_boxes_count_within_the_photograph_only(tmp_path):
+    _draw(tmp_path / "a.png")
+    _write_coco(tmp_path / "a.json", box=(60, 20, 100, 30))
+    fitted = fit(read_annotations(tmp_path).photographs[0], (40, 80), STRETCH)
+    assert fitted.boxes.tolist() == [[60, 20, 80, 30]]
+    _write_coco(tmp_path / "a.json", box=(90, 20, 100, 30))
+    outside = fit(read_annotations(tmp_path).photographs[0], (40, 80), STRETCH)
+    assert (len(outside.boxes), outside.is_kept.tolist()) == (0, [False])
+
+
+def test_an_unreadable_photograph_is_an_error_or_skipped(tmp_path):
+    _draw(tmp_path / "a.png")
+    (tmp_path / "b.png").write_bytes(b"no image")
+    _write_coco(tmp_path / "a.json", ["a.png", "b.png"])
+    photographs = read_annotations(tmp_path).photographs
+    with pytest.raises(InputError, match=r"b\.png cannot be read"):
+        [*fit_batches(photographs, (8, 8), LETTERBOX, 2)]
+    ((pair,),) = fit_batches(photographs, (8, 8), LETTERBOX, 2, skip_unreadable=True)
+    assert pair[0].name == "a.png"

@@ -1,0 +1,379 @@
+"""Read photographs with boxes of objects: a COCO file, or a folder with the text files of YOLO.
+
+A photograph is shown upright, as its EXIF orientation says, and brought to the size of a network.
+"""
+
+import json
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from jaxtyping import Bool, Float, Int, UInt8
+from PIL import ExifTags, Image
+
+from renderer.errors import InputError, single_line
+from renderer.io.images import open_image, read_rgb
+from train import console
+from train.data.photographs import SUFFIXES, find_unlabeled, visible_files
+
+# Ways to bring a photograph to the size of a network.
+LETTERBOX, STRETCH = "letterbox", "stretch"
+FITS = {
+    LETTERBOX: "reduced with their aspect ratio, on gray borders",
+    STRETCH: "resized without keeping their aspect ratio",
+}
+# Gray of the borders, as in Ultralytics.
+BORDER = 114
+# The aspect ratio of a photograph may differ by this factor from that of its annotation.
+MAX_RATIO = 1.02
+# Text files that list the names of classes, one on each line.
+CLASS_FILES = ("classes.txt", "obj.names")
+# Images are read at full size.
+FULL_SIZE = 2**16
+# From the coordinates (x, y) in a stored image, as fractions of its sides, to those in the upright
+# one, by the EXIF orientation. Only these exchange width and height.
+TURNED = {
+    5: lambda x, y: (y, x),
+    6: lambda x, y: (1 - y, x),
+    7: lambda x, y: (1 - y, 1 - x),
+    8: lambda x, y: (y, 1 - x),
+}
+
+
+@dataclass(frozen=True)
+class Annotated:
+    """A photograph and the boxes of its objects.
+
+    Attributes:
+        path: Path of the photograph.
+        name: Name that the annotations give it, or its path relative to the folder.
+        size: Width and height of the image in the unit of the boxes. None for those of the upright
+            photograph in pixels.
+        boxes: Left, top, right and bottom of each object.
+        labels: Indices of classes.
+        is_crowd: Whether a box has a crowd, on which detections do not count.
+    """
+
+    path: Path
+    name: str
+    size: tuple[float, float] | None
+    boxes: Float[np.ndarray, "M 4"]
+    labels: Int[np.ndarray, " M"]
+    is_crowd: Bool[np.ndarray, " M"]
+
+    @property
+    def source(self) -> str:
+        """Folder of the photograph in its name. Empty without one."""
+        folder = PurePosixPath(self.name).parent
+        return "" if folder == PurePosixPath(".") else str(folder)
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """Photographs with boxes, and the names of the classes of the boxes.
+
+    Attributes:
+        file: File or folder of the annotations.
+        photographs: The photographs whose files exist.
+        classes: Names of the classes. All of their objects are marked in all photographs.
+        missing: Names of the photographs whose files are missing.
+    """
+
+    file: Path
+    photographs: Sequence[Annotated]
+    classes: tuple[str, ...]
+    missing: Sequence[str]
+
+
+class Fitted(NamedTuple):
+    """A photograph at the size of a network.
+
+    Attributes:
+        pixels: sRGB image.
+        boxes: Boxes of the objects within the photograph, in its upright pixels.
+        is_kept: Which boxes of the annotation these are. Others have no area.
+        scale: Factors of x and y from upright pixels to those of the network.
+        shift: Added to x and y after that.
+        size: Width and height of the upright photograph in pixels.
+    """
+
+    pixels: UInt8[np.ndarray, "3 H W"]
+    boxes: Float[np.ndarray, "K 4"]
+    is_kept: Bool[np.ndarray, " M"]
+    scale: Float[np.ndarray, "2"]
+    shift: Float[np.ndarray, "2"]
+    size: Float[np.ndarray, "2"]
+
+    def to_photograph(self, boxes: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+        """Convert boxes in pixels of the network to those of the photograph, without borders."""
+        corners = (boxes.reshape(-1, 2, 2) - self.shift) / self.scale
+        return corners.clip(0, self.size).reshape(-1, 4)
+
+
+def read_annotations(photos: Path) -> Annotations:
+    """Read the annotations of a COCO file, or of a folder that has one or is in the form of YOLO.
+
+    A photograph without a label file has no objects. Missing photographs are said.
+    """
+    if photos.is_file():
+        is_list_of_images = photos.suffix.lower() in (".yaml", ".yml")
+        return _read_yolo(photos.parent) if is_list_of_images else _read_coco(photos)
+    if not photos.is_dir():
+        raise InputError(f"photos={photos} does not exist: give a COCO file, or a folder", "photos")
+    files = sorted(photos.glob("*.json"))
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files)
+        raise InputError(f"photos={photos} has several files {names}: give one of them", "photos")
+    return _read_coco(files[0]) if files else _read_yolo(photos)
+
+
+def _read_coco(file: Path) -> Annotations:
+    """Read a COCO file. Its images lie beside it or, from a folder annotations, beside that."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8-sig"))
+        names = {item["id"]: str(item["name"]) for item in content["categories"]}
+        classes = tuple(dict.fromkeys(names[key] for key in sorted(names)))
+        images = {item["id"]: item for item in content["images"]}
+        of_image: dict[Any, list[Mapping[str, Any]]] = defaultdict(list)
+        for item in content["annotations"]:
+            for key, known in (("image_id", images), ("category_id", names)):
+                if item[key] not in known:
+                    raise ValueError(f"an annotation has the unknown {key} {item[key]}")
+            box = np.array(item["bbox"], float)
+            if box.shape != (4,) or not (np.isfinite(box).all() and (box[2:] >= 0).all()):
+                raise ValueError(f"an annotation has the bbox {item['bbox']}")
+            of_image[item["image_id"]].append(item)
+        find = _Finder(file)
+        photographs, missing = [], []
+        for key, image in images.items():
+            name = str(image["file_name"]).replace("\\", "/")
+            path = find(name)
+            if path is None:
+                missing.append(name)
+                continue
+            items = of_image[key]
+            boxes = np.array([item["bbox"] for item in items], float).reshape(-1, 4)
+            boxes[:, 2:] += boxes[:, :2]
+            labels = np.array([classes.index(names[item["category_id"]]) for item in items], int)
+            is_crowd = np.array([bool(item.get("iscrowd")) for item in items], bool)
+            size = (image["width"], image["height"]) if image.get("width") else None
+            photographs.append(Annotated(path, name, size, boxes, labels, is_crowd))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = f"no key {error}" if isinstance(error, KeyError) else single_line(error)
+        raise InputError(
+            f"{file} is no COCO file of detections ({reason}): it needs images, categories, and "
+            "annotations with image_id, category_id and bbox (x, y, width, height)"
+        ) from error
+    if not photographs:
+        first = f", such as {missing[0]}" if missing else ""
+        raise InputError(f"{file} names no image that exists{first}: move the images beside it")
+    return Annotations(file, photographs, classes, missing)
+
+
+class _Finder:
+    """Function from the name of an image in a COCO file to its path. None if it is missing."""
+
+    def __init__(self, file: Path):
+        self.file = file
+        above = file.parent.parent
+        self.folders = [file.parent, *([above] if file.parent.name == "annotations" else [])]
+        self.by_name: dict[str, list[Path]] | None = None
+
+    def __call__(self, name: str) -> Path | None:
+        for folder in self.folders:
+            if (folder / name).is_file():
+                return folder / name
+        if self.by_name is None:
+            self.by_name = defaultdict(list)
+            for path in visible_files(self.folders[-1]):
+                if path.suffix.lower() in SUFFIXES:
+                    self.by_name[path.name].append(self.folders[-1] / path)
+        paths = self.by_name.get(PurePosixPath(name).name, [])
+        if len(paths) > 1:
+            listed = " and ".join(map(str, paths[:2]))
+            raise InputError(f"{self.file} names the image {name}, which may be {listed}")
+        return paths[0] if paths else None
+
+
+def _read_yolo(folder: Path) -> Annotations:
+    """Read a folder of images with label files: beside them, or below labels/ instead of images/.
+
+    A line of a label file has the index of a class, and the center and size of a box, or the
+    corners of a polygon, as fractions of the sides of the image.
+    """
+    classes = _yolo_classes(folder)
+    photographs = []
+    label_count = 0
+    for photograph in find_unlabeled(folder):
+        path = folder / photograph.path
+        file = next(filter(Path.is_file, _label_files(path)), None)
+        label_count += file is not None
+        rows = [] if file is None else [*_yolo_rows(file, len(classes))]
+        labels = np.array([row[0] for row in rows], int)
+        boxes = np.array([row[1] for row in rows], float).reshape(-1, 4)
+        is_crowd = np.zeros(len(rows), bool)
+        name = str(photograph.path)
+        photographs.append(Annotated(path, name, (1, 1), boxes, labels, is_crowd))
+    if not label_count:
+        first = _label_files(photographs[0].path.absolute())[0]
+        raise InputError(
+            f"photos={folder} has neither a COCO file nor label files: give one, or text files of "
+            f"YOLO such as {first}",
+            "photos",
+        )
+    return Annotations(folder, photographs, classes, [])
+
+
+def _label_files(path: Path) -> list[Path]:
+    """Return where the label file of an image may be."""
+    parts = [*path.absolute().parts]
+    beside = path.with_suffix(".txt")
+    files = [beside, path.parent / "labels" / beside.name]
+    if "images" in parts:
+        place = len(parts) - 1 - parts[::-1].index("images")
+        files.insert(0, Path(*parts[:place], "labels", *parts[place + 1 :]).with_suffix(".txt"))
+    return files
+
+
+def _yolo_classes(folder: Path) -> tuple[str, ...]:
+    """Read the names of the classes from data.yaml or classes.txt in a folder or above it."""
+    for parent in [folder, *list(folder.absolute().parents)[:2]]:
+        for file in sorted([*parent.glob("*.yaml"), *parent.glob("*.yml")]):
+            try:
+                content = yaml.safe_load(file.read_text(encoding="utf-8-sig"))
+            except (OSError, ValueError, yaml.YAMLError) as error:
+                raise InputError(f"{file} cannot be read: {single_line(error)}") from error
+            names = content.get("names") if isinstance(content, dict) else None
+            if isinstance(names, dict):
+                # Keys are indices, of which some may be missing.
+                return tuple(str(names.get(key, key)) for key in range(max(names, default=-1) + 1))
+            if isinstance(names, list):
+                return tuple(map(str, names))
+        for name in (*CLASS_FILES, *(f"labels/{name}" for name in CLASS_FILES)):
+            if (parent / name).is_file():
+                lines = (parent / name).read_text(encoding="utf-8-sig").splitlines()
+                return tuple(line.strip() for line in lines if line.strip())
+    raise InputError(
+        f"photos={folder} does not name its classes: add data.yaml with names, or classes.txt",
+        "photos",
+    )
+
+
+def _yolo_rows(
+    file: Path, class_count: int
+) -> Iterator[tuple[int, tuple[float, float, float, float]]]:
+    """Yield the class and the box of each line of a label file."""
+    for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            label, *values = map(float, line.split())
+            if len(values) != 4 and (len(values) < 6 or len(values) % 2):
+                raise ValueError(f"it has {1 + len(values)} numbers")
+            if label not in range(class_count):
+                raise ValueError(f"class {label:g} is none of {class_count} classes")
+            if not all(0 <= value <= 1 for value in values):
+                raise ValueError("coordinates must be fractions of the sides, from 0 to 1")
+        except ValueError as error:
+            raise InputError(
+                f"line {number} of {file} is no box ({error}): write class x y width height"
+            ) from error
+        if len(values) == 4:
+            x, y, width, height = values
+            box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+        else:
+            box = (min(values[::2]), min(values[1::2]), max(values[::2]), max(values[1::2]))
+        yield int(label), box
+
+
+def fit(photograph: Annotated, size: tuple[int, int], how: str) -> Fitted:
+    """Read a photograph, and bring it to a height and width as `FITS` says."""
+    image = read_rgb(photograph.path, FULL_SIZE)
+    upright = np.array(image.size, float)
+    boxes = _upright_boxes(photograph, upright).clip(0, np.tile(upright, 2))
+    is_kept = (boxes[:, 2:] > boxes[:, :2]).all(1)
+    available = np.array(size[::-1])
+    scale = available / upright
+    if how == LETTERBOX:
+        scale = np.repeat(scale.min(), 2)
+    shown = (upright * scale).round().clip(1).astype(int)
+    shift = (available - shown) // 2
+    canvas = Image.new("RGB", tuple(available.tolist()), (BORDER,) * 3)
+    reduced = image.resize(tuple(shown.tolist()), Image.Resampling.LANCZOS)
+    canvas.paste(reduced, tuple(shift.tolist()))
+    pixels = np.array(canvas).transpose(2, 0, 1)
+    return Fitted(pixels, boxes[is_kept], is_kept, shown / upright, shift.astype(float), upright)
+
+
+def _upright_boxes(
+    photograph: Annotated, upright: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "M 4"]:
+    """Return boxes in the pixels of the upright photograph.
+
+    If only its stored, turned form has the aspect ratio of the annotation, the boxes are turned.
+    """
+    if photograph.size is None:
+        return photograph.boxes
+    marked = np.array(photograph.size, float)
+    corners = photograph.boxes.reshape(-1, 2, 2) / marked
+    if photograph.size != (1, 1) and not _is_similar(marked, upright):
+        with open_image(photograph.path) as image:
+            turn = TURNED.get(image.getexif().get(ExifTags.Base.Orientation, 1))
+        if turn is None or not _is_similar(marked[::-1], upright):
+            width, height = upright.astype(int)
+            raise InputError(
+                f"{photograph.path} has {width} × {height} pixels, but its annotation says "
+                f"{marked[0]:g} × {marked[1]:g}: its boxes are of another image"
+            )
+        corners = np.stack(turn(corners[..., 0], corners[..., 1]), axis=-1)
+    corners = np.concatenate([corners.min(1), corners.max(1)], axis=-1)
+    return corners * np.tile(upright, 2)
+
+
+def _is_similar(one: Float[np.ndarray, "2"], other: Float[np.ndarray, "2"]) -> bool:
+    """Return whether two images have about the same aspect ratio."""
+    ratio = one[0] * other[1] / (one[1] * other[0])
+    return bool(1 / MAX_RATIO <= ratio <= MAX_RATIO)
+
+
+def fit_batches(
+    photographs: Sequence[Annotated],
+    size: tuple[int, int],
+    how: str,
+    batch_size: int,
+    skip_unreadable: bool = False,
+) -> Iterator[list[tuple[Annotated, Fitted]]]:
+    """Read photographs in batches, by several threads. Unreadable ones are skipped, or an error."""
+    read = partial(_try_fit, size, how)
+    with ThreadPoolExecutor() as pool:
+        for start in range(0, len(photographs), batch_size):
+            batch = photographs[start : start + batch_size]
+            results = [*zip(batch, pool.map(read, batch), strict=True)]
+            for item, result in results:
+                if isinstance(result, Fitted):
+                    continue
+                if not skip_unreadable:
+                    raise InputError(
+                        f"{item.path} cannot be read ({result}): replace it, or set "
+                        "skip_unreadable=True"
+                    )
+                console.warning("%s is skipped, because it cannot be read", item.path)
+            yield [pair for pair in results if isinstance(pair[1], Fitted)]
+
+
+def _try_fit(size: tuple[int, int], how: str, photograph: Annotated) -> Fitted | Exception:
+    """Read a photograph, or return why that fails. Pillow raises errors of almost any type."""
+    try:
+        return fit(photograph, size, how)
+    except InputError:
+        raise
+    except Exception as error:
+        return error
