@@ -39,5 +39,6 @@ from augment.settings import PropSettings as PropSettings
 from augment.settings import RendererSettings as RendererSettings
 from augment.settings import SceneSettings as SceneSettings
 from augment.sources import load_classifier as load_classifier
+from augment.tasks.classification import Classification as Classification
 
 __version__: str

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from torch import Tensor, nn
 
 from augment import network as wrappers
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
+from augment.tasks import recognized_task
+from augment.tasks.classification import Classification
+from augment.tasks.task import Task
 from renderer import errors
 from renderer.errors import InputError
 from renderer.settings import MAX_SIZE
@@ -40,9 +43,6 @@ Label = str | Sequence[str]
 Normalization = str | tuple[Sequence[float], Sequence[float]] | None
 # Image values may exceed the range [0, 1] by at most this much, because of interpolation and noise.
 OVERSHOOT = 0.1
-# A network is refused if its outputs for this many images look like probabilities. The logits of a
-# single image may do so by chance.
-MIN_PROBABILITY_ROWS = 2
 # Pixel value of the gray image with which a function is called to find out whether it has
 # gradients.
 GRAY = 0.5
@@ -74,51 +74,36 @@ class OperatingPoint:
     negatives: int
 
 
-class LogitNetwork(wrappers.Network):
-    """Network whose outputs are checked: a row of logits for each image, and no probabilities.
+class CheckedNetwork(wrappers.Network):
+    """Network whose failures are errors of one sentence, and whose outputs a task checks.
 
     Attributes:
         title: Name of the network at the start of error messages.
-        class_count: Number of logits of an image. None for any number.
-        probability_rows: Number of images so far whose outputs look like
-            probabilities. None as soon as a batch has other outputs. Then no
-            further batch is checked, which saves time.
+        task: What the outputs mean. None returns them as they are.
     """
 
     def __init__(
-        self, network: Callable[[Tensor], Tensor], title: str, class_count: int | None = None
+        self,
+        network: Callable[[Tensor], Any],
+        title: str,
+        task: Task | None = None,
+        class_count: int | None = None,
     ):
         super().__init__(network)
         self.title = title
-        self.class_count = class_count
-        self.probability_rows: int | None = 0
+        self.task = task
+        self._read = None if task is None else task.reader(title, class_count)
 
-    def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N C"]:
-        """Compute the logits of images, and check them."""
+    def forward(self, images: Float[Tensor, "N 3 H W"]) -> Any:
+        """Compute the outputs of images in the form of the task, and check them."""
         try:
-            logits = self.network(images)
+            outputs = self.network(images)
         except Exception as error:
             # The caller handles errors of memory. An `InputError` already tells what is wrong.
             if isinstance(error, InputError) or errors.is_out_of_memory(error):
                 raise
             raise InputError(self._failure(images, error)) from error
-        is_tensor = isinstance(logits, Tensor)
-        has_row_per_image = is_tensor and logits.ndim == 2 and len(logits) == len(images)
-        if not has_row_per_image or self.class_count not in (None, logits.shape[1]):
-            returned = tuple(logits.shape) if is_tensor else type(logits).__name__
-            remedy = f"it must return logits {(len(images), self.class_count or 'C')}"
-            if hasattr(logits, "logits") or (isinstance(logits, dict) and "logits" in logits):
-                remedy = "give a function that returns its logits alone"
-            shape = tuple(images.shape)
-            raise InputError(f"{self.title} returned {returned} for images {shape}: {remedy}")
-        if self.probability_rows is not None and len(logits):
-            rows = self.probability_rows + len(logits)
-            self.probability_rows = rows if wrappers.are_probabilities(logits) else None
-        # A network is refused only if all outputs so far look like probabilities.
-        if (self.probability_rows or 0) >= MIN_PROBABILITY_ROWS:
-            reason = f"{self.title} returned probabilities instead of logits"
-            raise InputError(f"{reason}: remove the softmax, or return their logarithms")
-        return logits
+        return outputs if self._read is None else self._read(outputs, images)
 
     def _failure(self, images: Float[Tensor, "N 3 H W"], error: Exception) -> str:
         """Return the message of the error for a network that failed on images."""
@@ -132,7 +117,123 @@ class LogitNetwork(wrappers.Network):
         return f"{self.title} fails on {given} ({kind}: {errors.single_line(error)}): {remedy}"
 
 
-class Classifier(LogitNetwork):
+class TaskNetwork(CheckedNetwork):
+    """Frozen network of a task, with the size of its images and the names of its classes.
+
+    The parameters of the network get no gradient. The network stays in evaluation mode, even after
+    `train()`. Images are not resized. `Classifier` explains the arguments.
+    """
+
+    task: Task
+    assumed: Sequence[str] = ()
+
+    def __init__(
+        self,
+        network: Callable[[Tensor], Any],
+        size: int,
+        classes: Sequence[str],
+        name: str = "callable",
+        normalize_light: NormalizeLight = None,
+        task: Task = Classification(),  # noqa: B008 (It has no state.)
+    ):
+        kind = "classifier" if isinstance(task, Classification) else f"{task.name} network"
+        expected = "a torch.nn.Module, or a function of images"
+        errors.require_kind("network", network, Callable, expected)
+        errors.require_whole(f"{kind} {name}: size", size, 1, MAX_SIZE)
+        names = as_class_names(f"{kind} {name}: classes", classes)
+        super().__init__(network, f"{kind} {name}", task, len(names))
+        self.network = wrappers.with_normalized_light(self.network, normalize_light)
+        self.size = size
+        self.classes = names
+        self.name = name
+        if len(set(self.classes)) < len(self.classes):
+            reason = f"{self.title}: classes has a name that occurs twice"
+            raise InputError(f"{reason}: give each class a name of its own")
+        self.requires_grad_(False).eval()
+
+    def forward(self, images: Float[Tensor, "N 3 size size"]) -> Any:
+        """Compute the outputs of images: logits of a classifier, or those of another task.
+
+        Args:
+            images: RGB images in [0, 1], shape (N, 3, size, size).
+
+        Returns:
+            Logits of a classifier, shape (N, C).
+
+        Raises:
+            InputError: If the images have another size or are far from [0, 1].
+                Also if the network fails, or returns anything but finite logits
+                with a gradient.
+        """
+        size = self.size
+        if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
+            advice = "use floating-point RGB in [0, 1], such as images / 255"
+            raise InputError(f"images is {errors.describe(images)}: {advice}")
+        images = errors.as_tensor("images", images)
+        if images.shape[1:] != (3, size, size):
+            reason = f"takes images (N, 3, {size}, {size}), not {tuple(images.shape)}"
+            raise InputError(f"{self.title} {reason}: give a batch of this shape")
+        outputs = super().forward(images)
+        # Check the range of the images after the call of the network. The check waits until the
+        # GPU is idle.
+        if len(images):
+            low, high = torch.stack(torch.aminmax(images.detach())).tolist()
+            if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
+                advice = "use RGB in [0, 1], without normalization (divide bytes by 255)"
+                raise InputError(f"images has values from {low:g} to {high:g}: {advice}")
+        self.task.require_finite(outputs, images, self.title)
+        return outputs
+
+    @property
+    def normalized_light(self) -> NormalizedLightSettings | None:
+        """Settings with which the light of images is normalized. None if it is not normalized."""
+        return wrappers.light_settings(self.network)
+
+    def normalizing_light(self, normalize_light: NormalizeLight = True) -> TaskNetwork:
+        """Return a network that first normalizes the light of images. It shares the weights."""
+        if read_normalized_light(normalize_light) is None:
+            return self
+        return TaskNetwork(
+            self.network, self.size, self.classes, self.name, normalize_light, self.task
+        )
+
+    def is_differentiable(self, like: Tensor) -> bool:
+        """Return whether the outputs are differentiable in the pixels.
+
+        A network of torch with weights is assumed to have differentiable
+        outputs. Any other function is called with a gray image to find out.
+
+        Args:
+            like: Tensor with the dtype and the device of the image.
+        """
+        if next(self.parameters(), None) is not None:
+            return True
+        gray = like.new_full((1, 3, self.size, self.size), GRAY, requires_grad=True)
+        try:
+            with torch.enable_grad():
+                return self.task.has_gradient(super().forward(gray))
+        except InputError:
+            # A function that converts images to NumPy fails on images with gradients.
+            return False
+
+    def train(self, mode: bool = True) -> Self:
+        """Do nothing but keep evaluation mode, whatever `mode` is."""
+        return super().train(False)
+
+    def label(self, class_name: str | int) -> int:
+        """Return the index of a class.
+
+        Args:
+            class_name: Name of the class, or its index.
+
+        Raises:
+            InputError: If there is no such class. The message suggests similar
+                names.
+        """
+        return class_index(self.classes, class_name, self.title)
+
+
+class Classifier(TaskNetwork):
     """Frozen classifier from RGB images in [0, 1] to logits of C classes.
 
     If the network is a module of torch, the logits are differentiable with
@@ -165,7 +266,6 @@ class Classifier(LogitNetwork):
     """
 
     operating_points: Sequence[OperatingPoint] = ()
-    assumed: Sequence[str] = ()
 
     def __init__(
         self,
@@ -176,66 +276,12 @@ class Classifier(LogitNetwork):
         normalize_light: NormalizeLight = None,
     ):
         """Check the arguments, which the docstring of the class explains. Freeze the network."""
-        expected = "a torch.nn.Module, or a function from images to logits"
-        errors.require_kind("network", network, Callable, expected)
-        errors.require_whole(f"classifier {name}: size", size, 1, MAX_SIZE)
-        names = as_class_names(f"classifier {name}: classes", classes)
-        super().__init__(network, f"classifier {name}", len(names))
-        self.network = wrappers.with_normalized_light(self.network, normalize_light)
-        self.size = size
-        self.classes = names
-        self.name = name
+        super().__init__(network, size, classes, name, normalize_light)
         if len(self.classes) < 2:
             raise InputError(
                 f"classifier {name} has classes={self.classes}: give at least two, with one logit "
                 "each (for a network with a single output z, return the logits 0 and z)"
             )
-        if len(set(self.classes)) < len(self.classes):
-            reason = f"classifier {name}: classes has a name that occurs twice"
-            raise InputError(f"{reason}: give each class a name of its own")
-        self.requires_grad_(False).eval()
-
-    def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
-        """Compute the logits of images.
-
-        Args:
-            images: RGB images in [0, 1], shape (N, 3, size, size).
-
-        Returns:
-            Logits, shape (N, C).
-
-        Raises:
-            InputError: If the images have another size or are far from [0, 1].
-                Also if the network fails, or returns anything but finite logits
-                with a gradient.
-        """
-        size = self.size
-        if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
-            advice = "use floating-point RGB in [0, 1], such as images / 255"
-            raise InputError(f"images is {errors.describe(images)}: {advice}")
-        images = errors.as_tensor("images", images)
-        if images.shape[1:] != (3, size, size):
-            reason = f"takes images (N, 3, {size}, {size}), not {tuple(images.shape)}"
-            raise InputError(f"{self.title} {reason}: give a batch of this shape")
-        logits = super().forward(images)
-        # Check the range of the images after the call of the network. The check waits until the
-        # GPU is idle.
-        if len(images):
-            low, high = torch.stack(torch.aminmax(images.detach())).tolist()
-            if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
-                advice = "use RGB in [0, 1], without normalization (divide bytes by 255)"
-                raise InputError(f"images has values from {low:g} to {high:g}: {advice}")
-        if not logits.is_floating_point() or not logits.isfinite().all():
-            raise InputError(f"{self.title} returned NaN or infinite logits: check its weights")
-        if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
-            advice = "compute them in torch, or choose optimizer='random_search'"
-            raise InputError(f"{self.title} returned logits without a gradient: {advice}")
-        return logits
-
-    @property
-    def normalized_light(self) -> NormalizedLightSettings | None:
-        """Settings with which the light of images is normalized. None if it is not normalized."""
-        return wrappers.light_settings(self.network)
 
     def normalizing_light(self, normalize_light: NormalizeLight = True) -> Classifier:
         """Return a classifier that first normalizes the light of images.
@@ -265,25 +311,6 @@ class Classifier(LogitNetwork):
             return self
         return Classifier(self.network, self.size, self.classes, self.name, normalize_light)
 
-    def is_differentiable(self, like: Tensor) -> bool:
-        """Return whether the logits are differentiable in the pixels.
-
-        A network of torch with weights is assumed to have differentiable
-        logits. Any other function is called with a gray image to find out.
-
-        Args:
-            like: Tensor with the dtype and the device of the image.
-        """
-        if next(self.parameters(), None) is not None:
-            return True
-        gray = like.new_full((1, 3, self.size, self.size), GRAY, requires_grad=True)
-        try:
-            with torch.enable_grad():
-                return bool(super().forward(gray).requires_grad)
-        except InputError:
-            # A function that converts images to NumPy fails on images with gradients.
-            return False
-
     def detect(
         self, images: Float[Tensor, "N 3 size size"], label: str | None = None
     ) -> Bool[Tensor, " N"]:
@@ -309,22 +336,6 @@ class Classifier(LogitNetwork):
             raise InputError(f"{self.title} has no operating point for label={label}: {remedy}")
         (point,) = points
         return log_odds(self(images).double(), self.label(point.label)) > point.threshold
-
-    def train(self, mode: bool = True) -> Self:
-        """Do nothing but keep evaluation mode, whatever `mode` is."""
-        return super().train(False)
-
-    def label(self, class_name: str | int) -> int:
-        """Return the index of a class.
-
-        Args:
-            class_name: Name of the class, or its index.
-
-        Raises:
-            InputError: If there is no such class. The message suggests similar
-                names.
-        """
-        return class_index(self.classes, class_name, self.title)
 
 
 def as_class_names(name: str, classes: object) -> tuple[str, ...]:
@@ -363,9 +374,10 @@ def nearest(name: str, choices: Sequence[str]) -> str:
     return ", ".join(difflib.get_close_matches(name, choices, n=3, cutoff=0))
 
 
-def remembering(classifier: Classifier) -> Classifier:
+def remembering(classifier: TaskNetwork) -> TaskNetwork:
     """Return a copy of a classifier that classifies each different image only once."""
-    if isinstance(classifier.network, wrappers.Remembered):
+    is_remembering = isinstance(classifier.network, wrappers.Remembered)
+    if is_remembering or not isinstance(classifier, Classifier):
         return classifier
     network = wrappers.Remembered(classifier.network)
     remembered = Classifier(network, classifier.size, classifier.classes, classifier.name)
@@ -382,8 +394,15 @@ def log_odds(logits: Float[Tensor, "N classes"], label: int) -> Float[Tensor, " 
     return logits[:, label] - others.logsumexp(dim=1)
 
 
-def as_classifier(
-    network: Classifier | Callable[[Tensor], Tensor],
+def as_classifier(network: Any, *options: Any, **named: Any) -> Classifier:
+    """Make a classifier of a plain network. See `as_network` for the options."""
+    made = as_network(network, *options, **named, task=Classification())
+    assert isinstance(made, Classifier)
+    return made
+
+
+def as_network(
+    network: TaskNetwork | Callable[[Tensor], Any],
     size: int | None = None,
     classes: Sequence[str] | None = None,
     normalization: Normalization = None,
@@ -393,22 +412,27 @@ def as_classifier(
     name: str | None = None,
     normalize_light: NormalizeLight = None,
     dtype: torch.dtype = torch.float32,
-) -> Classifier:
-    """Make a classifier of a plain network, and check it on gray images.
+    task: Task | None = None,
+) -> TaskNetwork:
+    """Make a network of a task of a plain network, and check it on gray images.
 
-    Without a size, that of the network counts or, if it tells none, 224. Classes are "0", "1" and
-    so on by default. Mean and standard deviation are in units of `value_range`, the values of black
-    and white. A `Classifier` only gets `normalize_light`.
+    Without a size, that of the network counts or, if it tells none, 224. Classes are those that the
+    task knows by default, such as "0", "1" and so on. Mean and standard deviation are in units of
+    `value_range`, the values of black and white. Without a task, the outputs decide, which a line
+    says. A `TaskNetwork` only gets `normalize_light`.
     """
     if size is not None:
         errors.require_whole("size", size, 1, MAX_SIZE)
-    if isinstance(network, Classifier):
+    if isinstance(network, TaskNetwork):
+        if task not in (None, network.task):
+            reason = f"task is {task}, but {network.title} has the task {network.task}"
+            raise InputError(f"{reason}: leave the task out")
         if classes is not None or normalization is not None or value_range != UNIT_RANGE:
             given = "classes, normalization and value_range"
             raise InputError(f"{given} are for a plain network: leave them out")
         if size not in (None, network.size):
             advice = f"use the size of its images, {network.size}"
-            raise InputError(f"size={size} does not fit classifier {network.name}: {advice}")
+            raise InputError(f"size={size} does not fit {network.title}: {advice}")
         return network.normalizing_light(normalize_light)
     expected = "a torch.nn.Module, a function to logits, or a Classifier"
     errors.require_kind(argument, network, Callable, expected)
@@ -430,11 +454,21 @@ def as_classifier(
     shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device, dtype=dtype)
     images = shades.view(-1, 1, 1, 1).expand(-1, 3, size, size).contiguous()
     with torch.no_grad():
-        count = LogitNetwork(function, argument)(images).shape[1]
-    if names is not None and len(names) != count:
+        outputs = CheckedNetwork(function, argument)(images)
+    if task is None:
+        task = recognized_task(outputs, argument)
+        if not isinstance(task, Classification):
+            wrappers.say_once(f"network {name}: its outputs are of {task}")
+    count = task.output_count(task.reader(argument)(outputs, images))
+    if names is not None and count not in (None, len(names)):
         reason = f"classes has {len(names)} names, but the network returns {count} outputs"
         raise InputError(f"{reason}: give one name per output")
-    return Classifier(function, size, names or [*map(str, range(count))], name, normalize_light)
+    names = names or task.class_names(network, count)
+    if names is None:
+        raise InputError("classes is None, but the network does not name its classes: give them")
+    if isinstance(task, Classification):
+        return Classifier(function, size, names, name, normalize_light)
+    return TaskNetwork(function, size, names, name, normalize_light, task)
 
 
 def assumed_facts(size: int | None, normalization: Normalization) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -69,6 +69,21 @@ class Network(nn.Module):
         for transform in self.transforms:
             images = transform(images)
         return self.network(images)
+
+
+def plain_outputs(outputs: Any) -> Any:
+    """Return what a network computes for images, without what its library puts around it.
+
+    Of a tuple, this is the first entry, and of an output of transformers, its `logits`. Outputs of
+    object detectors (`pred_boxes`) and of segmenters of torchvision (`out`) are kept.
+    """
+    if isinstance(outputs, tuple) and outputs:
+        return plain_outputs(outputs[0])
+    if hasattr(outputs, "pred_boxes") or isinstance(outputs, Tensor | np.ndarray):
+        return outputs
+    if isinstance(outputs, Mapping) and "pred_boxes" not in outputs and "logits" in outputs:
+        return outputs["logits"]
+    return getattr(outputs, "logits", outputs)
 
 
 def unwrapped(network: Any) -> Any:
@@ -243,7 +258,7 @@ class Function(nn.Module):
             except Exception as error:  # Users' functions raise errors of many kinds.
                 failures.append(error)
                 continue
-            if isinstance(scores, Tensor):
+            if isinstance(scores, Tensor) or _is_structured(scores):
                 self.takes = takes
                 return scores
             returned = scores
@@ -251,19 +266,28 @@ class Function(nn.Module):
             raise failures[0]
         return returned  # The caller raises an error, because this is not a tensor.
 
-    def _call(self, images: Tensor, takes: str) -> Tensor:
+    def _call(self, images: Tensor, takes: str) -> Any:
         """Compute the scores of images in the form that the function takes."""
         if takes == TENSORS:
             return self.function(images)
         detached = images.detach()
         given = detached if takes == DETACHED else detached.cpu().float().numpy()
-        scores = torch.as_tensor(np.asarray(self.function(given))).to(images)
+        outputs = self.function(given)
+        if _is_structured(outputs):
+            return outputs
+        scores = torch.as_tensor(np.asarray(outputs)).to(images)
         if self.has_probabilities is None and scores.ndim == 2:
             self.has_probabilities = are_probabilities(scores)
         if self.has_probabilities:
             # Replace 0 by the smallest positive number, because the logarithm of 0 is infinite.
             return scores.clamp(min=torch.finfo(scores.dtype).tiny).log()
         return scores
+
+
+def _is_structured(outputs: Any) -> bool:
+    """Return whether outputs are those of a detector, a segmenter or a library, and no array."""
+    entries = outputs if isinstance(outputs, list | tuple) else [outputs]
+    return any(isinstance(item, Tensor | Mapping) or hasattr(item, "logits") for item in entries)
 
 
 def are_probabilities(outputs: Float[Tensor, "N C"]) -> bool:

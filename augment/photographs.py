@@ -30,13 +30,14 @@ from augment.attack_settings import (
     StepSettings,
 )
 from augment.attacks.loop import minimize
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import Objective
 from augment.attacks.optimizers import Gradient, NormBalls, Optimizer, sample
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, as_classifier
 from augment.network import Network, Quantization, device_of, frozen_eval_mode, gradient_flags_kept
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.patterns import draw_slides, interpolate_smoothly, luminance
+from augment.tasks.classification import ClassCriterion
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
@@ -476,7 +477,7 @@ def _attack_slide(
     source = result.source[rows].to(images.device)[:, None]
     examples = torch.arange(len(rows), device=images.device)
     for light in result.changed:
-        criterion = Criterion(source)
+        criterion = ClassCriterion(source)
         # No search reaches this margin, so each uses all passes. The slide as it is takes no step.
         search = replace(
             success,

@@ -18,18 +18,10 @@ from torch.utils.data import Dataset
 
 from augment import distributed
 from augment.attacks.loop import minimize
-from augment.attacks.objective import (
-    NO_CLASS,
-    Criterion,
-    Objective,
-    is_correct,
-    label_loss,
-    preprocessed_model,
-    require_known,
-)
+from augment.attacks.objective import Objective, preprocessed_model
 from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed_light
 from augment.augmentation_settings import AugmentationSettings
-from augment.classifier import LogitNetwork
+from augment.classifier import CheckedNetwork
 from augment.network import compute_outputs, frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
@@ -37,6 +29,14 @@ from augment.scene.build import MeshSource, build_scene, with_needed_degree
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
+from augment.tasks.classification import (
+    ClassCriterion,
+    Classification,
+    is_correct,
+    label_loss,
+    require_known,
+)
+from augment.tasks.task import NO_CLASS
 from renderer.errors import InputError, as_integers, describe, require_kind, require_whole
 from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
@@ -246,7 +246,7 @@ class AugmentationService:
         """
         require_kind("model", model, nn.Module, "a torch.nn.Module from images to logits")
         require_whole("number", number)
-        model = LogitNetwork(model, "model")
+        model = CheckedNetwork(model, "model", Classification())
         if self.images is not None and self.settings.renders:
             return self._from_folder(model, self.images, number)
         if self.scene is None or not self.settings.renders:
@@ -406,7 +406,7 @@ class AugmentationService:
         """Collect from all processes what each computed for its `shard` of the E examples."""
         return distributed.all_gather_rows(part, shard, len(self.labels), self.world_size)
 
-    def _attack_criterion(self) -> Criterion:
+    def _attack_criterion(self) -> ClassCriterion:
         """Return the source and the target class of the attack on each example.
 
         If there are no positive classes (classes that the network must tell from all others), the
@@ -414,7 +414,7 @@ class AugmentationService:
         class. All other examples are attacked towards a positive class, each class in turn.
         """
         if not self.positive_classes:
-            return Criterion(self.labels[:, None])
+            return ClassCriterion(self.labels[:, None])
         positive_classes = torch.tensor(self.positive_classes, device=self.labels.device)
         # A negative label says which class an example does not show. Such an example has no
         # source class.
@@ -423,7 +423,7 @@ class AugmentationService:
         target_in_turn = positive_classes[indices % len(positive_classes)]
         is_positive = torch.isin(self.labels, positive_classes)
         target = torch.where(is_positive, NO_CLASS, target_in_turn)
-        return Criterion(source[:, None], target[:, None])
+        return ClassCriterion(source[:, None], target[:, None])
 
     def _attack_start(self, problem: SceneProblem, number: int) -> Float[Tensor, "E D"]:
         """Return the attack values at which the next attack starts.

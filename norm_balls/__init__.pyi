@@ -4,6 +4,7 @@ from augment import AttackSettings as AttackSettings
 from augment import AugmentationService as AugmentationService
 from augment import AugmentationSettings as AugmentationSettings
 from augment import CameraEffectSettings as CameraEffectSettings
+from augment import Classification as Classification
 from augment import Classifier as Classifier
 from augment import Conditions as Conditions
 from augment import EOTSettings as EOTSettings

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from numbers import Integral
 from typing import Any, TypeVar
 
@@ -17,16 +18,18 @@ from augment import classifier as classifiers
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings, StepSettings
 from augment.attacks.adversary import final_images
 from augment.attacks.loop import minimize
-from augment.attacks.objective import NOISE_DRAWS, Criterion, Objective
+from augment.attacks.objective import NOISE_DRAWS, Objective
 from augment.attacks.problem import build_problem, source_labels, warn_of_changed_light
 from augment.attacks.result import ZERO_GRADIENT, AttackResult
-from augment.classifier import UNIT_RANGE, Classifier, Normalization
+from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork
 from augment.network import gradient_flags_kept
 from augment.progress import Phases, progress
 from augment.random_streams import generator
 from augment.scene.build import with_needed_degree
 from augment.scene.scene import Scene
 from augment.settings import NormalizeLight, SceneSettings
+from augment.tasks.classification import ClassCriterion, Classification
+from augment.tasks.task import Criterion, Task
 from renderer.errors import InputError, as_list, is_whole, require_flag, require_kind, require_whole
 from renderer.light.basis import harmonics_of
 from renderer.light.files import PROBES, UNIFORM, load_light
@@ -61,11 +64,12 @@ Settings = TypeVar("Settings", bound=SceneSettings)
 
 
 def attack(
-    classifier: Classifier | Callable[[Tensor], Tensor],
+    classifier: Classifier | Callable[[Tensor], Any],
     scene: Scene,
     target: str | int | Sequence[str | int] | None = None,
     settings: AttackSettings | None = None,
     *,
+    task: Task | None = None,
     classes: Sequence[str] | None = None,
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
@@ -73,14 +77,14 @@ def attack(
     seed: int = 0,
     force: bool = False,
 ) -> AttackResult:
-    """Change the examples of a scene until a classifier misclassifies them.
+    """Change the examples of a scene until a network misclassifies or misses them.
 
-    The mode and the gradient flags of the classifier are restored afterwards.
+    The mode and the gradient flags of the network are restored afterwards.
 
     Args:
         classifier: The classifier to attack, or a plain network from images of
-            the scene's size to logits, such as a `torch.nn.Module`. It must be
-            on the device of the scene.
+            the scene's size to logits, such as a `torch.nn.Module`. Other tasks
+            take other networks. It must be on the device of the scene.
         scene: The scene, with E examples of V views. Its labels are names or
             indices of classes.
         target: Class as which the images shall be classified. A list has one
@@ -89,8 +93,12 @@ def attack(
             accepts any misclassification.
         settings: Attacked parameters with their norm-balls, and the steps. By
             default, the light is changed without a limit.
+        task: What the outputs of a plain network mean, such as
+            `nb.Classification()`. None decides by the outputs for gray images,
+            and says so.
         classes: Names of the classes of a plain network, in the order of its
-            outputs. None for "0", "1" and so on.
+            outputs. None for the names that the network knows, or "0", "1" and
+            so on.
         normalization: Normalization of images for a plain network: "imagenet",
             or mean and standard deviation of the channels red, green and blue,
             in units of `value_range`. None if the network takes images in
@@ -139,14 +147,14 @@ def attack(
     like = scene.lights
     given = scene.settings.size, classes, normalization, value_range, like.device, "classifier"
     with gradient_flags_kept(classifier):
-        adapted = classifiers.as_classifier(
-            classifier, *given, normalize_light=normalize_light, dtype=like.dtype
+        adapted = classifiers.as_network(
+            classifier, *given, normalize_light=normalize_light, dtype=like.dtype, task=task
         )
         return _attack(adapted, scene, target, settings, seed, force)
 
 
 def _attack(
-    classifier: Classifier,
+    classifier: TaskNetwork,
     scene: Scene,
     target: str | int | Sequence[str | int] | None,
     settings: AttackSettings,
@@ -164,6 +172,9 @@ def _attack(
             f"{settings.query_limit} queries for each example (max_queries, optimizer)",
             stacklevel=3,
         )
+    if settings.eot.draws and not isinstance(classifier.task, Classification):
+        advice = "set eot.draws=0"
+        raise InputError(f"eot averages logits, but the task is {classifier.task}: {advice}", "eot")
     if not has_gradients:
         # Classify each image once only, because a function without gradients may be slow.
         classifier = classifiers.remembering(classifier)
@@ -174,12 +185,14 @@ def _attack(
     images_before = problem.images(problem.start)
     source = source_labels(scene, images_before.device, classifier)
     phases = Phases(images_before.device)
-    objective = Objective(classifier, Criterion(source), settings, seed, phases)
-    logits_before = objective.logits(images_before)
+    truth = partial(scene.truth, classifier.label)
+    criterion = classifier.task.criterion(source, truth, len(classifier.classes))
+    objective = Objective(classifier, criterion, settings, seed, phases)
+    evidence_before = objective.evidence(images_before)
     if not force:
-        require_clean_correct(scene, logits_before, source, classifier)
-    criterion = Criterion(source, target_labels(target, source, logits_before, classifier))
-    objective.criterion = criterion
+        require_clean_correct(scene, evidence_before, criterion, classifier)
+    labels = target_labels(target, source, evidence_before, classifier)
+    objective.criterion = replace(criterion, target=labels)
     with phases("attack"):
         numbers = range(1, settings.restarts + 1)
         restarts = (problem.sample(generator(seed, number, "restart")) for number in numbers)
@@ -189,13 +202,17 @@ def _attack(
     if minimum.zero_gradient.any():
         warnings.warn(ZERO_GRADIENT, stacklevel=3)
 
-    logits, success_in_views, _ = objective.judge(images, problem.all_examples)
+    if criterion.needs_truth:
+        # The attack may have moved the objects.
+        objective = objective.at(problem.truth(minimum.values, problem.all_examples))
+    criterion = objective.criterion
+    evidence, success_in_views, _ = objective.judge(images, problem.all_examples)
     # Images that the search or `final_images` showed to the classifier.
     queries = minimum.queries + scene.views * (images is not minimum.images)
     if settings.sensor_noise:
         # `fooled_in_views` tests an example with noise if at least one view meets the
         # criterion. It then classifies all views of the example in each draw of the noise.
-        is_tested = criterion.reached_in_views(logits.argmax(2)).any(1)
+        is_tested = criterion.reached_in_views(criterion.predicted(evidence)).any(1)
         queries += NOISE_DRAWS * scene.views * is_tested
     return AttackResult(
         problem=problem,
@@ -205,8 +222,8 @@ def _attack(
         seed=seed,
         images_in_views_before=images_before,
         images_in_views=images,
-        logits_in_views_before=logits_before,
-        logits_in_views=logits,
+        evidence_in_views_before=evidence_before,
+        evidence_in_views=evidence,
         success_in_views=success_in_views,
         minimum=minimum,
         queries=queries,
@@ -215,22 +232,21 @@ def _attack(
 
 
 def require_clean_correct(
-    scene: Scene, logits: Float[Tensor, "E V C"], source: Int[Tensor, "E V"], classifier: Classifier
+    scene: Scene, evidence: Float[Tensor, "E V K"], criterion: Criterion, network: TaskNetwork
 ) -> None:
-    """Check that every image of a scene is classified correctly.
+    """Check that the network finds the true class in every image of a scene.
 
-    The error names the five most probable classes of the first image that is misclassified.
+    The error says what it finds in the first other image.
     """
-    misclassified = (logits.argmax(2) != source).nonzero().tolist()
-    if not misclassified:
+    wrong = (criterion.predicted(evidence) != criterion.source).nonzero().tolist()
+    if not wrong:
         return
-    example, view = misclassified[0]
+    example, view = wrong[0]
     item = scene.objects[scene.examples[example].object]
-    confidences = logits[example, view].softmax(0)
-    indices = confidences.topk(min(5, len(confidences))).indices.tolist()
-    most_probable = ", ".join(f"{classifier.classes[i]} {confidences[i]:.1%}" for i in indices)
-    count = f"{len(misclassified)} of {source.numel()} images are not classified as their class"
-    first = f"the first, of {item.name}, class {item.label!r}: {most_probable}"
+    found = network.task.describe(evidence[example, view], network.classes)
+    missed = network.task.missed
+    count = f"{len(wrong)} of {criterion.source.numel()} images {missed}"
+    first = f"the first, of {item.name}, class {item.label!r}: {found}"
     advice = "change the scene, or set force=True"
     raise InputError(f"force=False, and {count} ({first}): {advice}", "force")
 
@@ -238,8 +254,8 @@ def require_clean_correct(
 def target_labels(
     target: str | int | Sequence[str | int] | None,
     source: Int[Tensor, "E V"],
-    logits: Float[Tensor, "E V C"],
-    classifier: Classifier,
+    evidence: Float[Tensor, "E V K"],
+    classifier: TaskNetwork,
 ) -> Int[Tensor, "E V"] | None:
     """Return the target class of each view as an index of the classifier.
 
@@ -247,9 +263,10 @@ def target_labels(
     """
     if target is None:
         return None
+    classifier.task.require_target(target)
     if isinstance(target, str) and target == LEAST_LIKELY:
-        return logits.argmin(2)
-    view_count = logits.shape[1]
+        return evidence.argmin(2)
+    view_count = evidence.shape[1]
     names: list[Any] = [target] * view_count
     if not isinstance(target, str) and not is_whole(target):
         advice = "the name or the index of a class, or one for each view"
@@ -359,8 +376,8 @@ def _confidences(
     images = problem.images(problem.start)
     labels = source_labels(scene, images.device, classifier)
     # Probability of each of the C classes in each view of each example, shape (E, V, C).
-    objective = Objective(classifier, Criterion(labels), attack_settings)
-    probabilities = objective.logits(images).softmax(2)
+    objective = Objective(classifier, ClassCriterion(labels), attack_settings)
+    probabilities = objective.evidence(images).softmax(2)
     confidence = probabilities.gather(2, labels[..., None])[..., 0]
     is_correct = probabilities.argmax(2) == labels
     return (confidence * is_correct).view(groups, -1).amin(1)

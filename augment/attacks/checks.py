@@ -16,7 +16,7 @@ from torch import Tensor
 from augment.attack_settings import StepSettings
 from augment.attacks.adversary import Adversary, final_images
 from augment.attacks.loop import minimize
-from augment.attacks.objective import Criterion, Examples, Images, Objective, Values
+from augment.attacks.objective import Examples, Images, Objective, Values
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult, predictions, require_result
@@ -25,6 +25,7 @@ from augment.network import gradient_flags_kept
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject
+from augment.tasks.classification import ClassCriterion
 from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, as_list, require_number
 
 # `check` repeats an attack with these multiples of its number of steps.
@@ -312,7 +313,10 @@ def _add(
     again with exact shadows and bounces, and these images decide, without and with sensor noise.
     """
     objective = result.objective().select(examples)
-    is_reached = objective.criterion.reached(objective.logits(images).argmax(2))
+    criterion = objective.criterion
+    if criterion.needs_truth:
+        objective = objective.at(problem.truth(values, examples))
+    is_reached = criterion.reached(criterion.predicted(objective.evidence(images)))
     rows = torch.nonzero(is_reached)[:, 0]
     if len(rows):
         examples = examples[rows]
@@ -376,7 +380,7 @@ def _classify(
     target = criterion.target
     if target is not None:
         target = target.cpu().apply_(lambda index: classifier.label(classes[index]))
-    criterion = Criterion(source[:, None].expand(-1, criterion.view_count), target)
+    criterion = ClassCriterion(source[:, None].expand(-1, criterion.view_count), target)
     criterion = criterion.map(lambda tensor: tensor.to(examples.device))
     objective = Objective(classifier, criterion, result.settings, result.seed)
     if len(examples):
@@ -384,7 +388,7 @@ def _classify(
         for adversary in progress(changed, "transfer"):
             images.append(adversary.render_views(result.problem.scene.rasterizer))
         images_before, images_after = torch.stack(images).to(result.images_in_views).chunk(2)
-        logits_before = objective.logits(images_before)
+        logits_before = objective.evidence(images_before)
         logits, fooled_in_views, without_noise = objective.judge(images_after, examples)
     else:
         logits_before = logits = result.logits_in_views[examples]

@@ -19,10 +19,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
-from augment.attacks.objective import NOISE_DRAWS, Examples, Images, Objective, Rows, Score, Values
+from augment.attacks.objective import NOISE_DRAWS, Examples, Images, Objective, Score, Values
 from augment.attacks.optimizers import CMAES, Evaluation, Gradient, Optimizer, Problem, RandomSearch
 from augment.network import frozen_eval_mode
 from augment.progress import progress
+from augment.tasks.task import Rows
 from renderer.errors import ShortRepr
 
 # Fields of a `Minimum` that belong to the returned candidate.
@@ -268,7 +269,10 @@ def evaluate(
         with torch.set_grad_enabled(needs_gradient):
             rendered = problem.render(part, examples[rows[group]])
         images.append(rendered.detach())
-        score, image_gradient = objective.select(rows[group]).score(images[-1], needs_gradient)
+        chosen = objective.select(rows[group])
+        if objective.criterion.needs_truth:
+            chosen = chosen.at(problem.truth(part.detach(), examples[rows[group]]))
+        score, image_gradient = chosen.score(images[-1], needs_gradient)
         scores.append(score)
         if needs_gradient:
             # Chain rule: the gradient with respect to the images gives the gradient with respect

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from augment.attacks.objective import Examples, Images, Score, Values
 from augment.random_streams import generator, stream_seed
+from augment.scene.truth import Truth
 from renderer.errors import InputError
 from renderer.vectors import Ball, nearest_in_box
 
@@ -57,6 +58,9 @@ class Problem(Protocol):
 
     def render(self, values: Values, examples: Examples) -> Images:
         """Render the V views of examples, differentiable in the values."""
+
+    def truth(self, values: Values, examples: Examples) -> Truth:
+        """Find where the objects are in the images. Only criteria with `needs_truth` ask for it."""
 
     def project(self, values: Values, examples: Examples) -> Values:
         """Find the nearest values that are feasible and lie in the norm-balls."""

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -12,11 +13,12 @@ from augment.attacks.objective import Examples, Images, Values
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.lights import Lighting, Skylight, environment_light
 from augment.attacks.parameters.parameter import Parameter
-from augment.classifier import Classifier
+from augment.classifier import TaskNetwork
 from augment.progress import progress
 from augment.scene.build import MAX_IRRADIANCE_ERROR
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
+from augment.scene.truth import NO_OBJECT, Truth
 from renderer.light.harmonics import irradiance_error
 
 
@@ -76,6 +78,18 @@ class SceneProblem:
             groups = progress(groups, "images")
         return torch.cat([self.render(values[group], group) for group in groups])
 
+    def truth(self, values: Values, examples: Examples) -> Truth:
+        """Find where the objects are in the images, which attacks on shape and pose move."""
+        conditions = self.conditions(values, examples)
+        if conditions.vertices is None and conditions.cameras is None:
+            return self._still_truth.select(examples)
+        return self.scene.truth(_unlabeled, examples, conditions)
+
+    @cached_property
+    def _still_truth(self) -> Truth:
+        """Where the objects of all examples are before any attack."""
+        return self.scene.truth(_unlabeled)
+
     def scale_gradient(self, gradient: Values) -> Values:
         """Compute the step of each parameter that gradient descent subtracts from the values."""
         parts = self.split_by_parameter(gradient)
@@ -112,6 +126,11 @@ class SceneProblem:
         """Split the attack values of examples into the values of each parameter."""
         parts = values.split(self._value_counts, dim=1)
         return list(zip(self.parameters, parts, strict=True))
+
+
+def _unlabeled(label: str | int) -> int:
+    """Return a label for a truth of which only positions are used."""
+    return NO_OBJECT
 
 
 def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
@@ -151,7 +170,9 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
         warnings.warn(message, stacklevel=stacklevel)
 
 
-def source_labels(scene: Scene, device: torch.device, classifier: Classifier) -> Int[Tensor, "E V"]:
+def source_labels(
+    scene: Scene, device: torch.device, classifier: TaskNetwork
+) -> Int[Tensor, "E V"]:
     """Return the true class of each view as an index of the classifier."""
     labels = [classifier.label(label) for label in scene.labels]
     return torch.tensor(labels, device=device)[:, None].expand(-1, scene.views)

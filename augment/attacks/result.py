@@ -17,10 +17,12 @@ from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
 from augment.attacks.loop import Minimum
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import Objective
 from augment.attacks.problem import SceneProblem
-from augment.classifier import Classifier
+from augment.classifier import TaskNetwork
 from augment.scene.objects import Conditions
+from augment.tasks.classification import ClassCriterion
+from augment.tasks.task import Criterion
 from renderer.errors import ShortRepr, as_path, require_choice, require_kind, require_whole
 from renderer.io.images import PAPER, draw_grid, tiles_of, write_image
 from renderer.light.basis import Basis
@@ -73,10 +75,10 @@ class AttackResult(ShortRepr):
             rounded, shape (E, V, 3, size, size).
         images_in_views: Images after the attack, with the same shape and range.
             Their shadows and bounces are those of the attacked shape and colors.
-        logits_in_views_before: Logits of the preprocessed images before the
-            attack, shape (E, V, C).
-        logits_in_views: Logits of the preprocessed images after the attack,
-            shape (E, V, C).
+        evidence_in_views_before: How strongly each class is found in the
+            preprocessed images before the attack, shape (E, V, K). These are
+            the logits of a classifier.
+        evidence_in_views: The same after the attack.
         success_in_views: Whether each view meets the criterion without noise and
             in each draw of sensor noise, shape (E, V), bool.
         minimum: Result of the optimizer, before the final images are rendered. If
@@ -90,14 +92,14 @@ class AttackResult(ShortRepr):
     """
 
     problem: SceneProblem
-    classifier: Classifier
+    classifier: TaskNetwork
     criterion: Criterion
     settings: AttackSettings
     seed: int
     images_in_views_before: Tensor
     images_in_views: Tensor
-    logits_in_views_before: Tensor
-    logits_in_views: Tensor
+    evidence_in_views_before: Tensor
+    evidence_in_views: Tensor
     success_in_views: Tensor
     minimum: Minimum
     queries: Tensor
@@ -118,6 +120,22 @@ class AttackResult(ShortRepr):
         The shape is (E, V, 3, size, size), or (E, 3, size, size) if an example has one view.
         """
         return self.images_in_views.squeeze(1)
+
+    @property
+    def logits_in_views_before(self) -> Tensor:
+        """Logits of a classifier before the attack, shape (E, V, C)."""
+        return self._logits(self.evidence_in_views_before)
+
+    @property
+    def logits_in_views(self) -> Tensor:
+        """Logits of a classifier after the attack, shape (E, V, C)."""
+        return self._logits(self.evidence_in_views)
+
+    def _logits(self, evidence: Tensor) -> Tensor:
+        """Return evidence that consists of logits."""
+        if not isinstance(self.criterion, ClassCriterion):
+            raise AttributeError(f"an attack on {self.classifier.task} has no logits")
+        return evidence
 
     @property
     def logits_before(self) -> Tensor:
@@ -155,21 +173,22 @@ class AttackResult(ShortRepr):
         All views of the example meet the criterion in their images without sensor noise. Before
         the attack, the example did not meet it.
         """
-        return self.criterion.reached(self.logits_in_views.argmax(2)) & ~self.success_before
+        predicted = self.criterion.predicted(self.evidence_in_views)
+        return self.criterion.reached(predicted) & ~self.success_before
 
     @property
     def success_with_margin(self) -> Tensor:
-        """Return a mask of the successful examples with a sufficient logit gap, shape (E,).
+        """Return a mask of the successful examples with a sufficient gap, shape (E,).
 
-        The logit gap, see `Criterion.gap`, is at least `settings.margin` in all views.
+        The gap, see `Criterion.gap`, is at least `settings.margin` in all views.
         """
-        gaps = self.criterion.gap(self.logits_in_views)
+        gaps = self.criterion.gap(self.evidence_in_views)
         return self.success & (gaps >= self.settings.margin).all(1)
 
     @property
     def success_before(self) -> Tensor:
         """Return a mask of the examples that met the criterion before the attack, shape (E,)."""
-        return self.criterion.reached(self.logits_in_views_before.argmax(2))
+        return self.criterion.reached(self.criterion.predicted(self.evidence_in_views_before))
 
     @property
     def clean_correct(self) -> Tensor:
@@ -178,7 +197,12 @@ class AttackResult(ShortRepr):
         All views of such an example are correct. Success rates count only these examples. Shape
         (E,).
         """
-        return (self.logits_in_views_before.argmax(2) == self.criterion.source).all(1)
+        return self._is_found_before.all(1)
+
+    @property
+    def _is_found_before(self) -> Tensor:
+        """Return a mask of the views in which the true class was found before the attack."""
+        return self.criterion.predicted(self.evidence_in_views_before) == self.criterion.source
 
     @property
     def steps(self) -> Tensor:
@@ -261,7 +285,7 @@ class AttackResult(ShortRepr):
             require_whole("example", example, 0, example_count - 1)
         if view is not None:
             require_whole("view", view, 0, view_count - 1)
-        was_correct = self.logits_in_views_before.argmax(2) == self.criterion.source
+        was_correct = self._is_found_before
         # 2 for views that the attack turned from correct to wrong, 1 for others that were correct.
         scores = was_correct * (1 + self.success_in_views.to(was_correct.device).int())
         rows = slice(None) if example is None else example
@@ -323,7 +347,7 @@ class AttackResult(ShortRepr):
         images[0] = self.images_in_views_before[example, view]
         images[-1] = self.images_in_views[example, view]
         shown = torch.stack(images)
-        logits = self.objective().logits(shown[:, None])[:, 0]
+        logits = self.objective().evidence(shown[:, None])[:, 0]
         titles = _titles(logits, self.classifier.classes)
         if shown.shape[-1] > MAX_SIDE:
             size = (MAX_SIDE, MAX_SIDE)

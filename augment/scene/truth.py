@@ -33,6 +33,10 @@ class Truth:
     masks: Bool[Tensor, "E V O H W"]
     visible: Float[Tensor, "E V O"]
 
+    def select(self, examples: Int[Tensor, " A"]) -> Truth:
+        """Return the truth of some examples."""
+        return Truth(*(part[examples] for part in vars(self).values()))
+
 
 def boxes_of(masks: Bool[Tensor, "... H W"]) -> Float[Tensor, "... 4"]:
     """Return the smallest boxes that contain masks: left, top, right and bottom, in pixels.

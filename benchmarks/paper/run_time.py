@@ -11,9 +11,10 @@ import torch
 
 from augment import AttackSettings, Classifier
 from augment.attacks.loop import minimize
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import Objective
 from augment.attacks.problem import build_problem
 from augment.scene.objects import SceneObject
+from augment.tasks.classification import ClassCriterion
 from benchmarks.common import Row
 from benchmarks.paper import common
 
@@ -33,7 +34,7 @@ def measure_attack(
         Record of the attack.
     """
     scene = common.make_scene(subject, classifier.size, [view])
-    criterion = Criterion(torch.tensor([[classifier.label(subject.label)]]))
+    criterion = ClassCriterion(torch.tensor([[classifier.label(subject.label)]]))
     start = time.process_time()
     problem = build_problem(settings, scene)
     result = minimize(problem, Objective(classifier, criterion, settings))

@@ -15,10 +15,11 @@ from torch import Tensor
 
 from augment import AttackSettings, Classifier
 from augment.attacks.loop import minimize
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import Objective
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject
+from augment.tasks.classification import ClassCriterion
 from benchmarks.paper import common
 from renderer.errors import MAX_SCALE
 
@@ -113,7 +114,7 @@ def find_adversaries(
         Values of all examples.
     """
     labels = torch.full((len(problem.start), view_count), classifier.label(label))
-    criterion = Criterion(labels)
+    criterion = ClassCriterion(labels)
     first = minimize(problem, Objective(classifier, criterion, settings)).values
     further_settings = replace(settings, max_steps=ADDITIONAL_STEPS, margin=ENDLESS_MARGIN)
     further_objective = Objective(classifier, criterion, further_settings)

@@ -171,7 +171,7 @@ def with_pixel_mean(network: nn.Module) -> nn.Module:
     ("change", "options", "message"),
     [
         (without_eval, {}, "training mode"),
-        (lambda _: lambda images: {"logits": images.mean((2, 3))}, {}, "dict"),
+        (lambda _: lambda images: {"scores": images.mean((2, 3))}, {}, "dict"),
         (
             lambda network: nn.Sequential(Normalize(MEAN, STD), network).eval(),
             {"normalization": "imagenet"},

@@ -9,8 +9,9 @@ from torch import nn
 
 from augment.attack_settings import AttackSettings
 from augment.attacks.loop import Minimum, minimize
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import Objective
 from augment.network import compute_outputs, say_once
+from augment.tasks.classification import ClassCriterion
 
 OUT_OF_MEMORY = [
     torch.OutOfMemoryError("CUDA out of memory"),
@@ -61,7 +62,7 @@ class Shades:
 
 def attack(model: nn.Module, batch_size: int = 4, group_size: int = 10) -> Minimum:
     """Attack ten examples with one restart."""
-    criterion = Criterion(torch.zeros(10, 1, dtype=torch.int64))
+    criterion = ClassCriterion(torch.zeros(10, 1, dtype=torch.int64))
     settings = AttackSettings(max_steps=6, margin=0.0, quantized=False, batch_size=batch_size)
     objective = Objective(model, criterion, settings)
     return minimize(Shades(group_size), objective, restarts=[Shades.start.flip(0)])

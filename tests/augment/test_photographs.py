@@ -10,7 +10,7 @@ from torch import nn
 
 from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.attacks.loop import minimize
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import Objective
 from augment.photographs import (
     ADVERSARIAL,
     LIGHTS,
@@ -24,6 +24,7 @@ from augment.photographs import (
 )
 from augment.random_streams import generator
 from augment.scene.patterns import draw_cells
+from augment.tasks.classification import ClassCriterion
 from renderer.errors import InputError
 from renderer.image import LUMINANCE, decode, encode, to_unit
 
@@ -111,7 +112,7 @@ def test_steps_lower_the_confidence_in_the_source(photographs):
     source = network(images).argmax(1)
     problem = RelitPhotographs(albedo, light, SETTINGS)
     settings = AttackSettings(max_steps=4, margin=100.0, quantized=False)
-    found = minimize(problem, Objective(network, Criterion(source[:, None]), settings))
+    found = minimize(problem, Objective(network, ClassCriterion(source[:, None]), settings))
     before = network(light.expose(albedo)).log_softmax(1)
     after = network(light.expose(albedo, problem.log_gain(found.values))).log_softmax(1)
     change = (after - before).gather(1, source[:, None])

@@ -8,7 +8,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from augment.attack_settings import StepSettings
-from augment.attacks.objective import complementary_label
 from augment.augmentation_settings import (
     AugmentationSettings,
     RandomLightSettings,
@@ -20,6 +19,7 @@ from augment.scene.build import build_scene
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
+from augment.tasks.classification import complementary_label
 from renderer.light.files import probe
 from renderer.solids import solid
 

@@ -28,7 +28,7 @@ from augment.attack_settings import (
 )
 from augment.attacks.attack import EXPOSURES, attack
 from augment.attacks.checks import success_by_radius
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import Objective
 from augment.attacks.problem import build_problem
 from augment.attacks.result import AttackResult, predictions
 from augment.augmentation_settings import VariationSettings
@@ -41,6 +41,7 @@ from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
 from augment.settings import LampsSettings, ProjectorSettings
+from augment.tasks.classification import ClassCriterion
 from renderer.camera import orbit_cameras
 from renderer.errors import MAX_SCALE
 from renderer.image import to_bytes
@@ -321,7 +322,7 @@ def transfer_success(
         result = adversaries(attacked, views, kind, additional=True)
         problem = build_problem(result.settings, views.scene(other.size, kind))
         label = other.label(problem.scene.labels[0])
-        criterion = Criterion(torch.full_like(result.criterion.source, label))
+        criterion = ClassCriterion(torch.full_like(result.criterion.source, label))
         objective = Objective(other, criterion, result.settings, result.seed)
         recognized = is_correct(other, problem.scene, problem.images(problem.start))
         lights = {"further": (result.clean_correct & result.success, result.minimum.values)}
@@ -353,7 +354,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     with torch.no_grad():
         images = result.problem.render(values, examples)
         conditions = result.problem.conditions(values, examples)
-        logits = result.objective().logits(images)[:, 0]
+        logits = result.objective().evidence(images)[:, 0]
     probabilities = logits.softmax(1).cpu()
     label = int(result.criterion.source[example, 0])
     ranked = probabilities.amax(dim=0).argsort(descending=True).tolist()

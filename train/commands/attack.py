@@ -21,7 +21,7 @@ from augment.attacks.adversary import Adversary, reload
 from augment.attacks.attack import attack, find_scene
 from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
 from augment.attacks.files import require_renderers, save
-from augment.attacks.objective import NO_CLASS, Criterion, Objective, preprocessed_model
+from augment.attacks.objective import Objective, preprocessed_model
 from augment.attacks.result import ZERO_GRADIENT, AttackResult, predictions, warnings
 from augment.classifier import Classifier
 from augment.network import compute_outputs
@@ -30,6 +30,8 @@ from augment.scene.build import build_scene
 from augment.scene.objects import add_table, load_object
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
+from augment.tasks.classification import ClassCriterion
+from augment.tasks.task import NO_CLASS
 from renderer.errors import InputError, keyed, keys_of
 from renderer.visibility import Rasterizer
 from train.auditing.relit import MODELED, attack_folder
@@ -298,7 +300,7 @@ def format_reloaded(
     predicted = logits.argmax(2)
     # The target class of the "attack" is `predicted`. `fooled_in_views` then tests whether
     # the images are still classified as `predicted` when there is noise.
-    criterion = Criterion(source=torch.full_like(predicted, NO_CLASS), target=predicted)
+    criterion = ClassCriterion(source=torch.full_like(predicted, NO_CLASS), target=predicted)
     objective = Objective(classifier, criterion, settings, seed)
     example = torch.zeros(1, dtype=torch.int64)
     is_same_with_noise = objective.fooled_in_views(images[None], predicted, example)[0]

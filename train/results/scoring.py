@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from augment.classifier import Label, LogitNetwork, OperatingPoint, log_odds
+from augment.classifier import CheckedNetwork, Label, OperatingPoint, log_odds
 from augment.network import compute_outputs
+from augment.tasks.classification import Classification
 from renderer.errors import InputError, ShortRepr, require_choice
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
@@ -149,7 +150,7 @@ def compute_logits(
             "the model has a single class, so its log-odds are infinite: "
             "evaluate a model with at least two classes"
         )
-    checked = LogitNetwork(model, "model", classes)
+    checked = CheckedNetwork(model, "model", Classification(), classes)
     logits = compute_outputs(checked, images, BATCH, device).cpu()
     if not logits.isfinite().all():
         raise InputError(

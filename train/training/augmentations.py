@@ -16,10 +16,11 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.attack_settings import AttackSettings, RelightingSettings, StepSettings
 from augment.attacks.loop import minimize_from
-from augment.attacks.objective import Criterion, Objective, label_loss
+from augment.attacks.objective import Objective
 from augment.attacks.optimizers import Gradient, NormBalls
 from augment.photographs import RelitPhotographs, draw_projected_light
 from augment.random_streams import generator, stream_seed
+from augment.tasks.classification import ClassCriterion, label_loss
 from renderer.errors import MAX_SCALE
 from renderer.image import decode, to_bytes, to_unit
 from renderer.vectors import Ball, nearest_in_box
@@ -117,7 +118,7 @@ class _Pixels(NormBalls):
 
 
 @dataclass(frozen=True)
-class _LossOfLabels(Criterion):
+class _LossOfLabels(ClassCriterion):
     """Criterion that raises the loss of labels, which may be complementary, and is never reached.
 
     Attributes:
@@ -172,7 +173,7 @@ class RelitBatches:
         values = problem.sample(draws)
         if steps and relighting.radius and self.teacher is not None:
             with torch.no_grad():
-                criterion = Criterion(self.teacher(unit).argmax(1)[:, None])
+                criterion = ClassCriterion(self.teacher(unit).argmax(1)[:, None])
             values = _attack(problem, values, self.model, criterion, steps)
         with torch.no_grad():
             return to_bytes(light.expose(albedo, problem.log_gain(values)))
@@ -182,7 +183,7 @@ def _attack(
     problem: _Pixels | RelitPhotographs,
     start: Float[Tensor, "B D"],
     model: nn.Module,
-    criterion: Criterion,
+    criterion: ClassCriterion,
     steps: int,
 ) -> Float[Tensor, "B D"]:
     """Attack the images of a batch along the gradient. With this margin, no attack ends early."""

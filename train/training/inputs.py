@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.attacks.objective import complementary_label
 from augment.classifier import Classifier, class_index
 from augment.files import as_facts, is_network_file, require_no_facts
 from augment.network import without_normalized_light
@@ -18,6 +17,7 @@ from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
 from augment.sources import load_source
+from augment.tasks.classification import complementary_label
 from renderer.errors import InputError, as_path, keyed, keys_of, require_range
 from renderer.settings import MAX_SIZE
 from train import checkpoints, console

@@ -15,9 +15,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
-from augment.attacks.objective import is_correct, label_loss
 from augment.classifier import log_odds, nearest
 from augment.network import eval_mode
+from augment.tasks.classification import is_correct, label_loss
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.device import PRECISIONS, MixedPrecision

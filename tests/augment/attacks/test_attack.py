@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 import augment
 from augment.attack_settings import PARAMETER_NAMES
-from augment.attacks.objective import Criterion
+from augment.tasks.classification import ClassCriterion
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
 from renderer.light.nonnegative import project_nonnegative
@@ -38,7 +38,7 @@ def test_logits_costs_and_success_are_those_of_the_images(result, by_color):
     after = (result.images, result.logits, result.minimum.cost)
     for images, logits, cost in (before, after):
         assert torch.equal(logits, by_color(images))
-        expected = Criterion(labels).cost(logits)
+        expected = ClassCriterion(labels).cost(logits)
         # Sums of 64 pixels in another order differ by rounding.
         torch.testing.assert_close(cost, expected, rtol=0, atol=1e-4)
     assert torch.equal(result.success, result.logits.argmax(1) != 0)

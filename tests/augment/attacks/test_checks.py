@@ -237,8 +237,8 @@ def test_a_transfer_is_to_a_scene_with_turned_cameras_or_with_another_mesh(resul
 def test_only_clean_correct_examples_are_transferred(result):
     logits_before = result.logits_in_views_before.clone()
     logits_before[0] *= -1  # The first example becomes misclassified.
-    (row,) = augment.transfer(replace(result, logits_in_views_before=logits_before), [network()])
+    (row,) = augment.transfer(replace(result, evidence_in_views_before=logits_before), [network()])
     assert row["confidence"] == confidence(result.logits_in_views[1:])
-    nothing = replace(result, logits_in_views_before=-result.logits_in_views_before)
+    nothing = replace(result, evidence_in_views_before=-result.logits_in_views_before)
     (row,) = augment.transfer(nothing, [network()])
     assert row["confidence"] == row["success"] == []

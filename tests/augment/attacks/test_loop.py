@@ -12,8 +12,9 @@ from torch import Tensor, nn
 
 from augment.attack_settings import NORMS, OPTIMIZERS, STEPS, AttackSettings, StepSettings
 from augment.attacks.loop import Minimum, minimize
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import Objective
 from augment.attacks.optimizers import NormBalls, sample
+from augment.tasks.classification import ClassCriterion
 
 EPS = torch.finfo(torch.float64).eps
 IMAGE_SHAPE = (3, 2, 2)
@@ -83,13 +84,13 @@ def settings_of(max_steps: int = 30, margin: float = 0.0, **others) -> AttackSet
     return AttackSettings(max_steps=max_steps, margin=margin, quantized=False, **others)
 
 
-def descend(model: nn.Module, problem, criterion: Criterion, settings, restarts=()) -> Minimum:
+def descend(model: nn.Module, problem, criterion: ClassCriterion, settings, restarts=()) -> Minimum:
     return minimize(problem, Objective(model, criterion, settings), restarts=restarts)
 
 
 def attack(model: nn.Module, problem, labels: Tensor, steps: int = 30, **settings) -> Minimum:
     """Run an untargeted descent on examples of one view each."""
-    return descend(model, problem, Criterion(labels[:, None]), settings_of(steps, **settings))
+    return descend(model, problem, ClassCriterion(labels[:, None]), settings_of(steps, **settings))
 
 
 # --------------------------------------------------------------- known minima
@@ -109,7 +110,7 @@ def test_the_lowest_point_of_a_ball_is_found_from_anywhere_in_it(optimizer, norm
     start = sample(ball, center, torch.Generator().manual_seed(0))
     # With a target, the cost is the sum of the leads of all views, which is linear in the values.
     zeros = torch.zeros(3, views, dtype=torch.int64)
-    criterion = Criterion(zeros, zeros + 1)
+    criterion = ClassCriterion(zeros, zeros + 1)
     queries = None if optimizer == "gradient" else 400 * views
     settings = settings_of(120, optimizer=optimizer, max_queries=queries)
     problem = LinearScene(start, ball, views, center)
@@ -178,7 +179,7 @@ def test_descent_on_a_linear_classifier_follows_its_closed_form(rule):
 def test_descent_ends_when_every_view_is_misclassified_by_the_margin():
     start = random(EXAMPLE_COUNT, VALUE_COUNT, seed=2)
     problem = LinearScene(start, StepSettings(step_size=0.3), views=2)
-    criterion = Criterion(torch.zeros(EXAMPLE_COUNT, 2, dtype=torch.int64))
+    criterion = ClassCriterion(torch.zeros(EXAMPLE_COUNT, 2, dtype=torch.int64))
     model = Linear()
     result = descend(model, problem, criterion, settings_of(30, margin=0.5))
     logits = model(result.images.flatten(0, 1)).unflatten(0, (-1, 2))
@@ -259,7 +260,7 @@ def test_a_step_that_does_not_lower_the_cost_is_taken_back_and_tried_at_half_its
     """Every value is exact."""
     start = torch.tensor([[1.0], [0.125], [0.75]], dtype=torch.float64)
     zeros = torch.zeros(3, 1, dtype=torch.int64)
-    criterion = Criterion(zeros, zeros + 1)
+    criterion = ClassCriterion(zeros, zeros + 1)
     result = descend(
         two_classes(lambda value: 1 + value**2),
         Axis(start),
@@ -356,7 +357,7 @@ def attack_nine(views: int, examples: Tensor | None = None, seed: int = 0, **set
     """Attack nine examples, of which some succeed at once, some on the way and some never."""
     problem = LinearScene(NINE_STARTS, StepSettings("l2", 3.0, step_size=0.3), views=views)
     chosen = torch.arange(9) if examples is None else examples
-    criterion = Criterion((chosen % 4)[:, None].expand(-1, views))
+    criterion = ClassCriterion((chosen % 4)[:, None].expand(-1, views))
     objective = Objective(small_network(), criterion, settings_of(8, **settings), seed)
     return minimize(problem, objective, examples=examples)
 
@@ -412,7 +413,7 @@ def test_restarts_go_on_with_the_examples_without_success_and_keep_the_first_suc
     """Of 40 examples, some need one or two restarts and some never succeed."""
     center = random(40, VALUE_COUNT, seed=3)
     steps = StepSettings("linf", 0.5, "sign", 0.1)
-    criterion = Criterion(torch.arange(40)[:, None] % 2)
+    criterion = ClassCriterion(torch.arange(40)[:, None] % 2)
     settings = settings_of(2, sensor_noise=0.0)
     starts = [sample(steps, center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
     problem = LinearScene(center, steps)

@@ -12,18 +12,12 @@ from torch import Tensor, nn
 import augment
 from augment.attack_settings import EOTSettings
 from augment.attacks import objective
-from augment.attacks.objective import (
-    NO_CLASS,
-    Criterion,
-    as_jpeg,
-    average_transformed,
-    complementary_label,
-    is_correct,
-    label_loss,
-)
+from augment.attacks.objective import as_jpeg, average_transformed
 from augment.classifier import log_odds
 from augment.network import Network, Quantization
 from augment.random_streams import generator
+from augment.tasks.classification import ClassCriterion, complementary_label, is_correct, label_loss
+from augment.tasks.task import NO_CLASS
 from train.training.recipe import kl_divergence, ranking_loss
 
 EPS = torch.finfo(torch.float64).eps
@@ -43,7 +37,7 @@ def test_the_gradient_in_float32_is_exact_if_the_network_is_certain(gap):
     # the equal sum of the other probabilities.
     expected = -probabilities
     expected[0, 1] = probabilities[0, [0, 2, 3]].sum()
-    Criterion(torch.tensor([1]), torch.tensor([NO_CLASS])).cost(logits).sum().backward()
+    ClassCriterion(torch.tensor([1]), torch.tensor([NO_CLASS])).cost(logits).sum().backward()
     # The difference of two logits has an error of up to 50 / 2 · ε, which the exponential keeps.
     rtol = 50 * torch.finfo(torch.float32).eps
     torch.testing.assert_close(logits.grad.double(), expected, rtol=rtol, atol=0)
@@ -54,14 +48,14 @@ def test_the_gradient_of_an_overconfident_network_is_that_of_its_log_odds(factor
     """The other class of the largest logit has all probability that the source does not have."""
     logits = factor * torch.tensor([[0.5, 4.0, 2.0, 0.0]])
     logits.requires_grad_(True)
-    Criterion(torch.tensor([1])).cost(logits).sum().backward()
+    ClassCriterion(torch.tensor([1])).cost(logits).sum().backward()
     assert logits.grad.tolist() == [[0.0, 1.0, -1.0, 0.0]]
 
 
 def test_the_cost_grows_with_the_log_odds_on_both_sides_of_50():
     odds = torch.tensor([40.0, 49.9, 50.0, 50.1, 104.0, 1e5])
     logits = torch.stack([odds, torch.zeros_like(odds)], dim=1)
-    cost = Criterion(torch.zeros(len(odds), dtype=torch.int64)).cost(logits)
+    cost = ClassCriterion(torch.zeros(len(odds), dtype=torch.int64)).cost(logits)
     assert (cost.diff() > 0).all()
     torch.testing.assert_close(cost[:3], torch.nn.functional.logsigmoid(odds[:3]), rtol=0, atol=0)
 
@@ -88,8 +82,8 @@ def test_the_gap_of_a_target_is_its_lead_and_without_one_that_of_the_best_other_
     logits = torch.tensor([[3.0, 1.0, 2.0], [3.0, 1.0, 2.0], [0.0, 4.0, 1.5]])
     source = torch.tensor([1, 0, 1])
     target = torch.tensor([0, 2, NO_CLASS])
-    assert Criterion(source, target).gap(logits).tolist() == [1.0, -1.0, -2.5]
-    assert Criterion(source).gap(logits).tolist() == [2.0, -1.0, -2.5]
+    assert ClassCriterion(source, target).gap(logits).tolist() == [1.0, -1.0, -2.5]
+    assert ClassCriterion(source).gap(logits).tolist() == [2.0, -1.0, -2.5]
 
 
 def test_the_gradient_is_finite_if_the_excluded_class_is_certain():
@@ -140,18 +134,18 @@ def test_ranking_without_a_pair_is_zero_with_a_zero_gradient(label):
 
 def test_the_cost_is_the_log_probability_or_with_a_target_the_difference_of_the_logits():
     expected = LOG_PROBABILITIES[ROWS, CLASSES]
-    cost = Criterion(CLASSES).cost(LOGITS)
+    cost = ClassCriterion(CLASSES).cost(LOGITS)
     torch.testing.assert_close(cost, expected, rtol=16 * EPS, atol=16 * EPS)
     target = (CLASSES + 2) % 5
     expected = LOGITS[ROWS, CLASSES] - LOGITS[ROWS, target]
-    cost = Criterion(CLASSES, target).cost(LOGITS)
+    cost = ClassCriterion(CLASSES, target).cost(LOGITS)
     torch.testing.assert_close(cost, expected, rtol=0, atol=64 * EPS)
 
 
 def test_the_cost_without_any_class_is_zero():
     nothing = torch.full_like(CLASSES, NO_CLASS)
     assert NO_CLASS not in EXCLUDED
-    assert not Criterion(nothing, nothing).cost(LOGITS).any()
+    assert not ClassCriterion(nothing, nothing).cost(LOGITS).any()
 
 
 class Means(nn.Module):

@@ -10,10 +10,12 @@ from torch import Tensor
 
 import augment
 from augment.attacks.loop import minimize
-from augment.attacks.objective import NO_CLASS, NOISE_DRAWS, Criterion, Objective, add_sensor_noise
+from augment.attacks.objective import NOISE_DRAWS, Objective, add_sensor_noise
 from augment.attacks.result import AttackResult
 from augment.augmentation_settings import TrainingAttackSettings
 from augment.service import Renders
+from augment.tasks.classification import ClassCriterion
+from augment.tasks.task import NO_CLASS
 
 SIZE = 8
 PATTERN = torch.randn(3, SIZE, SIZE, generator=torch.Generator().manual_seed(0)) / SIZE
@@ -42,11 +44,11 @@ def nervous(threshold: float) -> augment.Classifier:
 
 
 def counted(
-    images: Tensor, classifier: augment.Classifier, criterion: Criterion | None = None
+    images: Tensor, classifier: augment.Classifier, criterion: ClassCriterion | None = None
 ) -> Tensor:
     """Return which images (A, V, 3, SIZE, SIZE) count, by default as no orange."""
     views = images.shape[:2]
-    criterion = criterion or Criterion(torch.zeros(views, dtype=torch.long))
+    criterion = criterion or ClassCriterion(torch.zeros(views, dtype=torch.long))
     predicted = classifier(images.flatten(0, 1)).argmax(1).view(views)
     objective = Objective(classifier, criterion, augment.AttackSettings(quantized=False))
     return objective.fooled_in_views(images, predicted, torch.arange(len(images)))
@@ -132,7 +134,7 @@ def test_each_view_is_counted_by_itself():
 def test_a_target_must_be_reached_with_noise(source):
     """Another class is not enough, and the image is close to the threshold."""
     images = (GRAY + 1e-4 * PATTERN)[None, None]
-    criterion = Criterion(torch.tensor([[source]]), torch.tensor([[1]]))
+    criterion = ClassCriterion(torch.tensor([[source]]), torch.tensor([[1]]))
     assert not counted(images, nervous(AT_GRAY), criterion).any()
 
 
@@ -220,7 +222,7 @@ def test_descent_goes_on_until_every_view_leads_by_the_noise_margin(leads, steps
     gray = torch.full((2, 3, SIZE, SIZE), 0.5)
     direction = PATTERN / PATTERN.square().sum()
     views = gray + (wanted - resemblance(gray))[:, None, None, None] * direction
-    criterion = Criterion(torch.zeros(1, 2, dtype=torch.long))
+    criterion = ClassCriterion(torch.zeros(1, 2, dtype=torch.long))
     settings = augment.AttackSettings(
         max_steps=3, margin=0.0, sensor_noise=1.0, noise_margin=1.0, quantized=False
     )

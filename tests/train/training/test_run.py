@@ -17,7 +17,7 @@ import torch
 from omegaconf import OmegaConf
 from PIL import Image
 
-from augment.attacks.objective import complementary_label
+from augment.tasks.classification import complementary_label
 from renderer.errors import InputError
 from tests.runs import completed_run, loaded_run
 from train import checkpoints, run_folder

@@ -13,13 +13,14 @@ from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings, SkylightSettings, StepSettings
 from augment.attacks.loop import Minimum, minimize
-from augment.attacks.objective import Criterion, Objective
+from augment.attacks.objective import Objective
 from augment.attacks.optimizers import NormBalls
 from augment.attacks.parameters import make_parameter
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.scene import render
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
+from augment.tasks.classification import ClassCriterion
 from renderer.camera import orbit_cameras
 from renderer.light.basis import DEGREE
 from renderer.light.environment import read_map, to_map, write_map
@@ -67,18 +68,20 @@ def free(*names: str) -> dict[str, StepSettings]:
     return settings
 
 
-def attack(model: nn.Module, problem: SceneProblem, criterion: Criterion, steps: int) -> Minimum:
+def attack(
+    model: nn.Module, problem: SceneProblem, criterion: ClassCriterion, steps: int
+) -> Minimum:
     """Run the descent until the classifier errs, without a margin."""
     settings = AttackSettings(max_steps=steps, margin=0.0, quantized=False)
     return minimize(problem, Objective(model, criterion, settings))
 
 
-def towards(problem: SceneProblem, target: int | None = 1) -> Criterion:
+def towards(problem: SceneProblem, target: int | None = 1) -> ClassCriterion:
     """Return the criterion that class 0 of every image falls and the target, if any, rises."""
     source = torch.zeros(len(problem.scene), problem.scene.views, dtype=torch.int64)
     if target is None:
-        return Criterion(source, None)
-    return Criterion(source, torch.full_like(source, target))
+        return ClassCriterion(source, None)
+    return ClassCriterion(source, torch.full_like(source, target))
 
 
 def float64_noise(*shape: int, draws: torch.Generator) -> Tensor:
@@ -220,7 +223,7 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
     expected = (before + epsilon * gradient.sign().view_as(before)).clamp(0, 1)
 
     problem = problem_of(scene, pixels=StepSettings("linf", epsilon, "sign", epsilon))
-    images = attack(model, problem, Criterion(labels.view(3, 2)), steps=1).images
+    images = attack(model, problem, ClassCriterion(labels.view(3, 2)), steps=1).images
     assert torch.equal(images, expected)
     is_changed = (images - before).abs() > 0.99 * epsilon
     assert is_changed.double().mean() > 0.4
@@ -423,7 +426,7 @@ TARGETS_OF_VIEWS = torch.tensor([[1, 2], [2, 1], [1, 1]])
 def test_one_light_shows_each_view_as_another_class(make_scene, make_linear):
     gray = torch.full((3, 3, 6, 6), 0.5)
     scene = make_scene(cameras=[[FRONT, SIDE]] * 3, backgrounds=gray)
-    criterion = Criterion(torch.zeros_like(TARGETS_OF_VIEWS), TARGETS_OF_VIEWS)
+    criterion = ClassCriterion(torch.zeros_like(TARGETS_OF_VIEWS), TARGETS_OF_VIEWS)
     model = make_linear(3, seed=6)
     problem = problem_of(scene, lighting=StepSettings())
     result = attack(model, problem, criterion, steps=30)

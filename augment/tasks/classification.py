@@ -1,0 +1,259 @@
+"""Classification: the outputs of a network are logits, one for each class.
+
+A label is the index of a class. A complementary label says that an image does not show a class. It
+is the number −1 − class. If there are several positive classes, the argument `absent` contains the
+other classes that images with a complementary label do not show, either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from augment.network import are_probabilities, plain_outputs
+from augment.scene.truth import Truth
+from augment.tasks.task import NO_CLASS, Criterion, Task
+from renderer.errors import InputError, require_range
+
+# A network is overconfident where its log-odds exceed this number. Networks rarely do so, unless
+# their logits are multiplied by a factor.
+OVERCONFIDENT = 50.0
+# A network is refused if its outputs for this many images look like probabilities. The logits of a
+# single image may do so by chance.
+MIN_PROBABILITY_ROWS = 2
+
+
+@dataclass(frozen=True)
+class Classification(Task):
+    """Task of a network that returns a row of logits for each image, one for each class.
+
+    An attack succeeds if the class with the largest logit is not the true
+    class or, with a target, if it is the target.
+
+    Example:
+        >>> import torch
+        >>> import norm_balls as nb
+        >>> def logits(images):
+        ...     mean = images.mean((1, 2, 3))
+        ...     return torch.stack([mean, 0.3 + 0 * mean], dim=1)
+        >>> scene = nb.build_scene([("solid:orange", "0")], size=8)
+        >>> settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.5), max_steps=2)
+        >>> result = nb.attack(logits, scene, task=nb.Classification(), settings=settings)
+        >>> result.logits.shape
+        torch.Size([1, 2])
+    """
+
+    name = "classification"
+    returns = "a tensor of logits (N, C)"
+    missed = "are not classified as their class"
+
+    def recognizes(self, outputs: Any) -> bool:
+        """Return whether outputs are a tensor with two dimensions, such as logits."""
+        plain = plain_outputs(outputs)
+        return isinstance(plain, Tensor) and plain.ndim == 2
+
+    def class_names(self, network: Any, count: int | None) -> Sequence[str]:
+        """Name the classes "0", "1" and so on."""
+        return [*map(str, range(count or 0))]
+
+    def reader(self, title: str, class_count: int | None = None) -> _LogitReader:
+        """Return a function that checks logits."""
+        return _LogitReader(title, class_count)
+
+    def output_count(self, outputs: Tensor) -> int:
+        """Return the number of logits of an image."""
+        return outputs.shape[1]
+
+    def require_finite(self, outputs: Tensor, images: Tensor, title: str) -> None:
+        """Check logits of an attacked network."""
+        if not outputs.is_floating_point() or not outputs.isfinite().all():
+            raise InputError(f"{title} returned NaN or infinite logits: check its weights")
+        if torch.is_grad_enabled() and images.requires_grad and not outputs.requires_grad:
+            advice = "compute them in torch, or choose optimizer='random_search'"
+            raise InputError(f"{title} returned logits without a gradient: {advice}")
+
+    def has_gradient(self, outputs: Tensor) -> bool:
+        """Return whether logits have a gradient."""
+        return outputs.requires_grad
+
+    def criterion(
+        self, source: Int[Tensor, "E V"], truth: Callable[[], Truth], class_count: int
+    ) -> ClassCriterion:
+        """Return the criterion of an untargeted attack, for which positions do not matter."""
+        return ClassCriterion(source)
+
+    def require_target(self, target: Any) -> None:
+        """Accept every target."""
+
+    def describe(self, evidence: Float[Tensor, " C"], classes: Sequence[str]) -> str:
+        """Return the five most probable classes with their probabilities."""
+        confidences = evidence.softmax(0)
+        indices = confidences.topk(min(5, len(confidences))).indices.tolist()
+        return ", ".join(f"{classes[i]} {confidences[i]:.1%}" for i in indices)
+
+
+class _LogitReader:
+    """Function that checks the outputs of a classifier: rows of logits, and no probabilities.
+
+    Attributes:
+        title: Name of the network at the start of error messages.
+        class_count: Number of logits of an image. None for any number.
+        probability_rows: Number of images so far whose outputs look like
+            probabilities. None as soon as a batch has other outputs. Then no
+            further batch is checked, which saves time.
+    """
+
+    def __init__(self, title: str, class_count: int | None):
+        self.title = title
+        self.class_count = class_count
+        self.probability_rows: int | None = 0
+
+    def __call__(self, outputs: Any, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N C"]:
+        logits = plain_outputs(outputs)
+        is_tensor = isinstance(logits, Tensor)
+        has_row_per_image = is_tensor and logits.ndim == 2 and len(logits) == len(images)
+        if not has_row_per_image or self.class_count not in (None, logits.shape[1]):
+            returned = tuple(logits.shape) if is_tensor else type(logits).__name__
+            remedy = f"it must return logits {(len(images), self.class_count or 'C')}"
+            shape = tuple(images.shape)
+            raise InputError(f"{self.title} returned {returned} for images {shape}: {remedy}")
+        if self.probability_rows is not None and len(logits):
+            rows = self.probability_rows + len(logits)
+            self.probability_rows = rows if are_probabilities(logits) else None
+        # A network is refused only if all outputs so far look like probabilities.
+        if (self.probability_rows or 0) >= MIN_PROBABILITY_ROWS:
+            reason = f"{self.title} returned probabilities instead of logits"
+            raise InputError(f"{reason}: remove the softmax, or return their logarithms")
+        return logits
+
+
+@dataclass(frozen=True)
+class ClassCriterion(Criterion):
+    """Criterion of an attack on a classifier. The evidence of an image is its logits.
+
+    A view reaches the criterion when it is classified as its target or, without a target, as any
+    class except its source.
+    """
+
+    def evidence(self, outputs: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+        """Return the logits themselves."""
+        return outputs
+
+    def predicted(self, evidence: Float[Tensor, "... C"]) -> Int[Tensor, " ..."]:
+        """Return the classes with the largest logits."""
+        return evidence.argmax(-1)
+
+    def is_overconfident(self, evidence: Float[Tensor, "... C"]) -> Bool[Tensor, " ..."]:
+        """See `is_overconfident`."""
+        return is_overconfident(evidence)
+
+    def cost(self, logits: Float[Tensor, "N C"]) -> Float[Tensor, " N"]:
+        """Compute the cost of single images, for a criterion that is flat.
+
+        Without a target, the cost and its gradient round to 0 if the log-odds o of the source are
+        large. Where they exceed 50, o − 50 is therefore added.
+        """
+        # `require_known` refuses NO_CLASS, which is negative. Class 0 stands for it.
+        source = self.source.clamp(min=0)
+        require_known(source, logits)
+        # The logarithm of the probability is log σ of the log-odds. Its gradient is accurate even
+        # if the probability rounds to 1. The gradient of `cross_entropy` then loses the term of
+        # the class.
+        other_logits = logits.scatter(1, source[:, None], -torch.inf)
+        odds = logits.gather(1, source[:, None])[:, 0] - other_logits.logsumexp(1)
+        is_added = odds > OVERCONFIDENT
+        if self.target is not None:
+            is_added = is_added & (self.target == NO_CLASS)
+        cost = F.logsigmoid(odds) + torch.where(is_added, odds - OVERCONFIDENT, 0)
+        cost = torch.where(self.source == NO_CLASS, 0, cost)
+        if self.target is not None:
+            target_cost = F.cross_entropy(
+                logits, self.target, reduction="none", ignore_index=NO_CLASS
+            )
+            cost = cost + target_cost
+        return cost
+
+    def gap(self, logits: Float[Tensor, "... C"]) -> Float[Tensor, " ..."]:
+        """Compute by how much each view reaches the criterion: its logit gap.
+
+        With a target class, it is the logit of the target minus the largest other logit. Without
+        one, it is the largest logit of the other classes minus the logit of the source class. It is
+        negative if the view does not reach the criterion.
+        """
+        target = torch.full_like(self.source, NO_CLASS) if self.target is None else self.target
+        has_target = target != NO_CLASS
+        # Class whose logit is compared with the others, shape (..., 1).
+        compared_class = torch.where(has_target, target, self.source)[..., None]
+        compared_logit = logits.gather(-1, compared_class)[..., 0]
+        largest_other = logits.scatter(-1, compared_class, -torch.inf).amax(-1)
+        difference = compared_logit - largest_other
+        return torch.where(has_target, difference, -difference)
+
+
+def is_overconfident(logits: Float[Tensor, "... classes"]) -> Bool[Tensor, " ..."]:
+    """Return a mask of the images with a class of log-odds above 50 or below −50."""
+    lowest, highest = logits.aminmax(dim=-1)
+    return highest - lowest > OVERCONFIDENT
+
+
+def complementary_label(label: int) -> int:
+    """Return the complementary label of a class. It says that images do not show the class."""
+    return -1 - label
+
+
+def require_known(labels: Int[Tensor, " N"], logits: Float[Tensor, "_ classes"]) -> None:
+    """Check that every label has a logit. Labels may be complementary."""
+    require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
+
+
+def label_loss(
+    logits: Float[Tensor, "N classes"],
+    labels: Int[Tensor, " N"],
+    label_smoothing: float = 0.0,
+    absent: Sequence[int] = (),
+) -> Float[Tensor, " N"]:
+    """Compute the loss of each image by its label.
+
+    An image of class c has the label c. Its loss is the cross entropy. An image that does not
+    show class c has the complementary label −1 − c. Its loss is −log(1 − p), where p is the sum
+    of the probabilities of c and of the classes `absent`.
+    """
+    classes = _class_of(labels)
+    # Set the logits of the classes that are not shown to -∞. Only the logits of the other
+    # classes remain.
+    other_logits = logits.scatter(1, classes[:, None], -torch.inf)
+    for index in absent:
+        other_logits[:, index] = -torch.inf
+    # The other classes have the probability Σ exp(other_logits) / Σ exp(logits) = 1 - p.
+    complementary = logits.logsumexp(1) - other_logits.logsumexp(1)
+    cross_entropy = F.cross_entropy(
+        logits, classes, reduction="none", label_smoothing=label_smoothing
+    )
+    return torch.where(labels < 0, complementary, cross_entropy)
+
+
+def is_correct(
+    predicted: Int[Tensor, " N"], labels: Int[Tensor, " N"], absent: Sequence[int] = ()
+) -> Bool[Tensor, " N"]:
+    """Return a mask of the predictions that agree with the labels.
+
+    A label that is a class demands the prediction of this class. The complementary label
+    −1 − c says that the image does not show class c. It demands a prediction that is neither c
+    nor one of the classes `absent`.
+    """
+    is_class_of_label = predicted == _class_of(labels)
+    is_excluded = is_class_of_label
+    for index in absent:
+        is_excluded = is_excluded | (predicted == index)
+    return torch.where(labels < 0, ~is_excluded, is_class_of_label)
+
+
+def _class_of(labels: Tensor) -> Tensor:
+    """Return the class c of each label, which is c or, if it is complementary, −1 − c."""
+    return torch.where(labels < 0, -1 - labels, labels)
