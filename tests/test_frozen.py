@@ -87,22 +87,12 @@ RENDERS = {
 }
 
 
-@dataclass(frozen=True)
-class OperatorCase:
-    """A call of `precompute_transfer`, whose fields are like those of `RenderCase`."""
-
-    mesh: str
-    cameras: Any
-    options: dict[str, Any]
-
-
-OPERATORS = {
-    "one_color": OperatorCase("ball:0", ABOVE, {"normals": "flat"}),
-    "colors": OperatorCase(
-        "orange:3", RING, {"encoding": "srgb", "albedo_scale": 1.3, "samples": 3}
-    ),
-    "shadows": OperatorCase("plate:0", NEAR, {"shadows": True}),
-    "bounces": OperatorCase("cup:1", ASIDE, {"bounces": 2}),
+# Meshes, cameras and options of `precompute_transfer`.
+OPERATORS: dict[str, tuple[str, Any, dict[str, Any]]] = {
+    "one_color": ("ball:0", ABOVE, {"normals": "flat"}),
+    "colors": ("orange:3", RING, {"encoding": "srgb", "albedo_scale": 1.3, "samples": 3}),
+    "shadows": ("plate:0", NEAR, {"shadows": True}),
+    "bounces": ("cup:1", ASIDE, {"bounces": 2}),
 }
 LIGHTS_OF_OPERATORS = ("grace", "skylight", "environment")
 
@@ -116,27 +106,25 @@ DISCS = augment.LampsSettings(
 )
 
 
-@dataclass(frozen=True)
-class SceneCase:
-    meshes: list[Any]
-    views: int
-    options: dict[str, Any]
-
-
-SCENES = {
-    "grid": SceneCase(
-        [("solid:orange:0", "orange"), ("solid:apple:0", "apple")], 2, {"backgrounds": [0.2, 0.8]}
+# Meshes, views and options of `build_scene`.
+SCENES: dict[str, tuple[list[Any], int, dict[str, Any]]] = {
+    "grid": (
+        [("solid:orange:0", "orange"), ("solid:apple:0", "apple")],
+        2,
+        {"backgrounds": [0.2, 0.8]},
     ),
-    "props": SceneCase([AMONG_PROPS], 2, {"ground": [0.6, 0.5, 0.4], "shadows": True, "fov": 40.0}),
-    "projector": SceneCase(
-        [("solid:mushroom:0", "orange")], 1, {"projector": PROJECTOR, "encoding": "srgb"}
+    "props": ([AMONG_PROPS], 2, {"ground": [0.6, 0.5, 0.4], "shadows": True, "fov": 40.0}),
+    "projector": (
+        [("solid:mushroom:0", "orange")],
+        1,
+        {"projector": PROJECTOR, "encoding": "srgb"},
     ),
-    "lamps": SceneCase(
-        [("solid:cup:2", "orange")], 2, {"lamps": DISCS, "shared": True, "ground": [0.5, 0.5, 0.5]}
+    "lamps": (
+        [("solid:cup:2", "orange")],
+        2,
+        {"lamps": DISCS, "shared": True, "ground": [0.5, 0.5, 0.5]},
     ),
-    "all_lights": SceneCase(
-        [AMONG_PROPS], 1, {"lamps": LAMPS, "projector": PROJECTOR, "shadows": True}
-    ),
+    "all_lights": ([AMONG_PROPS], 1, {"lamps": LAMPS, "projector": PROJECTOR, "shadows": True}),
 }
 
 CLASSES = ["orange", "apple", "pear", "bottle"]
@@ -254,11 +242,12 @@ def test_values_of_a_render(name, tmp_path, verify_values):
     verify_values(images, *gradients(images, list(leaves.values())))
 
 
-def render_by_operators(case: OperatorCase, lights: Tensor, folder: Path) -> list[Tensor]:
+def render_by_operators(name: str, lights: Tensor, folder: Path) -> list[Tensor]:
     """Return images of all cameras, the gradient of the lights, and the radiance of one camera."""
-    mesh = mesh_named(case.mesh, folder)
-    options = SOFTWARE | case.options
-    operators = renderer.precompute_transfer(mesh, listed(case.cameras), SIZE, **options)
+    mesh, cameras, options = OPERATORS[name]
+    operators = renderer.precompute_transfer(
+        mesh_named(mesh, folder), listed(cameras), SIZE, **SOFTWARE | options
+    )
     images = torch.stack([operator.image(lights, 0.3) for operator in operators])
     radiance = operators[0].radiance(lights.detach())
     return [images, *gradients(images, [lights]), radiance]
@@ -267,21 +256,20 @@ def render_by_operators(case: OperatorCase, lights: Tensor, folder: Path) -> lis
 @pytest.mark.parametrize("name", OPERATORS)
 def test_render_by_operators(name, tmp_path, verify):
     lights = torch.stack([light_named(light, tmp_path) for light in LIGHTS_OF_OPERATORS])
-    verify(*render_by_operators(OPERATORS[name], lights.requires_grad_(), tmp_path))
+    verify(*render_by_operators(name, lights.requires_grad_(), tmp_path))
 
 
 @pytest.mark.parametrize("name", sorted(OPERATORS.keys() - TRACED))
 def test_values_of_a_render_by_operators(name, tmp_path, verify_values):
     lights = torch.stack([light_named(light, tmp_path) for light in LIGHTS_OF_OPERATORS])
     lights = lights.double().requires_grad_()
-    verify_values(*render_by_operators(OPERATORS[name], lights, tmp_path))
+    verify_values(*render_by_operators(name, lights, tmp_path))
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_render_of_a_scene(name, verify):
-    case = SCENES[name]
-    options = SCENE_OPTIONS | case.options
-    scene = augment.build_scene(case.meshes, SIZE, case.views, **options)
+    meshes, views, options = SCENES[name]
+    scene = augment.build_scene(meshes, SIZE, views, **SCENE_OPTIONS | options)
     examples = torch.arange(len(scene))
     lights = scene.lights.clone().requires_grad_()
     relit = scene.render(Conditions(lights), examples)

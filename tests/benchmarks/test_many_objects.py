@@ -79,16 +79,6 @@ def mean_of(*groups) -> Estimate:
     return many_objects.mean_with_interval(groups, "network", None)
 
 
-def test_the_interval_is_as_wide_as_that_of_one_value_of_each_setup():
-    values = np.random.default_rng(0).integers(0, 2, 50).astype(float)
-    alone = mean_of(one_group(values))
-    repeated = mean_of(one_group(values.repeat(4), setups=np.arange(50).repeat(4)))
-    assert (repeated.low, repeated.high) == pytest.approx((alone.low, alone.high))
-    # The interval of the normal approximation.
-    error = 1.96 * values.std() / np.sqrt(50)
-    assert alone.high - alone.low == pytest.approx(2 * error, rel=0.15)
-
-
 def test_the_interval_of_equal_images_is_that_over_seeds():
     # With one degree of freedom, t is 12.7, so nothing is known.
     values = np.array([[0.0] * 9, [1.0] * 9])

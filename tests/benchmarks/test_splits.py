@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from torchvision.models import squeezenet1_1
 
 from augment.network import normalize_light
 from augment.scene import patterns
@@ -137,16 +136,3 @@ def test_a_network_with_normalized_light_sees_dark_images_brighter():
     with torch.inference_mode():
         assert normalizing(dark).equal(network(normalize_light(dark, NormalizedLightSettings())))
         assert not normalizing(dark).allclose(network(dark))
-
-
-def test_a_classifier_may_have_weights_in_a_file(tmp_path):
-    torch.manual_seed(0)
-    network = squeezenet1_1().eval()
-    path = tmp_path / "weights.pth"
-    torch.save(network.state_dict(), path)
-    loaded = splits.load(f"torchvision:squeezenet1_1={path}", 64)
-    images = torch.rand(2, 3, 64, 64)
-    with torch.inference_mode():
-        mean = torch.tensor((0.485, 0.456, 0.406)).view(3, 1, 1)
-        std = torch.tensor((0.229, 0.224, 0.225)).view(3, 1, 1)
-        torch.testing.assert_close(loaded(images), network((images - mean) / std))

@@ -121,18 +121,5 @@ def boards() -> Mesh:
     return concatenate([painted(vertices, board.faces) for vertices in lifted])
 
 
-def non_manifold() -> Mesh:
-    """Create three faces with a common edge, and two tetrahedra with a common corner."""
-    fan = [[0, 0, -0.7], [0, 0, 0.7], [0.8, 0, 0], [-0.4, 0.7, 0], [-0.4, -0.7, 0]]
-    faces_on_edge = painted(fan, [[0, 1, 2], [0, 1, 3], [1, 0, 4]])
-    tips = np.array([[0.3, 0, 0.1], [0, 0.3, 0.2], [0.2, 0.2, 0.5]])
-    vertices = np.concatenate([np.zeros((1, 3)), tips, -tips])
-    # Corner 0 is common to both tetrahedra. The second one is mirrored, and the
-    # reversed order of its corners makes its faces point outward again.
-    tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
-    mirrored = np.where(tetrahedron == 0, 0, tetrahedron + len(tips))[:, ::-1]
-    return concatenate([faces_on_edge, painted(vertices, np.concatenate([tetrahedron, mirrored]))])
-
-
 def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

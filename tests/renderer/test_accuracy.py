@@ -208,9 +208,6 @@ def topology_cases(ball: Mesh) -> Iterator[Case]:
 
     yield Case("open, its inside visible", 8, all_errors, [Setup(hard.opened(ball))])
 
-    shared = "not manifold: three faces on an edge, two solids in a point"
-    yield Case(shared, 8, all_errors, [Setup(hard.non_manifold())])
-
 
 def thin_face_cases(count: int) -> Iterator[Case]:
     double = [thin_faces(power, count, torch.float64) for power in (2, 4, 6, 8, 10, 12)]

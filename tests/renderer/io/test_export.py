@@ -50,28 +50,9 @@ def box() -> Mesh:
     return Mesh.plain(geometry.vertices + np.array([0, 0, 0.25]), geometry.faces)
 
 
-def with_a_seam() -> Mesh:
-    """Return a smooth ball with texture coordinates that jump along one meridian."""
-    ball = trimesh.creation.uv_sphere(count=[8, 12])
-    x, y, z = ball.vertices.T
-    colors = np.random.default_rng(1).random(ball.vertices.shape)
-    u = np.arctan2(y, x)[ball.faces] / (2 * np.pi)
-    is_at_seam = np.ptp(u, axis=1, keepdims=True) > 0.5
-    u = np.where(is_at_seam, u % 1, u)
-    v = z[ball.faces] / 2 + 0.5
-    texture = np.random.default_rng(2).integers(0, 256, (16, 32, 3), dtype=np.uint8)
-    return replace(
-        Mesh.plain(ball.vertices, ball.faces, colors),
-        corner_uvs=np.stack([u, v], axis=-1).astype(np.float32),
-        texture_ids=np.zeros(len(ball.faces), dtype=np.int32),
-        textures=(texture,),
-    )
-
-
 MESHES = {
     "smooth colors": solid("orange"),
     "two parts": solid("cup"),
-    "a seam": with_a_seam(),
     "several textures and none": painted(solid("pear"), 3),
     "more textures than ten": painted(solid("pear"), 12),
 }

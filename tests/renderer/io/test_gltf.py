@@ -223,7 +223,8 @@ def masked(texels: np.ndarray, mode: str = "MASK", **entries: Any) -> Gltf:
     return gltf.square(pbrMetallicRoughness=model, alphaMode=mode, **entries)
 
 
-def test_a_circle_of_alpha_is_cut_out(tmp_path):
+def test_a_circle_of_alpha_is_cut_out_without_cracks(tmp_path):
+    """Each inner edge belongs to two faces, so the rim of the hole is one closed line."""
     mesh = masked(hole(64, 20)).load(tmp_path)
     circle = math.pi * (20 / 64) ** 2
     assert mesh.face_areas().sum() == pytest.approx(1 - circle, abs=1e-3 * circle)
@@ -232,11 +233,6 @@ def test_a_circle_of_alpha_is_cut_out(tmp_path):
     assert distance.min() == pytest.approx(20, abs=0.15)
     assert_allclose(mesh.corner_uvs, corners_of(mesh)[..., :2], atol=1e-6)
     assert (mesh.face_normals()[:, 2] > 0.99).all()
-
-
-def test_a_cut_surface_has_no_cracks(tmp_path):
-    """Each inner edge belongs to two faces, so the rim of the hole is one closed line."""
-    mesh = masked(hole(64, 20)).load(tmp_path)
     edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     pairs, counts = np.unique(edges, axis=0, return_counts=True)
     assert counts.max() == 2
@@ -548,10 +544,10 @@ def small_file_of_many_copies() -> Gltf:
     return gltf
 
 
-def small_file_of_many_vertices(count: int, indices: np.ndarray | None) -> Gltf:
+def small_file_of_many_zeros() -> Gltf:
     gltf = Gltf()
-    gltf.tree["accessors"].append({"componentType": 5126, "count": count, "type": "VEC3"})
-    gltf.mesh({"POSITION": 0}, indices)
+    gltf.tree["accessors"].append({"componentType": 5126, "count": 2 * 10**9, "type": "VEC3"})
+    gltf.mesh({"POSITION": 0})
     return gltf
 
 
@@ -564,13 +560,8 @@ def small_file_of_a_large_image() -> Gltf:
 
 @pytest.mark.parametrize(
     "create",
-    [
-        small_file_of_many_copies,
-        lambda: small_file_of_many_vertices(2 * 10**9, None),
-        lambda: small_file_of_many_vertices(3 * 10**6, np.uint16([0, 1, 2])),
-        small_file_of_a_large_image,
-    ],
-    ids=["copies", "zeros", "unused vertices", "image"],
+    [small_file_of_many_copies, small_file_of_many_zeros, small_file_of_a_large_image],
+    ids=["copies", "zeros", "image"],
 )
 def test_a_small_file_that_needs_more_memory_than_is_free_is_refused(tmp_path, monkeypatch, create):
     (tmp_path / "meminfo").write_text("MemAvailable: 400000 kB\n")
@@ -678,16 +669,6 @@ def different_instances() -> Gltf:
     return with_entries(gltf, nodes=[{"mesh": 0, "extensions": extensions}])
 
 
-def one_matrix_for_two_joints() -> Gltf:
-    gltf = plain()
-    attributes = gltf.tree["meshes"][0]["primitives"][0]["attributes"]
-    attributes["JOINTS_0"] = gltf.array(np.zeros((4, 4), np.uint8))
-    attributes["WEIGHTS_0"] = gltf.array(np.float32([[1, 0, 0, 0]] * 4))
-    matrices = gltf.array(np.float32([np.eye(4).ravel()]))
-    skins = [{"joints": [1, 2], "inverseBindMatrices": matrices}]
-    return with_entries(gltf, nodes=[{"mesh": 0, "skin": 0}, {}, {}], skins=skins)
-
-
 def with_colors_of_two_numbers() -> Gltf:
     gltf = plain()
     attributes = gltf.tree["meshes"][0]["primitives"][0]["attributes"]
@@ -703,7 +684,6 @@ REFUSED = {
     "have different lengths": different_instances(),
     "COLOR_0": with_colors_of_two_numbers(),
     "number 0 of 0 skins": with_entries(plain(), nodes=[{"mesh": 0, "skin": 0}]),
-    "1 matrices for 2 joints": one_matrix_for_two_joints(),
     "an array ends behind its buffer view": changed("accessors", byteOffset=-4),
     "KHR_draco_mesh_compression": with_entries(
         plain(), extensionsRequired=["KHR_draco_mesh_compression"]

@@ -83,17 +83,12 @@ def test_positive_indices_may_name_later_vertices(tmp_path):
 
 SPELLINGS = {
     "tabs": PLAIN.replace(" ", "\t"),
-    "indentation": re.sub("^", " \t ", PLAIN, flags=re.MULTILINE),
-    "blanks at the end": PLAIN.replace("\n", " \t \n"),
-    "several blanks": PLAIN.replace(" ", "   "),
     "CRLF": PLAIN.replace("\n", "\r\n"),
     "CR": PLAIN.replace("\n", "\r"),
-    "no last line break": PLAIN.rstrip(),
     "continued lines": PLAIN.replace(" 0 ", " \\\n0 \\\r\n"),
     "comments": PLAIN.replace("\n", "\n# mtllib other.mtl \\\n\t#f 1 2 3\n"),
     "comments at the end": re.sub("^([vf].*)$", r"\1 # usemtl blue", PLAIN, flags=re.MULTILINE),
     "comments after names": PLAIN.replace("m.mtl", "m.mtl # x").replace("red", "red # y"),
-    "empty lines": PLAIN.replace("\n", "\n\n \n"),
     "UTF-8 with BOM": b"\xef\xbb\xbf" + PLAIN.encode(),
     "UTF-16": PLAIN.encode("utf-16"),
     "UTF-16 BE": b"\xfe\xff" + PLAIN.encode("utf-16-be"),

@@ -135,9 +135,17 @@ def test_vertices_are_those_of_the_formula_of_gltf(tmp_path, suffix):
         (None, {"weights": 0.5 * np.rint(255 * WEIGHTS)}),
         (None, {"joints": (7, 7, 7, 7)}),
         (lambda tree: tree["skins"][0].update(joints=[1, 2, 70]), {}),
+        (lambda tree: tree["skins"][0].update(joints=[1, 2]), {}),
         (lambda tree: tree["skins"].clear(), {}),
     ],
-    ids=["no weights", "half weights", "joint out of range", "missing node", "no skin"],
+    ids=[
+        "no weights",
+        "half weights",
+        "joint out of range",
+        "missing node",
+        "two of three joints",
+        "no skin",
+    ],
 )
 def test_a_damaged_skin_is_refused_by_the_name_of_the_file(tmp_path, change, arrays):
     gltf = arm_file(**arrays)

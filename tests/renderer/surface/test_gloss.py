@@ -567,29 +567,6 @@ def test_metals_look_as_mitsubas_in_light_of_degree_6():
     assert relative_error(found, mitsuba_radiance(EGG, light, rough_mirror(0.3), 144)) < 0.016
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("mesh", "roughness", "largest_error", "largest_truncation_error"),
-    [
-        (EGG, 0.3, 0.02, 0.032),
-        (BALL, 0.8, 0.025, 0.04),
-        (BALL, 0.2, 0.02, 0.018),
-        (BALL, 0.3, 0.02, 0.035),
-        (EGG, 0.5, 0.024, 0.05),
-    ],
-)
-def test_metals_need_no_more_bands_than_the_degree_for_their_roughness(
-    mesh, roughness, largest_error, largest_truncation_error
-):
-    light = positive_light(20)
-    gloss = Gloss(roughness, metallic=1.0)
-    expected = mitsuba_radiance(mesh, light, rough_mirror(roughness), 144)
-    assert relative_error(our_radiance(mesh, light, gloss), expected) < largest_error
-    truncated_light = light[: (required_degree(roughness) + 1) ** 2]
-    truncated = our_radiance(mesh, truncated_light, gloss)
-    assert relative_error(truncated, expected) < largest_truncation_error
-
-
 @pytest.mark.parametrize("roughness", [0.4, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_the_highlight_of_varnish_over_black_looks_as_mitsubas(roughness):
     varnish = {
