@@ -36,8 +36,6 @@ USUAL_SIZE = 224
 CHECKED_COUNT = 2
 # Names of module classes of torchvision, kornia and this library that normalize images.
 NORMALIZING = frozenset({"Normalize", "ChannelNormalization"})
-# Names of buffers that contain the mean in networks that normalize images themselves.
-MEANS = frozenset({"mean", "image_mean", "pixel_mean"})
 # Name of one positive class, or names of several.
 Label = str | Sequence[str]
 Normalization = str | tuple[Sequence[float], Sequence[float]] | None
@@ -125,7 +123,6 @@ class TaskNetwork(CheckedNetwork):
     """
 
     task: Task
-    assumed: Sequence[str] = ()
 
     def __init__(
         self,
@@ -142,6 +139,8 @@ class TaskNetwork(CheckedNetwork):
         errors.require_whole(f"{kind} {name}: size", size, 1, MAX_SIZE)
         names = as_class_names(f"{kind} {name}: classes", classes)
         super().__init__(network, f"{kind} {name}", task, len(names))
+        own = wrappers.NETWORK if wrappers.normalization_of(self.network) else None
+        self.inputs = wrappers.Inputs(wrappers.YOU, own, None)
         self.network = wrappers.with_normalized_light(self.network, normalize_light)
         self.size = size
         self.classes = names
@@ -193,9 +192,19 @@ class TaskNetwork(CheckedNetwork):
         """Return a network that first normalizes the light of images. It shares the weights."""
         if read_normalized_light(normalize_light) is None:
             return self
-        return TaskNetwork(
-            self.network, self.size, self.classes, self.name, normalize_light, self.task
-        )
+        return self.with_network(self.network, normalize_light)
+
+    def with_network(self, network: nn.Module, normalize_light: NormalizeLight = None) -> Self:
+        """Return a copy with another network of the same images, and without operating points."""
+        options = {} if isinstance(self, Classifier) else {"task": self.task}
+        given = self.size, self.classes, self.name, normalize_light
+        made = type(self)(network, *given, **options)
+        made.inputs = self.inputs
+        return made
+
+    def describe_inputs(self) -> str:
+        """Write size, normalization and value range of the images, each with who states it."""
+        return self.inputs.describe(self.network, self.size)
 
     def is_differentiable(self, like: Tensor) -> bool:
         """Return whether the outputs are differentiable in the pixels.
@@ -257,8 +266,9 @@ class Classifier(TaskNetwork):
     Attributes:
         operating_points: Thresholds for `detect`, at most one for each class.
             Empty if the network has none.
-        assumed: Those of "size" and "normalization" that neither the user nor
-            the file of the network gave.
+        inputs: Who states size, normalization and value range of the images:
+            the user, the file of the network, or the library that published
+            it. What nobody states is assumed.
 
     Raises:
         InputError: If a class name occurs twice, if there are fewer than two
@@ -309,7 +319,7 @@ class Classifier(TaskNetwork):
         """
         if read_normalized_light(normalize_light) is None:
             return self
-        return Classifier(self.network, self.size, self.classes, self.name, normalize_light)
+        return self.with_network(self.network, normalize_light)
 
     def detect(
         self, images: Float[Tensor, "N 3 size size"], label: str | None = None
@@ -379,8 +389,7 @@ def remembering(classifier: TaskNetwork) -> TaskNetwork:
     is_remembering = isinstance(classifier.network, wrappers.Remembered)
     if is_remembering or not isinstance(classifier, Classifier):
         return classifier
-    network = wrappers.Remembered(classifier.network)
-    remembered = Classifier(network, classifier.size, classifier.classes, classifier.name)
+    remembered = classifier.with_network(wrappers.Remembered(classifier.network))
     remembered.operating_points = classifier.operating_points
     return remembered
 
@@ -413,13 +422,16 @@ def as_network(
     normalize_light: NormalizeLight = None,
     dtype: torch.dtype = torch.float32,
     task: Task | None = None,
+    size_from: str = wrappers.YOU,
+    says: bool = True,
 ) -> TaskNetwork:
     """Make a network of a task of a plain network, and check it on gray images.
 
     Without a size, that of the network counts or, if it tells none, 224. Classes are those that the
     task knows by default, such as "0", "1" and so on. Mean and standard deviation are in units of
     `value_range`, the values of black and white. Without a task, the outputs decide, which a line
-    says. A `TaskNetwork` only gets `normalize_light`.
+    says. A `TaskNetwork` only gets `normalize_light`. `size_from` tells who states the size, and
+    `says` whether to log what images the network gets.
     """
     if size is not None:
         errors.require_whole("size", size, 1, MAX_SIZE)
@@ -433,6 +445,8 @@ def as_network(
         if size not in (None, network.size):
             advice = f"use the size of its images, {network.size}"
             raise InputError(f"size={size} does not fit {network.title}: {advice}")
+        if says:
+            wrappers.say_inputs(network.name, network.network, network.size, network.inputs)
         return network.normalizing_light(normalize_light)
     expected = "a torch.nn.Module, a function to logits, or a Classifier"
     errors.require_kind(argument, network, Callable, expected)
@@ -444,13 +458,22 @@ def as_network(
     device = wrappers.device_of(network) if device is None else errors.as_device(device)
     function = _preprocessed(network, normalization, value_range).to(device)
     name = name or type(network).__name__
+    normalizer = wrappers.NETWORK if wrappers.normalization_of(network) else None
+    if normalization is not None:
+        normalizer = wrappers.YOU
+    # A mean is in the units of the value range. The default range is an object of its own.
+    is_stated = normalization is not None or value_range is not UNIT_RANGE
+    limits = (0.0, 1.0) if normalization == IMAGENET else (value_range[0], value_range[1])
+    sizer: str | None = size_from
     if size is None:
         known_size = wrappers.own_size(network)
-        assumed = assumed_facts(known_size, wrappers.normalization_of(function) or None)
+        sizer = wrappers.NETWORK if known_size else None
         # timm records the size of the published weights, which need not be those of the network.
         published = getattr(network, "pretrained_cfg", {}).get("input_size", [USUAL_SIZE])
         size = known_size or published[-1]
-        wrappers.say_inputs(name, function, size, assumed)
+    inputs = wrappers.Inputs(sizer, normalizer, wrappers.YOU if is_stated else None, limits)
+    if says:
+        wrappers.say_inputs(name, function, size, inputs)
     shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device, dtype=dtype)
     images = shades.view(-1, 1, 1, 1).expand(-1, 3, size, size).contiguous()
     with torch.no_grad():
@@ -467,14 +490,11 @@ def as_network(
     if names is None:
         raise InputError("classes is None, but the network does not name its classes: give them")
     if isinstance(task, Classification):
-        return Classifier(function, size, names, name, normalize_light)
-    return TaskNetwork(function, size, names, name, normalize_light, task)
-
-
-def assumed_facts(size: int | None, normalization: Normalization) -> tuple[str, ...]:
-    """Return which of the two arguments neither the user nor the network gives."""
-    given = {"size": size, "normalization": normalization}
-    return tuple(name for name, value in given.items() if value is None)
+        made: TaskNetwork = Classifier(function, size, names, name, normalize_light)
+    else:
+        made = TaskNetwork(function, size, names, name, normalize_light, task)
+    made.inputs = inputs
+    return made
 
 
 def require_evaluation_mode(network: object, argument: str) -> None:
@@ -505,7 +525,8 @@ def _preprocessed(
     if normalization is not None:
         # Networks of several libraries are known by the names of their modules and buffers.
         kinds = {type(part).__name__ for part in module.modules()}
-        buffers = {name for name, _ in module.named_buffers() if name.rpartition(".")[2] in MEANS}
+        buffered = [name for name, _ in module.named_buffers()]
+        buffers = {name for name in buffered if name.rpartition(".")[2] in wrappers.MEANS}
         found = sorted(kinds & NORMALIZING) + sorted(buffers)
         if found:
             reason = f"normalization is given, but the network contains {found[0]}"

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from augment import classifier as classifiers
 from augment.classifier import Classifier
-from augment.network import ARRAYS, Function, Network, normalization_of, own_size, unwrapped
+from augment.network import ARRAYS, FILE, YOU, Function, Network, plain_outputs, unwrapped
 from renderer.errors import InputError, require_file, require_whole, single_line
 from renderer.settings import MAX_SIZE
 
@@ -156,12 +156,9 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
         # Set the mode without a call of `eval`, which networks of torch.export refuse.
         for module in network.modules():
             module.training = False
-    size = facts.size or height or own_size(network)
-    given = size or classifiers.USUAL_SIZE, facts.classes, facts.normalization
-    classifier = classifiers.as_classifier(network, *given, name=name)
-    classifier.assumed = classifiers.assumed_facts(
-        size, normalization_of(classifier.network) or None
-    )
+    given = facts.size or height, facts.classes, facts.normalization
+    sizer = YOU if facts.size else FILE
+    classifier = classifiers.as_classifier(network, *given, name=name, size_from=sizer, says=False)
     _require_evaluation_outputs(classifier, name)
     return classifier
 
@@ -172,7 +169,9 @@ def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
     images = levels[torch.randperm(len(levels), generator=torch.Generator().manual_seed(0))]
     images = images.view(3, 3, classifier.size, classifier.size)
     with torch.no_grad():
-        first, second = (classifier.network(images[[0, other]]).float() for other in (1, 2))
+        first, second = (
+            plain_outputs(classifier.network(images[[0, other]])).float() for other in (1, 2)
+        )
     if (first[0] - second[0]).abs().max() > MAX_CHANGE * (first.max() - first.min()):
         raise name_error(name, IN_TRAINING_MODE)
 

@@ -38,10 +38,49 @@ DARKEST_ENCODED = 1 / 255
 # Linear value of this sRGB value. Images are brightened as if their brightness were at least this,
 # so that black images stay black.
 DARKEST = DARKEST_ENCODED / 12.92
+# Who states a fact about the images of a network, besides the library that published it.
+YOU, FILE, NETWORK, DATA = "you", "the file", "the network", "the training images"
+# Names of the mean of the channels in networks that normalize images themselves. That of the
+# standard deviation ends with "std" instead.
+MEANS = ("mean", "image_mean", "pixel_mean")
 # What a function takes: tensors, arrays of float32, or tensors without gradients.
 TENSORS, ARRAYS, DETACHED = "tensors", "arrays", "detached tensors"
 
 Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Who states the facts about the images of a network, such as "you". None: it is assumed.
+
+    Attributes:
+        size: Who states the pixels per side.
+        normalization: Who states mean and standard deviation.
+        value_range: Who states the values of black and white.
+        limits: Values of black and white before the normalization.
+    """
+
+    size: str | None
+    normalization: str | None
+    value_range: str | None
+    limits: tuple[float, float] = (0.0, 1.0)
+
+    def describe(self, network: Any, size: int) -> str:
+        """Write the facts about the images of a network, each with who states it."""
+        black, white = self.limits
+        facts = {
+            f"{size} × {size} pixels": self.size,
+            normalization_of(network, self.limits) or "not normalized": self.normalization,
+            f"values from {black:g} to {white:g}": self.value_range,
+        }
+        return "; ".join(
+            f"{fact}, {f'stated by {source}' if source else 'assumed'}"
+            for fact, source in facts.items()
+        )
+
+
+FROM_FILE = Inputs(FILE, FILE, FILE)
+FROM_DATA = Inputs(DATA, DATA, DATA)
 
 
 class Network(nn.Module):
@@ -463,18 +502,12 @@ def own_size(network: object) -> int | None:
     return None
 
 
-def say_inputs(name: str, network: Any, size: int, assumed: Sequence[str] = ()) -> None:
-    """Log the size and the normalization of the images of a network, once for each text.
-
-    `assumed` are the arguments that neither the user nor the network gave.
-    """
-    text = f"network {name}: images of {size} × {size} pixels, "
-    text += normalization_of(network) or "values in [0, 1], not normalized before the network"
-    if assumed:
-        are = " are" if len(assumed) > 1 else " is"
-        text += f"; {' and '.join(assumed)}{are} assumed: give what the network needs"
+def say_inputs(name: str, network: Any, size: int, inputs: Inputs) -> None:
+    """Log what images a network gets and who states that, once for each text."""
     if rank() == 0:
-        say_once(text)
+        say_once(f"network {name}: images of {inputs.describe(network, size)}")
+        if inputs.size is None:
+            say_once(f"network {name}: size={size} is assumed: give size=, if its images differ")
 
 
 @cache
@@ -483,19 +516,31 @@ def say_once(text: str) -> None:
     logging.getLogger(__name__).warning(text)
 
 
-def normalization_of(network: Any) -> str:
-    """Describe the first mean and standard deviation of three channels in a network, if any."""
+def normalization_of(network: Any, limits: tuple[float, float] = (0.0, 1.0)) -> str:
+    """Describe the first mean and standard deviation of three channels in a network, if any.
+
+    They are in the units of `limits`, the values of black and white. Mean 0 and standard
+    deviation 1 give "".
+    """
+    black, white = limits
     for module in network.modules() if isinstance(network, nn.Module) else ():
-        mean, std = (_channels(getattr(module, name, None)) for name in ("mean", "std"))
-        if mean and std:
-            order = " of blue, green and red" if getattr(module, "bgr", False) else ""
-            return f"normalized by mean {mean} and std {std}{order}"
+        for name in MEANS:
+            names = name, name.replace("mean", "std")
+            mean, std = (_channels(getattr(module, found, None)) for found in names)
+            if mean and std:
+                mean = [black + (white - black) * value for value in mean]
+                std = [(white - black) * value for value in std]
+                if np.allclose([*mean, *std], [0, 0, 0, 1, 1, 1], atol=1e-6):
+                    return ""
+                means, stds = (", ".join(f"{value:.3g}" for value in row) for row in (mean, std))
+                order = " of blue, green and red" if getattr(module, "bgr", False) else ""
+                return f"normalized by mean ({means}) and std ({stds}){order}"
     return ""
 
 
-def _channels(value: Any) -> str:
-    """Write three numbers, such as "(0.485, 0.456, 0.406)". Any other value gives ""."""
+def _channels(value: Any) -> list[float]:
+    """Return the numbers of three channels. Any other value gives an empty list."""
     if not isinstance(value, Tensor | list | tuple):
-        return ""
+        return []
     numbers = torch.as_tensor(value).flatten().tolist()
-    return f"({', '.join(f'{number:.3g}' for number in numbers)})" if len(numbers) == 3 else ""
+    return numbers if len(numbers) == 3 else []

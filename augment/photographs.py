@@ -409,7 +409,8 @@ def attack_photographs(
     size = photographs.shape[-1]
     with gradient_flags_kept(network):
         device = device_of(network)
-        classifier = as_classifier(network, size, classes, normalization, value_range, device)
+        given = size, classes, normalization, value_range, device
+        classifier = as_classifier(network, *given, size_from="the photographs")
         if classifier.size != size:
             raise InputError(
                 f"photographs have {size} pixels per side, "

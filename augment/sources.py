@@ -17,9 +17,18 @@ from typing import Any
 from torch import Tensor, nn
 
 from augment import files
-from augment.classifier import Classifier, Normalization, assumed_facts, mean_and_std, nearest
+from augment.classifier import Classifier, Normalization, mean_and_std, nearest
 from augment.files import NetworkFacts
-from augment.network import ChannelNormalization, Network, own_size, say_inputs, unwrapped
+from augment.network import (
+    FILE,
+    YOU,
+    ChannelNormalization,
+    Inputs,
+    Network,
+    own_size,
+    say_inputs,
+    unwrapped,
+)
 from augment.progress import progress_message
 from augment.settings import NormalizeLight
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
@@ -55,11 +64,20 @@ def _classifier(
     mean: Sequence[float],
     std: Sequence[float],
 ) -> Classifier:
-    """Make a classifier of a network. What `facts` leave open is as it was published."""
+    """Make a classifier of a network. What `facts` leave open is as its library published it."""
+    library = name.partition(":")[0]
     if facts.normalization is not None:
         mean, std = mean_and_std(facts.normalization)
     normalized = Network(network, [ChannelNormalization(mean, std)])
-    return Classifier(normalized, facts.size or size, facts.classes or classes, name)
+    classifier = Classifier(normalized, facts.size or size, facts.classes or classes, name)
+    classifier.inputs = _inputs_of(facts, library, library)
+    return classifier
+
+
+def _inputs_of(facts: NetworkFacts, size: str | None, normalization: str | None) -> Inputs:
+    """Return who states the facts about the images of a network, besides the user."""
+    normalization = normalization if facts.normalization is None else YOU
+    return Inputs(YOU if facts.size else size, normalization, normalization)
 
 
 def _torchvision(
@@ -151,7 +169,7 @@ def _with_weights(
     if told != facts:
         classifier = build(told)
     if not is_published:
-        classifier.assumed = assumed_facts(told.size, facts.normalization)
+        classifier.inputs = _inputs_of(facts, FILE if told.size else None, None)
     return files.fill(classifier, state, source)
 
 
@@ -191,6 +209,7 @@ def _efficientnet_lite(
     normalized = Network(network, [ChannelNormalization([127 / 255] * 3, [128 / 255] * 3)])
     size = facts.size or network.input_image_size
     classifier = Classifier(normalized, size, imagenet_classes(), name)
+    classifier.inputs = _inputs_of(facts, package, package)
     if is_random:
         return classifier
     if weights is None:
@@ -211,6 +230,7 @@ def _squeezenet_caffe(weights: Path | None, facts: NetworkFacts, is_random: bool
     normalized = Network(network, [ChannelNormalization(mean, [1 / 255] * 3, bgr=True)])
     size = facts.size or _CAFFE_SIZE
     classifier = Classifier(normalized, size, imagenet_classes(), SQUEEZENET_CAFFE)
+    classifier.inputs = _inputs_of(facts, "Caffe", "Caffe")
     if is_random:
         return classifier
     if weights is None:
@@ -389,7 +409,7 @@ def load_classifier(
     facts = files.as_facts(classes, size, normalization)
     require_flag("trust_code", trust_code)
     classifier = load_source(name, path, facts, trust_code)
-    say_inputs(classifier.name, classifier.network, classifier.size, classifier.assumed)
+    say_inputs(classifier.name, classifier.network, classifier.size, classifier.inputs)
     return classifier.normalizing_light(normalize_light)
 
 

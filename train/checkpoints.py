@@ -21,7 +21,7 @@ from torch import Tensor, cuda, nn
 
 from augment.classifier import Classifier, Normalization, OperatingPoint
 from augment.files import as_facts, is_network_file, require_no_facts
-from augment.network import say_inputs, unwrapped, with_normalized_light
+from augment.network import FROM_FILE, say_inputs, unwrapped, with_normalized_light
 from augment.settings import NormalizeLight
 from augment.sources import SOURCES, load_classifier
 from renderer.errors import InputError, as_path, keyed, require_file, require_kind, single_line
@@ -232,13 +232,14 @@ def load_run(
         network = with_normalized_light(built, light)
         network.load_state_dict(state["model"])
         classifier = Classifier(network, size, classes, f"{RUN}{run}")
+        classifier.inputs = FROM_FILE
         stored = state.get("operating_point", [])
         points = stored if isinstance(stored, list) else [stored]
         classifier.operating_points = [OperatingPoint(**values) for values in points]
         for point in classifier.operating_points:
             # This call raises InputError if the network lacks the class.
             classifier.label(point.label)
-        say_inputs(classifier.name, classifier.network, classifier.size, classifier.assumed)
+        say_inputs(classifier.name, classifier.network, classifier.size, classifier.inputs)
         return classifier
 
 

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from augment import distributed
-from augment.network import Network
+from augment.network import Network, plain_outputs
 from augment.progress import progress_message
 from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, keyed, require_choice
@@ -152,7 +152,7 @@ class MixedPrecision(Network):
         dtype = PRECISIONS[self.precision]
         is_mixed = dtype != torch.float32
         with torch.autocast(images.device.type, dtype, enabled=is_mixed):
-            return self.network(images).float()
+            return plain_outputs(self.network(images)).float()
 
 
 @functools.cache

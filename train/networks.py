@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from augment import distributed
 from augment.files import as_facts
-from augment.network import ChannelNormalization, Network, eval_mode
+from augment.network import ChannelNormalization, Network, eval_mode, plain_outputs
 from augment.sources import build_classifier, call_python, require_architecture
 from renderer.errors import InputError, single_line
 from train.train_settings import WIDERESNET
@@ -198,7 +198,7 @@ def build_network(
             built = _build_architecture(architecture, len(classes), size)
             network = Network(built, [ChannelNormalization(mean, std)])
         with eval_mode(network), torch.no_grad():
-            shape_of_two = tuple(network(torch.zeros(2, 3, size, size)).shape)
+            shape_of_two = tuple(plain_outputs(network(torch.zeros(2, 3, size, size))).shape)
         if shape_of_two != (2, len(classes)):
             raise ValueError(f"it returned {shape_of_two} for 2 images")
     except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:

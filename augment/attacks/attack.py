@@ -148,7 +148,12 @@ def attack(
     given = scene.settings.size, classes, normalization, value_range, like.device, "classifier"
     with gradient_flags_kept(classifier):
         adapted = classifiers.as_network(
-            classifier, *given, normalize_light=normalize_light, dtype=like.dtype, task=task
+            classifier,
+            *given,
+            normalize_light=normalize_light,
+            dtype=like.dtype,
+            task=task,
+            size_from="the scene",
         )
         return _attack(adapted, scene, target, settings, seed, force)
 

@@ -238,7 +238,8 @@ def transfer(
             classifier = network
             if not isinstance(network, Classifier):
                 name = f"classifiers[{index}]"
-                classifier = as_classifier(network, *given, name, dtype=images.dtype)
+                options: dict[str, Any] = {"dtype": images.dtype, "size_from": "the attack"}
+                classifier = as_classifier(network, *given, name, **options)
             resized = partial(_resized, size=classifier.size)
             rows.append({"network": classifier.name, **classify(classifier, resized)})
     for azimuth in azimuths:

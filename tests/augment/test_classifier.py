@@ -1,5 +1,7 @@
 """Classifiers of networks, which stay frozen; what a plain network does not tell is assumed."""
 
+import re
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -11,7 +13,7 @@ from torchvision.transforms import Normalize
 import augment
 import norm_balls as nb
 import renderer
-from augment.classifier import Classifier, as_classifier
+from augment.classifier import Classifier, as_classifier, remembering
 from augment.network import ChannelNormalization, Network, say_once
 from renderer import InputError
 
@@ -23,6 +25,13 @@ COLORS = ("red", "green", "blue")
 EPS = torch.finfo(torch.float64).eps
 SHIFT = (0.1, 0.4, 0.6)
 SCALE = (0.2, 0.5, 3.0)
+
+
+@dataclass
+class SimpleLogits:
+    """Output of a network, with a field of logits."""
+
+    logits: Tensor
 
 
 def random_images(size: int = 8) -> Tensor:
@@ -228,8 +237,7 @@ def test_a_function_whose_network_is_in_training_mode_is_refused(layer, wrap):
     as_classifier(wrap(network.eval()), size=8)
 
 
-IMAGENET = "mean (0.485, 0.456, 0.406) and std (0.229, 0.224, 0.225)"
-ASSUMED = "size and normalization are assumed"
+IMAGENET = "normalized by mean (0.485, 0.456, 0.406) and std (0.229, 0.224, 0.225)"
 
 
 @pytest.fixture
@@ -237,6 +245,12 @@ def said(caplog):
     """Function that returns the lines about images so far."""
     say_once.cache_clear()
     return lambda: [record.message for record in caplog.records if "pixels" in record.message]
+
+
+@pytest.fixture
+def warned(caplog):
+    """Function that returns the sizes of the warnings so far that a size is assumed."""
+    return lambda: re.findall(r"size=\d+(?= is assumed: give size=)", caplog.text)
 
 
 @pytest.fixture(scope="module")
@@ -249,19 +263,71 @@ def resnet_weights(tmp_path_factory):
 
 
 def test_what_is_known_of_own_weights_is_said_once_and_what_the_user_leaves_out_is_assumed(
-    resnet_weights, said
+    resnet_weights, said, warned
 ):
     half = ((0.5, 0.5, 0.5), (0.25, 0.25, 0.25))
     for options in ({}, {}, {"size": 64}, {"size": 64, "normalization": half}):
         nb.load_classifier("torchvision:resnet18", resnet_weights, **options)
     first, second, third = said()
-    for part in ("torchvision:resnet18", "224 × 224", IMAGENET, ASSUMED):
-        assert part in first
-    assert "64 × 64" in second
-    assert "normalization is assumed" in second
-    assert "size" not in second
-    assert "mean (0.5, 0.5, 0.5) and std (0.25, 0.25, 0.25)" in third
-    assert "assumed" not in third
+    sizes = ["224 × 224 pixels, assumed", *["64 × 64 pixels, stated by you"] * 2]
+    for line, size in zip((first, second, third), sizes, strict=True):
+        assert size in line
+    for line in (first, second):
+        assert f"{IMAGENET}, assumed; values from 0 to 1, assumed" in line
+    half = "mean (0.5, 0.5, 0.5) and std (0.25, 0.25, 0.25), stated by you"
+    assert f"{half}; values from 0 to 1, stated by you" in third
+    assert warned() == ["size=224"]
+
+
+@pytest.mark.parametrize(
+    ("options", "facts"),
+    [
+        ({}, "224 × 224 pixels, assumed; not normalized, assumed; values from 0 to 1, assumed"),
+        (
+            {"size": 8, "value_range": (0, 255)},
+            "8 × 8 pixels, stated by you; not normalized, assumed; "
+            "values from 0 to 255, stated by you",
+        ),
+        (
+            {"size": 8, "value_range": (-1, 1), "normalization": ((0, 0.1, 0), (1, 2, 1))},
+            "8 × 8 pixels, stated by you; normalized by mean (0, 0.1, 0) and std (1, 2, 1), "
+            "stated by you; values from -1 to 1, stated by you",
+        ),
+        (
+            {"size": 8, "value_range": (0, 255), "normalization": "imagenet"},
+            f"8 × 8 pixels, stated by you; {IMAGENET}, stated by you; "
+            "values from 0 to 1, stated by you",
+        ),
+    ],
+)
+def test_what_a_plain_network_gets_is_said_in_the_units_of_the_user(options, facts, said):
+    as_classifier(nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval(), **options)
+    assert said() == [f"network Sequential: images of {facts}"]
+
+
+def test_a_network_that_normalizes_images_itself_states_its_normalization(said):
+    normalize = Normalize(MEAN, STD)
+    network = nn.Sequential(normalize, nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()
+    as_classifier(network, 8)
+    assert f"{IMAGENET}, stated by the network; values from 0 to 1, assumed" in said()[0]
+
+
+@pytest.mark.parametrize(
+    "wrap", [lambda logits: {"logits": logits}, lambda logits: (logits, 0), SimpleLogits]
+)
+def test_logits_in_the_output_of_a_library_are_read_with_their_gradient(wrap, images):
+    classifier = as_classifier(lambda given: wrap(given.mean((2, 3))), 8)
+    images.requires_grad_()
+    logits = classifier(images)
+    assert torch.equal(logits, images.mean((2, 3)))
+    (gradient,) = torch.autograd.grad(logits.sum(), images)
+    torch.testing.assert_close(gradient, torch.full_like(images, 1 / 64))
+
+
+def test_facts_of_a_classifier_stay_with_copies_of_it():
+    classifier = as_classifier(lambda images: images.mean((2, 3)), 8, normalization="imagenet")
+    for copy in (classifier.normalizing_light(), remembering(classifier)):
+        assert copy.describe_inputs() == classifier.describe_inputs()
 
 
 @pytest.mark.parametrize("source", [pytest.param("torchvision", marks=pytest.mark.slow), "timm"])
@@ -270,18 +336,22 @@ def test_position_embeddings_tell_the_size(source, said, tmp_path):
     if source == "torchvision":
         from torchvision.models import vit_b_32
 
-        name, network = "vit_b_32", vit_b_32(num_classes=3, image_size=64)
+        mean, name, network = (
+            "0.485, 0.456, 0.406",
+            "vit_b_32",
+            vit_b_32(num_classes=3, image_size=64),
+        )
     else:
         timm = pytest.importorskip("timm")
-        name = "vit_tiny_patch16_224"
+        mean, name = "0.5, 0.5, 0.5", "vit_tiny_patch16_224"
         network = timm.create_model(name, num_classes=3, img_size=64)
     torch.save(network.state_dict(), path)
     classifier = nb.load_classifier(f"{source}:{name}", path)
     assert classifier.size == 64
     assert classifier(torch.rand(2, 3, 64, 64)).shape == (2, 3)
     (line,) = said()
-    assert "64 × 64" in line
-    assert "normalization is assumed" in line
+    assert f"64 × 64 pixels, stated by the file; normalized by mean ({mean}) and std" in line
+    assert ", assumed; values from 0 to 1, assumed" in line
 
 
 def test_onnx_gives_the_scores_of_its_graph_and_the_size_that_it_tells_is_not_assumed(
@@ -304,22 +374,14 @@ def test_onnx_gives_the_scores_of_its_graph_and_the_size_that_it_tells_is_not_as
         images = torch.rand(4, 3, classifier.size, classifier.size)
         torch.testing.assert_close(classifier(images), images.mean((2, 3)), rtol=1e-5, atol=1e-6)
     fixed, free = said()
-    for part in ("64 × 64", "not normalized", "normalization is assumed"):
-        assert part in fixed
-    assert "size" not in fixed
-    assert "224 × 224" in free
-    assert ASSUMED in free
+    assert "64 × 64 pixels, stated by the file; not normalized, assumed" in fixed
+    assert "224 × 224 pixels, assumed; not normalized, assumed" in free
 
 
-def test_a_plain_network_is_mentioned_only_if_its_size_is_assumed(said):
-    network = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()
-    as_classifier(network, 8)
-    assert said() == []
-    as_classifier(network)
+def test_timm_tells_the_size_of_a_network_in_memory_which_is_assumed(said, warned):
     timm = pytest.importorskip("timm")
     # timm records the size of the images in the configuration of a network.
     network = timm.create_model("test_efficientnet", num_classes=3).eval()
     assert as_classifier(network).size == 160
-    for line, size in zip(said(), (224, 160), strict=True):
-        assert f"{size} × {size}" in line
-        assert ASSUMED in line
+    assert "160 × 160 pixels, assumed" in said()[0]
+    assert warned() == ["size=160"]

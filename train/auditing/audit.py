@@ -110,6 +110,8 @@ def run_audit(
             caveats.append(f"The laboratory is left out, and hard_negatives with it ({error}).")
     for sentence in caveats:
         console.warning(sentence)
+    described = [f"Images of {one.name}: {one.describe_inputs()}." for one in networks.values()]
+    caveats = [*described, *caveats]
     with sole_writer("out", out):
         _prepare_folder(settings, out, renders)
         for key in networks:

@@ -80,7 +80,7 @@ def run(settings: AttackExperimentSettings) -> None:
         if not settings.attack.parameters:
             return
     targets = load_targets(settings, classifier, device)
-    with _results_of(settings) as out, catch_warnings():
+    with _results_of(settings, classifier) as out, catch_warnings():
         if settings.attack.checks is not False:
             # The checks say this for each mesh.
             filterwarnings("ignore", ZERO_GRADIENT)
@@ -117,14 +117,15 @@ def run(settings: AttackExperimentSettings) -> None:
 
 
 @contextmanager
-def _results_of(settings: AttackExperimentSettings) -> Iterator[Path]:
+def _results_of(settings: AttackExperimentSettings, classifier: Classifier) -> Iterator[Path]:
     """Yield the empty folder of the results, and write config.yaml at the end of the block."""
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
     with sole_writer("out", out):
         remove_attack(out)
         yield out
-        write_config(out, settings, command=command_line("attack"))
+        facts = {"command": command_line("attack"), "images": classifier.describe_inputs()}
+        write_config(out, settings, **facts)
 
 
 def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
@@ -326,7 +327,7 @@ def _attack_photographs(
     """Attack a network by the light of a projector on photographs, and print the results."""
     device = choose_device(settings.device)
     classifier = load_chosen(settings).to(device)
-    with _results_of(settings) as out, keyed("unlabeled"):
+    with _results_of(settings, classifier) as out, keyed("unlabeled"):
         scores = attack_folder(
             classifier,
             published(Path(folder)),

@@ -166,7 +166,7 @@ def harden(
     if isinstance(network, Classifier):
         # A returned classifier has no operating points, because its logits differ.
         target = deepcopy(classifier.network)
-        copy = Classifier(target, classifier.size, classifier.classes, classifier.name)
+        copy = classifier.with_network(target)
     unwrapped(target).load_state_dict(unwrapped(run.trainer.selected.network).state_dict())
     return copy
 

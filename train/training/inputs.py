@@ -1,6 +1,6 @@
 """The inputs of a run: its initial network, its data set, and the service that renders images."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.classifier import Classifier, class_index
 from augment.files import as_facts, is_network_file, require_no_facts
-from augment.network import without_normalized_light
+from augment.network import FROM_FILE, YOU, Inputs, without_normalized_light
 from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
@@ -51,14 +51,14 @@ class Initial:
         weights: State dict of the network.
         network: The network itself, of which the run trains a copy. None if
             `build_network` can build it from the description.
-        assumed: Which of "size" and "normalization" are assumed.
+        inputs: Who states the size and the normalization of its images.
     """
 
     source: Path
     architecture: dict[str, Any]
     weights: dict[str, Tensor]
     network: nn.Module | None = None
-    assumed: Sequence[str] = ()
+    inputs: Inputs = FROM_FILE
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -171,8 +171,8 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     # The absolute path of a file is recorded, so that it is found from any folder.
     shape = {"name": str(Path(name).absolute()) if is_file else name, CLASSIFIER: True}
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
-    assumed = [fact for fact in classifier.assumed if size is None or fact != "size"]
-    return Initial(Path(name), architecture, network.state_dict(), assumed=assumed)
+    inputs = classifier.inputs if size is None else replace(classifier.inputs, size=YOU)
+    return Initial(Path(name), architecture, network.state_dict(), inputs=inputs)
 
 
 def initial_of(classifier: Classifier, size: int | None) -> Initial:
@@ -185,7 +185,9 @@ def initial_of(classifier: Classifier, size: int | None) -> Initial:
     if classifier.normalized_light is not None:
         shape[checkpoints.NORMALIZE_LIGHT] = asdict(classifier.normalized_light)
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
-    return Initial(Path(classifier.name), architecture, network.state_dict(), network)
+    inputs = classifier.inputs if size is None else replace(classifier.inputs, size=YOU)
+    source = Path(classifier.name)
+    return Initial(source, architecture, network.state_dict(), network, inputs)
 
 
 def choose_validation(

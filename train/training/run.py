@@ -14,7 +14,7 @@ from torch import Tensor
 
 from augment import distributed
 from augment import network as wrappers
-from augment.network import say_inputs
+from augment.network import FROM_DATA, say_inputs
 from augment.random_streams import stream_seed
 from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
@@ -76,6 +76,7 @@ class Run:
         self.data = inputs.relabel(settings, data, initial)
         self.folder = folder
         self.command = command
+        self._inputs = initial.inputs if initial else FROM_DATA
         self.scored_folders = settings.scored_folders
         # Class that the initial network predicts for each test image, shape (N,). None
         # if it was not computed.
@@ -132,6 +133,7 @@ class Run:
         facts = {
             "hardware": {**device, "threads": self._threads},
             "command": self.command,
+            "images": self._inputs.describe(self.trainer.model, self.data.size),
             "test_images": inputs.describe_test_images(self.settings, self.data),
         }
         write_config(self.folder, self.settings, **facts)
@@ -370,7 +372,7 @@ def _build_trainer(
     if initial:
         initial.copy_to(network, facts)
         if initial.network is None:
-            say_inputs(str(settings.network), network, data.size, initial.assumed)
+            say_inputs(str(settings.network), network, data.size, initial.inputs)
     of_initial = initial.architecture.get(checkpoints.NORMALIZE_LIGHT) if initial else None
     light = settings.normalize_light or of_initial
     if light is not None:
