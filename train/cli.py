@@ -118,8 +118,10 @@ class Command:
         return dict.fromkeys(self.groups) | types_below(self.kind)
 
     def register(self) -> None:
-        """Tell Hydra the settings class."""
+        """Tell Hydra the settings class, which is converted once, since that takes long."""
         store = ConfigStore.instance()
+        if f"{self.name}_settings.yaml" in store.repo:
+            return
         store.store(f"{self.name}_settings", self.kind)
         if not self.has_file:
             store.store(self.name, {"defaults": [f"{self.name}_settings", "command"]})
