@@ -41,10 +41,7 @@ def stone() -> Mesh:
 
 @pytest.fixture(scope="session")
 def make_scene(stone) -> Callable[..., Scene]:
-    """Return a function that builds a scene of three examples with two views each.
-
-    No pixel of the scene is clamped. Keywords change the scene.
-    """
+    """Return a function that builds three examples of two views without a clamped pixel."""
 
     def build(
         mesh: Mesh = stone,
@@ -74,10 +71,7 @@ def make_scene(stone) -> Callable[..., Scene]:
 
 @pytest.fixture(scope="session")
 def make_linear() -> Callable[..., nn.Module]:
-    """Return a function that builds a classifier whose logits are linear in the image.
-
-    Its weights (classes, 3 · size²) are random, and only class 0 has a bias.
-    """
+    """Return a function that builds a linear classifier, of which only class 0 has a bias."""
 
     def build(
         classes: int,
@@ -106,7 +100,6 @@ def logits_of_mean_color(images: Tensor) -> Tensor:
 
 @pytest.fixture(scope="session")
 def by_color() -> augment.Classifier:
-    """Return a classifier that takes red for orange, green for lime, and blue for sky."""
     classes = ("orange", "lime", "sky", "night")
     return augment.Classifier(logits_of_mean_color, 8, classes, "by_color")
 
@@ -132,10 +125,7 @@ REQUIRED_LIGHTS = {
 
 @pytest.fixture(scope="session")
 def attacked(by_color) -> Callable[..., augment.AttackResult]:
-    """Return a function that attacks an image of an orange of 80 faces.
-
-    The attack ends when the classifier errs.
-    """
+    """Return a function that attacks an orange of 80 faces until the classifier errs."""
     ball = trimesh.creation.icosphere(subdivisions=1)
     orange = Mesh.plain(ball.vertices, ball.faces, (0.9, 0.5, 0.1))
 
@@ -148,7 +138,6 @@ def attacked(by_color) -> Callable[..., augment.AttackResult]:
         force: bool = False,
         **settings,
     ) -> augment.AttackResult:
-        """Attack the orange."""
         steps = parameters
         if isinstance(parameters, str):
             steps = {name: STEPS.get(name, OTHER_STEPS) for name in parameters.split("+")}

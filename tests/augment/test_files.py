@@ -1,5 +1,3 @@
-"""Classifiers from files that contain a whole network."""
-
 import io
 import json
 import pickle
@@ -81,8 +79,6 @@ def test_a_copy_of_a_torchscript_network_is_trained_without_the_original(tmp_pat
 
 
 class Payload:
-    """Object whose pickle creates a file when it is loaded."""
-
     def __init__(self, path: Path):
         self.path = path
 
@@ -103,8 +99,6 @@ def replace_member(path: Path, ending: str, content: bytes) -> bytes:
 
 
 class Overwriting(nn.Module):
-    """Network that sets a file to zeros, as a program of TorchScript can."""
-
     def __init__(self, path: str):
         super().__init__()
         self.path = path

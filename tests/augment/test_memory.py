@@ -1,5 +1,3 @@
-"""Memory is required to be free before it is allocated."""
-
 import itertools
 from collections.abc import Callable
 from pathlib import Path
@@ -54,7 +52,6 @@ def test_more_than_a_group_of_processes_may_use_is_refused(with_4_gigabytes):
 
 
 def peak_memory(function: Callable[[], object]) -> int:
-    """Return the peak of the bytes that a function allocates, by torch's profiler."""
     activities = [torch.profiler.ProfilerActivity.CPU]
     with torch.profiler.profile(activities=activities, profile_memory=True) as profile:
         function()

@@ -1,5 +1,3 @@
-"""Many images pass through a network in batches, also if memory runs out."""
-
 import copy
 from dataclasses import fields
 
@@ -25,10 +23,7 @@ OUT_OF_MEMORY = [
 
 
 class Limited(nn.Module):
-    """A classifier of two classes with little memory."""
-
     def __init__(self, most: int = 99, error: Exception = OUT_OF_MEMORY[0]):
-        """Create a classifier."""
         super().__init__()
         self.most = most
         self.error = error
@@ -61,7 +56,6 @@ class Shades:
 
 
 def attack(model: nn.Module, batch_size: int = 4, group_size: int = 10) -> Minimum:
-    """Attack ten examples with one restart."""
     criterion = ClassCriterion(torch.zeros(10, 1, dtype=torch.int64))
     settings = AttackSettings(max_steps=6, margin=0.0, quantized=False, batch_size=batch_size)
     objective = Objective(model, criterion, settings)
@@ -69,7 +63,6 @@ def attack(model: nn.Module, batch_size: int = 4, group_size: int = 10) -> Minim
 
 
 def require_same(actual: Minimum, expected: Minimum) -> None:
-    """Require equal results to the bit."""
     for field in fields(Minimum):
         assert torch.equal(getattr(actual, field.name), getattr(expected, field.name)), field.name
 

@@ -16,7 +16,6 @@ SIZE = 12
 
 @pytest.fixture
 def radiance() -> np.ndarray:
-    """Return linear values of four color images in [0, 0.3]."""
     return np.random.default_rng(0).uniform(0, 0.3, (4, 3, SIZE, SIZE))
 
 
@@ -104,8 +103,6 @@ def test_images_without_contrast_are_finite_with_finite_gradients(image, gamma):
 
 
 class Spy(nn.Module):
-    """Network whose logits are the means of the channels."""
-
     def forward(self, images: Tensor) -> Tensor:
         return images.mean((2, 3))
 

@@ -163,7 +163,6 @@ def test_photographs_of_another_size_are_an_error(photographs):
 
 
 def plain_light(count=1):
-    """Return white light on a flat surface, without ambient light."""
     shape = (count, 1, SIZE, SIZE)
     zero = torch.zeros(count, 1, 1, 1)
     return ProjectedLight(torch.ones(count, 3, SIZE, SIZE), torch.ones(shape), zero, zero)
@@ -185,17 +184,6 @@ def test_a_camera_sees_albedo_times_light_at_its_exposure():
     exposed = radiance * (wanted / given)[:, None, None, None]
     expected = encode(torch.from_numpy(exposed.clip(0, 1)), "srgb")
     torch.testing.assert_close(relit.double(), expected, atol=1e-5, rtol=0)
-
-
-def test_light_is_linear_in_the_slide():
-    first = draw_projected_light(1, SIZE, generator(1))
-    second = draw_projected_light(1, SIZE, generator(2))
-    shading = first.shading
-    zero = torch.zeros(1, 1, 1, 1)
-    lights = []
-    for slide in (first.slide, second.slide, 0.3 * first.slide + 2 * second.slide):
-        lights.append(ProjectedLight(slide, shading, zero, zero).light())
-    torch.testing.assert_close(lights[2], 0.3 * lights[0] + 2 * lights[1])
 
 
 def test_gains_between_the_cells_stay_within_the_bound():

@@ -1,5 +1,3 @@
-"""The progress of long work is shown on a terminal, and not in a log."""
-
 import io
 import sys
 import time
@@ -11,8 +9,6 @@ from augment.progress import progress
 
 
 class Terminal(io.StringIO):
-    """A stream that says it is a terminal."""
-
     def isatty(self):
         return True
 
@@ -20,7 +16,7 @@ class Terminal(io.StringIO):
 @pytest.fixture
 def shown(monkeypatch):
     """Return a function that works on items, and returns whether each saw progress shown."""
-    monkeypatch.setattr(progress_module, "PATIENCE", 0.1)
+    monkeypatch.setattr(progress_module, "PATIENCE", 0.03)
 
     def work(stream: io.StringIO, seconds: float, items: list[int]) -> list[bool]:
         monkeypatch.setattr(sys, "stderr", stream)
@@ -38,11 +34,11 @@ def shown(monkeypatch):
 @pytest.mark.parametrize("items", [[1], [1, 2]], ids=["ends early", "ends"])
 def test_progress_is_shown_before_the_first_item_is_done_and_nothing_of_it_is_left(shown, items):
     stream = Terminal()
-    assert shown(stream, 0.3, items) == [True] * len(items)
+    assert shown(stream, 0.2, items) == [True] * len(items)
     assert stream.getvalue().rpartition("\r")[2].strip() == ""
 
 
 def test_a_log_has_no_progress(shown):
     stream = io.StringIO()
-    shown(stream, 0.3, [1, 2])
+    shown(stream, 0.1, [1, 2])
     assert stream.getvalue() == ""

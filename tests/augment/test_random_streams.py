@@ -1,5 +1,3 @@
-"""Random streams depend on their key alone."""
-
 import itertools
 
 import torch

@@ -32,7 +32,6 @@ LONG = TrainingAttackSettings(max_steps=30, step_size=0.5)
 
 
 def built(views: int, *backgrounds: float) -> Scene:
-    """Build a scene of a plate and a table, eight pixels wide."""
     meshes = [(f"solid:{name}", name) for name in CLASSES]
     options = {"normals": "flat", "rasterizer": "numpy"}
     return build_scene(meshes, 8, views, backgrounds=backgrounds, **options)
@@ -45,24 +44,20 @@ def scene() -> Scene:
 
 
 def render(scene: Scene, lights: Tensor) -> Tensor:
-    """Render the first view (E, 3, H, W) of all examples in lights (E, 49, 3)."""
     return scene.render(Conditions(lights), torch.arange(len(scene)))[:, 0]
 
 
 def render_in(scene: Scene, light: Tensor) -> Tensor:
-    """Render the first view (E, 3, H, W) of all examples in one light (49, 3)."""
     return render(scene, light.expand(len(scene), -1, -1))
 
 
 @pytest.fixture(scope="module")
 def labels(scene) -> Tensor:
-    """Return the class (E,) of each example."""
     return torch.tensor([CLASSES[label] for label in scene.labels])
 
 
 @pytest.fixture(scope="module")
 def model(scene, labels) -> nn.Module:
-    """Return a small network that has learned the two solids in the scene's own light."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         network = nn.Sequential(
@@ -84,8 +79,6 @@ def model(scene, labels) -> nn.Module:
 
 @pytest.fixture
 def serve(scene, labels):
-    """Return a function that builds a service; keywords are those of its settings."""
-
     def build(
         seed: int = 0, labels: Tensor = labels, positive_classes: tuple[int, ...] = (), **settings
     ) -> AugmentationService:
@@ -97,7 +90,6 @@ def serve(scene, labels):
 
 @torch.no_grad()
 def logits_of(model: nn.Module, images: Tensor) -> Tensor:
-    """Classify images in evaluation mode, and return to training mode."""
     logits = model.eval()(images)
     model.train()
     return logits
@@ -128,8 +120,6 @@ def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
 
 
 class Always(nn.Module):
-    """A network that predicts one of three classes for every image."""
-
     def __init__(self, label: int):
         super().__init__()
         self.bias = 5 * F.one_hot(torch.tensor(label), 3)
@@ -190,10 +180,7 @@ PAPER_STEP_SIZE = 0.05
 def papers_loop(
     model: nn.Module, scene: Scene, labels: Tensor, step: str
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Run the paper's loop, in which every example is classified in every step.
-
-    Return the images, and the values of each example whose means the service reports.
-    """
+    """Run the paper's loop; return the images, and what the service reports of each example."""
     lights = LIGHT.repeat(len(scene), 1, 1)
     step_counts = torch.zeros_like(labels)
     before = []
@@ -333,10 +320,7 @@ def test_hard_negatives_with_a_class_succeed_as_the_studied_class_alone(serve, m
 def test_hard_negatives_of_several_classes_are_attacked_towards_each_in_turn(
     serve, scene, model, labels
 ):
-    """Plates belong to neither of the two classes, and tables to the second.
-
-    Each plate is attacked as if its class were the only one.
-    """
+    """Plates belong to neither of the two classes, and tables to the second."""
     is_plate = labels == 0
     mixed = torch.where(is_plate, complementary_label(1), labels)
     images = serve(labels=mixed, positive_classes=(1, 2)).regenerate(model, 0).images

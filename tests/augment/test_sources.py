@@ -25,12 +25,10 @@ LITE_SIZES = {0: 224, 2: 260}
 
 
 def random_images(size: int, count: int = 2) -> torch.Tensor:
-    """Draw images (count, 3, size, size)."""
     return torch.rand(count, 3, size, size, generator=torch.Generator().manual_seed(0))
 
 
 def first_input(classifier: Classifier, images: torch.Tensor) -> torch.Tensor:
-    """Return the input of the first convolution."""
     inputs = []
     convolutions = (module for module in classifier.modules() if isinstance(module, nn.Conv2d))
 
@@ -45,16 +43,12 @@ def first_input(classifier: Classifier, images: torch.Tensor) -> torch.Tensor:
 
 
 def file_name(weights) -> str:
-    """Return the name of the file of torchvision's weights."""
     return weights.url.rpartition("/")[2]
 
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch) -> Path:
-    """Return the folder of torchvision's downloads, which is empty.
-
-    A file of the right name in it is not downloaded.
-    """
+    """Return the empty folder in which torchvision looks for a file before it downloads it."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     folder = tmp_path / "hub" / "checkpoints"
     folder.mkdir(parents=True)
@@ -86,7 +80,6 @@ def test_efficientnet_lite_gets_images_in_its_own_units(version, size):
 
 @pytest.fixture(scope="module")
 def squeezenet_file(tmp_path_factory) -> Path:
-    """Write random weights of SqueezeNet 1.0, with biases, which torchvision starts at zero."""
     torch.manual_seed(0)
     network = squeezenet1_0()
     nn.init.uniform_(network.classifier[1].bias, -0.1, 0.1)
@@ -97,7 +90,6 @@ def squeezenet_file(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def squeezenet(squeezenet_file) -> Classifier:
-    """Return Caffe's SqueezeNet with random weights."""
     return load_classifier("squeezenet_caffe", squeezenet_file)
 
 
@@ -130,10 +122,7 @@ def test_the_last_convolution_of_squeezenet_is_padded_by_one(squeezenet, squeeze
 
 
 def as_in_2017(state: dict) -> dict:
-    """Return a copy of the weights of a DenseNet in the format of 2017.
-
-    The names of its layers have dots, and batch normalization has no counts of batches.
-    """
+    """Return the weights with dots in the names of layers and without counts of batches."""
     old = {}
     for key, value in state.items():
         if not key.endswith("num_batches_tracked"):
@@ -172,8 +161,6 @@ def test_a_torchvision_model_gives_torchvisions_logits_from_a_file_and_a_downloa
 
 
 class Harmful:
-    """An object whose reading makes a folder."""
-
     def __reduce__(self):
         return os.mkdir, ("harm",)
 
@@ -201,7 +188,6 @@ def test_a_file_of_other_weights_is_refused_by_name_and_runs_no_code(
 
 
 def refuse_connection(*_, **__) -> None:
-    """Fail as without a network."""
     raise URLError("Name or service not known")
 
 
@@ -232,10 +218,7 @@ def broken(): return 1 / 0
 
 @pytest.fixture
 def own_networks(tmp_path, monkeypatch) -> None:
-    """Write a module of own networks into the current folder.
-
-    The folder is taken off the path after the test, with what was imported from there.
-    """
+    """Write a module into the current folder, and forget it after the test."""
     (tmp_path / "own_networks.py").write_text(SOURCE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -268,10 +251,7 @@ def test_a_function_that_makes_no_classifier_is_refused(own_networks, name, mess
 
 @pytest.fixture(scope="module")
 def oranges() -> Callable[[int], torch.Tensor]:
-    """Return a function that reads 22 photographs of oranges at any size.
-
-    They are every twelfth one that is larger than a thumbnail.
-    """
+    """Return a function that reads every twelfth photograph of an orange at any size."""
     if not DATA.is_dir():
         pytest.skip("../shared/data is absent")
     folder = DATA / "photos" / "orange"
@@ -286,7 +266,6 @@ def oranges() -> Callable[[int], torch.Tensor]:
 
 @torch.no_grad()
 def fraction_of_oranges(classifier: Classifier, images: torch.Tensor) -> float:
-    """Return the fraction of images that are classified as an orange."""
     predicted = torch.cat([classifier(batch).argmax(1) for batch in images.split(16)])
     return float((predicted == classifier.label("orange")).float().mean())
 

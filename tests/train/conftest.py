@@ -47,10 +47,7 @@ def photos(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny(tiny_npz) -> Callable[..., ExperimentSettings]:
-    """Return a function that reads the real configuration with small sizes.
-
-    Its arguments are additional overrides.
-    """
+    """Return a function that reads the real configuration with small sizes and other overrides."""
 
     @cache  # Composing the configuration takes half a second.
     def read(*overrides: str) -> ExperimentSettings:
@@ -63,7 +60,6 @@ def tiny(tiny_npz) -> Callable[..., ExperimentSettings]:
 
 @pytest.fixture(scope="session")
 def finished(tiny, photos, tmp_path_factory) -> Path:
-    """Complete an adversarial run that is scored on photographs, and return its folder."""
     folder = tmp_path_factory.mktemp("runs") / "finished"
     settings = tiny(f"photos={photos}")
     completed_run(settings, folder)
@@ -89,11 +85,7 @@ def log_of_two_epochs() -> str:
 
 @pytest.fixture(scope="session")
 def made_up_run(tiny) -> Callable[..., Path]:
-    """Return a function that writes the folder of a finished run without checkpoints.
-
-    Its argument `photographs` has summaries of evaluations by the names of
-    their sub-folders.
-    """
+    """Return a function that writes a finished run without checkpoints, with these summaries."""
 
     def make(
         folder: Path, method: str = "none", photographs: dict | None = None, *overrides: str

@@ -12,7 +12,6 @@ FIG_LIME_ORANGE = ["fig", "lime", "orange"]
 
 
 def save_untrained_network(folder: Path, size: int) -> None:
-    """Save a small network with random weights, as a run saves its best one."""
     torch.manual_seed(0)
     shape = {"depth": 10, "width": 1, "dropout": 0.0}
     network = WideResNet(len(FIG_LIME_ORANGE), **shape)

@@ -1,5 +1,3 @@
-"""The classes of a run are those that its meshes name."""
-
 import re
 from dataclasses import replace
 

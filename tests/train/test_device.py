@@ -48,39 +48,31 @@ def test_threads_are_no_more_than_the_containers_quota_of_cores(
         assert most_threads() == expected
 
 
-def test_the_same_training_gets_the_same_threads_and_a_small_one_gets_one(monkeypatch):
+def test_a_large_training_gets_all_threads_and_a_small_one_gets_one(monkeypatch):
     monkeypatch.setattr(device, "most_threads", lambda: 6)
-    tiny = WideResNet(3, 10, 1, dropout=0.0)
-    paper = WideResNet(100, 16, 4, dropout=0.0)
-    assert [choose_threads(tiny, 16, 16) for _ in range(3)] == [1, 1, 1]
-    assert [choose_threads(paper, 128, 32) for _ in range(3)] == [6, 6, 6]
+    assert choose_threads(WideResNet(3, 10, 1, dropout=0.0), 16, 16) == 1
+    assert choose_threads(WideResNet(100, 16, 4, dropout=0.0), 128, 32) == 6
 
 
-@pytest.mark.parametrize("supported", [True, False])
 @pytest.mark.parametrize(
-    "where, machine, rule",
+    "where, machine, rule, otherwise",
     [
-        (GPU, "x86_64", "torch.cuda.is_bf16_supported"),
-        (CPU, "x86_64", "torch.cpu._is_avx512_bf16_supported"),
-        (CPU, "aarch64", "torch.ops.mkldnn._is_mkldnn_bf16_supported"),
+        (GPU, "x86_64", "torch.cuda.is_bf16_supported", "float16"),
+        (CPU, "x86_64", "torch.cpu._is_avx512_bf16_supported", "float32"),
+        (CPU, "aarch64", "torch.ops.mkldnn._is_mkldnn_bf16_supported", "float32"),
     ],
 )
 def test_auto_is_bfloat16_where_the_hardware_computes_in_it(
-    monkeypatch, caplog, where, machine, rule, supported
+    monkeypatch, where, machine, rule, otherwise
 ):
-    monkeypatch.setattr(device.platform, "machine", lambda: machine)
-    monkeypatch.setattr(rule, lambda **options: supported)
-    expected = "bfloat16" if supported else "float32" if where.type == "cpu" else "float16"
-    assert choose_precision("auto", where) == expected
-    assert choose_precision("float32", where) == "float32"
-    assert not caplog.records
-    assert choose_precision("bfloat16", where) == "bfloat16"
-    assert bool(caplog.records) == (where.type == "cpu" and not supported)
+    """A depthwise convolution is faster in float32 on every CPU."""
     grouped, depthwise = (torch.nn.Conv2d(4, 8, 3, groups=groups) for groups in (2, 4))
-    assert choose_precision("auto", where, grouped) == expected
-    assert choose_precision("auto", where, depthwise) == (
-        "float32" if where.type == "cpu" else expected
-    )
+    monkeypatch.setattr(device.platform, "machine", lambda: machine)
+    for supported, expected in ((True, "bfloat16"), (False, otherwise)):
+        monkeypatch.setattr(rule, lambda supported=supported, **_: supported)
+        assert choose_precision("auto", where, grouped) == expected
+        of_depthwise = "float32" if where.type == "cpu" else expected
+        assert choose_precision("auto", where, depthwise) == of_depthwise
 
 
 def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):

@@ -1,4 +1,3 @@
-import importlib.metadata
 import importlib.util
 import os
 import re
@@ -24,7 +23,6 @@ KINDS = ("*.py", "*.pyi", "py.typed", "*.yaml", "*.jinja", "*.safetensors")
 
 
 def installed_files() -> set[str]:
-    """List the paths of all files that an installation must have."""
     names = set()
     for package in PACKAGES:
         for kind in KINDS:
@@ -47,7 +45,6 @@ def dependencies() -> list[Requirement]:
 
 
 def oldest_versions() -> dict[str, str]:
-    """Read the versions with which the tests are run as the oldest ones."""
     lines = (ROOT / "tests" / "oldest.txt").read_text().splitlines()
     return dict(line.split("==") for line in lines if not line.startswith("#"))
 
@@ -62,19 +59,7 @@ def test_the_versions_that_are_tested_as_the_oldest_are_the_lower_bounds():
         assert tested.release[: len(lower.release)] == lower.release, requirement
 
 
-@pytest.mark.parametrize("name", [requirement.name for requirement in dependencies()])
-def test_dependencies_have_permissive_licenses(name):
-    about = importlib.metadata.metadata(name)
-    expression = about.get("License-Expression") or ""
-    title = (about.get("License") or "")[:100]
-    classifiers = [line for line in about.get_all("Classifier", []) if line.startswith("License")]
-    words = " ".join([expression, title, *classifiers])
-    assert re.search(r"MIT|BSD|Apache|ISC|Python Software Foundation|MPL-2.0", words)
-    assert "GPL" not in words
-
-
 def install(folder: Path, target: Path) -> None:
-    """Install a copy of the repository, so that nothing is left in the repository itself."""
     for name in (*PACKAGES, "pretrained"):
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / name, folder / name, ignore=ignored)
@@ -86,7 +71,6 @@ def install(folder: Path, target: Path) -> None:
 
 
 def write_modules_of_the_same_names(folder: Path) -> None:
-    """Write modules that end the process if they are imported."""
     for name in (
         *("train.py", "renderer.py", "augment.py", "conf/__init__.py", "scripts/__init__.py"),
     ):
@@ -148,7 +132,6 @@ class TestAnInstallation:
         assert '"renderer.mesh.Mesh"' in revealed
 
     def run(self, target: Path, folder: Path, command: str, *arguments: str) -> str:
-        """Run an installed command in a folder, and return its output."""
         done = subprocess.run(
             [target / "bin" / command, *arguments],
             cwd=folder,

@@ -85,6 +85,7 @@ def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
         *("meshes=[{{mesh: solid:orange, props: [{{mesh: {}, at: [1, 1]}}]}}]", "scene.light={}"),
         *("scene.backgrounds=[0.5,{}]", "augment.vary.environments=[{}]", "network={}"),
         *("network={0.parent}", "data.path={}", "data.path={0.parent}"),
+        "augment.folder={0.parent}",
     ],
 )
 def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
@@ -103,7 +104,6 @@ def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
 
 
 def replace_content(file: Path) -> None:
-    """Replace the content of a file by another of the same size, and keep its time of change."""
     status = file.stat()
     file.write_bytes(file.read_bytes()[::-1])
     os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))

@@ -1,5 +1,3 @@
-"""Tests of the memory of a process."""
-
 import os
 import subprocess
 import sys
@@ -28,7 +26,6 @@ REUSE = "from train.system import reuse_freed_memory\nreuse_freed_memory()\n"
 
 
 def count_faults(code):
-    """Count the page faults that the program ARRAYS has after a piece of code."""
     others = {name: value for name, value in os.environ.items() if name not in VARIABLES}
     done = subprocess.run(
         [sys.executable, "-c", code + ARRAYS],

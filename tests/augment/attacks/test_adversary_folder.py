@@ -37,8 +37,6 @@ STEPS = {
 
 
 def attacked(kinds: set[str], scene: Scene) -> augment.AttackResult:
-    """Attack the named parameters of a scene."""
-
     def logits(images: torch.Tensor) -> torch.Tensor:
         return 30 * images.mean((2, 3))
 
@@ -49,21 +47,16 @@ def attacked(kinds: set[str], scene: Scene) -> augment.AttackResult:
 
 
 def adversary_of(done: augment.AttackResult) -> Adversary:
-    """Return the first example of an attack as it is written."""
     before = done.images_in_views_before[0]
     return Adversary.of(done.problem.scene, 0, done.conditions, before, done.images_in_views[0])
 
 
 def tolerance(kinds: set[str]) -> float:
-    """Return the error of an image that is read back.
-
-    Painted textures have 8 bits, and everything else is exact but for rounding to float32.
-    """
+    """Return the error of 8 bits of painted textures, or of float32."""
     return 1 / 255 if kinds & CHANGE_TEXTURES else 1e-5
 
 
 def textured_pear() -> Mesh:
-    """Return a pear with a texture on half of its faces and colors at the corners of others."""
     mesh = solid("pear")
     draws = np.random.default_rng(0)
     is_textured = np.arange(len(mesh.faces)) % 2 == 1
@@ -79,7 +72,6 @@ def textured_pear() -> Mesh:
 
 
 def scene_with(item: SceneObject) -> Scene:
-    """Return a scene that shows one object."""
     options = {"rasterizer": "numpy", "width": 3.0, "degree": 6}
     scene = augment.build_scene([("solid:apple", "orange")], 24, **options)
     return scene.changed(objects=[item])
@@ -193,7 +185,6 @@ def test_an_attack_on_shape_moves_the_object_alone_even_after_it_is_read_back(
 
 @pytest.fixture(scope="module")
 def undamaged(tmp_path_factory) -> Path:
-    """Write an adversary."""
     scene = augment.build_scene([("solid:orange", "orange")], 8, rasterizer="numpy")
     folder = tmp_path_factory.mktemp("adversary")
     write_adversary(adversary_of(attacked({"pixels"}, scene)), folder)
@@ -227,7 +218,6 @@ def test_an_impossible_description_is_refused(undamaged, tmp_path, changes, mess
 
 
 def announce_10_terabytes(folder: Path) -> None:
-    """Write the header of an image of 10 TB, and nothing more."""
     header = {"descr": "<f4", "fortran_order": False, "shape": (10**6, 10**6, 3)}
     with open(folder / "after.npy", "wb") as file:
         np.lib.format.write_array_header_1_0(file, header)

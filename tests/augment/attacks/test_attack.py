@@ -19,7 +19,6 @@ TWO_BACKGROUNDS = {"backgrounds": [0.4, 0.5]}
 
 @pytest.fixture(scope="module", params=[*PARAMETER_NAMES, "lighting+geometry+pixels"])
 def result(request, attacked) -> augment.AttackResult:
-    """Return an attack on one parameter, or on several, of two examples."""
     done = attacked(request.param, TWO_BACKGROUNDS, max_steps=3)
     names = [parameter.name for parameter in done.problem.parameters]
     assert names == request.param.split("+")
@@ -130,7 +129,6 @@ def test_light_is_nonnegative_whatever_is_attacked_unless_negative_light_is_allo
 
 
 def sky_in_the_dark(images: Tensor) -> Tensor:
-    """Return logits by the mean color, which see the sky before a dark background."""
     is_dark = images[:, :1, 0, 0] < 0.1
     return 30 * images.mean((2, 3)) + 30 * is_dark * torch.tensor([0, 0, 1])
 
@@ -188,7 +186,6 @@ def test_a_network_may_return_logits_in_half_precision(tmp_path, optimizer, dtyp
 
 
 def orange_labeled(label: str) -> augment.Scene:
-    """Build the scene of an orange under any label."""
     return augment.build_scene([("solid:orange", label)], 8, rasterizer="numpy", width=2.4)
 
 

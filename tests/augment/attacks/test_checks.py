@@ -1,5 +1,3 @@
-"""Checks, success by radius and transfer of an attack's result."""
-
 from dataclasses import replace
 
 import pytest
@@ -16,7 +14,6 @@ SMALL_STEPS = {"lighting": StepSettings(step_size=0.02)}
 
 @pytest.fixture(scope="module")
 def slow_attack(attacked) -> AttackResult:
-    """Return an attack on three examples that needs more than its three steps."""
     return attacked(SMALL_STEPS, {"backgrounds": [0.3, 0.5, 0.7]}, max_steps=3)
 
 
@@ -81,10 +78,7 @@ def test_random_search_that_does_as_well_is_a_warning(attacked):
 
 @pytest.fixture(scope="module")
 def linear(make_scene, make_linear) -> AttackResult:
-    """Return an attack on the pixels of three examples.
-
-    The logits are linear in what is added, and no pixel is clamped.
-    """
+    """Attack pixels, none of which is clamped, so that logits are linear in what is added."""
     classifier = augment.Classifier(make_linear(2, bias=3.0), 6, ("stone", "other"))
     shown = make_scene()
     shown.objects[0] = replace(shown.objects[0], label="stone")
@@ -145,7 +139,6 @@ BOTH = torch.arange(2)
 
 
 def network(classes: tuple[str, ...] = CLASSES, size: int = 12) -> augment.Classifier:
-    """Return a classifier by the brightest channel, with classes in any order."""
     channels = [CLASSES.index(name) for name in classes]
 
     def logits(images: Tensor) -> Tensor:
@@ -156,14 +149,12 @@ def network(classes: tuple[str, ...] = CLASSES, size: int = 12) -> augment.Class
 
 @pytest.fixture(scope="module")
 def result(attacked) -> AttackResult:
-    """Return an attack on two views, each of which is an example."""
     found = attacked("lighting", TWO_VIEWS, network(), max_steps=20)
     assert found.success.all()
     return found
 
 
 def confidence(logits: Tensor) -> list[list[float]]:
-    """Return the largest probability of each view of each example."""
     return [pytest.approx(views, abs=1e-4) for views in logits.softmax(2).amax(2).tolist()]
 
 
@@ -182,7 +173,6 @@ def test_the_attacked_network_itself_predicts_the_same(attacked, parameters):
 
 @pytest.fixture(scope="module")
 def sky_attack(attacked) -> AttackResult:
-    """Return an attack on two views with the target sky."""
     light = {"lighting": StepSettings(step_size=0.2)}
     return attacked(light, {"views": 2}, network(), "sky", max_steps=60)
 

@@ -1,5 +1,3 @@
-"""Attacks without gradients stay in their balls and count their queries."""
-
 import numpy as np
 import pytest
 import torch
@@ -49,7 +47,6 @@ def test_search_lowers_the_cost_of_every_parameter(attacked, parameter):
 
 
 def logits_of_means(images: np.ndarray) -> np.ndarray:
-    """Return the logits (N, 2) of red and blue images as NumPy arrays."""
     assert isinstance(images, np.ndarray)
     return 30 * np.stack([images[:, 0].mean((1, 2)), images[:, 2].mean((1, 2))], axis=1)
 

@@ -25,17 +25,14 @@ DRAW_COUNT = 4000
 
 
 def norms(offsets: Tensor, name: str) -> Tensor:
-    """Return the norms (N,) of rows (N, D)."""
     return offsets.norm(dim=1) if name == "l2" else offsets.abs().amax(1)
 
 
 def dual_norms(offsets: Tensor, name: str) -> Tensor:
-    """Return the dual norms (N,) of rows (N, D)."""
     return offsets.norm(dim=1) if name == "l2" else offsets.abs().sum(1)
 
 
 def project(name: str, radius: float | None, values: Tensor, center: Tensor) -> Tensor:
-    """Project values (N, D) onto norm-balls around centers (N, D)."""
     balls = NormBalls(StepSettings(name, radius), center)
     return balls.project(values, torch.arange(len(values)))
 

@@ -24,8 +24,6 @@ def scene(network) -> nb.Scene:
 def attack(
     network: nb.Classifier, scene: nb.Scene, factor: float, optimizer: str
 ) -> nb.AttackResult:
-    """Attack a network, whose logits are multiplied by a factor, in a few views."""
-
     def logits(images: torch.Tensor) -> torch.Tensor:
         return factor * network.network(images)
 

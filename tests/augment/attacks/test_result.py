@@ -1,11 +1,7 @@
-"""The figure of an attack shows its images, its light and its probabilities."""
-
 import io
-from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image, ImageSequence
 
 import augment
@@ -61,26 +57,3 @@ def test_an_animation_shows_the_images_from_before_to_after(result, tmp_path, su
     assert [means[0], means[-1]] == pytest.approx(expected, abs=0.01)
     # The light is interpolated linearly, and so is an image in light alone.
     assert means[2] == pytest.approx((means[0] + means[4]) / 2, abs=0.02)
-
-
-def test_a_plot_shows_an_example_that_was_correct_and_is_fooled_with_its_true_class():
-    """The first example is wrong before the attack, and the second one is not fooled."""
-    names = ["orange", *(f"other {index}" for index in range(9))]
-
-    def logits(images: torch.Tensor) -> torch.Tensor:
-        brightness = images.mean((1, 2, 3))
-        others = [0.1 * index + 0 * brightness for index in range(9)]
-        orange = 5 * images[:, :, 0, 0].mean(1) + 0.1 * brightness - 2
-        return 100 * torch.stack([orange, *others], dim=1)
-
-    classifier = augment.Classifier(logits, SIZE, names)
-    scene = augment.build_scene([("solid:orange", "orange")], SIZE, backgrounds=[0.0, 1.0, 0.9])
-    light = augment.StepSettings(step_size=0.5)
-    settings = augment.AttackSettings(lighting=light, max_steps=1)
-    result = augment.attack(classifier, scene, settings=settings, force=True)
-    assert result.clean_correct.tolist() == [False, True, True]
-    result = replace(result, success_in_views=torch.tensor([[True], [False], [True]]))
-    before = result.plot().axes[0].images[0].get_array()
-    np.testing.assert_allclose(before, result.images_before[2].permute(1, 2, 0), atol=1e-6)
-    wrong_before = result.plot(example=0).axes[3]
-    assert "orange" in [label.get_text() for label in wrong_before.get_yticklabels()]

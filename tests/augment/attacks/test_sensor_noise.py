@@ -26,15 +26,11 @@ CHANGE_BY_NOISE = 2 * GAIN * float(PATTERN.norm()) / 255 * math.sqrt(1 + 1 / 12)
 
 
 def resemblance(images: Tensor) -> Tensor:
-    """Return the products (N,) of images (N, 3, H, W) with the pattern."""
     return (images * PATTERN.to(images)).sum((1, 2, 3))
 
 
 def nervous(threshold: float) -> augment.Classifier:
-    """Return a classifier that sees an orange if the image resembles the pattern little.
-
-    Noise alone changes its logits by several units.
-    """
+    """Make a classifier by the pattern whose logits noise alone changes by several units."""
 
     def logits(images: Tensor) -> Tensor:
         excess = GAIN * (resemblance(images) - threshold)
@@ -87,7 +83,6 @@ def test_an_image_counts_with_the_probability_of_gaussian_noise_in_three_draws(w
 
 
 def noisy_images(images: Tensor, rows: Tensor, seed: int) -> list[Tensor]:
-    """Return the noisy images of all draws."""
     return list(add_sensor_noise(images, 1.0, rows, seed, "noise"))
 
 
@@ -160,7 +155,6 @@ def small_attack(attacked, parameter: str = "lighting", **settings) -> AttackRes
 
 
 def dark_center(images: Tensor) -> Tensor:
-    """Return logits that prefer class 1 if the red of the center is below 0.61."""
     brightness = 60 * (images[:, 0, SIZE // 2, SIZE // 2] - 0.61)
     return torch.stack([brightness, 0 * brightness], dim=1)
 
@@ -198,8 +192,6 @@ def test_noise_changes_no_descent_and_no_other_random_number_and_fewer_attacks_c
 
 
 class StillScene:
-    """A scene of one example whose views (V, 3, SIZE, SIZE) no step changes."""
-
     def __init__(self, views: Tensor):
         self.views = views
         self.start = torch.zeros(1, 1)
@@ -279,7 +271,6 @@ def test_checks_files_transfers_and_sweeps_count_as_the_attack_does(attacked, tm
 
 
 def training_renders(**settings) -> Renders:
-    """Attack two views of an orange as training does."""
     attack = TrainingAttackSettings(max_steps=4, **settings)
     service = augment.AugmentationService.from_meshes(
         [("solid:orange:0", 0)],

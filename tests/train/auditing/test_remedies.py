@@ -1,5 +1,3 @@
-"""An audit recommends a remedy only if its gain is larger than chance."""
-
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
@@ -27,10 +25,7 @@ COUNT = 60
 
 
 def evaluation(found: Sequence[int], labels: Sequence[str] = ("orange",)) -> Evaluation:
-    """Make the evaluation of a network that finds some of COUNT images of each label.
-
-    An image that is found scores above all negatives, and has the rank 1. Others score below.
-    """
+    """Score found images of COUNT of each label above all negatives, and other ones below."""
     numbers = {name: range(COUNT) for name in (*labels, "other_ball")}
     photographs = [
         Photograph(PurePosixPath(f"{name}/{number}.png"), name, None)
@@ -87,7 +82,6 @@ def test_a_remedy_is_unknown_without_negatives():
 
 
 def network(normalize_light: bool) -> augment.Classifier:
-    """Make a classifier of the mean color."""
     return augment.Classifier(
         lambda images: images.mean((2, 3)),
         8,

@@ -20,13 +20,11 @@ from train.commands.attack import attacks, overrides
 
 
 def configured(*arguments: str) -> AttackExperimentSettings:
-    """Read the real configuration with small sizes and additional overrides."""
     small = ["renderer.rasterizer=numpy", "renderer.shadows=false", "attack.max_steps=8"]
     return attack_command.read([*small, "attack.margin=0", *arguments])
 
 
 def by_color(classes: tuple[str, ...] = ("orange", "lime", "sky")) -> Classifier:
-    """Make a classifier whose logits are the mean red, green and blue."""
     return Classifier(lambda images: 30 * images.mean((2, 3)), 8, classes, "by_color")
 
 
@@ -58,14 +56,6 @@ def test_exposure_multiplies_the_light_and_albedo_scale_the_surface():
     whiter = attacked(*unchanged, whiter_mesh).images_before
     torch.testing.assert_close(brighter, whiter, rtol=0, atol=1e-6)
     assert not torch.equal(brighter, same)
-
-
-@pytest.mark.parametrize("light", ["projector", "lamps"])
-def test_an_attacked_local_light_is_added_to_the_scene(light):
-    with_light = attacked(f"attack={light}", "attack.max_steps=1")
-    without_light = attacked("attack=lighting", "attack.max_steps=1")
-    coefficients = with_light.problem.scene.lights[0]
-    assert len(coefficients) > len(without_light.problem.scene.lights[0])
 
 
 def test_a_class_whose_name_is_a_number_is_a_target():

@@ -1,5 +1,3 @@
-"""pnb-attack attack=relighting on a folder of photographs, without a mesh."""
-
 import json
 
 import numpy as np
@@ -17,7 +15,6 @@ from train.results.predictions import RELIT
 
 
 def load_bright_or_dark():
-    """Return a network of two classes that takes images of 16 pixels."""
     return bright_or_dark, 16, ["bright", "dark"]
 
 

@@ -1,6 +1,7 @@
 """Any network is audited in one call, which returns the numbers of the page."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -29,7 +30,6 @@ class Brightness(nn.Module):
 
 @pytest.fixture
 def laboratory(tmp_path_factory) -> str:
-    """Write two gray images of each class, and return their folder."""
     folder = tmp_path_factory.mktemp("laboratory")
     for name in CLASSES:
         (folder / name).mkdir()
@@ -40,8 +40,8 @@ def laboratory(tmp_path_factory) -> str:
 
 @pytest.fixture
 def options(monkeypatch, laboratory) -> dict:
-    """Return arguments of an audit of a second."""
-    for name, number in {"STEPS": 2, "FRAME_COUNT": 2, "BALL_SIDE": 8, "SIDE": 8}.items():
+    steps = {"STEPS": 2, "ADDITIONAL_STEPS": 2}
+    for name, number in {**steps, "FRAME_COUNT": 2, "BALL_SIDE": 8, "SIDE": 8}.items():
         monkeypatch.setattr(lights, name, number)
     for kind in ("skylight", "projector", "lamps"):
         monkeypatch.delitem(lights.KINDS, kind)
@@ -65,23 +65,19 @@ def test_the_report_has_the_numbers_of_the_files(options, tmp_path):
     assert network.limit.requires_grad
 
 
-def test_nothing_is_written_without_a_folder(options, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    report = nb.audit(Brightness().eval(), [("solid:orange:0", 0)], **options)
-    assert report.label == "orange"
-    assert not [*tmp_path.iterdir()]
-
-
 def counts_of(report: nb.AuditReport) -> tuple:
-    """Return the numbers of the attack of an audit."""
     attack = report.network.attacks["lighting"]
     return attack.views, attack.correct, attack.adversarial
 
 
 @pytest.mark.filterwarnings("ignore:.*deprecated")
 @pytest.mark.parametrize("suffix", ["pt", pytest.param("pt2", marks=pytest.mark.slow)])
-def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index(options, tmp_path, suffix):
+def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index_without_a_folder(
+    options, tmp_path, monkeypatch, suffix
+):
     """The numbers are those of the mesh's file and of the network itself, by name."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
     network = Brightness().eval()
     nb.export_mesh(nb.solid("orange", 0), tmp_path / "orange.glb")
     mesh = nb.load_mesh(tmp_path / "orange.glb")
@@ -99,3 +95,4 @@ def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index(options, 
     found = nb.audit(classifier, [mesh], label=0, **options)
     assert counts_of(found) == counts_of(expected)
     assert found.label == "orange"
+    assert not [*Path().iterdir()]  # An audit writes nothing unless it is asked to.

@@ -1,5 +1,3 @@
-"""Any network is scored on class folders of photographs."""
-
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,6 @@ SHADES = {"dark": [10, 20, 200, 30], "bright": [250, 40, 220]}
 
 @pytest.fixture
 def photographs(tmp_path) -> Path:
-    """Write one gray image for each of SHADES, and return the folder of the class folders."""
     folder = tmp_path / "photographs"
     for name, shades in SHADES.items():
         (folder / name).mkdir(parents=True)

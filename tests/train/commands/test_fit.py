@@ -1,5 +1,3 @@
-"""pnb-fit finds the camera and the light of path-traced photographs."""
-
 import math
 import re
 import shlex
@@ -34,7 +32,6 @@ ROUNDING = 0.0005  # Rounding error of a printed percentage with one decimal.
 
 
 def textured(name: str) -> Mesh:
-    """Make a solid with a texture of smooth noise, which tells its sides apart."""
     mesh = renderer.solid(name)
     azimuth = np.arctan2(mesh.vertices[:, 1], mesh.vertices[:, 0])[mesh.faces] / (2 * np.pi)
     azimuth = np.where(np.ptp(azimuth, axis=1, keepdims=True) > 0.5, azimuth % 1, azimuth)

@@ -1,5 +1,3 @@
-"""A copy of any network is hardened in one call, as pnb-train does it."""
-
 from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
@@ -39,7 +37,6 @@ def make():
 
 
 def build() -> nn.Sequential:
-    """Build a network with random weights."""
     layers = [nn.Linear(12, 8), nn.Tanh(), nn.Linear(8, 3)]
     return nn.Sequential(nn.AdaptiveAvgPool2d(2), nn.Flatten(), *layers)
 
@@ -52,7 +49,6 @@ def network() -> nn.Sequential:
 
 @pytest.fixture
 def photographs(tmp_path) -> Path:
-    """Write 20 images of noise, and return their folder."""
     rng = np.random.default_rng(0)
     for index in range(20):
         save_noise(tmp_path / "photographs" / f"{index}.png", rng, (SIZE, SIZE))

@@ -1,5 +1,3 @@
-"""Masks of all kinds mark the same object."""
-
 from pathlib import Path
 
 import numpy as np
@@ -28,14 +26,11 @@ def palette(*colors: tuple[int, int, int]) -> Image.Image:
 
 MASKS = {
     "white on black": Image.fromarray(WHITE_ON_BLACK),
-    "RGB": Image.fromarray(WHITE_ON_BLACK).convert("RGB"),
     "one bit": Image.fromarray(WHITE_ON_BLACK).convert("1"),
     "zero and one": Image.fromarray(IS_OBJECT.astype(np.uint8)),
     "16 bits": Image.fromarray(WHITE_ON_BLACK.astype(np.uint16) * 257),
     "16 bits, zero and one": Image.fromarray(IS_OBJECT.astype(np.uint16)),
-    "16 bits, zero and 255": Image.fromarray(WHITE_ON_BLACK.astype(np.uint16)),
     "palette": palette((0, 0, 0), (128, 0, 0)),
-    "palette, green": palette((0, 0, 0), (0, 128, 0)),
     "palette, white first": palette((0, 0, 0), (255, 255, 255)),
     "color": rgba((0, 0, 200), (0, 0, 0)),
     "cut-out": rgba((210, 180, 80, 255), (50, 40, 30, 0)),

@@ -1,5 +1,3 @@
-"""Commands replace results only with `overwrite=true`."""
-
 import json
 from pathlib import Path
 
@@ -50,7 +48,6 @@ RESULTS = {
 
 
 def write_results(folder: Path, command: str) -> None:
-    """Write the file by which the results of a command are recognized."""
     name, content = RESULTS[command]
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_text(content)
@@ -63,7 +60,6 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def here(tmp_path) -> Path:
-    """Make a folder with a network and photographs of its classes."""
     save_untrained_network(tmp_path / "network", size=16)
     rng = np.random.default_rng(0)
     for label in ("orange", "fig"):
@@ -81,11 +77,10 @@ def test_a_folder_with_results_of_any_command_is_refused_by_its_argument(tmp_pat
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("other", ["evaluate", pytest.param("attack", marks=pytest.mark.slow)])
 def test_every_command_refuses_the_folder_of_another_command_and_leaves_it_as_it_is(
-    call, here, capsys, command, other
+    call, here, capsys, command
 ):
-    write_results(here / "out", other)
+    write_results(here / "out", "evaluate")
     before = contents(here)
     assert call(command, *COMMANDS[command], "out=out") == USER_ERROR
     lines = capsys.readouterr().err.splitlines()
@@ -113,15 +108,6 @@ def test_an_attack_over_an_earlier_one_leaves_none_of_its_adversaries(call, here
     assert call(*command) == USER_ERROR
     assert call(*command, "overwrite=true") == 0
     assert len(list((here / "out").glob("*/example_*.png"))) == 1
-
-
-def test_the_page_of_an_audit_is_not_replaced_by_a_report(call, here, capsys):
-    write_results(here / "network", "audit")
-    page = here / "network" / "report.html"
-    page.write_text("the audit's")
-    assert call("report", "network") == USER_ERROR
-    assert "overwrite=true" in capsys.readouterr().err
-    assert page.read_text() == "the audit's"
 
 
 EPOCH_LINE = '{"epoch": 1, "train/loss": 1.0}\n'

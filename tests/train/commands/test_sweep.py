@@ -4,7 +4,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -32,17 +32,16 @@ SMALL = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def no_report(monkeypatch) -> None:
-    monkeypatch.setattr(sweep, "report_of", lambda folders, out: f"report: {len(folders)} in {out}")
+@pytest.fixture(autouse=True, scope="module")
+def no_report() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep, "report_of", lambda folders, out: f"report: {len(folders)} in {out}")
+        yield
 
 
 @pytest.fixture(scope="module")
 def run_sweep(tiny_npz) -> Callable[..., int | None]:
-    """Return a function that trains a small network by a sweep in this process.
-
-    The function returns the exit status.
-    """
+    """Return a function that trains by a sweep in this process, and returns the exit status."""
 
     def run(folder: Path, *overrides: str) -> int | None:
         arguments = [*SMALL, f"data.path={tiny_npz}", f"sweep={folder}", *overrides]
@@ -59,10 +58,7 @@ def run_sweep(tiny_npz) -> Callable[..., int | None]:
 
 @pytest.fixture(scope="module")
 def folder_of(tiny_npz) -> Callable[..., Path]:
-    """Return a function that finds the folder of a run of `run_sweep` by its overrides.
-
-    The runs of the sweep differ in the key of the last override.
-    """
+    """Return a function that finds a run, which differs from others in the last override."""
 
     def find(parent: Path, *overrides: str) -> Path:
         override_of_key = {}
@@ -77,7 +73,6 @@ def folder_of(tiny_npz) -> Callable[..., Path]:
 
 @pytest.fixture(scope="module")
 def swept(run_sweep, tmp_path_factory) -> Path:
-    """Finish a sweep over two seeds, and return its folder."""
     folder = tmp_path_factory.mktemp("sweeps") / "swept"
     assert run_sweep(folder, "seed=0,1") == 0
     return folder
@@ -122,7 +117,6 @@ def test_file_systems_and_command_lines_take_the_name_of_a_run(values):
 
 
 def read_files(folders: list[Path]) -> dict[Path, tuple[bytes, int]]:
-    """Read the contents and the modification times of all files, except for locks."""
     files = {}
     for folder in folders:
         for path in folder.rglob("*"):
@@ -205,8 +199,6 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
     ("override", "start"),
     [
         ("train.learning_rate=0.05,-1", "train.learning_rate=-1.0"),
-        ("train.soup=false,true", "train.soup=True needs a network to begin with"),
-        ("data.path=missing.npz", "data.path=missing.npz does not exist"),
         ("photos=null,missing", "photos: missing is not a folder"),
     ],
 )
@@ -214,7 +206,7 @@ def test_a_wrong_setting_of_any_run_fails_once_before_a_run_begins(
     run_sweep, tmp_path, monkeypatch, capsys, override, start
 ):
     monkeypatch.chdir(tmp_path)
-    assert run_sweep(tmp_path / "sweep", override, "seed=0,1") == USER_ERROR
+    assert run_sweep(tmp_path / "sweep", override) == USER_ERROR
     printed = capsys.readouterr()
     assert printed.err.startswith(f"error: {start}")
     assert printed.err.count("error:") == 1
@@ -246,16 +238,11 @@ def test_a_run_with_other_settings_is_refused_before_any_is_trained(
     assert not folder_of(parent, "seed=2").exists()
 
 
-@pytest.mark.parametrize(
-    ("launcher", "plugin"),
-    [("joblib", "joblib"), ("slurm", "submitit"), ("submitit_local", "submitit")],
-)
-def test_the_settings_of_every_launcher_are_accepted_by_its_plugin(launcher, plugin):
-    pytest.importorskip(f"hydra_plugins.hydra_{plugin}_launcher")
+def test_the_settings_of_the_launcher_slurm_are_accepted_by_its_plugin():
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     with initialize_config_module("conf", version_base="1.3"):
-        config = compose("train", [f"launcher={launcher}"], return_hydra_config=True)
-    target = config.hydra.launcher._target_
-    assert target.startswith(f"hydra_plugins.hydra_{plugin}_launcher.")
+        config = compose("train", ["launcher=slurm"], return_hydra_config=True)
+    assert config.hydra.launcher._target_.startswith("hydra_plugins.hydra_submitit_launcher.")
 
 
 def start_sweep(folder: Path, *overrides: str) -> subprocess.Popen:
@@ -274,7 +261,6 @@ def start_sweep(folder: Path, *overrides: str) -> subprocess.Popen:
 
 
 def child_of(process_id: int) -> int:
-    """Return the id of the only child of a process."""
     return int(Path(f"/proc/{process_id}/task/{process_id}/children").read_text())
 
 

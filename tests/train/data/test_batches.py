@@ -30,7 +30,6 @@ def numbered(images: torch.Tensor) -> TrainingImages:
 
 
 def gray_images(count: int) -> torch.Tensor:
-    """Make images of 8 × 8 pixels whose values are their rows."""
     values = torch.arange(count, dtype=torch.uint8)
     return values.view(-1, 1, 1, 1).expand(-1, 3, 8, 8)
 

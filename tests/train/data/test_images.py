@@ -20,14 +20,12 @@ def load_files(folder: Path, skip: bool = False) -> ImageFiles:
 
 
 def ramp(width: int, height: int) -> Image.Image:
-    """Make an image whose red grows with the column, and whose green grows with the row."""
     x, y = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
     return Image.fromarray(np.stack([x, y, np.full_like(x, 128)], axis=-1).astype(np.uint8))
 
 
 @pytest.fixture
 def files(tmp_path) -> ImageFiles:
-    """Save images of several sizes and modes."""
     image = ramp(90, 120)
     turned = Image.Exif()
     turned[0x0112] = 6

@@ -41,7 +41,6 @@ def touch(folder: Path, *names: str) -> Path:
 
 
 def load_one(path: Path) -> np.ndarray:
-    """Return the image as integers, shape (32, 32, 3)."""
     _, images, _ = load_photographs(
         path.parent, [Photograph(PurePosixPath(path.name), "orange", None)]
     )

@@ -128,21 +128,6 @@ def test_a_fault_in_a_folder_is_named(tmp_path, images, fault):
         load_folder(str(tmp_path / "data"), 8, 0.1)
 
 
-def test_a_broken_image_of_a_class_is_an_error_and_other_files_are_counted_and_named(
-    tmp_path, caplog
-):
-    for number in range(4):
-        save_image(tmp_path / "fig" / f"{number}.png", 0)
-        save_image(tmp_path / "lime" / f"{number}.png", 0)
-        (tmp_path / "fig" / f"{number}.heic").touch()
-    with caplog.at_level("WARNING", "train"):
-        load_folder(str(tmp_path), 8, 0.25)
-    assert f"4 files in {tmp_path} are not images: fig/0.heic, fig/1.heic" in caplog.text
-    (tmp_path / "fig" / "b.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match=r"1 of 9 photographs cannot be read, .*fig/b\.png"):
-        load_folder(str(tmp_path), 8, 0.25)
-
-
 def test_torchvisions_data_become_splits_with_the_channels_first(monkeypatch):
     pixels = np.random.default_rng(0).integers(0, 256, (2, 10, 32, 32, 3), dtype=np.uint8)
 

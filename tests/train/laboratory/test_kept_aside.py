@@ -1,5 +1,3 @@
-"""Renders that are kept aside share no instance and no pattern with training."""
-
 import pytest
 
 from train.__main__ import main as train_command

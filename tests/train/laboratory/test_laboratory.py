@@ -54,7 +54,6 @@ def draw(
     pictures: Sequence[np.ndarray] = (),
     **changes,
 ) -> list[Shot]:
-    """Draw shots in the light of patterns, or of environment maps by their names."""
     maps = environments or {}
     changes |= {"patterns": [*families], "environments": [*maps], "brightness": [*brightness]}
     lab_settings = LabSettings("out", setups=setups, seed=seed, **changes)
@@ -261,10 +260,7 @@ def test_slides_project_a_picture_in_its_own_colors():
 
 
 def frontal(**changes) -> Shot:
-    """Make a shot of an upright object with camera and projector at the same place in front.
-
-    The light is white, and the table is black.
-    """
+    """Make a shot in white light on a black table, with camera and projector at one place."""
     (shot,) = draw(1, ["solid"], (1, 1))
     center = np.array([0, 0, 1.0])
     front = np.array([0, -6.0, 1.0])
@@ -309,10 +305,7 @@ def directions(shot: Shot, size: int) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
-    """The object is too small to see.
-
-    A projector lights planes that face it evenly, by 1 / z² at depth z.
-    """
+    """A projector lights planes that face it evenly, by 1 / z² at depth z."""
     (shot,) = draw(1, ["solid"], (1.5, 1.5), seed)
     shot = replace(shot, scale=1e-4, ambient=np.array([0.1, 0.2, 0.3]))
     image = path_traced(lab_parts(solid("orange"), 1.0), shot, 8, 4096, bounces=1, seed=0)

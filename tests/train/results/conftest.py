@@ -1,5 +1,3 @@
-"""A browser for the tests of pages."""
-
 import shutil
 from collections.abc import Iterator
 from typing import Any

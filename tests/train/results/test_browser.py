@@ -51,7 +51,6 @@ LOWEST_CONTRAST = """([needed, neededIfLarge]) => {
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory) -> Path:
-    """Audit two classifiers with light from all around alone, on four images."""
     folder = tmp_path_factory.mktemp("audit")
     for label in CLASSES:
         (folder / "lab" / label).mkdir(parents=True)

@@ -57,7 +57,6 @@ def predictions_of(rows: Rows) -> Predictions:
 
 @pytest.fixture
 def scored_run(tmp_path, made_up_run, monkeypatch) -> Callable[..., Path]:
-    """Return a function that makes the folder of a finished run with scores."""
     # Tests do not look at figures, and saving them is slow.
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)
 
@@ -114,6 +113,7 @@ def test_a_report_has_top_1_by_class_of_each_network(scored_run):
 
 
 def test_a_comparison_shows_every_source_and_the_total_without_an_excluded_one(compared_sources):
+    assert "adversarial minus none (1 and 1 seeds)" in compared_sources  # The seeds make no pairs.
     _, *rows = compared_sources["by source"]
     assert [row[:2] for row in rows] == [
         ["all but studio", "none"],
@@ -128,10 +128,6 @@ def test_a_comparison_shows_every_source_and_the_total_without_an_excluded_one(c
     # The studio has nothing to rank oranges against.
     aucs = [row[4].partition(" ")[0] for row in rows]
     assert aucs == ["0.500", "0.714", "-", "-", "0.500", "0.800"]
-
-
-def test_runs_of_other_seeds_are_compared_without_pairs(compared_sources):
-    assert "adversarial minus none (1 and 1 seeds)" in compared_sources
 
 
 def test_a_comparison_shows_the_mean_seconds_of_the_phases_of_an_epoch(compared_sources):
@@ -160,7 +156,6 @@ class TestAnotherFolderOfPhotographs:
 
 @pytest.fixture
 def runs_on_two_sets(scored_run) -> list[Path]:
-    """Make two methods scored on the same four images, and a third one scored on two others."""
     return [
         scored_run("none", {"web": ([1, -1], [0, 2])}),
         scored_run("random", {"web": ([1, -1], [0, -2])}),
@@ -185,7 +180,6 @@ def test_only_scores_on_the_same_images_share_a_plot_and_a_table(runs_on_two_set
 class TestAHardenedNetwork:
     @pytest.fixture
     def initial(self, scored_run) -> Path:
-        """Score the network that the runs start from with one of four oranges right."""
         return scored_run("none", {"web": ([1, -1, -1, -1], [0, 2])}) / "photographs"
 
     @pytest.fixture
@@ -279,15 +273,3 @@ def test_a_difference_of_three_seeds_is_that_of_their_means_and_paired(scored_ru
     found = [float(cell.partition(" ")[0]) for cell in (web[1], web[3])]
     expected = [recalls[1] - recalls[0], areas[1] - areas[0]]
     assert found == pytest.approx(expected, abs=5.1e-4)  # The table has three digits.
-
-
-def test_groups_of_an_arm_are_named_by_the_settings_in_which_they_differ(scored_run):
-    folders = [
-        scored_run("none", STUDIO_AND_WEB),
-        scored_run("random", STUDIO_AND_WEB, "augment.random_light.radius=1.5"),
-        scored_run("random", STUDIO_AND_WEB),
-    ]
-    titles = set(compare(folders))
-    for radius in (1.5, None):
-        group = f"random, random light radius={radius}"
-        assert f"{group} minus none (1 and 1 seeds, paired)" in titles

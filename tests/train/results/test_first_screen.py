@@ -1,5 +1,3 @@
-"""The first screen shows images that only one of two networks gets right."""
-
 import re
 from pathlib import Path, PurePosixPath
 
@@ -9,13 +7,8 @@ import torch
 from PIL import Image
 
 from train.data.photo import Photograph
-from train.results.compare import Difference, Evaluation
-from train.results.first_screen import (
-    FirstScreen,
-    choose_disagreements,
-    compare_networks,
-    gain_sentence,
-)
+from train.results.compare import Evaluation
+from train.results.first_screen import FirstScreen, choose_disagreements, compare_networks
 from train.results.metrics import Pooled
 from train.results.predictions import Predictions
 from train.results.scoring import rank_classes
@@ -29,7 +22,6 @@ LABELS = ("banana", "mug")
 
 
 def predictions_of(predicted: tuple[str, ...], labels: tuple[str, ...] = LABELS) -> Predictions:
-    """Make the predictions of a network that predicts a class for each of the images."""
     classes = ("banana", "mug", "spoon")
     photographs = [
         Photograph(PurePosixPath(f"{number}.png"), shown, f"source {number}")
@@ -52,17 +44,7 @@ def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predict
     assert [re.findall(r"\d+", title) for title in rows] == [["2", "6"], ["2", "6"]]
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "expected"), [(-0.004, 0.364, ["−0.4", "+36"]), (0.0, 0.016, ["0", "+2"])]
-)
-def test_an_end_of_an_interval_is_shown_as_0_only_if_it_is_0(low, high, expected):
-    change = Difference(0.1, low, high, "objects", before=0.2, after=0.3)
-    interval = gain_sentence("Recall", change).partition("over objects: ")[2]
-    assert re.findall(r"[−+]?\d[\d.]*", interval) == expected
-
-
 def screen_of(labels: tuple[str, ...]) -> FirstScreen:
-    """Compare both networks on the images, for some positive classes."""
     run = RunSummary(Path("run"), "", {}, {}, None)
     before, after = (
         [Evaluation(run, Pooled(predictions_of(predicted, labels)))]

@@ -61,7 +61,6 @@ def test_recall_at_a_rate_is_that_at_the_lowest_threshold_within_the_rate(positi
 
 
 def mean_of(values: np.ndarray, units: np.ndarray) -> Jackknife:
-    """Leave out each unit of a mean."""
     (mean,) = leave_out(partial(weighted_means, values[None]), Units([units], "units"))
     return mean
 
@@ -108,7 +107,6 @@ def test_intervals_do_not_depend_on_how_often_an_image_repeats(repeats):
 
 
 def runs_of(values: np.ndarray) -> list[Jackknife]:
-    """Make training runs with the given scores, which do not depend on the images."""
     return [Jackknife(value, [np.full(9, value)], 9, "objects") for value in values]
 
 
@@ -147,16 +145,12 @@ def test_intervals_of_few_photographs_cover_the_recall_at_a_false_positive_rate(
 
 
 def roc_of(positives: np.ndarray, negatives: np.ndarray) -> list[Jackknife]:
-    """Leave out each image of a ROC curve."""
     units = Units([np.arange(len(positives)), np.arange(len(negatives))], "images")
     return leave_out_of_roc(positives, negatives, units)
 
 
 def test_the_threshold_of_a_recall_has_woodruffs_interval():
-    """Of 30 negatives, 6 are above the threshold. Its ends have the interval of a rate of 0.2.
-
-    The jackknife of a mean is exact, so the error of the logit of 0.2 is that of a sample.
-    """
+    """The ends of the threshold have the interval of its rate: 6 of 30 negatives are above it."""
     negatives = np.arange(30.0)
     positives = np.arange(0.5, 30, 0.5)
     recall = roc_of(positives, negatives)[-1]
@@ -206,15 +200,10 @@ def test_few_objects_have_an_interval_over_images(object_count, over):
         assert (recall.low, recall.high) == pytest.approx((wilson.low, wilson.high))
 
 
-def draw_ranks(seed: int) -> tuple[list[str], np.ndarray]:
-    """Draw the class and the rank of the true class of 60 images of 5 classes of all sizes."""
-    generator = np.random.default_rng(seed)
-    names = generator.choice(["a", "b", "c", "d", "e"], 60, p=[0.5, 0.2, 0.15, 0.1, 0.05])
-    return names.tolist(), generator.integers(1, 9, 60)
-
-
 def test_means_over_drawn_classes_count_repeated_images():
-    names, ranks = draw_ranks(1)
+    generator = np.random.default_rng(1)
+    names = generator.choice(["a", "b", "c", "d", "e"], 60, p=[0.5, 0.2, 0.15, 0.1, 0.05]).tolist()
+    ranks = generator.integers(1, 9, 60)
     hits = np.stack([ranks <= 1, ranks <= 5])
     counts = np.random.default_rng(2).integers(0, 3, (4, 60))
     sizes = [names.count(name) for name in names]
@@ -226,18 +215,12 @@ def test_means_over_drawn_classes_count_repeated_images():
             assert class_means(hits, names, counts)[way, replicate] == pytest.approx(expected)
 
 
-def photograph(name: str, number: int) -> Photograph:
-    """Return the photograph of a class. Each object has two photographs."""
-    mesh = f"{name}_{number // 2}.glb"
-    return Photograph(PurePosixPath(f"{name}/{number}.png"), name, None, (), mesh)
-
-
 @pytest.mark.parametrize("labels", [["orange"], ["orange", "lemon"]])
 def test_top_k_is_that_of_torch_for_images_of_known_classes(labels):
     classes = ["orange", "lemon", "pear", *map(str, range(9))]
     generator = torch.Generator().manual_seed(0)
     photographs = [
-        photograph(name, number)
+        Photograph(PurePosixPath(f"{name}/{number}"), name, None, (), f"{name}{number // 2}.glb")
         for name, count in {"orange": 8, "lemon": 4, "pear": 2, "other_ball": 6}.items()
         for number in range(count)
     ]
@@ -254,17 +237,6 @@ def test_top_k_is_that_of_torch_for_images_of_known_classes(labels):
             by_class.append(hits.float().mean().item())
         assert metric.value == pytest.approx(np.mean(by_class))
         assert metric.low < metric.value < metric.high
-
-
-def test_the_interval_of_one_image_per_class_is_wilsons_up_to_rounding():
-    """The logit and Wilson's interval differ by less than 0.02 for 40 images."""
-    names = [f"class {number}" for number in range(40)]
-    hits = np.random.default_rng(4).integers(1, 4, 40) == 1
-    units = Units([np.arange(40)], "images")
-    (metric,) = leave_out(partial(class_means, hits[None], names), units)
-    wilson = binomtest(int(hits.sum()), 40).proportion_ci(method="wilson")
-    ends = (metric.estimate.low, metric.estimate.high)
-    assert ends == pytest.approx((wilson.low, wilson.high), abs=0.03)
 
 
 def test_a_recall_of_1_has_wilsons_interval_for_the_objects_with_students_quantile():

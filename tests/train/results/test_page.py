@@ -1,5 +1,3 @@
-"""The report shows runs in every state, as a file and in a browser."""
-
 import csv
 import json
 import shutil
@@ -20,8 +18,6 @@ COMMAND = "python -m train experiment=best"
 
 
 class Page(HTMLParser):
-    """The contents of a page."""
-
     def __init__(self, text: str):
         super().__init__()
         self.tags = []
@@ -47,7 +43,6 @@ class Page(HTMLParser):
 
 
 def write_unfinished_runs(folder: Path) -> None:
-    """Write runs that are interrupted, failed, begun and damaged."""
     for name in ("going", "damaged", "failed", "weights", "begun"):
         (folder / name).mkdir()
     (folder / "weights" / "best.pt").write_bytes(b"")
@@ -74,7 +69,6 @@ SUCCESSFUL_EXAMPLE = {
 
 
 def write_attack(folder: Path) -> None:
-    """Write an attack on four examples with different outcomes."""
     folder.mkdir(parents=True)
     unsuccessful = SUCCESSFUL_EXAMPLE | {"success": False, "success_without_noise": False}
     lines = [
@@ -90,7 +84,6 @@ def write_attack(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def page(finished, made_up_run, tiny, tmp_path_factory) -> Path:
-    """Write a page of runs in every state, of an attack, and of files from elsewhere."""
     folder = tmp_path_factory.mktemp("all")
     shutil.copytree(finished, folder / "finished")
     write_config(folder / "finished", tiny(), command=COMMAND)
@@ -169,20 +162,3 @@ def test_each_predictions_csv_is_parsed_once_for_tables_and_the_report(
     tables = sorted(str(path) for path in folder.rglob("predictions.csv"))
     assert tables
     assert sorted(name for name in parsed if name.endswith("predictions.csv")) == tables
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "dark")])
-def test_a_browser_shows_the_page_without_overflow_wide_and_narrow_light_and_dark(
-    page, browser, width, scheme
-):
-    view = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
-    urls = []
-    errors = []
-    view.on("console", lambda message: errors.append(message.text))
-    view.on("request", lambda request: urls.append(request.url))
-    view.goto(page.as_uri())
-    assert view.evaluate("document.documentElement.scrollWidth") <= width
-    assert view.evaluate("[...document.images].every(image => image.naturalWidth && image.alt)")
-    assert [url for url in urls if not url.startswith("data:")] == [page.as_uri()]
-    assert errors == []
-    view.close()

@@ -32,8 +32,6 @@ from train.results.tables import THESE_OBJECTS, fraction
 
 
 class TableModel(torch.nn.Module):
-    """Predict row i of a table of logits for an image whose red is i."""
-
     def __init__(self, table):
         super().__init__()
         self.table = torch.as_tensor(table, dtype=torch.float32)
@@ -48,12 +46,7 @@ class TableModel(torch.nn.Module):
 
 @pytest.fixture
 def known_model(tmp_path) -> Callable[..., tuple[TableModel, list[str], Path]]:
-    """Return a function that makes a folder of images and a model that knows them.
-
-    The model gives the i-th image the i-th row of logits. The function returns
-    the model, its classes and the folder, in the order in which `evaluate`
-    takes them.
-    """
+    """Return a function that makes a model, its classes, and images with the given logits."""
 
     def make(
         names: Sequence[str], logits: Sequence, classes: list[str]
@@ -72,8 +65,6 @@ FRUIT_CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
 
 @dataclass(frozen=True)
 class Fruit:
-    """A photograph of a fruit, and what the model predicts for it."""
-
     name: str
     source: str
     order: str
@@ -84,14 +75,12 @@ class Fruit:
 
     @property
     def letter(self) -> str:
-        """Return the letter by which a test names the photograph."""
         return Path(self.name).stem
 
     def is_of(self, label: str) -> bool:
         return self.name.startswith(f"{label}/")
 
     def place(self, label: str) -> int:
-        """Return the place of a class in the ranking, from 0."""
         return self.ranking.index(label)
 
     def log_odds(self, label: str) -> float:
@@ -116,7 +105,6 @@ COUNTS = {"photographs": 10, "positives": 5, "negatives": 5}
 
 
 def write_table(folder: Path, **columns: list[str]) -> None:
-    """Write photos.csv with the sources of the fruit and additional columns."""
     with open(folder / "photos.csv", "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["path", "source_tag", *columns])
@@ -127,7 +115,6 @@ def write_table(folder: Path, **columns: list[str]) -> None:
 
 @pytest.fixture
 def fruit(known_model) -> tuple[TableModel, list[str], Path]:
-    """Make a model with known predictions, its classes and a folder of photographs."""
     logits = [[-item.place(name) for name in FRUIT_CLASSES] for item in FRUIT]
     model, classes, folder = known_model([item.name for item in FRUIT], logits, FRUIT_CLASSES)
     write_table(folder)
@@ -164,20 +151,15 @@ def evaluate(*arguments, **options) -> dict:
 
 
 def wilson(hits: int, n: int) -> dict[str, float | None]:
-    """Return a fraction as summary.json has it."""
     return asdict(fraction(hits, n))
 
 
 def counts(proportion: dict[str, float]) -> tuple[float, float, float]:
-    """Return a fraction without its interval."""
     return proportion["value"], proportion["hits"], proportion["n"]
 
 
 def count_metrics(fruits: list[Fruit]) -> dict[str, object]:
-    """Count the metrics of photographs, and compare all pairs for the AUC.
-
-    A lower place of orange in the ranking means a higher score.
-    """
+    """Count the metrics; a lower place of orange in the ranking means a higher score."""
     oranges = [item.place("orange") for item in fruits if item.is_of("orange")]
     others = [item.place("orange") for item in fruits if not item.is_of("orange")]
     wins = [(own < other) + (own == other) / 2 for own in oranges for other in others]
@@ -194,11 +176,9 @@ class TestTheMetricsOfAKnownModel:
     def summary(self, fruit, tmp_path) -> dict:
         return evaluate(*fruit, "orange", tmp_path / "new" / "out")
 
-    def test_are_written_to_a_file(self, summary, tmp_path):
+    def test_count_the_photographs_and_are_written_to_a_file(self, summary, tmp_path):
         text = (tmp_path / "new" / "out" / "summary.json").read_text(encoding="utf-8")
         assert json.loads(text) == summary
-
-    def test_count_the_photographs(self, summary):
         assert summary["n"] == COUNTS | {"unreadable": 0, "left_out": 0}
         counts = {source: row["n"] for source, row in summary["by_source"].items()}
         assert counts == {"lab": 2, "shop": 2, "street": 4}
@@ -227,11 +207,7 @@ class TestTheMetricsOfAKnownModel:
 
 
 def test_a_source_is_ranked_against_the_hard_negatives_that_it_names(fruit, tmp_path):
-    """Rank the oranges of the lab against the pears of the shop.
-
-    The oranges have the places 1 and 2, and the pears 2 and 1. Of the four
-    pairs, one is won, one is lost, and two are ties.
-    """
+    """Oranges of ranks 1 and 2 win one pair and lose one with pears of ranks 2 and 1."""
     *_, folder = fruit
     negatives = ["shop" if item.letter == "a" else "" for item in FRUIT]
     write_table(folder, hard_negatives=negatives)
@@ -302,10 +278,7 @@ class TestAnOperatingPoint:
 
 
 def pooled_auc(labels: list[str], own_letters: str, source: str | None = None) -> float:
-    """Compute the AUC of all pairs of the photographs of labels and of others.
-
-    Each photograph has a score for each label.
-    """
+    """Compare all pairs, where each photograph has a score for each label."""
     positives = []
     negatives = []
     for item in FRUIT:
@@ -398,16 +371,12 @@ def test_predictions_have_the_probabilities_and_ranks_of_a_sorted_softmax(known_
         assert prediction.predicted == best
         assert prediction.label_rank == ranking.index("orange") + 1
         assert prediction.true_rank == (ranking.index(label) + 1 if is_known else np.inf)
-        assert prediction.probability == approx_closely(probabilities[best])
-        assert prediction.label_probability == approx_closely(probabilities["orange"])
+        assert prediction.probability == pytest.approx(probabilities[best], rel=1e-12)
+        assert prediction.label_probability == pytest.approx(probabilities["orange"], rel=1e-12)
         if is_known:
-            assert prediction.true_probability == approx_closely(probabilities[label])
+            assert prediction.true_probability == pytest.approx(probabilities[label], rel=1e-12)
         else:
             assert np.isnan(prediction.true_probability)
-
-
-def approx_closely(value: float):
-    return pytest.approx(value, rel=1e-12)
 
 
 @pytest.mark.parametrize("place", [0, 4, 5])
@@ -420,22 +389,17 @@ def test_a_tie_of_all_classes_goes_to_the_first_class(known_model, tmp_path, pla
     assert summary["top5"]["value"] == (place < 5)
 
 
-class TestPhotographsThatCannotBeRead:
-    @pytest.fixture(autouse=True)
-    def unreadable(self, fruit) -> None:
-        """Add a broken file, and one of a kind that is not read."""
-        *_, folder = fruit
-        (folder / "orange" / "broken.jpg").touch()
-        (folder / "orange" / "photo.HEIC").touch()
-
-    def test_are_counted_and_named_if_they_are_skipped(self, fruit, tmp_path):
-        scores = scored(*fruit, "orange", tmp_path, skip_unreadable=True)
-        summary = scores.to_summary()
-        assert summary["unreadable"] == ["orange/broken.jpg"]
-        assert summary["n"] == COUNTS | {"unreadable": 1, "left_out": 1}
-        for text in (format_scores(scores), format_overall(scores)):
-            assert "orange/broken.jpg" in text
-            assert "orange/photo.HEIC" in text
+def test_photographs_that_cannot_be_read_are_counted_and_named_if_they_are_skipped(fruit, tmp_path):
+    *_, folder = fruit
+    (folder / "orange" / "broken.jpg").touch()
+    (folder / "orange" / "photo.HEIC").touch()
+    scores = scored(*fruit, "orange", tmp_path, skip_unreadable=True)
+    summary = scores.to_summary()
+    assert summary["unreadable"] == ["orange/broken.jpg"]
+    assert summary["n"] == COUNTS | {"unreadable": 1, "left_out": 1}
+    for text in (format_scores(scores), format_overall(scores)):
+        assert "orange/broken.jpg" in text
+        assert "orange/photo.HEIC" in text
 
 
 @pytest.mark.parametrize(
@@ -493,7 +457,6 @@ FRAMED = IMAGE_SIZE + 2 * FRAME_WIDTH
 
 
 def count_frames(sheet: Image.Image) -> list[int]:
-    """Count the frames of each color on a contact sheet."""
     pixels = np.asarray(sheet)
     counts = []
     for color in FRAMES:
@@ -513,11 +476,7 @@ def test_the_contact_sheet_frames_each_hit_miss_and_false_positive(fruit, tmp_pa
 def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both_kinds(
     fruit, tmp_path
 ):
-    """Compare with curves by hand.
-
-    The ranks of orange are 1, 2, 6, 5, 2 for oranges and 1, 5, 2, 1, 2 for
-    others. In the street, they are 6, 2 and 1, 5.
-    """
+    """In the street, the ranks are 6 and 2 for oranges, and 1 and 5 for others."""
     evaluate(*fruit, "orange", tmp_path)
     curves = defaultdict(list)
     thresholds = defaultdict(list)

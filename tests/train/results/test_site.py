@@ -1,13 +1,8 @@
-"""Chromium shows the documentation site: its links lead somewhere, and its search finds names."""
-
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
@@ -40,18 +35,6 @@ def site(tmp_path_factory) -> Path:
     command = [sys.executable, "-m", "sphinx", *options, "docs", "html"]
     subprocess.run(command, cwd=folder, check=True)
     return folder / "html"
-
-
-@pytest.fixture(scope="module")
-def address(site) -> Iterator[str]:
-    """Serve the site, because the search fetches the pages that it finds."""
-    handler = partial(SimpleHTTPRequestHandler, directory=str(site))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join()
 
 
 @pytest.fixture(params=[(1280, "light"), (400, "dark")])
@@ -90,16 +73,3 @@ def test_links_lead_to_a_place_in_the_site(site, browser, name):
         assert target.is_file(), target
         if link.fragment and target.suffix == ".html":
             assert f'id="{unquote(link.fragment)}"' in target.read_text(), link
-
-
-def test_the_index_leads_to_the_results(site, view):
-    view.goto((site / "index.html").as_uri())
-    view.locator("article a[href^='results.html']").first.click()
-    assert view.url.startswith((site / "results.html").as_uri())
-
-
-def test_the_search_finds_a_public_name(address, view):
-    view.goto(f"{address}/search.html?q=precompute_transfer")
-    found = view.locator("#search-results a").first
-    found.wait_for()
-    assert "precompute_transfer" in found.get_attribute("href")

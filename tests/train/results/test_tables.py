@@ -9,10 +9,7 @@ from train.results.tables import Proportion, Table, format_fraction, format_inte
 
 
 def test_a_fraction_has_the_wilson_interval():
-    """Compare with Wilson's formula (1927) for 8 of 40.
-
-    Its ends are 1.96 standard errors from (8 + z² / 2) / (40 + z²), z = 1.96.
-    """
+    """The ends are 1.96 standard errors from (8 + z² / 2) / (40 + z²), z = 1.96 (Wilson 1927)."""
     expected = {"value": 0.2, "low": 0.10500, "high": 0.34757, "hits": 8, "n": 40}
     found = vars(fraction(8, 40))
     assert found.pop("over") == "images"

@@ -38,7 +38,6 @@ State = dict[str, Tensor]
 
 
 def noise(count: int) -> Split:
-    """Draw images of noise and labels of three classes."""
     draws = torch.Generator().manual_seed(count)
     images = torch.randint(0, 256, (count, 3, 16, 16), dtype=torch.uint8, generator=draws)
     labels = torch.randint(0, 3, (count,), generator=draws)
@@ -46,14 +45,12 @@ def noise(count: int) -> Split:
 
 
 def single_colors(count: int) -> Split:
-    """Draw images of one color each, so that shifts and flips do not change them."""
     draws = torch.Generator().manual_seed(count)
     colors = torch.randint(0, 256, (count, 3, 1, 1), dtype=torch.uint8, generator=draws)
     return Split(colors.expand(-1, -1, 8, 8), torch.arange(count) % 3)
 
 
 def color_network() -> nn.Sequential:
-    """Make a linear network of the mean color of an image."""
     torch.manual_seed(1)
     return nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(3, 3))
 
@@ -65,7 +62,6 @@ def make_trainer(
     has_initial: bool = True,
     **settings,
 ) -> Trainer:
-    """Make a trainer without renders."""
     torch.manual_seed(0)
     network = network or WideResNet(3, 10, 1, dropout=0.0)
     model = MixedPrecision(network, precision)
@@ -78,7 +74,6 @@ def make_trainer(
 
 
 def fit(trainer: Trainer, trained: Split, validated: Split) -> list[dict]:
-    """Train and validate on these images, and return the lines of metrics."""
     images = torch.cat([trained.images, validated.images])
     both = Split(images, torch.cat([trained.labels, validated.labels]))
     held_out = torch.arange(len(both)) >= len(trained)
@@ -87,17 +82,14 @@ def fit(trainer: Trainer, trained: Split, validated: Split) -> list[dict]:
 
 
 def fit_noise(trainer: Trainer) -> list[dict]:
-    """Train and validate on noise, and return the lines of metrics."""
     return fit(trainer, noise(TRAINED), noise(VALIDATED))
 
 
 def load(folder: Path, name: str = run_folder.LAST) -> dict:
-    """Load a checkpoint of a run."""
     return checkpoints.load(folder / name)
 
 
 def states_after_steps(trainer: Trainer) -> list[State]:
-    """Return a list to which every step adds a copy of the network's state."""
     states: list[State] = []
 
     def record(*_) -> None:
@@ -181,10 +173,7 @@ def test_a_batch_whose_activations_need_more_than_the_free_memory_is_refused(tmp
 
 
 def one_step(folder: Path, **settings) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Take a step of a linear network on a batch of eight images.
-
-    Return the weights, and then the biases: before and after the step, and their gradient.
-    """
+    """Return weights and biases before and after a step on eight images, and their gradient."""
     images = single_colors(8)
     network = color_network()
     linear = network[2]

@@ -1,5 +1,3 @@
-"""Schedules, losses and augmentations against their formulas."""
-
 import math
 from copy import deepcopy
 from dataclasses import replace
@@ -34,21 +32,18 @@ LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
 
 @pytest.fixture
 def images() -> Tensor:
-    """Draw six images of noise."""
     draws = torch.Generator().manual_seed(0)
     return torch.randint(0, 256, (6, 3, 16, 16), dtype=torch.uint8, generator=draws)
 
 
 @pytest.fixture
 def model() -> nn.Module:
-    """Make a network of four classes, in training mode."""
     torch.manual_seed(0)
     return WideResNet(4, 10, 1, 0.3)
 
 
 @pytest.fixture
 def teacher() -> nn.Module:
-    """Make another network of the same classes, which does not learn."""
     torch.manual_seed(1)
     return WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
 
@@ -210,15 +205,12 @@ def test_pgd_raises_the_probability_of_the_classes_that_hard_negatives_are_not(i
 
 
 def learning_layers(network: nn.Module) -> set[str]:
-    """Freeze all layers but the last, and return the names of the others."""
     freeze(network, "all_but_last", size=2)
     names = [name for name, value in network.named_parameters() if value.requires_grad]
     return {name.rpartition(".")[0] for name in names}
 
 
 class HeadFirst(nn.Module):
-    """Network that defines its layers in another order than it calls them."""
-
     def __init__(self):
         super().__init__()
         self.head = nn.Linear(5, 2)
@@ -259,10 +251,7 @@ def test_a_network_that_cannot_learn_in_its_last_layer_is_refused():
 
 
 class Scaled(nn.Module):
-    """Classifier whose features are multiplied by a factor, and the weights of the layer divided.
-
-    Its logits do not depend on the factor.
-    """
+    """Classifier whose logits do not depend on the factor of its features."""
 
     def __init__(self, factor: float):
         super().__init__()
@@ -315,8 +304,6 @@ LAST_LAYER_ONLY = {"freeze": "all_but_last", "eval_mode": True}
 
 
 class Counted(nn.Module):
-    """Layer that counts its calls."""
-
     calls = 0
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
@@ -325,7 +312,6 @@ class Counted(nn.Module):
 
 
 def pair(*layers_after: nn.Module) -> tuple[MixedPrecision, MixedPrecision]:
-    """Build a pupil and its teacher."""
     torch.manual_seed(0)
     layers = [Counted(), nn.Linear(3 * TINY**2, 8), nn.Dropout(), nn.Linear(8, 5)]
     pupil = MixedPrecision(nn.Sequential(*layers, *layers_after), "float32")

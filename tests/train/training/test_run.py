@@ -19,6 +19,7 @@ from PIL import Image
 
 from augment.tasks.classification import complementary_label
 from renderer.errors import InputError
+from tests.helpers import save_noise
 from tests.runs import completed_run, loaded_run
 from train import checkpoints, run_folder
 from train.checkpoints import load_run
@@ -37,13 +38,11 @@ WITHOUT_RENDERS = ("augment=none", "train.epochs=1")
 
 
 def weight_hashes(folder: Path) -> list[str]:
-    """Hash the weights of the last network and of the selected one."""
     names = (run_folder.LAST, run_folder.BEST)
     return [content_hash(checkpoints.load(folder / name)["model"]) for name in names]
 
 
 def metrics(folder: Path) -> list[dict]:
-    """Read the log of a run without the entries that are times."""
     lines = read_metrics(folder)
     return [{name: line[name] for name in line if name[:8] != "seconds/"} for line in lines]
 
@@ -53,8 +52,6 @@ def modification_times(folder: Path) -> dict[Path, int]:
 
 
 def act_at(monkeypatch, round_number: int, step: int, act: Callable[[], None]) -> None:
-    """Let training call a function at one step."""
-
     def acting(images, batch_size, seed, now, *options):
         shown = batches.training_batches(images, batch_size, seed, now, *options)
         for number, batch in enumerate(shown, 1):
@@ -68,7 +65,6 @@ def act_at(monkeypatch, round_number: int, step: int, act: Callable[[], None]) -
 def train_with_signal(
     settings, folder: Path, round_number: int, step: int, number: signal.Signals
 ) -> None:
-    """Train, and raise a signal at a step of a round."""
     with pytest.MonkeyPatch.context() as patch:
         act_at(patch, round_number, step, lambda: signal.raise_signal(number))
         completed_run(settings, folder)
@@ -76,7 +72,6 @@ def train_with_signal(
 
 @pytest.fixture
 def renders_of_rounds(monkeypatch) -> list[Split]:
-    """Return a list that grows by the renders of each round as training gets them."""
     renders = []
     training_images = loop.TrainingImages
 
@@ -102,11 +97,7 @@ HANDLED_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 def test_a_signal_ends_a_run_after_the_step_and_resuming_ends_as_if_it_had_not_come(
     tiny, finished, tmp_path, number, average
 ):
-    """An epoch has 40 of 54 images, in rounds of 16, 16 and 8 images with 4 renders each.
-
-    The rounds have 2, 2 and 1 steps. The lights continue from round to round,
-    and the network has dropout and a teacher.
-    """
+    """Epochs have rounds of 2, 2 and 1 steps, through which lights, dropout and teacher go on."""
     rounds = ("augment.regenerate_every=16", "train.images_per_epoch=40")
     teacher = ("train.distillation_weight=2", f"network={finished}")
     settings = tiny("train.epochs=2", "train.resume=true", *rounds, *teacher, average)
@@ -266,10 +257,7 @@ TENSORBOARD_APPEND = "tensorboard.compat.tensorflow_stub.io.gfile.LocalFileSyste
 
 # The thread of TensorBoard raises the error, too.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-@pytest.mark.parametrize(
-    "writer",
-    [TENSORBOARD_APPEND, "train.training.run_log.RunLog.scalars", "renderer.io.files.os.fsync"],
-)
+@pytest.mark.parametrize("writer", [TENSORBOARD_APPEND, "renderer.io.files.os.fsync"])
 def test_a_full_disk_is_one_error_for_every_writer_and_the_run_can_be_resumed(
     tiny, tmp_path, writer
 ):
@@ -301,10 +289,7 @@ APPLE, ORANGE, PEAR = range(3)
 def test_meshes_and_hard_negatives_are_rendered_with_their_own_labels(
     tiny, tmp_path, renders_of_rounds
 ):
-    """Each mesh has 2 views before 2 backgrounds.
-
-    A hard negative without a class has the complementary label.
-    """
+    """A hard negative without a class has the complementary label."""
     meshes = "meshes=[{mesh: 'solid:pear', label: pear}, 'solid:orange']"
     negatives = "hard_negatives=['solid:fruit', {mesh: 'solid:apple:2', label: apple}]"
     completed_run(tiny("train.epochs=1", meshes, negatives, "augment.examples=16"), tmp_path)
@@ -331,8 +316,7 @@ def test_several_folders_of_photographs_are_scored_in_sub_folders_of_their_names
 def test_without_a_label_and_renders_photographs_are_scored_for_each_class_with_a_folder(
     tiny, photos, tmp_path
 ):
-    overrides = ["label=null", f"photos={photos}"]
-    completed_run(tiny(*WITHOUT_RENDERS, *overrides), tmp_path)
+    completed_run(tiny(*WITHOUT_RENDERS, "label=null", f"photos={photos}"), tmp_path)
     summary = json.loads((tmp_path / "photographs" / "summary.json").read_text())
     assert summary["label"] == ["apple", "orange"]
 
@@ -368,46 +352,26 @@ def test_the_selected_network_is_the_best_on_validation_and_scored_once_after_th
     assert network.size == 16
 
 
-class TestAFolderOfRenders:
-    @pytest.fixture
-    def label_of_image(self, tmp_path) -> dict[bytes, int]:
-        """Write three images of each of three labels, and return the labels by pixels."""
-        rng = np.random.default_rng(0)
-        labels = {"orange": ORANGE, "apple": APPLE, "other_ball": complementary_label(ORANGE)}
-        label_of_image = {}
-        for name, label in labels.items():
-            (tmp_path / "lab" / name).mkdir(parents=True)
-            for number in range(3):
-                pixels = rng.integers(0, 256, (16, 16, 3)).astype(np.uint8)
-                Image.fromarray(pixels).save(tmp_path / "lab" / name / f"{number}.png")
-                label_of_image[pixels.tobytes()] = label
-        return label_of_image
-
-    @pytest.fixture
-    def settings(self, tiny, label_of_image, tmp_path):
-        """Return settings of two epochs with two rounds of 4 images each."""
-        folder = ("augment=folder", f"augment.folder={tmp_path / 'lab'}", "augment.examples=4")
-        rounds = ("augment.warm_start=false", "augment.regenerate_every=27", "train.epochs=2")
-        return tiny(*folder, *rounds, "train.resume=true", "train.ranking_weight=1")
-
-    def test_is_shown_in_turn_with_its_labels(
-        self, settings, label_of_image, renders_of_rounds, tmp_path
-    ):
-        completed_run(settings, tmp_path / "run")
-        assert len(renders_of_rounds) == 4
-        shown = []
-        for renders in renders_of_rounds:
-            images = [image.permute(1, 2, 0).numpy().tobytes() for image in renders.images]
-            assert [label_of_image[image] for image in images] == renders.labels.tolist()
-            shown += images
-        assert len(set(shown[:9])) == 9
-
-    def test_stops_a_resumed_run_if_it_has_changed(self, settings, tmp_path):
-        with pytest.raises(Interrupted):
-            train_with_signal(settings, tmp_path / "run", 0, 1, signal.SIGTERM)
-        (tmp_path / "lab" / "apple" / "0.png").unlink()
-        with pytest.raises(InputError, match=r"lab has changed since"):
-            loaded_run(settings, tmp_path / "run")
+def test_a_folder_of_renders_is_shown_in_turn_with_its_labels(tiny, tmp_path, renders_of_rounds):
+    """Two epochs of two rounds each show 4 of 9 images."""
+    rng = np.random.default_rng(0)
+    label_of_image = {}
+    labels = {"orange": ORANGE, "apple": APPLE, "other_ball": complementary_label(ORANGE)}
+    for name, label in labels.items():
+        for number in range(3):
+            path = tmp_path / "lab" / name / f"{number}.png"
+            save_noise(path, rng, (16, 16))
+            label_of_image[np.asarray(Image.open(path)).tobytes()] = label
+    folder = ("augment=folder", f"augment.folder={tmp_path / 'lab'}", "augment.examples=4")
+    rounds = ("augment.warm_start=false", "augment.regenerate_every=27", "train.epochs=2")
+    completed_run(tiny(*folder, *rounds, "train.ranking_weight=1"), tmp_path / "run")
+    assert len(renders_of_rounds) == 4
+    shown = []
+    for renders in renders_of_rounds:
+        images = [image.permute(1, 2, 0).numpy().tobytes() for image in renders.images]
+        assert [label_of_image[image] for image in images] == renders.labels.tolist()
+        shown += images
+    assert len(set(shown[:9])) == 9
 
 
 @pytest.mark.parametrize(
@@ -458,22 +422,18 @@ def test_the_initial_network_is_scored_on_the_same_images(tiny, finished, photos
         assert before.read_text() == (finished / "photographs" / file).read_text()
 
 
-def kill() -> None:
-    """Raise KeyboardInterrupt, after which nothing is saved, like after a kill."""
-    raise KeyboardInterrupt
-
-
 def test_a_run_killed_within_its_first_epoch_is_resumed_there_and_ends_the_same(
     tiny, tmp_path, monkeypatch
 ):
-    settings = tiny("train.epochs=2", "train.resume=true")
+    """After KeyboardInterrupt nothing is saved, as after a kill."""
+    settings = tiny(*WITHOUT_RENDERS, "train.resume=true")
     completed_run(settings, tmp_path / "whole")
     killed = tmp_path / "killed"
     with monkeypatch.context() as patch:
         # Save after each step instead of each minute.
         patch.setattr(loop, "SAVING_EVERY", 0.0)
         patch.setattr(loop, "SAVING_SHARE", 1e9)
-        act_at(patch, 0, 4, kill)
+        act_at(patch, 0, 4, Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             completed_run(settings, killed)
     state = checkpoints.load(killed / run_folder.LAST)

@@ -1,5 +1,3 @@
-"""Attacks on roughness, metallic, strength, and the hue of the albedo."""
-
 import colorsys
 import json
 import math
@@ -33,14 +31,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*takes light of degree")
 
 
 def egg(gloss: Gloss | None) -> Mesh:
-    """Return an ellipsoid of one color."""
     vertices, faces = sphere(1)
     mesh = Mesh.plain(vertices * [1.0, 0.7, 0.8], faces, (0.8, 0.5, 0.3))
     return mesh if gloss is None else gloss.on(mesh)
 
 
 def textured_egg(gloss: Gloss) -> Mesh:
-    """Return an ellipsoid with textures of color and of gloss."""
     draws = np.random.default_rng(0)
     plain = egg(None)
     face_count = len(plain.faces)
@@ -57,7 +53,6 @@ def textured_egg(gloss: Gloss) -> Mesh:
 
 
 def scene_of(*meshes: Mesh, ground: list[float] | None = None, **options) -> Scene:
-    """Return a scene with one example for each mesh, in float64."""
     choices = {"samples": 1, "width": 2.6, "rasterizer": "numpy", "degree": 6} | options
     scene = augment.build_scene([(meshes[0], "egg")], 16, **choices)
     objects = [add_table(SceneObject("egg", mesh), ground) for mesh in meshes]
@@ -67,7 +62,6 @@ def scene_of(*meshes: Mesh, ground: list[float] | None = None, **options) -> Sce
 
 
 def problem_of(scene: Scene, **settings) -> SceneProblem:
-    """Return the problem of an attack on the material; keywords are those of its settings."""
     chosen = augment.MaterialSettings(**UNITS | settings)
     return SceneProblem(scene, [Material(scene, chosen)])
 
@@ -104,7 +98,6 @@ def test_gradients_are_central_differences(mesh, options):
 
 @pytest.fixture
 def varied() -> Mesh:
-    """Return an egg whose faces differ in roughness."""
     plain = egg(None)
     roughness = torch.linspace(0.3, 0.7, len(plain.faces))
     return Gloss(roughness, 0.2, 0.5).on(plain)
@@ -112,7 +105,6 @@ def varied() -> Mesh:
 
 @pytest.fixture
 def three_eggs(varied) -> Scene:
-    """Return a scene of a matte egg, an even one, and one whose faces differ in roughness."""
     return scene_of(egg(None), egg(Gloss(0.4)), varied, ground=TABLE)
 
 
@@ -179,7 +171,6 @@ def test_the_hue_turns_by_the_angle_and_keeps_the_mean(angle):
 
 
 def write(problem: SceneProblem, values: torch.Tensor, folder: Path) -> Adversary:
-    """Write the only example of a problem with some attack values."""
     before, after = (
         final_images(problem, each, FIRST, problem.images(each))[0]
         for each in (problem.start, values)
@@ -192,10 +183,7 @@ def write(problem: SceneProblem, values: torch.Tensor, folder: Path) -> Adversar
 
 @pytest.fixture(params=[egg, textured_egg], ids=["plain", "textured"])
 def written(request, tmp_path) -> tuple[Adversary, float]:
-    """Write an adversary beside a table that casts the shadows of highlights.
-
-    The number is the error that its textures, which are painted anew, may have.
-    """
+    """Write an adversary beside a table; return the error of its painted textures, too."""
     scene = scene_of(request.param(Gloss(0.5, 0.3, 0.4)), ground=TABLE, shadows=True)
     problem = problem_of(scene)
     values = problem.start + torch.tensor([[-0.5, 0.6, 0.8, 0.7]])
@@ -219,10 +207,7 @@ def test_a_material_is_read_back_to_its_image_and_written_as_gltfs_factors(writt
 
 
 def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color):
-    """The grid has 5 × 5 materials of roughness and strength in the ball.
-
-    Lamps make the highlights narrow. Descent reaches at least 98 % of the gain.
-    """
+    """Descent reaches at least 98 % of the gain of the best of 5 × 5 materials."""
     lamps = augment.LampsSettings([[1.5, 0.5, 2.0], [-1.0, 2.0, 1.5]], start=6.0)
     steps = augment.MaterialSettings("linf", 1.0, "sign", 0.2, roughness=0.3, specular_factor=1.0)
     result = attacked(

@@ -44,24 +44,20 @@ IS_WITHOUT_EFFECT[nonzero_coefficients(6)] = False
 
 
 def sky_at(start: tuple[float, float, float], **steps: Any) -> SkylightSettings:
-    """Return the settings of a sky whose start is (zenith, azimuth, turbidity)."""
     zenith, azimuth, turbidity = start
     return SkylightSettings(zenith=zenith, azimuth=azimuth, turbidity=turbidity, **steps)
 
 
 def split(problem: SceneProblem, values: Tensor) -> list[Tensor]:
-    """Return the values of each parameter."""
     return [part for _, part in problem.split_by_parameter(values)]
 
 
 def problem_of(scene: Scene, **settings: StepSettings) -> SceneProblem:
-    """Return an attack problem on the named parameters with these settings."""
     parameters = [make_parameter(name, scene, steps) for name, steps in settings.items()]
     return SceneProblem(scene, parameters)
 
 
 def free(*names: str) -> dict[str, StepSettings]:
-    """Return settings without a radius for each named parameter."""
     settings = {name: StepSettings() for name in names}
     if "skylight" in names:
         settings["skylight"] = sky_at(SKY)
@@ -71,7 +67,6 @@ def free(*names: str) -> dict[str, StepSettings]:
 def attack(
     model: nn.Module, problem: SceneProblem, criterion: ClassCriterion, steps: int
 ) -> Minimum:
-    """Run the descent until the classifier errs, without a margin."""
     settings = AttackSettings(max_steps=steps, margin=0.0, quantized=False)
     return minimize(problem, Objective(model, criterion, settings))
 
@@ -85,7 +80,6 @@ def towards(problem: SceneProblem, target: int | None = 1) -> ClassCriterion:
 
 
 def float64_noise(*shape: int, draws: torch.Generator) -> Tensor:
-    """Draw normal numbers in float64."""
     return torch.randn(*shape, generator=draws, dtype=torch.float64)
 
 
@@ -233,17 +227,13 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
 
 
 def in_sunlight(scene: Scene) -> Scene:
-    """Return a copy of the scene in the light of a sun.
-
-    Harmonics of degree 6 cut this light off, so that it is negative in places.
-    """
+    """Light the scene by a sun, which degree 6 cuts off, so that it is negative in places."""
     direction = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
     color = torch.full((3,), 0.3, dtype=torch.float64)
     return scene.changed(lights=directional(direction, color))
 
 
 def norms(offsets: Tensor, norm: str) -> Tensor:
-    """Return the norms (N,) of rows (N, D)."""
     return offsets.norm(dim=1) if norm == "l2" else offsets.abs().amax(1)
 
 
@@ -302,7 +292,6 @@ SKY_UNITS = [math.degrees(1), math.degrees(1), 4.0]
 
 @pytest.fixture(scope="session")
 def scenes_by_dtype(make_scene) -> dict[torch.dtype, Scene]:
-    """Return a scene for each floating-point type."""
     return {dtype: make_scene(dtype=dtype) for dtype in (torch.float32, torch.float64)}
 
 
@@ -345,10 +334,7 @@ def test_a_sky_stays_in_its_domain_and_its_ball(
 
 
 def light_slope(scene: Scene, weight: Tensor) -> Tensor:
-    """Return the derivative (E, 49, 3) of weight · images by the light.
-
-    The images of all views are summed. The derivative comes from the operators alone.
-    """
+    """Derive weight · images, summed over views, by the light (E, 49, 3) from operators alone."""
     slope = torch.zeros(len(scene), 49, 3, dtype=weight.dtype)
     coefficients = nonzero_coefficients(6)
     for row, cameras in enumerate(scene.cameras):
