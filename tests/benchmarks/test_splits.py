@@ -7,12 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
-from augment.network import normalize_light
 from augment.scene import patterns
-from augment.settings import NormalizedLightSettings
 from benchmarks import splits
 from tests.helpers import save_noise
 
@@ -127,12 +124,3 @@ def test_the_splits_share_no_image_object_or_light_and_evaluations_are_logged(
         printed = capsys.readouterr().out
         assert ("was evaluated for 'mine' before" in printed) == (logged_count == 4)
     assert {row["network"] for row in csv.DictReader(log.read_text().splitlines())} == set(networks)
-
-
-def test_a_network_with_normalized_light_sees_dark_images_brighter():
-    network = splits.load("pretrained/none", 32)
-    normalizing = splits.load("normalized:pretrained/none", 32)
-    dark = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0)) / 4
-    with torch.inference_mode():
-        assert normalizing(dark).equal(network(normalize_light(dark, NormalizedLightSettings())))
-        assert not normalizing(dark).allclose(network(dark))

@@ -175,12 +175,6 @@ def test_joined_and_selected_meshes_keep_their_normals():
     assert_array_equal(select_faces(both, slice(len(CAN.faces))).corner_normals, CAN.corner_normals)
 
 
-@pytest.mark.parametrize("name", ["orange", "lemon", "peach", "ball", "fruit"])
-def test_round_solids_have_no_sharp_edge(name):
-    mesh = nb.solid(name, 3)
-    assert is_same_partition(mesh.normal_ids, mesh.faces)
-
-
 def test_moved_vertices_keep_the_sharp_edges_of_the_mesh():
     """A flattened rim stays sharp, so that images have no jump as the vertices move."""
     moved = CAN.moved(CAN.vertices * [1, 1, 0.01])

@@ -57,18 +57,6 @@ def test_an_operators_image_is_the_rendered_one(stone, light, encoding, normals)
         torch.testing.assert_close(operator.image(light, 0.3), image, rtol=0, atol=13 * 8 * EPS32)
 
 
-def test_images_of_a_camera_alone_are_those_of_a_list_without_their_first_dimension(stone, light):
-    camera = CAMERAS[1]
-    [expected] = renderer.render(stone, [camera], light, **SMALL)
-    assert torch.equal(renderer.render(stone, camera, light, **SMALL), expected)
-
-    lights = light.float() * torch.tensor([0.5, 1.0])[:, None, None]
-    [expected] = renderer.precompute_transfer(stone, [camera], **SMALL).image(lights)
-    operator = renderer.precompute_transfer(stone, camera, **SMALL)
-    assert torch.equal(operator.image(lights), expected)
-    assert expected.shape == (2, 3, 9, 9)
-
-
 @pytest.fixture
 def variables(stone, light) -> dict[str, Tensor]:
     """Return the inputs of `render` that have gradients."""
@@ -252,14 +240,7 @@ def test_a_light_sphere_shows_a_lamp_by_the_inverse_square_law():
     expected = encode(linear.clamp(max=1), "srgb").float()
     assert expected[:, is_inside].std() > 0.05
     torch.testing.assert_close(image[:, is_inside], expected[:, is_inside], rtol=0, atol=6e-3)
-
-
-def test_a_light_sphere_shows_even_light_before_white():
-    color = torch.tensor([0.1, 0.4, 0.9])
-    image = light_sphere(ambient(color), 16)
-    torch.testing.assert_close(image[:, 8, 8], encode(color, "srgb"), rtol=0, atol=1e-6)
-    image_corners = image[:, ::15, ::15]
-    assert (image_corners == 1).all()
+    assert (image[:, ::63, ::63] == 1).all()  # The background is white.
 
 
 @pytest.mark.parametrize("function", ["render", "precompute_transfer"])

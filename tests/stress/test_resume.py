@@ -1,11 +1,10 @@
 """Runs that are interrupted and resumed end like an uninterrupted run, bit for bit.
 
-Every signal, full disks and damaged files are tried, in processes of their own. Without `-m slow`,
+Every signal and full disks are tried, in processes of their own. Without `-m slow`,
 tests/train/training/test_run.py interrupts runs within the process of the tests.
 """
 
 import resource
-import shutil
 import signal
 import time
 from collections.abc import Callable, Mapping
@@ -149,43 +148,3 @@ def test_a_full_disk_is_an_error_in_one_sentence_and_the_run_is_resumed_later(
     assert errors.startswith("error: ")
     assert errors.count("\n") == 1
     assert_resumed(tmp_path / "run")
-
-
-@pytest.fixture(scope="module")
-def half(data, tmp_path_factory) -> Path:
-    """Terminate a run after half of its epochs, and return its folder."""
-    run = tmp_path_factory.mktemp("runs") / "half"
-    process = start(data, run, EPOCHS // 2)
-    process.terminate()
-    assert end(process)[0] == 128 + signal.SIGTERM
-    return run
-
-
-def flip(content: bytes) -> bytes:
-    middle = len(content) // 2
-    flipped = bytes(255 - value for value in content[middle : middle + 16])
-    return content[:middle] + flipped + content[middle + 16 :]
-
-
-DAMAGES = {"flip": flip, "cut": lambda content: content[:-9], "empty": lambda _: b""}
-
-
-@pytest.mark.parametrize(
-    ("file", "damages"),
-    [
-        (run_folder.LAST, ("flip", "cut", "empty", "missing")),
-        (run_folder.PREVIOUS, ("flip",)),
-        (METRICS, ("cut", "missing")),
-    ],
-)
-def test_a_run_with_a_damaged_or_missing_file_reports_it_and_ends_the_same(
-    half, tmp_path, assert_resumed, file, damages
-):
-    for damage in damages:
-        run = shutil.copytree(half, tmp_path / damage)
-        content = (run / file).read_bytes()
-        (run / file).unlink()
-        if damage in DAMAGES:
-            (run / file).write_bytes(DAMAGES[damage](content))
-        reported = f"{run_folder.LAST} " if file == run_folder.LAST else "resumed"
-        assert reported in assert_resumed(run)

@@ -10,12 +10,10 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 import torch
-import trimesh
 from gltf_files import SQUARE, SQUARE_FACES, SQUARE_UVS, Gltf
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import corners_of, encoded, srgb_of
 from PIL import Image
-from scipy.spatial import KDTree
 
 from renderer import errors
 from renderer.errors import InputError
@@ -721,24 +719,3 @@ def test_the_reflectance_follows_from_the_refractive_index(tmp_path):
     }
     mesh = plain(extensions=extensions).load(tmp_path, gloss=True)
     assert mesh.gloss[0, 2] == pytest.approx(0.4 * (0.2 / 2.2) ** 2 / 0.04)
-
-
-# Other readers and the writer
-
-
-@pytest.mark.parametrize("suffix", ["glb", "gltf"])
-def test_an_ordinary_file_is_read_as_trimesh_reads_it(tmp_path, suffix):
-    sphere = trimesh.creation.icosphere(2)
-    sphere.apply_translation([1, 2, 3])
-    scene = trimesh.Scene()
-    scene.add_geometry(
-        sphere, transform=trimesh.transformations.rotation_matrix(0.7, [0.1, 0.5, 0.9])
-    )
-    scene.add_geometry(trimesh.creation.box(), transform=np.diag([1, -2, 3, 1]))
-    scene.export(tmp_path / f"scene.{suffix}")
-    expected = scene.to_geometry()
-    mesh = load_mesh(tmp_path / f"scene.{suffix}", up="z")
-    assert_allclose(np.sort(mesh.face_areas()), np.sort(expected.area_faces), rtol=1e-5)
-    distances, _ = KDTree(mesh.vertices).query(expected.vertices)
-    assert distances.max() < 1e-5
-    assert mesh.closed

@@ -99,34 +99,6 @@ def faces_point_outward(corners: np.ndarray) -> bool:
 # Colors and textures
 
 
-def load_square_obj(folder: Path, uvs: list[tuple[float, float]]) -> Mesh:
-    """Load a textured square whose two faces have six texture coordinates."""
-    write(folder / "peel.png", encoded(TEXTURE))
-    write(folder / "square.mtl", "newmtl peel\nKd 1.0 0.5 0.25\nmap_Kd peel.png\n")
-    lines = [
-        "mtllib square.mtl",
-        "usemtl peel",
-        "v 0 0 0",
-        "v 1 0 0",
-        "v 1 1 0",
-        "v 0 1 0",
-        *(f"vt {u} {v}" for u, v in uvs),
-        "f 1/1 2/2 3/3",
-        "f 1/4 3/5 4/6",
-    ]
-    return load_mesh(write(folder / "square.obj", "\n".join(lines)))
-
-
-def test_the_corners_of_an_obj_at_a_seam_have_their_own_texture_coordinates(tmp_path):
-    uvs = [(0.1, 0.2), (0.9, 0.2), (0.9, 0.8), (0.3, 0.4), (0.6, 0.7), (0.2, 0.9)]
-    mesh = load_square_obj(tmp_path, uvs)
-    assert len(mesh.vertices) == 4
-    lower_face = [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
-    upper_face = [[0, 0, 0], [1, 1, 0], [0, 1, 0]]
-    assert_array_equal(corners_of(mesh), [lower_face, upper_face])
-    assert_close(mesh.corner_uvs.reshape(6, 2), uvs)
-
-
 def test_an_stl_is_white_and_its_corners_are_joined(tmp_path):
     """The format repeats a vertex in each of its faces."""
     box = trimesh.creation.box()

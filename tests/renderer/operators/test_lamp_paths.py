@@ -121,18 +121,6 @@ def test_images_are_mitsubas(make_mesh, basis, sample_count, tmp_path, monkeypat
     assert abs((found - expected).mean()) < 2e-3 * expected.mean()
 
 
-@pytest.mark.parametrize("basis", [PROJECTOR, LAMPS, DISCS], ids=["projector", "lamps", "discs"])
-def test_the_gradient_by_the_light_is_the_adjoint_of_the_radiance(basis):
-    """The radiance is linear in the light."""
-    operator = operator_of(ball_on_a_table(), basis, samples=2)
-    light = draw_uniform(basis.size, 3)
-    upstream = draw_uniform(3, len(operator.pixels), seed=1)
-    by_gradient = (operator.light_gradient(upstream) * light).sum()
-    by_radiance = (upstream * operator.radiance(light)).sum()
-    assert by_radiance > 0
-    torch.testing.assert_close(by_gradient, by_radiance, rtol=1e-12, atol=0)
-
-
 def test_a_screen_at_the_origin_shows_the_pattern_upright_and_with_its_brightness():
     """The projector is at the camera, so each pixel of the white screen is one of the pattern."""
     distance = 3.0
