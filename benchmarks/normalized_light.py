@@ -36,7 +36,7 @@ from train.results.scoring import compute_logits, rank_classes
 from train.results.store import RunSummary
 from train.results.tables import Table, format_interval
 from train.run_folder import read_json
-from train.settings import published
+from train.settings import published_folder
 
 # Networks on which `choose` scores the settings, by their names for `benchmarks.splits.load`.
 NETWORKS = ("efficientnet_lite0", "pretrained/best")
@@ -75,7 +75,7 @@ def parts(data: Path, renders: Path) -> dict[str, dict[str, Any]]:
     Returns:
         Settings by the name of a part, such as "validation/patterns".
     """
-    laboratory = read_json(published(Path("pretrained/laboratory")) / "lab.json")
+    laboratory = read_json(published_folder(Path("pretrained/laboratory")) / "lab.json")
     splits = {
         VALIDATION: {
             "meshes": solids(3001),

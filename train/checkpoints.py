@@ -29,7 +29,7 @@ from renderer.io.files import atomic_write
 from train.data.sets import content_hash
 from train.networks import PYTHON, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
-from train.settings import NetworkSettings, published
+from train.settings import NetworkSettings, published_folder
 
 # Key in a checkpoint. Its value is the hash of the other entries.
 HASH = "sha256"
@@ -267,7 +267,7 @@ def selected_file(run: Path) -> Path | None:
 
     None if there is none. `run` can also be the file itself, or a folder below pretrained/.
     """
-    found = published(run)
+    found = published_folder(run)
     files = (found, found / BEST, found / PUBLISHED)
     return next((file for file in files if file.is_file()), None)
 

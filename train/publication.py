@@ -17,7 +17,7 @@ from train.results.store import summarize, trained_labels
 from train.results.tables import Estimate
 from train.run_config import mapped
 from train.run_folder import PUBLISHED, writable_folder
-from train.settings import published
+from train.settings import published_folder
 
 # Folder of the published networks, in the installation or in a clone.
 PRETRAINED = Path("pretrained")
@@ -60,9 +60,9 @@ def load(name: str) -> PublishedNetwork:
         >>> round(network.results["photographs/auc"].value, 3)
         0.966
     """
-    files = published(PRETRAINED).glob(f"*/{PUBLISHED}")
+    files = published_folder(PRETRAINED).glob(f"*/{PUBLISHED}")
     require_choice("name", name, sorted(path.parent.name for path in files))
-    folder = published(PRETRAINED / name)
+    folder = published_folder(PRETRAINED / name)
     loaded = load_run(folder)
     _, state = load_selected(folder)
     network = PublishedNetwork(loaded.network, loaded.size, loaded.classes, name)
@@ -156,7 +156,7 @@ def publish(
             # Published weights have 16 bits.
             loaded.half().float()
             predictor = Predictor(loaded, loaded.classes, loaded.size)
-            negatives = published(as_path("calibrate", calibrate))
+            negatives = published_folder(as_path("calibrate", calibrate))
             with keyed(folder="calibrate"):
                 points = choose_operating_points(predictor, negatives, labels, false_positive_rate)
             state["operating_point"] = [asdict(point) for point in points]

@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.run_folder import opened_text
-from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted, published
+from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted, published_folder
 from train.system import program
 
 CONFIG = "config.yaml"
@@ -262,7 +262,7 @@ def _path_of(text: str) -> Path:
             spec = find_spec(text.split(":")[1])
             if spec and spec.origin:
                 return Path(spec.origin)
-    return published(Path(text.removeprefix("run:")))
+    return published_folder(Path(text.removeprefix("run:")))
 
 
 def _fingerprint(path: Path) -> str:

@@ -333,7 +333,7 @@ class ExperimentSettings(NetworkSettings):
         named = self.photos if isinstance(self.photos, dict) else {}
         if isinstance(self.photos, str):
             named = {PHOTOGRAPHS: self.photos}
-        return {str(name): published(Path(folder)) for name, folder in named.items()}
+        return {str(name): published_folder(Path(folder)) for name, folder in named.items()}
 
     @property
     def object_count(self) -> int:
@@ -447,7 +447,7 @@ def label_names(label: str | int | Sequence[str | int]) -> list[str]:
     return names
 
 
-def published(run: Path) -> Path:
+def published_folder(run: Path) -> Path:
     """Find a path below pretrained/, also if the current folder does not contain pretrained/.
 
     The library is installed with the folder pretrained/, which has networks and test images. A

@@ -1,12 +1,13 @@
 """The loop of all attacks: ask an optimizer for candidates, score them, and tell it the costs.
 
 An example is attacked through its values x, such as the coefficients of its lighting. A problem
-(`augment.attacks.problem`) says which values are possible and renders them, an objective
+(`Problem`, such as `SceneProblem`) says which values are possible and renders them, an objective
 (`augment.attacks.objective`) says what they cost and when they succeed, and an optimizer
 (`augment.attacks.optimizers`) says which to try next.
 
 Examples that are finished are dropped. Until then, the successful values of lowest cost are kept.
-Whether a success counts is decided after the loop (`Objective.fooled_in_views`).
+The loop tests with sensor noise of its own. Whether a success counts is finally decided after it
+(`Objective.fooled_in_views`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from augment.progress import progress
 from augment.tasks.task import Rows
 from renderer.errors import ShortRepr
 
-# Fields of a `Minimum` that belong to the returned candidate.
+# Fields of a `Minimum` that belong to the returned candidate: the keys of `Evaluation.found`.
 FOUND = ("values", "images", "success", "cost", "predicted")
 # Optimizers by their names in the settings.
 OPTIMIZERS: dict[str, type[Optimizer]] = {
@@ -45,9 +46,10 @@ class Minimum(Rows, ShortRepr):
 
     - the candidate that reached the criterion with the required margin,
     - if there is none, the candidate of lowest cost that reached the criterion,
-    - if there is none, the last candidate that the optimizer accepted.
+    - if there is none, the last candidate that the optimizer accepted (`Optimizer.tell`).
 
-    Each tensor has one row for each example, and lies on the device of the attacked values.
+    The candidate of a restart that succeeds replaces it. Each tensor has one row for each example,
+    and lies on the device of the attacked values.
 
     Attributes:
         values: Values of the returned candidate.
@@ -67,9 +69,9 @@ class Minimum(Rows, ShortRepr):
 
     values: Values
     images: Images
-    steps: Examples
-    queries: Examples
-    backward_passes: Examples
+    steps: Int[Tensor, " E"]
+    queries: Int[Tensor, " E"]
+    backward_passes: Int[Tensor, " E"]
     success_before: Bool[Tensor, " E"]
     success: Bool[Tensor, " E"]
     cost_before: Float[Tensor, " E"]
@@ -106,7 +108,7 @@ class Minimum(Rows, ShortRepr):
         for name, candidates in found.items():
             getattr(self, name)[rows[kept]] = candidates[kept]
 
-    def add_restart(self, rows: Examples, restart: Minimum) -> None:
+    def add_restart(self, rows: Int[Tensor, " N"], restart: Minimum) -> None:
         """Add an attack on some examples from other initial values.
 
         Its steps and passes are added to the counts. Where it succeeds, its candidate replaces that
@@ -171,7 +173,7 @@ def _minimize_group(
     limit = settings.query_limit_of_start
     if limit is not None and limit < objective.passes_per_candidate:
         return result
-    # The last start, and the rows of its examples in the result.
+    # Result of the latest start alone, and the rows of its examples in the whole result.
     latest = result
     rows = torch.arange(len(examples), device=examples.device)
     for restart in restarts:
@@ -209,7 +211,7 @@ def minimize_from(
 
     Each example takes steps until it reaches its criterion with the required margin, or has used up
     its steps or queries. Without `scores_last`, the values after the last step are the result of
-    the examples that are not finished, whatever they cost.
+    the examples that are not finished, whatever they cost. Their images and costs are older then.
     """
     settings = objective.settings
     active = torch.arange(len(start), device=start.device)
@@ -228,8 +230,8 @@ def minimize_from(
             is_accepted = optimizer.tell(active, evaluation)
             score = evaluation.score
             is_finished, noisy_count = part.finished(score, evaluation.images, examples[active])
-            # An example without a success takes each accepted candidate as its result. An example
-            # with a success takes only successes of lower cost.
+            # An example without a success takes each candidate that the optimizer accepts as its
+            # result. An example with a success takes only successes of lower cost.
             is_cheaper = score.is_success & (score.cost < result.cost[active])
             is_first = ~result.success[active] & (score.is_success | is_accepted)
             result.record(active, evaluation.found, is_finished | is_cheaper | is_first)

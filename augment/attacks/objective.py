@@ -173,7 +173,7 @@ class Objective:
 
     def finished(
         self, score: Score, images: Images, examples: Examples
-    ) -> tuple[Bool[Tensor, " E"], Examples]:
+    ) -> tuple[Bool[Tensor, " E"], Int[Tensor, " E"]]:
         """Return a mask of the successes with the required margin, also with sensor noise.
 
         Only overconfident networks, and settings with a noise margin, are shown noisy images. Their

@@ -7,9 +7,8 @@ contains the box filter, the texture and the albedo exactly. It also contains
 gloss (`renderer.surface.gloss`), and shadows and bounces (the package
 `renderer.operators`).
 
-Shapes use these letters: a view has S covered samples in P pixels, which show G
-faces of the mesh. K coefficients of the light reach a pixel. The dots (...) are any
-axes of a batch of lights.
+Shapes use these letters: the mesh covers P pixels of a view, and K coefficients of
+the light reach a pixel. The dots (...) are any axes of a batch of lights.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from renderer.settings import ImageSettings
 COLORS = 3
 
 
-# Coefficients of lights, and radiance of the P covered pixels.
+# Coefficients of lights.
 Lights = Float[Tensor, "... coefficients 3"]
 # Values of the P covered pixels under each light.
 PixelValues = Float[Tensor, "... 3 P"]
@@ -50,7 +49,7 @@ class SparseTransfer(NamedTuple):
             light each entry describes, int64, shape (N,).
         pixel: Index of the covered pixel of each entry, int64, shape (N,).
         weight: Radiance of the pixel per unit of the function's coefficient, in
-            C = 1 or 3 color channels, shape (N, C).
+            one channel that all colors share or in three, shape (N, C).
     """
 
     function: Int[Tensor, " N"]
@@ -94,9 +93,9 @@ class TransferOperator:
             open sky (`Harmonics.nonzero`), and all 49 with shadows or gloss.
         settings: Settings of the image.
         basis: Basis of the lights.
-        sparse: Nonzero entries of further rows of the matrix, in three channels.
-            These are rows of projected patterns, which are mostly zero. None
-            without such rows.
+        sparse: Nonzero entries of further rows of the matrix, in three channels that
+            include the albedo. These are rows of projected patterns, which are
+            mostly zero. None without such rows.
 
     Example:
         >>> import torch
@@ -267,7 +266,7 @@ class TransferOperator:
         background_images, background_values = background
         unclamped = self._radiance(lights).add_(background_values)
         clamped_values = unclamped.clamp(0, 1)
-        # 1 for values in [0, 1], including the limits. Only these have a gradient.
+        # 1.0 for values in [0, 1], including the limits: they have a gradient. 0.0 for others.
         is_unclamped = unclamped.eq_(clamped_values)
         encoded = encode(clamped_values, self.settings.encoding)
         batch_shape = lights.shape[:-2]
@@ -324,12 +323,12 @@ class TransferOperator:
         # Coefficients that change a pixel. All other coefficients have no row in the matrix.
         used_lights = lights.index_select(-2, self.nonzero).to(self.transfer.dtype)
         shared, *white = self._channels
-        if len(white) < 2:
+        if len(self._channels) == COLORS:
+            radiance = torch.einsum("...kc,ckp->...cp", used_lights, self.transfer)
+        else:
             radiance = (used_lights.mT @ shared).mul_(self.albedo)
             if white:
                 radiance.add_(used_lights.mT @ white[0])
-        else:
-            radiance = torch.einsum("...kc,ckp->...cp", used_lights, self.transfer)
         if self.sparse is not None:
             light_of_entry = lights.to(radiance.dtype).index_select(-2, self.sparse.function)
             # Radiance that each nonzero entry of the matrix adds to its pixel: one row for
@@ -344,12 +343,12 @@ class TransferOperator:
         # Compute the gradient with respect to the K used coefficients, shape (..., 3, K). The
         # function `linear(a, b)` of torch is a bᵀ.
         shared, *white = self._channels
-        if len(white) < 2:
+        if len(self._channels) == COLORS:
+            used_gradient = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
+        else:
             used_gradient = linear(upstream * self.albedo, shared)
             if white:
                 used_gradient = used_gradient + linear(upstream, white[0])
-        else:
-            used_gradient = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
         gradient = self._placement @ used_gradient.mT
         if self.sparse is not None:
             gradient_of_entry = upstream.mT.index_select(-2, self.sparse.pixel)
@@ -407,10 +406,10 @@ class TransferOperator:
 
     @property
     def by_channel(self) -> Tensor:
-        """Transfer matrix in three color channels, which include the albedo, shape (3, K, P)."""
-        shared, *white = self.transfer
-        if len(white) == 2:
+        """`transfer` in three color channels, which include the albedo, shape (3, K, P)."""
+        if len(self.transfer) == COLORS:
             return self.transfer
+        shared, *white = self.transfer
         colored = shared * self.albedo[:, None]
         return colored + white[0] if white else colored
 

@@ -46,7 +46,7 @@ from train.settings import (
     LABORATORY,
     OTHER_PREFIX,
     PHOTOGRAPHS,
-    published,
+    published_folder,
     read_objects,
     simplified,
     solid_name,
@@ -96,7 +96,7 @@ def run_audit(
         settings = complete(settings, networks[CLASSIFIER])
         plan = _Plan(settings, networks, device)
     else:
-        find_unlabeled(published(Path(str(settings.unlabeled))))
+        find_unlabeled(published_folder(Path(str(settings.unlabeled))))
     out = writable_folder(settings.out, "out")
     _require_continuable(out, settings.overwrite, is_named)
     renders = out / "renders"
@@ -123,7 +123,7 @@ def run_audit(
             plan.measure(networks, out)
         if settings.unlabeled:
             # A path below pretrained/ is found from any working folder.
-            photographs = published(Path(str(settings.unlabeled)))
+            photographs = published_folder(Path(str(settings.unlabeled)))
             attack = RelightingSettings(passes=relit.PASSES)
             count = settings.scale(relit.PHOTOGRAPH_COUNT)
             options: dict[str, Any] = {"seed": settings.seed, "limit": count}
@@ -195,7 +195,7 @@ class _Plan:
         self.items = [*meshes, *hard_negatives]
         folders = {LABORATORY: settings.laboratory, PHOTOGRAPHS: settings.photos}
         self.image_folders = {
-            name: published(Path(folder)) for name, folder in folders.items() if folder
+            name: published_folder(Path(folder)) for name, folder in folders.items() if folder
         }
         labels = {item.label for item in self.items if not item.label.startswith(OTHER_PREFIX)}
         for network in networks.values():

@@ -45,7 +45,7 @@ from train.results.predictions import RELIT, SWEEP_FIGURE, SWEEP_TABLE, TRANSFER
 from train.results.tables import Table
 from train.run_config import write_config
 from train.run_folder import sole_writer, writable_folder
-from train.settings import published, read_object, read_objects
+from train.settings import published_folder, read_object, read_objects
 from train.system import command_line, is_verbose, shortened
 
 # Warnings about at most 3 unreadable files are printed if --verbose is not set.
@@ -330,7 +330,7 @@ def _attack_photographs(
     with _results_of(settings, classifier) as out, keyed("unlabeled"):
         scores = attack_folder(
             classifier,
-            published(Path(folder)),
+            published_folder(Path(folder)),
             relighting,
             out,
             sensor_noise=settings.attack.sensor_noise,

@@ -21,7 +21,7 @@ from train.results.overwrite import require_replaceable
 from train.results.scoring import Predictor, Scores, format_overall, format_scores
 from train.results.store import trained_labels
 from train.run_folder import sole_writer, writable_folder
-from train.settings import label_names, published
+from train.settings import label_names, published_folder
 from train.system import is_verbose
 
 
@@ -38,7 +38,8 @@ def run(settings: EvaluateSettings) -> None:
         loaded = load_run(settings.run, settings.weights, settings.network, settings.trust)
         # The returned copy normalizes the light of each image, unless the setting is None.
         network = loaded.normalizing_light(settings.normalize_light)
-        if label is None and class_folders(published(Path(settings.photos)), network.classes):
+        photos = published_folder(Path(settings.photos))
+        if label is None and class_folders(photos, network.classes):
             label = trained_labels(Path(settings.run)) or None
     with keyed("label"):
         for name in [] if label is None else label_names(label):
@@ -140,7 +141,7 @@ def evaluate(
         280
     """
     require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
-    folder = published(as_folder("photos", photos))
+    folder = published_folder(as_folder("photos", photos))
     device = device_of(network) if device is None else torch.device(device)
     with gradient_flags_kept(network):
         classifier = as_classifier(
@@ -164,7 +165,7 @@ def evaluate(
             stored = {point.label: point for point in classifier.operating_points}
             points = [stored[name] for name in labels] if stored.keys() >= set(labels) else []
             if calibrate is not None and false_positive_rate is not None:
-                negatives = published(Path(calibrate))
+                negatives = published_folder(Path(calibrate))
                 # The caller knows this folder as the argument `calibrate`.
                 with keyed(folder="calibrate"):
                     points = scoring.choose_operating_points(

@@ -181,7 +181,7 @@ def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
         for reference, reference_run in first_runs.items()
         if run.before is not None and reference_run.settings == run.before.settings
     ]
-    trained = [method for method, run in first_runs.items() if run.method != INITIAL]
+    trained = [method for method, run in first_runs.items() if run.mode != INITIAL]
     return pairs + [(method, trained[0]) for method in trained[1:]]
 
 
@@ -395,7 +395,7 @@ def format_table(runs: Sequence[RunSummary]) -> str:
     groups = group_by_images(methods)
     tables = run_tables(methods, groups)
     tables += [overall_differences(read_evaluations(group)) for group in groups.values()]
-    used_modes = {run.method for run in runs}
+    used_modes = {run.mode for run in runs}
     captions = [f"{mode}: {caption}" for mode, caption in MODES.items() if mode in used_modes]
     sheets = [
         f"image: {run.folder / name / CONTACT_SHEET}" for run in runs for name in run.photographs
@@ -441,7 +441,7 @@ def format_short_comparison(
     """
     methods = store.group_by_method(runs)
     groups = group_by_images(methods)
-    title = _find_group(groups, photographs) or next(iter(groups), "")
+    title = _find_group(groups, photographs)
     group = groups.get(title, {})
     evaluations = read_evaluations(group, exclude)
     if by != "source" and evaluations:
@@ -472,17 +472,17 @@ def _title_of_all(exclude: Sequence[str]) -> str:
     return f"all but {', '.join(exclude)}" if exclude else "all"
 
 
-def _find_group(groups: Mapping[str, Scored], photographs: str) -> str | None:
+def _find_group(groups: Mapping[str, Scored], photographs: str) -> str:
     """Find the title of the runs whose scores lie in a sub-folder of a given name.
 
-    A network that is not a run, such as a published network, has no seed and no such sub-folder.
-    Its scores may be compared with those in any sub-folder. None if no run has the usual sub-folder
-    "photographs"; any other name that no run has is an error.
+    A published or evaluated network has no such sub-folder: its scores are compared with those in
+    any. Without the usual sub-folder "photographs", it is the first group, or "" if there is none.
     """
     found = {}
     for title, group in groups.items():
         members = [scored for scored_runs in group.values() for scored in scored_runs]
-        if any(item.name == photographs or item.run.seed is None for item in members):
+        lone = [item for item in members if item.run.seed is None and item.run.mode != INITIAL]
+        if lone or any(item.name == photographs for item in members):
             found[title] = members[0].folder
     if len(found) > 1:
         first, second, *_ = found.values()
@@ -495,4 +495,4 @@ def _find_group(groups: Mapping[str, Scored], photographs: str) -> str | None:
             f"photos={photographs}: no run has a sub-folder of this name with scores: "
             "give a name in the setting photos of the runs"
         )
-    return next(iter(found), None)
+    return next(iter(found or groups), "")

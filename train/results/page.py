@@ -24,7 +24,7 @@ from train.results.predictions import CONTACT_SHEET
 from train.results.store import Methods, RunSummary, Scored, ScoredRun
 from train.run_config import CONFIG, read_config
 from train.run_folder import RENDERS, attack_success, read_json
-from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, in_words, published
+from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, in_words, published_folder
 from train.system import user_message
 
 # File name of the page.
@@ -120,7 +120,7 @@ def _title(found: store.Findings, methods: Methods) -> str:
     # Positive classes of all runs.
     stored = [scores for runs in methods.values() for scores in runs[0].photographs.values()]
     labels = {label for scores in stored for label in scores.labels}
-    trained = [method for method, runs in methods.items() if runs[0].method != store.INITIAL]
+    trained = [method for method, runs in methods.items() if runs[0].mode != store.INITIAL]
     if labels and len(trained) < len(methods):
         return f"Hardened against unusual lighting: {', '.join(map(in_words, sorted(labels)))}"
     subject = " and ".join(sorted(labels)) or "Networks"
@@ -229,7 +229,7 @@ def _read_renders(run: RunSummary, kind: str, title: str) -> list[Picture]:
             path_of_epoch[int(number)] = path
     pictures = []
     for epoch in evenly_spaced(sorted(path_of_epoch), SHOWN_EPOCHS):
-        alt = f"{title}, epoch {epoch}, {run.method}"
+        alt = f"{title}, epoch {epoch}, {run.mode}"
         pictures += read_pictures(path_of_epoch[epoch], alt, GRID_WIDTH, f"epoch {epoch}")
     return pictures
 
@@ -293,7 +293,7 @@ def _compare_on(group: Scored) -> first_screen.FirstScreen | None:
     pairs = compare.choose_pairs(evaluations)
     if not pairs:
         return None
-    hardened = [pair for pair in pairs if group[pair[1]][0].run.method == store.INITIAL]
+    hardened = [pair for pair in pairs if group[pair[1]][0].run.mode == store.INITIAL]
     method, base = (hardened or pairs)[-1]
     names = ("before hardening", "after hardening")
     subjects = first_screen.NETWORKS
@@ -348,7 +348,7 @@ def images_folder(run: RunSummary, name: str) -> Path | None:
         rendered = run.folder / KEPT_ASIDE
         return rendered if name == LABORATORY and rendered.is_dir() else None
     working_folder = Path(run.config.get("working_folder") or "")
-    for candidate in (published(Path(folder)), working_folder / folder):
+    for candidate in (published_folder(Path(folder)), working_folder / folder):
         if candidate.is_dir():
             return candidate
     return None

@@ -4,7 +4,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -19,7 +19,7 @@ from train.results.metrics import Metrics, Pooled, Thresholds, describe_point
 from train.results.predictions import PREDICTIONS, SUMMARY, read_predictions
 from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, PUBLISHED, read_json, read_metrics
-from train.settings import label_names, published
+from train.settings import label_names, published_folder
 
 # Methods are named by numbers instead of by their settings if there are more than this.
 MAX_NAMED = 30
@@ -72,7 +72,7 @@ class StoredScores:
         if len(labels) > 1:
             by_label = {label: Metrics.read(summary["by_label"][label]) for label in labels}
         return cls(
-            images=str(summary.get("images") or summary),
+            images=str(summary.get("images") or summary),  # Unknown images: equal scores only.
             labels=labels,
             overall=Metrics.read(summary),
             by_label=by_label,
@@ -99,7 +99,7 @@ class RunSummary:
 
     Attributes:
         folder: Folder of the run or of the network.
-        method: Kind of renders in the training, such as "adversarial". Without a
+        mode: Kind of renders in the training, such as "adversarial". Without a
             run, the name of the network.
         settings: Settings that decide the result, by dotted key.
         photographs: Scores on photographs, by the name of the sub-folder of
@@ -114,7 +114,7 @@ class RunSummary:
     """
 
     folder: Path
-    method: str
+    mode: str
     settings: Mapping[str, object]
     photographs: Mapping[str, StoredScores]
     accuracy: float | None
@@ -134,7 +134,7 @@ class ScoredRun(NamedTuple):
 
     Attributes:
         run: The run.
-        name: Name of the sub-folder of the run with these scores.
+        name: Name of the sub-folder of the run with these scores, or its absolute path.
     """
 
     run: RunSummary
@@ -184,7 +184,7 @@ def is_finished(folder: Path) -> bool:
 
 def summarize(folder: Path) -> RunSummary:
     """Read the settings and scores in the folder of a run, an evaluation or a published network."""
-    folder = published(folder)
+    folder = published_folder(folder)
     try:
         summary = _read(folder)
     except InputError:
@@ -225,6 +225,7 @@ def _read(folder: Path) -> RunSummary | None:
     name = str(Path(*path.parts[-2:]))
     settings = {"network": str(path)}
     if (folder / SUMMARY).is_file():
+        # pnb-evaluate wrote it. The folder lies in its parent as scores lie in the folder of a run.
         scores = {path.name: StoredScores.read(read_json(folder / SUMMARY))}
         return RunSummary(path.parent, name, settings, scores, accuracy=None)
     if (folder / PUBLISHED).is_file():
@@ -254,14 +255,14 @@ def _read_run(folder: Path) -> RunSummary:
         keys = ("network", "weights", "classes", "normalization", "normalize_light", "size")
         before = RunSummary(
             folder=path,
-            method=INITIAL,
+            mode=INITIAL,
             settings={key: OmegaConf.select(config, key) for key in keys},
             photographs=read_summaries(path),
             accuracy=scores["test/accuracy_before"],
         )
     return RunSummary(
         folder=folder,
-        method=str(config.augment.mode),
+        mode=str(config.augment.mode),
         settings=run_config.decisive_settings(config),
         photographs=read_summaries(folder),
         accuracy=scores["test/accuracy"],
@@ -301,29 +302,37 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     The networks with whose weights runs began come first, each once. Many varied settings in a name
     become a number.
     """
-    # Two initial networks are the same if they have the same settings and the same test images.
-    initial = {}
+    # Initial networks with the same settings are one network, which has the scores of all, once for
+    # the same images. Those of later runs are named by the absolute path of their folder.
+    initial: dict[str, RunSummary] = {}
     for before in filter(None, (run.before for run in runs)):
-        images = [scores.images for scores in before.photographs.values()]
-        initial[repr((before.settings, images))] = before
+        key = repr(before.settings)
+        first = initial.setdefault(key, before)
+        known = {scores.images for scores in first.photographs.values()}
+        more = {
+            str(before.folder.absolute() / name): scores
+            for name, scores in before.photographs.items()
+            if scores.images not in known
+        }
+        initial[key] = replace(first, photographs={**first.photographs, **more})
     # The key of a group is the text of the settings without the seed.
     groups: dict[str, list[RunSummary]] = {}
     for run in (*initial.values(), *runs):
         groups.setdefault(repr({**run.settings, "seed": None}), []).append(run)
     # Runs of a group differ only in their seed. The first one stands for all.
     heads = [group[0] for group in groups.values()]
-    if len(heads) == 2 and heads[0].method == INITIAL and heads[1].method != "none":
+    if len(heads) == 2 and heads[0].mode == INITIAL and heads[1].mode != "none":
         # One network, before and after it was trained with renders.
         return dict(zip((BEFORE_HARDENING, AFTER_HARDENING), groups.values(), strict=True))
     named: dict[str, list[RunSummary]] = {}
     for number, group in enumerate(groups.values(), 1):
         head = group[0]
         # Settings in which the groups with the same kind of renders differ.
-        varied = varied_settings([other for other in heads if other.method == head.method])
+        varied = varied_settings([other for other in heads if other.mode == head.mode])
         values = [f"{words}={head.settings.get(key)}" for key, words in varied.items()]
-        name = ", ".join([head.method, *values])
+        name = ", ".join([head.mode, *values])
         if len(heads) > MAX_NAMED or len(name) > LONGEST_NAME or name in named:
-            name = f"{number}: {head.method}"
+            name = f"{number}: {head.mode}"
         named[name] = group
     return named
 
@@ -359,7 +368,7 @@ class AttackSummary:
         without_noise: Number of examples that are misclassified after the attack
             in images without noise.
         correct: Number of examples that are classified correctly before the
-            attack. Only these examples count as successes.
+            attack. Only these can count as successes.
         checks: Results of `nb.check` by name.
     """
 
@@ -452,7 +461,7 @@ def find(folders: Sequence[Path]) -> Findings:
     """Find the runs and attacks in folders and in all folders below them."""
     # A dictionary has each folder once.
     paths: dict[Path, Path] = {}
-    for folder in map(published, folders):
+    for folder in map(published_folder, folders):
         if not folder.is_dir():
             raise InputError(
                 f"runs: {folder} is not a folder: give folders of runs, of a sweep or of attacks"
@@ -475,13 +484,14 @@ def find(folders: Sequence[Path]) -> Findings:
         except (InputError, OSError) as error:
             # OSError is raised if the folder belongs to another user.
             found.unfinished.append(Unfinished(path, f"cannot be read: {error}", []))
-    methods = [*MODES]
-    found.runs.sort(key=lambda run: methods.index(run.method) if run.method in methods else -1)
+    modes = [*MODES]
+    found.runs.sort(key=lambda run: modes.index(run.mode) if run.mode in modes else -1)
     return found
 
 
 def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
     """Read the finished runs in folders and below them, and warn about the others."""
+    # Networks that were scored into sub-folders of one folder differ only in the mode: their names.
     runs: dict[tuple[Path, str], RunSummary] = {}
     for folder in folders:
         found = find([folder])
@@ -496,7 +506,7 @@ def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
             left_out = f"{len(found.unfinished)} unfinished of {folder}"
             console.warning("left out: %s (%s: %s)", left_out, first.folder, first.state)
         for summary in found.runs:
-            runs.setdefault((summary.folder.resolve(), summary.method), summary)
+            runs.setdefault((summary.folder.resolve(), summary.mode), summary)
     return [*runs.values()]
 
 

@@ -90,14 +90,14 @@ class Run:
         set_deterministic(settings.train.deterministic)
         # Settings of the run that is resumed. None for a new run.
         earlier: DictConfig | None = None
-        resumes = settings.train.resume
-        if checkpoints.exists(folder) and not (settings.overwrite and not resumes):
-            if not resumes:
+        if checkpoints.exists(folder):
+            if settings.train.resume:
+                earlier = require_same_run(folder, settings)
+            elif not settings.overwrite:
                 raise InputError(
                     f"out={folder} holds a run already: set train.resume=true to continue it, "
                     "overwrite=true to replace it, or run to another folder"
                 )
-            earlier = require_same_run(folder, settings)
         self._is_resumed = earlier is not None
         # The number of threads changes the last bits of the results, so a resumed run keeps it.
         threads = settings.train.threads
@@ -124,9 +124,10 @@ class Run:
         """
         if distributed.rank() > 0:
             return
-        # Without `overwrite`, a configuration is that of a run without a checkpoint.
-        is_left = self.settings.overwrite or (self.folder / CONFIG).is_file()
-        if is_left and not self._is_resumed:
+        # Without `overwrite`, only a run that stopped before its first checkpoint can have left
+        # config.yaml here: `__init__` resumes or refuses a run with a checkpoint.
+        may_be_left = self.settings.overwrite or (self.folder / CONFIG).is_file()
+        if may_be_left and not self._is_resumed:
             remove_run(self.folder, with_others=not self.settings.train.resume)
         precision = self.trainer.model.precision
         device = {"device": str(self.trainer.device), "precision": precision}
@@ -155,11 +156,11 @@ class Run:
         if is_first:
             self._render_kept_aside()
         scores = self._score_initial(trainer.initial) if trainer.initial else {}
-        split = self.data.train.to(trainer.device)
+        split = self.data.train.to(trainer.device)  # `_score_initial` may have replaced its labels.
         with keyed(**keys_of("train", self.settings.train)):
             trainer.fit(split, self.held_out, log)
         scores |= self._score()
-        if log:
+        if log:  # Only the first process has a log.
             scores |= self._score_photographs(trainer.selected, self.folder)
             log.scalars(scores)
             self._export()
@@ -247,6 +248,7 @@ class Run:
         """Score the network after the last epoch and the selected one, whose weights remain."""
         trainer = self.trainer
         test = self.data.test.to(trainer.device)
+        # `trainer.selected` has the weights of the last epoch until they are replaced below.
         last = selected = evaluate(trainer.selected, test)["accuracy"]
         if self.settings.train.interpolate:
             self._interpolate()
@@ -264,7 +266,7 @@ class Run:
         predictions = self._initial_predictions
         has_consistency = bool(self.settings.train.consistency_weight)
         if predictions is not None and (has_consistency or CLASSIFIER in trainer.architecture):
-            agreement = selected
+            agreement = selected  # Of data without labels, the labels are these predictions.
             if self.data.labeled:
                 before = Split(test.images, predictions.to(trainer.device))
                 agreement = evaluate(trainer.selected, before)["accuracy"]
@@ -299,7 +301,7 @@ class Run:
             agreement = (relit == targets).double().mean().item()
             scores[f"test/relit_agreement_{name}"] = agreement
         line = (
-            "agreement with the original on %d photographs kept aside: unchanged %.3f; "
+            "agreement with the original on %d test images: unchanged %.3f; "
             "in the light of a projector %.3f before, %.3f after"
         )
         console.info(line, len(targets), unchanged, *scores.values())
@@ -333,7 +335,8 @@ def make_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
     """
     data, initial = inputs.load_inputs(next(iter(methods.values())))
     runs = [Run(settings, data, folder, initial, command) for folder, settings in methods.items()]
-    # The main run is the last one. The baselines write to subfolders of its folder.
+    # The main run is the last one. It begins first, because it also removes the earlier runs in the
+    # subfolders of its folder, to which the baselines write.
     for run in reversed(runs):
         run.begin()
     return runs
@@ -347,7 +350,7 @@ def _build_trainer(
     validation: dict[str, Any] | None,
     threads: int | None,
 ) -> Trainer:
-    """Build the network, the optimizer and the scene of a run. No file is written.
+    """Build the network, the optimizer and the service of renders of a run. No file is written.
 
     `validation` is the record of the validation images. Without `threads`, `choose_threads`
     chooses them.

@@ -140,10 +140,10 @@ class TestAnotherFolderOfPhotographs:
     def folders(self, scored_run) -> list[Path]:
         return [scored_run(method, STUDIO_AND_WEB, name="lab") for method in ("none", "random")]
 
-    def test_is_compared_by_its_name_alone(self, folders):
+    def test_is_compared_by_its_name_or_if_it_is_the_only_one(self, folders):
         title = "random minus none (1 and 1 seeds, paired)"
-        assert title not in compare(folders)
         assert title in compare(folders, photographs="lab")
+        assert title in compare(folders)
 
     def test_is_refused_if_no_run_has_it(self, folders):
         with pytest.raises(InputError, match=r"^photos=lib: no run has"):
@@ -233,6 +233,18 @@ class TestAHardenedNetwork:
             "adversarial minus the initial network": "+0.750",
             "adversarial minus random": "+0.500",
         }
+
+    def test_began_with_one_network_also_if_the_runs_were_scored_on_other_folders(self, hardened):
+        for folder in (hardened[1], hardened[1] / "before"):
+            summary = copytree(folder / "photographs", folder / "more") / "summary.json"
+            text = summary.read_text()
+            summary.write_text(re.sub('"images": ".*?"', '"images": "others"', text))
+        assert "after hardening" in format_short_comparison([summarize(hardened[1])])
+        tables = compare(hardened)
+        assert [row[0] for row in tables[""]].count("the initial network") == 1
+        assert "random minus the initial network (1 and 1 seeds, paired)" in tables
+        more = compare(hardened, photographs="more")
+        assert "adversarial minus the initial network (1 and 1 seeds, paired)" in more
 
     def test_is_compared_with_a_folder_of_scores(self, initial, hardened, tmp_path):
         folder = copytree(initial, tmp_path / "scores" / "base")
