@@ -187,7 +187,7 @@ def _read_torchscript(path: Path) -> Content:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
         network = Scripted(torch.jit.load(path, map_location="cpu").eval())
-    return network, (None, None, None, None)
+    return network, (None, None, None, None)  # TorchScript stores no size of the images.
 
 
 class Scripted(Network):

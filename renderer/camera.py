@@ -150,7 +150,7 @@ class Camera(ABC):
         Raises:
             InputError: If the center lies behind a perspective camera.
         """
-        # The center in the axes of the camera.
+        # The center relative to the pivot (`_from_pivot`), in the axes of the camera.
         right, up, back = self.axes() @ self._from_pivot(center)
         changed: dict[str, Any] = {
             "right": scale * (self.right + right),
@@ -259,9 +259,10 @@ class Camera(ABC):
         Returns:
             A tuple of
 
-            - (x w, y w, w) for the image position (x, y), shape (V, 3). The
-              number w is 1 for an orthographic camera, and the depth divided by
-              `distance` for a perspective camera;
+            - (x w, y w, w), shape (V, 3), for the position (x, y) from the image
+              center in halves of the image width. The number w is 1 for an
+              orthographic camera, and the depth divided by `distance` for a
+              perspective camera;
             - the nearness of each point, shape (V,). It is larger for nearer
               points. On a plane, it is a linear function of the image position.
         """

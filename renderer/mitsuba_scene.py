@@ -272,6 +272,7 @@ def write_mitsuba_scene(
     """
     folder.mkdir(parents=True, exist_ok=True)
     local_emitters = _local_emitters(folder, local_lights, albedo_scale)
+    # The first lines of this module explain both factors.
     sky = environment({"filename": light}, math.pi * albedo_scale)
     # Rays with random directions from surfaces find the environment
     # with little noise. The rays that are aimed at emitters are

@@ -159,12 +159,12 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
     """
     if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
         return
-    rows, harmonics = environment_light(given)
+    rows, basis = environment_light(given)  # Its rows in the coefficients of all lights.
     error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
     if error > MAX_IRRADIANCE_ERROR:
         message = (
             "the light has negative radiance, and after its removal the irradiance is off by "
-            f"{error:.0%} (rms) in {harmonics}: give a higher degree, "
+            f"{error:.0%} (rms) in {basis}: give a higher degree, "
             "or set allow_negative=True to keep the light as it is"
         )
         warnings.warn(message, stacklevel=stacklevel)

@@ -341,13 +341,13 @@ def _doubled_areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
 
 
-def _clip_ears(points: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Divide a counter-clockwise polygon (N, 2), and tell whether it intersects itself."""
+def _clip_ears(points: Float[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], bool]:
+    """Divide a counter-clockwise polygon into triangles, and tell whether it intersects itself."""
     count = len(points)
     ends = np.array([count], dtype=np.uint32)
     indices = mapbox_earcut.triangulate_float64(points, ends).astype(np.int64)
     triangles = indices.reshape(-1, 3)
-    if not len(triangles):
+    if not len(triangles):  # The polygon has no area.
         fan = np.arange(1, count - 1)
         return np.stack([0 * fan, fan, fan + 1], axis=1), False
     if _doubled_areas(points, triangles).sum() < 0:

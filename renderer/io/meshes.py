@@ -186,11 +186,11 @@ def _as_part(geometry: Any, file: MeshFile) -> Part:
     uvs = None
     textures = []
     if visual.kind == "vertex":
-        colors = visual.vertex_colors[faces]
+        colors = visual.vertex_colors[faces]  # A color for each corner, shape (F, 3, 4).
     elif visual.kind == "face":
-        colors = visual.face_colors[:, None]
+        colors = visual.face_colors[:, None]  # A color for each face, shape (F, 1, 4).
     elif visual.kind == "texture":
-        colors = visual.material.baseColorFactor
+        colors = visual.material.baseColorFactor  # One for all, shape (4,), or None.
         uvs = None if visual.uv is None else visual.uv[faces, :2]
         if visual.material.baseColorTexture is not None:
             textures = [np.array(eight_bits(visual.material.baseColorTexture).convert("RGB"))]

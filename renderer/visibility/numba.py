@@ -28,7 +28,9 @@ except ImportError as error:  # numba also raises ImportError for an unsupported
     ) from error
 
 VERSION = numba.__version__
-# Types of the arguments and of the result of `_draw`, for which numba compiles it.
+# Types of the arguments and of the result of `_draw`, for which numba compiles it: positions (2, V)
+# and depths (V,) of the vertices, faces (F, 3), and the index of the nearest face and its depth at
+# each sample.
 TYPES = (
     "void(int64[:, ::1], float64[::1], uint64[:, ::1], b1, int64, int32[:, ::1], float32[:, ::1])"
 )

@@ -106,8 +106,8 @@ def group_by_images(methods: Methods) -> dict[str, Scored]:
 def read_evaluations(group: Scored, exclude: Sequence[str] = ()) -> Evaluations:
     """Read the predictions of runs that were scored on the same images.
 
-    A published network has no file of predictions, and is left out. Sources in `exclude` do not
-    count among all images.
+    A published network has no file of predictions, and is left out. Images of the sources in
+    `exclude` are in no subset but that of their source.
     """
     methods: dict[str, list[Evaluation]] = {}
     for method, scored_runs in group.items():
@@ -157,8 +157,8 @@ def group_table(methods: Evaluations, overall: str = "all", by: str = "source") 
     every_evaluation = [item for evaluations in methods.values() for item in evaluations]
     # A dictionary has each subset once, in order.
     subsets = dict.fromkeys(subset for item in every_evaluation for subset in item.rows(by))
-    rows: list[list[str]] = []
-    shown: list[Estimate | None] = []
+    rows: list[list[str]] = []  # Cells of the table.
+    shown: list[Estimate | None] = []  # Metrics in all cells, whose intervals the title explains.
     for subset in subsets:
         for method, evaluations in methods.items():
             metrics = [mean_metric(evaluations, subset, name) for name in METRICS]

@@ -17,12 +17,12 @@ from train.results.tables import Estimate, fraction, wilson
 # False-positive rates at which the recall is reported. Decimal strings are exact,
 # while a float such as 0.1 is not.
 RATES = ("0.05", "0.10", "0.20")
-# Largest number of groups into which the objects are divided, each of which is left out
-# once. More groups would hardly change the interval, but the variance of a recall at a
-# false-positive rate, which depends on a quantile, needs groups of several images.
-MAX_GROUPS = 30
-# Smallest ratio of the errors without a group to all errors. It keeps the logit finite if
-# all errors are in one group.
+# Largest number of parts into which the units, such as objects, are divided. Each part is left out
+# once. More parts would hardly change most intervals. A recall at a false-positive rate depends on
+# a quantile: the jackknife gets its variance right only if parts have several images.
+MAX_PARTS = 30
+# Smallest ratio of the errors without a part to all errors. It keeps the logit finite if all
+# errors are in one part.
 MIN_RATIO = 0.2
 
 
@@ -104,10 +104,10 @@ class Jackknife:
 
 
 def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackknife]:
-    """Evaluate M statistics without each unit, or without each of MAX_GROUPS groups of units.
+    """Evaluate M statistics without each unit, or without each of MAX_PARTS parts of them.
 
     Images of the same object are not independent, so an object is left out with
-    all its images. The groups of units depend only on `units`. Metrics of two
+    all its images. The parts depend only on `units`. Metrics of two
     networks on the same images are therefore paired. `statistic` takes, for each group, how often
     each of its n images counts, shape (k, n), and returns an array of shape (M, ..., k).
     """
@@ -120,7 +120,7 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
         if unit_count == 1:
             without.append(values)
             continue
-        part_count = min(unit_count, MAX_GROUPS)
+        part_count = min(unit_count, MAX_PARTS)
         # A random order divides the units into parts of about equal size.
         order = np.random.default_rng(0).permutation(unit_count)
         part_of_image = (order * part_count // unit_count)[unit_of_image]
@@ -165,14 +165,15 @@ def leave_out_of_roc(
 def average(runs: Sequence[Jackknife]) -> Jackknife:
     """Average a metric over training runs. Several runs are a further group of units."""
     values = np.stack([run.value for run in runs])
+    # The values (..., k) without each unit of a group, of all runs.
     groups = zip(*(run.without for run in runs), strict=True)
     without = [np.mean(group, axis=0) for group in groups]
     over = runs[0].over
-    if len(runs) > 1:
+    if len(runs) > 1:  # The means of the other runs, without each run.
         without.append(np.moveaxis((values.sum(axis=0) - values) / (len(runs) - 1), 0, -1))
         over = f"seeds and {over}"
     all_ends = [run.at_ends for run in runs if run.at_ends is not None]
-    at_ends = np.mean(all_ends, axis=0) if all_ends else None
+    at_ends = np.mean(all_ends, axis=0) if all_ends else None  # Shape (2, ...).
     return Jackknife(values.mean(axis=0), without, runs[0].unit_count, over, at_ends)
 
 

@@ -391,13 +391,14 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
 
 def _plot_roc(methods: compare.Evaluations, subset: compare.Subset, images: str) -> Picture | None:
     """Plot the ROC curves of all methods on all images, or for one positive class."""
+    # Predictions for the images of the subset, of each seed of each method.
     pools = {
         method: [pool for item in evaluations if (pool := item.find(subset))]
         for method, evaluations in methods.items()
     }
     scores = {method: [pool.scores for pool in found] for method, found in pools.items()}
-    labels = next(iter(pools.values()))[0].predictions.labels
-    return plot_roc(scores, f"{' or '.join(labels)}, {images}")
+    positive_classes = next(iter(pools.values()))[0].predictions.labels
+    return plot_roc(scores, f"{' or '.join(positive_classes)}, {images}")
 
 
 def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:

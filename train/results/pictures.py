@@ -240,8 +240,8 @@ def encode_picture(image: Image.Image, alt: str, caption: str = "") -> Picture:
 def read_pictures(path: Path, alt: str, widest: int, caption: str = "") -> list[Picture]:
     """Read an image from a file, and encode it for a page.
 
-    A wider image is reduced to `widest` pixels. The list is empty if the file is missing or
-    damaged.
+    An image wider than `widest` pixels, or higher than four times as many, is reduced: contact
+    sheets are high. The list is empty if the file is missing or damaged.
     """
     try:
         with open_image(path) as image:

@@ -31,6 +31,10 @@ INITIAL = "the initial network"
 # network with whose weights it began.
 BEFORE_HARDENING = "before hardening"
 AFTER_HARDENING = "after hardening"
+# Files that show that a folder holds a training run: any of them.
+FILES_OF_RUN = {run_folder.METRICS, run_folder.FAILURE, run_folder.LAST, run_folder.BEST}
+# Files of a network without a run: scores that pnb-evaluate wrote, or a published network.
+FILES_OF_NETWORK = (SUMMARY, PUBLISHED)
 
 
 @dataclass(frozen=True)
@@ -476,7 +480,7 @@ def find(folders: Sequence[Path]) -> Findings:
         try:
             if (path / LINES).is_file():
                 found.attacks.append(read_attack(path))
-            elif (path / SUMMARY).is_file() or (path / PUBLISHED).is_file() or is_finished(path):
+            elif is_finished(path) or any((path / name).is_file() for name in FILES_OF_NETWORK):
                 found.runs.append(summarize(path))
             else:
                 epochs = [line for line in read_metrics(path) if "epoch" in line]
@@ -512,14 +516,12 @@ def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
 
 def _walk(folder: Path) -> Iterator[Path]:
     """Yield a folder and those below with a run, an attack or scores, except scores of a run."""
-    files_of_run = {run_folder.METRICS, run_folder.FAILURE, run_folder.LAST, run_folder.BEST}
-    files_of_others = {LINES, SUMMARY, PUBLISHED}
     for root, subfolders, file_names in os.walk(folder):
         path = Path(root)
         names = set(file_names)
         subfolders.sort()
-        is_run = not names.isdisjoint(files_of_run)
-        is_other_result = not names.isdisjoint(files_of_others)
+        is_run = not names.isdisjoint(FILES_OF_RUN)
+        is_other_result = not names.isdisjoint({LINES, *FILES_OF_NETWORK})
         # A run that has not finished an epoch has only these files.
         is_started_run = {CONFIG, "train.log"} <= names
         if is_run:

@@ -106,7 +106,8 @@ class Albedo(MeshParameter):
     ) -> Conditions:
         """Return a copy of the conditions with a color offset for each face.
 
-        The values are linear RGB offsets of the F faces of the largest mesh.
+        The values of each of the A examples are D = 3 F numbers: linear RGB offsets of the F faces
+        of the largest mesh.
         """
         return replace(conditions, albedo=self.offsets(values, examples))
 
