@@ -358,9 +358,10 @@ class Remembered(Network):
         self.outputs: dict[bytes, Tensor] = {}
 
     def forward(self, images: Tensor) -> Tensor:
-        key = str(images.dtype).encode()
+        # The same bytes are another image in another dtype.
+        dtype = str(images.dtype).encode()
         contents = [image.numpy().tobytes() for image in images.detach().cpu()]
-        keys = [blake2b(content, digest_size=16, key=key).digest() for content in contents]
+        keys = [blake2b(content, digest_size=16, key=dtype).digest() for content in contents]
         # Index of each new image in the batch, by its hash. Equal images have one entry.
         new_images = {key: index for index, key in enumerate(keys) if key not in self.outputs}
         if new_images:

@@ -365,7 +365,7 @@ class AugmentationService:
     def _adversarial(
         self, model: nn.Module, problem: SceneProblem, number: int, shard: Int[Tensor, " A"]
     ) -> Renders:
-        """Attack all examples."""
+        """Attack the examples of this process, `shard`, and gather those of all processes."""
         attack = self.settings.attack
         seed = stream_seed(self.seed, number)
         criterion = self._attack_criterion().select(shard)

@@ -327,7 +327,7 @@ def _local_emitters(
     for basis, coefficients in lights:
         emitters += basis.mitsuba_emitters(coefficients, albedo_scale)
     projectors = [emitter for emitter in emitters if emitter["type"] == "projector"]
-    for number, emitter in enumerate(projectors):
+    for number, emitter in enumerate(projectors):  # A bitmap in memory becomes one in a file.
         name = f"pattern_{number}.exr" if number else "pattern.exr"
         pattern = dict(emitter["irradiance"])
         write_map(folder / name, torch.from_numpy(pattern.pop("bitmap")))

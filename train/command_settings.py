@@ -389,6 +389,7 @@ class EvaluateSettings(NetworkSettings):
         require_calibration(self.false_positive_rate, self.calibrate)
         if self.label is not None:
             label_names(self.label)  # This call only checks the label.
+        # With `run`, `network` may only name the function that built the network of the run.
         builds_run = bool(self.network and self.network.startswith("python:"))
         if (self.run is None) == (self.network is None) and not (self.run and builds_run):
             raise InputError(

@@ -257,7 +257,7 @@ def _collect_texts(value: Any) -> set[str]:
 def _path_of(text: str) -> Path:
     """Return the file or folder that a setting such as run:FOLDER names, which may be missing."""
     if text.startswith("python:"):
-        # `find_spec` imports the packages above the module.
+        # `find_spec` imports the packages above the module, which can raise errors of any type.
         with suppress(Exception):
             spec = find_spec(text.split(":")[1])
             if spec and spec.origin:

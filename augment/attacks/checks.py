@@ -277,7 +277,7 @@ def _attack_others(
         objective = result.objective().select(examples)
         end = minimize(problem, objective, examples=examples, start=values[examples])
         values[examples] = end.values
-        _add(found, result, problem, end.values, examples, end.images)
+        _add_successes(found, result, problem, end.values, examples, end.images)
 
 
 def _add_draws(found: Successes, result: AttackResult, draw: Callable[[], Tensor]) -> None:
@@ -297,10 +297,10 @@ def _add_draws(found: Successes, result: AttackResult, draw: Callable[[], Tensor
         values = draw()[examples]
         with torch.no_grad():
             images = result.problem.render(values, examples)
-        _add(found, result, result.problem, values, examples, images)
+        _add_successes(found, result, result.problem, values, examples, images)
 
 
-def _add(
+def _add_successes(
     found: Successes,
     result: AttackResult,
     problem: SceneProblem,

@@ -500,7 +500,7 @@ class DirectRenderer:
     def _rasterize(
         self, object_index: int, camera: Camera, vertices: Float[np.ndarray, "V 3"]
     ) -> tuple[Fragments, Tensor]:
-        """Rasterize an object with given vertices."""
+        """Find the samples that show an object with given vertices, and their albedo (S, 3)."""
         item = self.objects[object_index]
         shown = (vertices, item.mesh.faces, [camera], self.settings, self.rasterizer)
         [fragments] = build_fragments(*shown, closed=item.mesh.closed)

@@ -78,7 +78,7 @@ class _Variation:
     is_on_table: Bool[Tensor, " E"]
 
     def change_geometry(self, once: bool) -> Scene:
-        """Return a copy of the scene with random cameras, backgrounds and objects."""
+        """Return a copy of the scene with random cameras, backgrounds and objects (see `vary`)."""
         scene = self.scene
         settings = self.settings
         examples = self._draw_cameras()
@@ -276,13 +276,13 @@ class _Variation:
         return encode(clamp(linear), scene.settings.encoding), pattern_points
 
     def _draw_log_uniform(self, limits: Sequence[float]) -> list[float]:
-        """Draw a number of each example, whose logarithm is uniformly distributed."""
+        """Draw a number for each example, whose logarithm is uniformly distributed."""
         low, high = (math.log(limit) for limit in limits)
         fractions = torch.rand(len(self.scene), generator=self.draws, dtype=torch.float64)
         return (low + (high - low) * fractions).exp().tolist()
 
     def _draw_pairs(self, limit: float) -> list[list[float]]:
-        """Draw a pair of numbers of each example uniformly from [-limit, limit]."""
+        """Draw a pair of numbers for each example uniformly from [-limit, limit]."""
         fractions = torch.rand(len(self.scene), 2, generator=self.draws, dtype=torch.float64)
         return (limit * (2 * fractions - 1)).tolist()
 

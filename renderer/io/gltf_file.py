@@ -170,7 +170,7 @@ class GltfFile:
     # Nodes
 
     def _trees(self) -> tuple[list[int], dict[int, np.ndarray]]:
-        """Return the nodes without a parent, and the poses of all nodes, parents first."""
+        """Return the nodes without a parent, and the poses (4, 4) of all nodes, parents first."""
         nodes = self.tree.get("nodes", [])
         children = [child for node in nodes for child in node.get("children", [])]
         # With two parents, 40 nodes could stand for 2^40 copies of a mesh.

@@ -46,7 +46,7 @@ class Part(NamedTuple):
     normals: Float[np.ndarray, "F 3 3"] | None = None
     matrix: Float[np.ndarray, "4 4"] = np.eye(4)
 
-    def placed(self) -> tuple[Mesh, np.ndarray]:
+    def placed(self) -> tuple[Mesh, Float[np.ndarray, "F 3 3"]]:
         """Return the mesh in the axes of the scene, and its normals there or zeros."""
         mesh = transformed(self.mesh, self.matrix)
         if self.normals is None:
@@ -336,7 +336,7 @@ def _projected(corners: np.ndarray, starts: np.ndarray, sizes: np.ndarray) -> np
 
 
 def _doubled_areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Compute twice the areas of triangles in the plane, which are negative if clockwise."""
+    """Compute twice the areas (T,) of triangles (T, 3) of points (N, 2), negative if clockwise."""
     a, b, c = points[triangles].swapaxes(0, 1)
     return (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
 

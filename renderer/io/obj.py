@@ -195,7 +195,7 @@ def _corners(words: list[bytes]) -> np.ndarray:
 
 
 def _materials(lines: dict[str, _Lines], file: MeshFile) -> tuple[list[_Material], np.ndarray]:
-    """Read the materials in use, the first for faces without one, and find that of each face."""
+    """Read the materials in use, the first for faces without one, and the index of each face's."""
     library = _library(lines["mtllib"].names(), file)
     # Name of the material of each line "usemtl", after None for faces before these lines.
     names = [None, *lines["usemtl"].names()]

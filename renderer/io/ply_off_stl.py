@@ -218,7 +218,7 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
 def _rows(
     body: bytes, offset: int, count: int, properties: list[_Property], order: str
 ) -> tuple[list[np.ndarray | _Lists], int]:
-    """Read the values of each property of an element, and find the offset of the next element."""
+    """Read the values of each property of an element, and find the byte after them."""
     # Each value has at least one byte. A damaged header
     # could otherwise announce more rows than fit into memory.
     if not 0 <= count * len(properties) <= len(body) - offset:

@@ -307,6 +307,6 @@ def _openimageio() -> ModuleType:
 
     # OpenImageIO's threads would compete with torch's threads.
     OpenImageIO.attribute("threads", 1)
-    OpenImageIO.attribute("exr_threads", -1)
+    OpenImageIO.attribute("exr_threads", -1)  # OpenEXR starts no threads of its own.
     OpenImageIO.attribute("limits:imagesize_MB", LARGEST_MAP)
     return OpenImageIO

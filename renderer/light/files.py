@@ -106,7 +106,7 @@ def save_light(
 
 
 def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, Tensor]:
-    """Read a light from a .json file.
+    """Read a light from a .json file: its basis, and its RGB coefficients (K, 3).
 
     A plain list of rows [r, g, b] holds SH coefficients. `kinds` are accepted classes, such
     as `Lamps`.

@@ -287,7 +287,7 @@ def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:
     """Plot the fraction of recognized views against the radius of attacks.
 
     Each network has a line for the attack and one for random draws, unless it recognizes no view
-    before.
+    before the attack.
     """
     pictures = []
     for kind, light in KINDS.items():

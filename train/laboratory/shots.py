@@ -110,13 +110,14 @@ def draw_shots(
     shots_per_lighting = settings.setups // len(lightings)
     for lighting, index in product(lightings, range(shots_per_lighting)):
         rng = np.random.default_rng(stream_seed(settings.seed, "shot", lighting, index))
+        # For what later versions added: the draws of `rng` stay those of earlier versions.
         extra_rng = np.random.default_rng(stream_seed(settings.seed, "more", lighting, index))
         # The range of log(brightness) is divided into equal intervals, one for each of
         # the shots in a lighting. A shot draws its brightness from its interval.
         position = (index + rng.uniform()) / shots_per_lighting
         brightness = dimmest * (brightest / dimmest) ** position
-        patterns = PLAIN_PATTERN if lighting in environments else lighting
-        shot = _draw_shot(patterns, brightness, settings, slides, rng, extra_rng)
+        pattern = PLAIN_PATTERN if lighting in environments else lighting
+        shot = _draw_shot(pattern, brightness, settings, slides, rng, extra_rng)
         if lighting in environments:
             radiance = _scale_environment(environments[lighting], brightness, rng)
             shot = replace(shot, lighting=lighting, environment=radiance, wall=None)
@@ -149,8 +150,7 @@ def _draw_shot(
 ) -> Shot:
     """Draw a random shot of an object in the light of projectors.
 
-    `brightness` is the radiance of a white surface that faces all projectors. `extra_rng` draws
-    what later versions added, so that older draws do not change.
+    `brightness` is the radiance of a white surface that faces all projectors.
     """
     first_pattern, *other_patterns = pattern_names.split("+")
     sources = [(first_pattern, rng), *((name, extra_rng) for name in other_patterns)]

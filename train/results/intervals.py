@@ -230,7 +230,7 @@ def _half_width(
 
 
 def _covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Compute the jackknife covariance of two statistics from their values without each unit."""
+    """Compute the jackknife covariance of statistics from their values (..., k) without units."""
     count = one.shape[-1]
     deviations = (x - x.mean(axis=-1, keepdims=True) for x in (one, other))
     return (count - 1) * np.mean(np.multiply(*deviations), axis=-1)
@@ -257,7 +257,7 @@ class _Spread(NamedTuple):
 
 
 def _keep_errors(values: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Keep at least MIN_RATIO of the distance of a value from 0 and from 1."""
+    """Move values (..., k) so that each keeps MIN_RATIO of the distance of `value` from 0 and 1."""
     return values.clip(MIN_RATIO * value, 1 - MIN_RATIO * (1 - value))
 
 

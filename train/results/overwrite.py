@@ -91,7 +91,7 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
         file.unlink(missing_ok=True)
     for name in (run_folder.RENDERS, BEFORE, KEPT_ASIDE):
         shutil.rmtree(folder / name, ignore_errors=True)
-    with suppress(InputError):
+    with suppress(InputError):  # config.yaml may be missing.
         for name in (PHOTOGRAPHS_FIRST, *read_config(folder / CONFIG).get("compare", ())):
             if with_others and (folder / name / CONFIG).is_file():
                 remove_run(folder / name)
