@@ -20,7 +20,7 @@ from augment.tasks.classification import Classification
 from augment.tasks.task import Task
 from renderer import errors
 from renderer.errors import InputError
-from renderer.settings import MAX_SIZE
+from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
 # normalization="imagenet" stands for the following mean and standard deviation of red, green and
 # blue, which most networks use that were trained on ImageNet.
@@ -127,7 +127,7 @@ class TaskNetwork(CheckedNetwork):
     def __init__(
         self,
         network: Callable[[Tensor], Any],
-        size: int,
+        size: Size,
         classes: Sequence[str],
         name: str = "callable",
         normalize_light: NormalizeLight = None,
@@ -136,13 +136,12 @@ class TaskNetwork(CheckedNetwork):
         kind = "classifier" if isinstance(task, Classification) else f"{task.name} network"
         expected = "a torch.nn.Module, or a function of images"
         errors.require_kind("network", network, Callable, expected)
-        errors.require_whole(f"{kind} {name}: size", size, 1, MAX_SIZE)
         names = as_class_names(f"{kind} {name}: classes", classes)
         super().__init__(network, f"{kind} {name}", task, len(names))
         own = wrappers.NETWORK if wrappers.normalization_of(self.network) else None
         self.inputs = wrappers.Inputs(wrappers.YOU, own, None)
         self.network = wrappers.with_normalized_light(self.network, normalize_light)
-        self.size = size
+        self.size = as_size(f"{kind} {name}: size", size, MAX_SIZE)
         self.classes = names
         self.name = name
         if len(set(self.classes)) < len(self.classes):
@@ -150,11 +149,11 @@ class TaskNetwork(CheckedNetwork):
             raise InputError(f"{reason}: give each class a name of its own")
         self.requires_grad_(False).eval()
 
-    def forward(self, images: Float[Tensor, "N 3 size size"]) -> Any:
+    def forward(self, images: Float[Tensor, "N 3 height width"]) -> Any:
         """Compute the outputs of images: logits of a classifier, or those of another task.
 
         Args:
-            images: RGB images in [0, 1], shape (N, 3, size, size).
+            images: RGB images in [0, 1], shape (N, 3, height, width).
 
         Returns:
             Logits of a classifier, shape (N, C).
@@ -164,13 +163,13 @@ class TaskNetwork(CheckedNetwork):
                 Also if the network fails, or returns anything but finite logits
                 with a gradient.
         """
-        size = self.size
+        shape = (3, *height_and_width(self.size))
         if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
             advice = "use floating-point RGB in [0, 1], such as images / 255"
             raise InputError(f"images is {errors.describe(images)}: {advice}")
         images = errors.as_tensor("images", images)
-        if images.shape[1:] != (3, size, size):
-            reason = f"takes images (N, 3, {size}, {size}), not {tuple(images.shape)}"
+        if images.shape[1:] != shape:
+            reason = f"takes images (N, {', '.join(map(str, shape))}), not {tuple(images.shape)}"
             raise InputError(f"{self.title} {reason}: give a batch of this shape")
         outputs = super().forward(images)
         # Check the range of the images after the call of the network. The check waits until the
@@ -217,7 +216,7 @@ class TaskNetwork(CheckedNetwork):
         """
         if next(self.parameters(), None) is not None:
             return True
-        gray = like.new_full((1, 3, self.size, self.size), GRAY, requires_grad=True)
+        gray = like.new_full((1, 3, *height_and_width(self.size)), GRAY, requires_grad=True)
         try:
             with torch.enable_grad():
                 return self.task.has_gradient(super().forward(gray))
@@ -251,11 +250,11 @@ class Classifier(TaskNetwork):
     resized.
 
     Args:
-        network: Function from images, shape (N, 3, size, size), to logits,
+        network: Function from images, shape (N, 3, height, width), to logits,
             shape (N, C). It takes tensors or NumPy arrays. If it is a
             `torch.nn.Module`, it is frozen, put in evaluation mode and moved
             with the classifier.
-        size: Pixels per side of the images, from 1 to 4,096.
+        size: Pixels per side of the images, or height and width, from 1 to 4,096.
         classes: Names of the C classes in the order of the logits, at least
             two. Each name occurs once, because labels are found by name.
         name: Name of the classifier in messages.
@@ -280,7 +279,7 @@ class Classifier(TaskNetwork):
     def __init__(
         self,
         network: Callable[[Tensor], Tensor],
-        size: int,
+        size: Size,
         classes: Sequence[str],
         name: str = "callable",
         normalize_light: NormalizeLight = None,
@@ -322,12 +321,12 @@ class Classifier(TaskNetwork):
         return self.with_network(self.network, normalize_light)
 
     def detect(
-        self, images: Float[Tensor, "N 3 size size"], label: str | None = None
+        self, images: Float[Tensor, "N 3 height width"], label: str | None = None
     ) -> Bool[Tensor, " N"]:
         """Decide which images show a class, by the threshold that is stored for the class.
 
         Args:
-            images: RGB images in [0, 1], shape (N, 3, size, size).
+            images: RGB images in [0, 1], shape (N, 3, height, width).
             label: Name of the class. May be None if there is exactly one
                 operating point.
 
@@ -412,7 +411,7 @@ def as_classifier(network: Any, *options: Any, **named: Any) -> Classifier:
 
 def as_network(
     network: TaskNetwork | Callable[[Tensor], Any],
-    size: int | None = None,
+    size: Size | None = None,
     classes: Sequence[str] | None = None,
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
@@ -434,7 +433,7 @@ def as_network(
     `says` whether to log what images the network gets.
     """
     if size is not None:
-        errors.require_whole("size", size, 1, MAX_SIZE)
+        size = as_size("size", size, MAX_SIZE)
     if isinstance(network, TaskNetwork):
         if task not in (None, network.task):
             reason = f"task is {task}, but {network.title} has the task {network.task}"
@@ -475,7 +474,7 @@ def as_network(
     if says:
         wrappers.say_inputs(name, function, size, inputs)
     shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device, dtype=dtype)
-    images = shades.view(-1, 1, 1, 1).expand(-1, 3, size, size).contiguous()
+    images = shades.view(-1, 1, 1, 1).expand(-1, 3, *height_and_width(size)).contiguous()
     with torch.no_grad():
         outputs = CheckedNetwork(function, argument)(images)
     if task is None:

@@ -9,6 +9,7 @@ import argparse
 import importlib
 import io
 import json
+import math
 import pickle
 import textwrap
 import warnings
@@ -27,10 +28,10 @@ from torch import Tensor, nn
 from augment import classifier as classifiers
 from augment.classifier import Classifier
 from augment.network import ARRAYS, FILE, YOU, Function, Network, plain_outputs, unwrapped
-from renderer.errors import InputError, require_file, require_whole, single_line
-from renderer.settings import MAX_SIZE
+from renderer.errors import InputError, require_file, single_line
+from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
-# A network from images (N, 3, size, size) to logits, and the sizes of the four dimensions of its
+# A network from images (N, 3, height, width) to logits, and the sizes of the four dimensions of its
 # images. None stands for any size, or an unknown one.
 Content = tuple[Callable[[Tensor], Tensor], Sequence[int | None]]
 
@@ -67,19 +68,19 @@ class NetworkFacts:
     Attributes:
         classes: Names of the classes in the order of the outputs. If neither
             the user nor the source gives names, they are "0", "1" and so on.
-        size: Pixels per side of the images.
+        size: Pixels per side of the images, or height and width.
         normalization: "imagenet", or mean and standard deviation of the
             channels red, green and blue, in units of [0, 1].
     """
 
     classes: tuple[str, ...] | None = None
-    size: int | None = None
+    size: Size | None = None
     normalization: classifiers.Normalization = None
 
 
 def as_facts(
     classes: Sequence[str] | str | Path | None = None,
-    size: int | None = None,
+    size: Size | None = None,
     normalization: classifiers.Normalization = None,
 ) -> NetworkFacts:
     """Check the classes, size and normalization that the user gives for a network.
@@ -92,7 +93,7 @@ def as_facts(
         classes = [line.strip() for line in lines if line.strip()]
     names = None if classes is None else classifiers.as_class_names("classes", classes)
     if size is not None:
-        require_whole("size", size, 1, MAX_SIZE)
+        size = as_size("size", size, MAX_SIZE)
     if normalization is not None:
         classifiers.mean_and_std(normalization)
     return NetworkFacts(names, size, normalization)
@@ -149,14 +150,15 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
         advice = "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
         raise name_error(path, f"cannot be read ({single_line(error)}): {advice}") from error
 
-    network, (batch_size, _, height, _) = content
+    network, (batch_size, _, height, width) = content
     if batch_size is not None:
         network = InBatches(network, batch_size)
     if isinstance(network, nn.Module):
         # Set the mode without a call of `eval`, which networks of torch.export refuse.
         for module in network.modules():
             module.training = False
-    given = facts.size or height, facts.classes, facts.normalization
+    told = (height, width) if height and width else height or width
+    given = facts.size or told, facts.classes, facts.normalization
     sizer = YOU if facts.size else FILE
     classifier = classifiers.as_classifier(network, *given, name=name, size_from=sizer, says=False)
     _require_evaluation_outputs(classifier, name)
@@ -165,9 +167,10 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
 
 def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
     """Raise InputError if logits are random or depend on other images (exported training mode)."""
-    levels = torch.linspace(0, 1, 3 * 3 * classifier.size**2)
+    shape = (3, 3, *height_and_width(classifier.size))
+    levels = torch.linspace(0, 1, math.prod(shape))
     images = levels[torch.randperm(len(levels), generator=torch.Generator().manual_seed(0))]
-    images = images.view(3, 3, classifier.size, classifier.size)
+    images = images.view(shape)
     with torch.no_grad():
         first, second = (
             plain_outputs(classifier.network(images[[0, other]])).float() for other in (1, 2)

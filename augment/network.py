@@ -26,6 +26,7 @@ from augment.progress import progress
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
 from renderer.errors import InputError, is_out_of_memory
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
+from renderer.settings import Size, height_and_width
 
 # Number of images that a network sees at a time if nothing else is said.
 BATCH = 256
@@ -65,11 +66,12 @@ class Inputs:
     value_range: str | None
     limits: tuple[float, float] = (0.0, 1.0)
 
-    def describe(self, network: Any, size: int) -> str:
+    def describe(self, network: Any, size: Size) -> str:
         """Write the facts about the images of a network, each with who states it."""
         black, white = self.limits
+        height, width = height_and_width(size)
         facts = {
-            f"{size} × {size} pixels": self.size,
+            f"{height} × {width} pixels": self.size,
             normalization_of(network, self.limits) or "not normalized": self.normalization,
             f"values from {black:g} to {white:g}": self.value_range,
         }
@@ -503,7 +505,7 @@ def own_size(network: object) -> int | None:
     return None
 
 
-def say_inputs(name: str, network: Any, size: int, inputs: Inputs) -> None:
+def say_inputs(name: str, network: Any, size: Size, inputs: Inputs) -> None:
     """Log what images a network gets and who states that, once for each text."""
     if rank() == 0:
         say_once(f"network {name}: images of {inputs.describe(network, size)}")

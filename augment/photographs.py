@@ -41,6 +41,7 @@ from augment.tasks.classification import ClassCriterion
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
+from renderer.settings import Size, as_size
 
 # Names of three lights: the slide as it is, the slide multiplied by the best of several random
 # factors, and the slide multiplied by factors that gradient descent finds.
@@ -119,7 +120,7 @@ class ProjectedLight(NamedTuple):
         return encode(clamp(exposure * radiance), "srgb")
 
 
-def draw_shading(count: int, size: int, draws: Generator) -> Float[Tensor, "count 1 size size"]:
+def draw_shading(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 1 height width"]:
     """Draw the shading of random smooth surfaces in light from random directions.
 
     It is the cosine between normal and light, or 0 if the surface faces away.
@@ -127,10 +128,11 @@ def draw_shading(count: int, size: int, draws: Generator) -> Float[Tensor, "coun
     # Steepness, azimuth and polar angle of the light, as fractions of their ranges.
     steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
     node_heights = torch.randn(count, 1, SURFACE_NODES, SURFACE_NODES, generator=draws)
-    # Height of each pixel, shape (count, 1, size, size).
+    # Height of each pixel, shape (count, 1, height, width).
     height = MAX_STEEPNESS * steepness[:, None] * interpolate_smoothly(node_heights, size)
-    # Slope of the surface. The image is 2 units wide, so a pixel has the width 2 / size.
-    slope_down, slope_right = torch.gradient(height[:, 0], spacing=2 / size, dim=(1, 2))
+    # Slope of the surface. The image is 2 units wide, so a pixel has the width 2 / width.
+    spacing = 2 / height.shape[-1]
+    slope_down, slope_right = torch.gradient(height[:, 0], spacing=spacing, dim=(1, 2))
     polar = math.radians(MAX_POLAR) * tilt
     azimuth = 2 * math.pi * turn
     # Components of the unit vector towards the light. The one along the view is polar.cos().
@@ -143,7 +145,7 @@ def draw_shading(count: int, size: int, draws: Generator) -> Float[Tensor, "coun
 
 
 def draw_projected_light(
-    count: int, size: int, draws: Generator, photographs: UInt8[Tensor, "N 3 H W"] | None = None
+    count: int, size: Size, draws: Generator, photographs: UInt8[Tensor, "N 3 H W"] | None = None
 ) -> ProjectedLight:
     """Draw the random light of a projector: slide, shading, ambient light and exposure.
 
@@ -166,15 +168,15 @@ def relight_photographs(
     random smooth surface. It needs neither meshes nor labels.
 
     Args:
-        photographs: Square photographs, sRGB of 8 bits, uint8, shape
-            (N, 3, size, size).
+        photographs: Photographs, sRGB of 8 bits, uint8, shape
+            (N, 3, height, width).
         seed: Seed of all random draws.
         slides: Photographs that the projector may show as slides, uint8, shape
             (M, 3, H, W). None for generated slides only.
 
     Returns:
         Photographs in the light of the projector, uint8, shape
-        (N, 3, size, size).
+        (N, 3, height, width).
 
     Raises:
         InputError: If the photographs have another dtype or shape.
@@ -190,20 +192,19 @@ def relight_photographs(
     if slides is not None:
         require_photographs("slides", slides)
     errors.require_whole("seed", seed)
-    count, _, size, _ = photographs.shape
-    light = draw_projected_light(count, size, generator(seed, "relight"), slides)
+    count, _, *shape = photographs.shape
+    light = draw_projected_light(count, shape, generator(seed, "relight"), slides)
     return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
 
 
 def require_photographs(name: str, photographs: Tensor) -> None:
-    """Check that a value is a tensor of square photographs of 8 bits."""
+    """Check that a value is a tensor of photographs of 8 bits."""
     errors.require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
     shape = tuple(photographs.shape)
-    is_square = len(shape) == 4 and shape[1] == 3 and shape[2] == shape[3]
-    if photographs.dtype != torch.uint8 or not is_square or not shape[0]:
+    if photographs.dtype != torch.uint8 or len(shape) != 4 or shape[1] != 3 or not all(shape):
         raise InputError(
             f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}: "
-            "give uint8 of shape (N, 3, size, size)"
+            "give uint8 of shape (N, 3, height, width)"
         )
 
 
@@ -279,7 +280,7 @@ class PhotographAttackResult(errors.ShortRepr):
 
     Attributes:
         classifier: The attacked network.
-        photographs: Unchanged photographs, uint8, shape (N, 3, size, size).
+        photographs: Unchanged photographs, uint8, shape (N, 3, height, width).
         settings: Settings of the attack.
         seed: Seed of the slides, the searches and the noise.
         source: Predicted classes of the unchanged photographs, shape (N,).
@@ -335,7 +336,7 @@ class PhotographAttackResult(errors.ShortRepr):
                 shows.
 
         Returns:
-            Image of 8 bits, uint8, shape (3, size, size).
+            Image of 8 bits, uint8, shape (3, height, width).
         """
         chosen = self.photographs[photograph]
         if light == UNCHANGED:
@@ -371,7 +372,7 @@ def attack_photographs(
     Args:
         network: A classifier, or a plain network from images to logits.
         photographs: Photographs of the size of the network, sRGB, uint8, shape
-            (N, 3, size, size). Slides show them, too.
+            (N, 3, height, width). Slides show them, too.
         settings: Norm-ball and passes of the attack. None for the defaults.
         classes: Names of the classes of a plain network. None for "0", "1" and
             so on.
@@ -406,14 +407,14 @@ def attack_photographs(
     errors.require_whole("seed", seed)
     settings = settings or RelightingSettings()
     success_settings = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
-    size = photographs.shape[-1]
+    size = as_size("photographs", photographs.shape[-2:])
     with gradient_flags_kept(network):
         device = device_of(network)
         given = size, classes, normalization, value_range, device
         classifier = as_classifier(network, *given, size_from="the photographs")
         if classifier.size != size:
             raise InputError(
-                f"photographs have {size} pixels per side, "
+                f"photographs have the size {size} in pixels, "
                 f"but the network takes {classifier.size}: resize them"
             )
         return _attack(classifier, photographs, settings, success_settings, seed)
@@ -421,7 +422,7 @@ def attack_photographs(
 
 def _attack(
     classifier: Classifier,
-    photographs: UInt8[Tensor, "N 3 size size"],
+    photographs: UInt8[Tensor, "N 3 height width"],
     settings: RelightingSettings,
     success: AttackSettings,
     seed: int,
@@ -457,7 +458,7 @@ def _attack(
 def _attack_slide(
     result: PhotographAttackResult,
     success: AttackSettings,
-    images: Float[Tensor, "B 3 size size"],
+    images: Float[Tensor, "B 3 height width"],
     rows: Int[Tensor, " B"],
     slide: int,
 ) -> None:
@@ -510,10 +511,10 @@ def _attack_slide(
 
 
 def _draw_lights(
-    photographs: UInt8[Tensor, "N 3 size size"], rows: Sequence[int], slide: int, seed: int
+    photographs: UInt8[Tensor, "N 3 height width"], rows: Sequence[int], slide: int, seed: int
 ) -> ProjectedLight:
     """Draw random projector light that depends on row, slide and seed, not on other photographs."""
-    size = photographs.shape[-1]
+    shape = photographs.shape[-2:]
     streams = [generator(seed, "light", row, slide) for row in rows]
-    lights = [draw_projected_light(1, size, draws, photographs) for draws in streams]
+    lights = [draw_projected_light(1, shape, draws, photographs) for draws in streams]
     return ProjectedLight(*map(torch.cat, zip(*lights, strict=True)))

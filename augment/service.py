@@ -41,6 +41,7 @@ from renderer.errors import InputError, as_integers, describe, require_kind, req
 from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.files import perturb
+from renderer.settings import Size
 
 # Largest number of successfully attacked renders that are kept for figures each time that the
 # renders of a training run are made.
@@ -170,7 +171,7 @@ class AugmentationService:
     def from_meshes(
         cls,
         meshes: Sequence[tuple[MeshSource, int]],
-        size: int,
+        size: Size,
         settings: AugmentationSettings | None = None,
         *,
         seed: int = 0,
@@ -183,7 +184,7 @@ class AugmentationService:
         Args:
             meshes: Pairs of a mesh and the index of its class. A mesh is a
                 file, solid:NAME or a `Mesh`.
-            size: Pixels per side of the renders.
+            size: Pixels per side of the renders, or (height, width).
             settings: Settings of the augmentation.
             seed: Seed of all random numbers.
             of_scene: Further arguments of `build_scene`. By default, there are
@@ -233,7 +234,7 @@ class AugmentationService:
         restored afterwards.
 
         Args:
-            model: A network from images (N, 3, size, size) in [0, 1] to logits.
+            model: A network from images (N, 3, height, width) in [0, 1] to logits.
             number: How often the renders were made before in this run. The
                 random numbers depend on this number and on the seed alone, so
                 that a resumed run repeats them.

@@ -22,6 +22,7 @@ from renderer.settings import (
     REQUIRED,
     ImageSettings,
     Settings,
+    Size,
     samples_per_side,
     setting,
     setting_like,
@@ -222,8 +223,8 @@ class RendererSettings(Settings):
         if not hasattr(self.rasterizer, "rasterize"):
             require_choice("rasterizer", self.rasterizer, RASTERIZERS)
 
-    def image(self, size: int) -> ImageSettings:
-        """Return the settings of images with a size in pixels per side."""
+    def image(self, size: Size) -> ImageSettings:
+        """Return the settings of images with a size: pixels per side, or height and width."""
         names = ("encoding", "normals", "shadows", "bounces", "silhouettes")
         options = {name: getattr(self, name) for name in names}
         return ImageSettings(size, samples_per_side(self.samples, self.silhouettes), **options)

@@ -37,7 +37,7 @@ from augment.classifier import Classifier
 from augment.network import compute_outputs
 from augment.photographs import relight_photographs
 from benchmarks.splits import Method, adapt_texture_or_material, load, log_evaluations
-from renderer.io.images import read_square
+from renderer.io.images import read_center
 from train.command_settings import LabSettings
 from train.data.photo import TABLE
 from train.laboratory.laboratory import write_laboratory
@@ -330,7 +330,7 @@ def read_images(paths: Sequence[Path], size: int) -> torch.Tensor:
     Returns:
         Images, uint8, shape (N, 3, size, size).
     """
-    images = [read_square(path, size) for path in paths]
+    images = [read_center(path, size) for path in paths]
     return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
 
 

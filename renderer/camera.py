@@ -40,7 +40,7 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class Camera(ABC):
-    """Camera that takes square images of a scene around the origin.
+    """Camera that takes images of a scene around the origin.
 
     The camera lies at a polar angle from +z and at an azimuth from +x toward
     +y. Fields can be numbers, or tensors, arrays and lists of one number. Images
@@ -53,7 +53,8 @@ class Camera(ABC):
         polar: Polar angle in degrees, within two turns.
         azimuth: Azimuth in degrees.
         width: Width of the image at the origin in world units. A normalized
-            mesh spans at most [-1, 1] along each axis.
+            mesh spans at most [-1, 1] along each axis. The height of the image
+            follows from its size in pixels.
         right: Distance by which the origin appears to the right of the image
             center, in world units.
         up: Distance by which the origin appears above the image center, in world
@@ -234,8 +235,8 @@ class Camera(ABC):
     def project(self, points: np.ndarray) -> np.ndarray:
         """Project points to normalized device coordinates.
 
-        The image goes from -1 to 1 in x and y. The depth is -1 at the near plane and
-        1 at the far plane. Planes in the world stay planes.
+        The image goes from -1 to 1 in x, and y has the same unit. The depth is -1 at the
+        near plane and 1 at the far plane. Planes in the world stay planes.
 
         Args:
             points: Points in world coordinates, shape (V, 3).
@@ -354,7 +355,7 @@ class PerspectiveCamera(Camera):
 
     @property
     def angle(self) -> float:
-        """Field of view, the angle between opposite sides of the image, in degrees."""
+        """Field of view, the angle between the left and the right side of the image."""
         return math.degrees(2 * math.atan(self.width / 2 / self.distance))
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -422,8 +423,8 @@ def orbit_cameras(
         width: Width in world units that an image shows at the origin.
         polar: Polar angle in degrees, within two turns.
         azimuth: Azimuth of the first camera in degrees, within two turns.
-        fov: Field of view: the angle between opposite sides of the image in
-            degrees, from 0.05 to 172. It sets the distance of perspective
+        fov: Field of view: the angle between the left and the right side of the
+            image in degrees, from 0.05 to 172. It sets the distance of perspective
             cameras. None creates orthographic cameras.
 
     Returns:

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, as_tensor, require_bounded, require_choice
-from renderer.settings import ENCODINGS, REC_709
+from renderer.settings import ENCODINGS, REC_709, Size, height_and_width
 
 # Linear value at which the sRGB curve changes
 # from a straight line to a power function.
@@ -49,9 +49,9 @@ def composite(
     radiance: Float[Tensor, "*batch 3 P"],
     coverage: Float[Tensor, " P"],
     pixels: Int[Tensor, " P"],
-    background: Float[Tensor, "*#batch 3 size size"],
+    background: Float[Tensor, "*#batch 3 height width"],
     encoding: str = "linear",
-) -> Float[Tensor, "*batch 3 size size"]:
+) -> Float[Tensor, "*batch 3 height width"]:
     """Put the radiance of covered pixels in front of a background.
 
     The radiance is already multiplied by the coverage. `pixels` are row-major, and the
@@ -60,7 +60,7 @@ def composite(
     batch_shape = radiance.shape[:-2]
     backgrounds = background.expand(*batch_shape, *background.shape[-3:])
     # The last axis is over the pixels of an image
-    # in row-major order, shape (..., 3, size²).
+    # in row-major order, shape (..., 3, height · width).
     background_pixels = backgrounds.flatten(-2)
     behind_mesh = background_pixels.index_select(-1, pixels)
     covered = tonemap(radiance, coverage[None], behind_mesh, encoding)
@@ -69,22 +69,23 @@ def composite(
 
 
 def as_background(
-    background: float | Tensor, size: int, like: Tensor
-) -> Float[Tensor, "... 3 size size"]:
+    background: float | Tensor, size: Size, like: Tensor
+) -> Float[Tensor, "... 3 height width"]:
     """Convert a gray value, a color or images to background images.
 
     Values outside [0, 1] raise `InputError`. The result gets the dtype and device of
     `like`.
     """
+    shape = height_and_width(size)
     values = as_tensor("background", background).to(like)
     if values.ndim < 2:
-        values = values.view(-1, 1, 1).expand(-1, size, size)
-    expected = f"a gray value, a color (3,) or images (3, {size}, {size}), in [0, 1]"
-    if values.ndim < 3 or values.shape[-3:] not in ((1, size, size), (3, size, size)):
+        values = values.view(-1, 1, 1).expand(-1, *shape)
+    expected = f"a gray value, a color (3,) or images {(3, *shape)}, in [0, 1]"
+    if values.ndim < 3 or values.shape[-3:] not in ((1, *shape), (3, *shape)):
         raise InputError(f"background has shape {tuple(values.shape)}: give {expected}")
     if not (values.min() >= 0 and values.max() <= 1):
         raise InputError(f"background has values outside [0, 1]: give {expected}")
-    return values.expand(*values.shape[:-3], 3, size, size)
+    return values.expand(*values.shape[:-3], 3, *shape)
 
 
 def background_term(

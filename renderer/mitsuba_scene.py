@@ -124,8 +124,8 @@ def load(module: Any, scene: Mapping[str, Any]) -> Any:
     return module.load_dict(converted)
 
 
-def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
-    """Render the first cameras of a file: linear RGB and coverage, (views, 4, size, size)."""
+def render_mitsuba_scene(path: Path, views: int, shape: tuple[int, int]) -> torch.Tensor:
+    """Render the first cameras of a file: linear RGB and coverage, (views, 4, *shape)."""
     with mitsuba() as module:
         try:
             scene = module.load_file(str(path))
@@ -136,11 +136,9 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
     images = []
     for image in rendered:
         channels = torch.from_numpy(image).permute(2, 0, 1)
-        height, width = channels.shape[1:]
-        if height != width:
-            # Mitsuba's pixels are square. Stretch the image to a square of its width.
-            square = (width, width)
-            [channels] = F.interpolate(channels[None], square, mode="bilinear", antialias=True)
+        if channels.shape[1:] != shape:
+            # Mitsuba's pixels are square. Those of the camera are not.
+            [channels] = F.interpolate(channels[None], shape, mode="bilinear", antialias=True)
         images.append(channels)
     return torch.stack(images)
 

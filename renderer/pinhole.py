@@ -106,6 +106,7 @@ class PinholeCamera(PerspectiveCamera):
         intrinsics: np.ndarray | Tensor | Sequence[Sequence[float]],
         size: int | tuple[int, int],
         convention: str = "opencv",
+        whole: bool = False,
     ) -> Self:
         """Create a camera from a view matrix and intrinsics.
 
@@ -114,8 +115,9 @@ class PinholeCamera(PerspectiveCamera):
         first pixel is at (0.5, 0.5), as in COLMAP and nerfstudio. In calibrations of
         OpenCV, it is at (0, 0): add 0.5 to their cx and cy.
 
-        Images are square. If the given image size is not square, the camera shows
-        the central square of the image, whose side is the shorter side.
+        If the given image size is not square, square renders show the central square
+        of the image, whose side is the shorter side. With `whole`, renders of the
+        size (height, width) show the whole image.
 
         Args:
             view: Matrix from world to camera coordinates, shape (4, 4) or
@@ -127,6 +129,8 @@ class PinholeCamera(PerspectiveCamera):
             convention: Axes of the camera. "opencv" (also COLMAP) has x to the
                 right, y down and z forward. "opengl" (also nerfstudio and Blender)
                 has x to the right, y up and z backward.
+            whole: Whether the camera is as wide as the image, also if the image is
+                wider than high.
 
         Returns:
             Camera. Attacks on the pose turn it about the point on its optical axis
@@ -155,7 +159,8 @@ class PinholeCamera(PerspectiveCamera):
         image_width, image_height = size if isinstance(size, tuple | list) else (size, size)
         for side in (image_width, image_height):
             errors.require_whole("size", side, 1, errors.MAX_MAGNITUDE)
-        side = min(image_width, image_height)
+        errors.require_flag("whole", whole)
+        side = image_width if whole else min(image_width, image_height)
         right, up, back = rotation
         position = -translation @ rotation
         distance = float(np.linalg.norm(position)) or 1.0
@@ -190,7 +195,7 @@ class PinholeCamera(PerspectiveCamera):
         return smallest, near * (1 - MIN_DEPTH_RATIO), far * (1 + MIN_DEPTH_RATIO)
 
 
-def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
+def load_cameras(path: str | Path, whole: bool = False) -> dict[str, PinholeCamera]:
     """Read the cameras of a scene from files of COLMAP or nerfstudio.
 
     COLMAP's models SIMPLE_PINHOLE and PINHOLE are read. Images with lens
@@ -200,11 +205,14 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
 
     The cameras have the world coordinates of the file, so load the mesh with
     `nb.load_mesh(path, up="z")`, which leaves its axes as they are. The camera of
-    an image that is not square shows the square in its center.
+    an image that is not square shows the square in its center. With `whole`, renders
+    of the size (height, width) show the whole image.
 
     Args:
         path: A transforms.json file of nerfstudio, or a folder with this file or
             with the files cameras.txt and images.txt of COLMAP.
+        whole: Whether a camera is as wide as its image, also if the image is wider
+            than high.
 
     Returns:
         Cameras by the names of their images, in the order of the file.
@@ -228,9 +236,10 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
     """
     path = errors.as_path("path", path)
     if path.is_dir() and (path / COLMAP_IMAGES).exists():
-        cameras = _read_colmap(path)
+        cameras = _read_colmap(path, whole)
     else:
-        cameras = _read_transforms(path / "transforms.json" if path.is_dir() else path)
+        file = path / "transforms.json" if path.is_dir() else path
+        cameras = _read_transforms(file, whole)
     if not cameras:
         raise InputError(f"{path} has no cameras: give files with at least one image")
     return cameras
@@ -256,7 +265,7 @@ def _add(values: dict[str, Any], name: str, value: object) -> None:
     values[name] = value
 
 
-def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
+def _read_colmap(folder: Path, whole: bool) -> dict[str, PinholeCamera]:
     """Read the cameras of a COLMAP model from its text files, by the names of their images."""
     from scipy.spatial.transform import Rotation
 
@@ -280,7 +289,8 @@ def _read_colmap(folder: Path) -> dict[str, PinholeCamera]:
             pose = np.array(numbers, dtype=float)
             rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
             view = np.column_stack([rotation, pose[4:]])
-            _add(cameras, image_name.strip(), PinholeCamera.from_matrix(view, *lenses[camera_id]))
+            camera = PinholeCamera.from_matrix(view, *lenses[camera_id], whole=whole)
+            _add(cameras, image_name.strip(), camera)
     return cameras
 
 
@@ -303,7 +313,7 @@ def _colmap_intrinsics(model: str, parameters: list[str]) -> np.ndarray:
     return np.array([[focal_lengths[0], 0, center_x], [0, focal_lengths[-1], center_y], [0, 0, 1]])
 
 
-def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
+def _read_transforms(path: Path, whole: bool) -> dict[str, PinholeCamera]:
     """Read the cameras of a transforms.json file of nerfstudio, by the paths of their images."""
     cameras: dict[str, PinholeCamera] = {}
     with _reading(path) as text:
@@ -312,7 +322,7 @@ def _read_transforms(path: Path) -> dict[str, PinholeCamera]:
             # A frame is an image of the scene. Its entries override those of the scene.
             intrinsics, size = _transforms_intrinsics({**scene, **frame})
             view = np.linalg.inv(np.array(frame["transform_matrix"], dtype=float))
-            camera = PinholeCamera.from_matrix(view, intrinsics, size, "opengl")
+            camera = PinholeCamera.from_matrix(view, intrinsics, size, "opengl", whole)
             if not isinstance(frame["file_path"], str):
                 raise TypeError(f"file_path is {frame['file_path']}")
             _add(cameras, frame["file_path"], camera)

@@ -29,7 +29,7 @@ from renderer.operators.build import build_operators
 from renderer.operators.rays import LocalLightView, Rays, Surface
 from renderer.operators.shadows import build_transport
 from renderer.operators.stack import TransferOperators
-from renderer.settings import RASTERIZERS, ImageSettings, samples_per_side
+from renderer.settings import RASTERIZERS, ImageSettings, Size, samples_per_side
 from renderer.shaded_view import ShadedView
 from renderer.solids import sphere
 from renderer.surface.albedo import face_albedo, surface_albedo
@@ -58,12 +58,12 @@ def render(
     mesh: Mesh,
     cameras: Camera | Sequence[Camera],
     light: Float[Tensor, "coefficients 3"] | None,
-    size: int = 224,
-    background: float | Float[Tensor, "*views channels size size"] | Float[Tensor, " 3"] = 0.5,
+    size: Size = 224,
+    background: float | Float[Tensor, "*views channels height width"] | Float[Tensor, " 3"] = 0.5,
     *,
     lights: Sequence[LocalLight] = (),
     vertices: Float[Tensor, "N 3"] | None = None,
-    albedo: Float[Tensor, "F 3"] | Float[Tensor, "height width 3"] | None = None,
+    albedo: Float[Tensor, "F 3"] | Float[Tensor, "rows columns 3"] | None = None,
     albedo_scale: float = 1.0,
     gloss: Gloss | None = None,
     samples: int | None = None,
@@ -73,7 +73,7 @@ def render(
     bounces: int = 0,
     silhouettes: bool = False,
     rasterizer: str = "auto",
-) -> Float[Tensor, "*views 3 size size"]:
+) -> Float[Tensor, "*views 3 height width"]:
     """Render a mesh, differentiable with respect to light, vertices, albedo and gloss.
 
     Arguments can be NumPy arrays or lists instead of tensors. The images have the
@@ -90,9 +90,10 @@ def render(
         cameras: One camera, or a list of V cameras.
         light: SH coefficients of environment light, such as `nb.load_light`
             returns, shape ((degree + 1)², 3). None for no environment light.
-        size: Width and height of the images in pixels.
+        size: Pixels per side of the images, or (height, width). The width of a
+            camera is horizontal, and pixels are square.
         background: Background in [0, 1]: a gray value, a color of shape (3,), one
-            image of shape (3, size, size), or an image for each camera.
+            image of shape (3, height, width), or an image for each camera.
         lights: Local lights, such as `nb.Lamps`. A light alone has full white
             power. A light can also be in a pair with its coefficients,
             shape (light.size, 3). Local lights cast shadows, but do not bounce, so
@@ -100,7 +101,7 @@ def render(
         vertices: Positions in world units, shape (N, 3). None uses the positions
             of the mesh.
         albedo: Linear albedo in [0, 1], shape (F, 3) for one color per face, or
-            (height, width, 3) for the only texture. None uses the colors of the
+            (rows, columns, 3) for the only texture. None uses the colors of the
             mesh.
         albedo_scale: Factor for the albedo. The product may exceed 1.
         gloss: Specular reflection. None uses the gloss of the mesh.
@@ -120,8 +121,8 @@ def render(
             or "numpy".
 
     Returns:
-        Images in [0, 1], shape (V, 3, size, size). For one camera that is not in a
-        list, one image of shape (3, size, size).
+        Images in [0, 1], shape (V, 3, height, width). For one camera that is not in a
+        list, one image of shape (3, height, width).
 
     Raises:
         InputError: If an argument holds NaN or has a wrong type or shape, if a
@@ -238,20 +239,20 @@ class TransferOptions(TypedDict, total=False):
 
 @overload
 def precompute_transfer(
-    mesh: Mesh, cameras: Camera, size: int = ..., **options: Unpack[TransferOptions]
+    mesh: Mesh, cameras: Camera, size: Size = ..., **options: Unpack[TransferOptions]
 ) -> TransferOperator: ...
 
 
 @overload
 def precompute_transfer(
-    mesh: Mesh, cameras: Sequence[Camera], size: int = ..., **options: Unpack[TransferOptions]
+    mesh: Mesh, cameras: Sequence[Camera], size: Size = ..., **options: Unpack[TransferOptions]
 ) -> TransferOperators: ...
 
 
 def precompute_transfer(
     mesh: Mesh,
     cameras: Camera | Sequence[Camera],
-    size: int = 224,
+    size: Size = 224,
     *,
     albedo_scale: float = 1.0,
     gloss: Gloss | None = None,
@@ -271,7 +272,7 @@ def precompute_transfer(
     Args:
         mesh: Mesh to render.
         cameras: One camera, or a list of V cameras.
-        size: Width and height of the images in pixels.
+        size: Pixels per side of the images, or (height, width).
         albedo_scale: Factor for the albedo.
         gloss: Specular reflection. None uses the gloss of the mesh.
         samples: Number of samples along one side of a pixel.
@@ -326,7 +327,7 @@ def light_sphere(
 
     Returns:
         sRGB-encoded image in front of a white background, float32,
-        shape (3, size, size).
+        shape (3, height, width).
 
     Raises:
         InputError: If the light has values that are not finite.

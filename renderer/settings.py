@@ -308,6 +308,26 @@ def _is_list(value: object) -> bool:
     return not isinstance(value, str) and (is_array or isinstance(value, Sequence))
 
 
+# Pixels per side of a square image, or height and width.
+Size = int | Sequence[int]
+
+
+def as_size(name: str, size: Any, largest: int = MAX_SAMPLES_PER_ROW) -> int | tuple[int, int]:
+    """Check the size of an image. A square has one number, and a rectangle (height, width)."""
+    sides = tuple(size) if _is_list(size) else (size, size)
+    if len(sides) != 2 or not all(is_whole(side) and 1 <= side <= largest for side in sides):
+        expected = f"a whole number from 1 to {largest:,}, or two, (height, width)"
+        raise InputError(f"{name} is {describe(size)}: give {expected}", name)
+    height, width = map(int, sides)
+    return height if height == width else (height, width)
+
+
+def height_and_width(size: Size) -> tuple[int, int]:
+    """Return height and width of an image in pixels."""
+    height, width = size if isinstance(size, Sequence) else (size, size)
+    return int(height), int(width)
+
+
 @dataclass(frozen=True)
 class ImageSettings(Settings):
     """Size, sampling and shading of rendered images.
@@ -317,7 +337,9 @@ class ImageSettings(Settings):
     True
     """
 
-    size: int = setting(32, "Pixels per side.", within=(1, MAX_SAMPLES_PER_ROW))
+    size: int | Sequence[int] = setting(
+        32, "Pixels per side, or height and width.", within=(1, MAX_SAMPLES_PER_ROW)
+    )
     samples: int = setting(
         2, "Samples per side of a pixel. With 2, each pixel has 4 samples.", within=(1, MAX_SAMPLES)
     )
@@ -346,9 +368,21 @@ class ImageSettings(Settings):
     )
 
     def __post_init__(self) -> None:
-        """Check each field, and the number of samples in a row of the image."""
+        """Check each field, and the number of samples in a row and a column of the image."""
+        object.__setattr__(self, "size", as_size("size", self.size))
         super().__post_init__()
-        require_range("size × samples", self.size * self.samples, 1, MAX_SAMPLES_PER_ROW)
+        for side in self.shape:
+            require_range("size × samples", side * self.samples, 1, MAX_SAMPLES_PER_ROW)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return height_and_width(self.size)
+
+    @property
+    def pixel_count(self) -> int:
+        """Number of pixels of an image."""
+        return math.prod(self.shape)
 
     @property
     def global_illumination(self) -> bool:

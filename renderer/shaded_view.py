@@ -100,8 +100,8 @@ class ShadedView:
 
         If `settings.silhouettes` and `is_moved` are True, gradients include how
         silhouettes and surfaces move in the image. Uncovered pixels into which silhouettes
-        may move then follow the covered ones. The background is encoded, shape (3, size²)
-        or (1, size²).
+        may move then follow the covered ones. The background is encoded, shape (3, height · width)
+        or (1, height · width).
         """
         if self.settings.silhouettes and self.is_moved:
             linear_background = decode(background, self.settings.encoding).expand(3, -1)

@@ -19,6 +19,7 @@ from renderer.settings import (
     MAX_VIEWS,
     REQUIRED,
     Settings,
+    as_size,
     pair,
     setting,
     setting_like,
@@ -254,7 +255,7 @@ class LabSettings(Settings):
     exposure: float = setting(
         1.0, "Factor of the radiance, of which 1 is white.", within=(1 / MAX_SCALE, MAX_SCALE)
     )
-    size: int = setting(64, "Pixels per side.", within=(1, MAX_SIZE))
+    size: Any = setting(64, "Pixels per side, or [height, width].", within=(1, MAX_SIZE))
     spp: int = setting(32, "Paths per pixel and light.", within=(1, 10**5))
     bounces: int = setting(4, "Largest number of bounces of light.", within=(1, 1000))
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
@@ -264,6 +265,7 @@ class LabSettings(Settings):
 
     def __post_init__(self) -> None:
         """Check all values, and that each pattern and each environment gets as many setups."""
+        self.size = as_size("size", self.size, MAX_SIZE)
         super().__post_init__()
         if self.label is None and self.meshes != LAB_MESHES:
             raise InputError("label is not set: give the class of the meshes, label=CLASS", "label")

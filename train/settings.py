@@ -150,9 +150,10 @@ class NetworkSettings(Settings):
     """Settings that choose a network, and describe it if it is a network of the user."""
 
     network: str | None = setting(None, f"The network: {NETWORKS}.")
-    size: int | None = setting(
+    size: Any = setting(
         None,
-        "Pixels per side of the network's images. null: those of its source, or 224.",
+        "Pixels per side of the network's images, or [height, width]. null: those of its source, "
+        "or 224.",
         within=(1, MAX_SIZE),
     )
     weights: str | None = setting(

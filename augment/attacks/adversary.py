@@ -65,10 +65,10 @@ class Adversary(ShortRepr):
         light: RGB coefficients of the light after the attack, multiplied by the
             exposure, shape (size of the basis, 3).
         basis: Basis of the light, such as spherical harmonics.
-        background: Background in [0, 1], RGB or gray, shape (3 or 1, size, size).
+        background: Background in [0, 1], RGB or gray, shape (3 or 1, height, width).
         settings: Settings of the images.
         images_in_views_before: Images before the attack, in [0, 1], shape
-            (V, 3, size, size).
+            (V, 3, height, width).
         images_in_views: Images after the attack, of the same shape.
         pixels: Offset of each pixel value by the attack, of the same shape. None
             if the attack did not change pixels directly.
@@ -86,12 +86,12 @@ class Adversary(ShortRepr):
 
     @property
     def images_before(self) -> Tensor:
-        """Images before the attack, shape (V, 3, size, size), or (3, size, size) if V is 1."""
+        """Images before the attack, (V, 3, height, width), or (3, height, width) if V is 1."""
         return self.images_in_views_before.squeeze(0)
 
     @property
     def images(self) -> Tensor:
-        """Images after the attack, shape (V, 3, size, size), or (3, size, size) if V is 1."""
+        """Images after the attack, (V, 3, height, width), or (3, height, width) if V is 1."""
         return self.images_in_views.squeeze(0)
 
     @staticmethod
@@ -111,7 +111,7 @@ class Adversary(ShortRepr):
             after: Light, shape, colors and pose of some or all examples after
                 the attack.
             before: Images of the V views before the attack, shape
-                (V, 3, size, size).
+                (V, 3, height, width).
             images: Images after the attack, of the same shape.
             row: Index of the example in the first dimension of `after`. None if
                 `after` has all examples of the scene.
@@ -160,7 +160,7 @@ class Adversary(ShortRepr):
             rasterizer: A rasterizer or its name. None for the default one.
 
         Returns:
-            Images in [0, 1], shape (V, 3, size, size), or (3, size, size) if
+            Images in [0, 1], shape (V, 3, height, width), or (3, height, width) if
             there is one camera.
         """
         return self.render_views(rasterizer).squeeze(0)
@@ -173,7 +173,7 @@ class Adversary(ShortRepr):
             rasterizer: A rasterizer or its name. None for the default one.
 
         Returns:
-            Images in [0, 1], shape (V, 3, size, size), also if there is one camera.
+            Images in [0, 1], shape (V, 3, height, width), also if there is one camera.
         """
         if not isinstance(rasterizer, Rasterizer):
             rasterizer = choose(rasterizer or "auto")
@@ -209,8 +209,9 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     folder.mkdir(parents=True, exist_ok=True)
     shown = adversary.shown
     settings = adversary.settings
+    height, width = settings.shape
     cameras = adversary.cameras
-    export_mesh(shown.mesh, folder / MESH, settings.normals, cameras, shown.own)
+    export_mesh(shown.mesh, folder / MESH, settings.normals, cameras, shown.own, width / height)
     (_, light), *local_lights = save_lights(folder, adversary.light, adversary.basis)
     gray = float(adversary.background.flatten()[0])
     is_gray = bool((adversary.background == gray).all())
@@ -332,7 +333,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     background = description["background"]
     if isinstance(background, str):
         background = folder / BACKGROUND
-    shape = (len(cameras), 3, settings.size, settings.size)
+    shape = (len(cameras), 3, *settings.shape)
     return Adversary(
         shown=SceneObject(label, mesh, albedo_scale, name, own_faces),
         cameras=tuple(cameras),

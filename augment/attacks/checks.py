@@ -27,6 +27,7 @@ from augment.random_streams import generator
 from augment.scene.objects import SceneObject
 from augment.tasks.classification import ClassCriterion
 from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, as_list, require_number
+from renderer.settings import Size, height_and_width
 
 # `check` repeats an attack with these multiples of its number of steps.
 GROWTH = (3, 10)
@@ -404,11 +405,11 @@ def _classify(
     }
 
 
-def _resized(adversary: Adversary, size: int) -> Adversary:
+def _resized(adversary: Adversary, size: Size) -> Adversary:
     """Return a copy of an adversary whose images have another size."""
     if adversary.settings.size == size:
         return adversary
-    resize = partial(F.interpolate, size=(size, size), mode="bilinear", antialias=True)
+    resize = partial(F.interpolate, size=height_and_width(size), mode="bilinear", antialias=True)
     background = resize(adversary.background[None])[0].clamp(0, 1)
     pixels = None if adversary.pixels is None else resize(adversary.pixels)
     settings = replace(adversary.settings, size=size)

@@ -168,7 +168,7 @@ def _write_example(
 
 
 def _numbers_of_version(
-    result: AttackResult, images: Float[Tensor, "E V 3 size size"]
+    result: AttackResult, images: Float[Tensor, "E V 3 height width"]
 ) -> list[dict[str, Any]]:
     """Return successes, predictions and differences of another version for each example."""
     judged = result.objective().judge(images, result.problem.all_examples)
@@ -192,7 +192,7 @@ def render_again(
 ) -> dict[str, Tensor]:
     """Render the V views of an example from its saved files alone.
 
-    Return images of shape (V, 3, size, size) by the name of the renderer.
+    Return images of shape (V, 3, height, width) by the name of the renderer.
     """
     adversary = reload(folder)
     images = {}
@@ -200,7 +200,9 @@ def render_again(
         images["reload"] = adversary.render_views(rasterizer)
     if MITSUBA in renderers:
         encoding = adversary.settings.encoding
-        rgba = render_mitsuba_scene(folder / MITSUBA / SCENE, len(adversary.cameras))
+        rgba = render_mitsuba_scene(
+            folder / MITSUBA / SCENE, len(adversary.cameras), adversary.settings.shape
+        )
         # The fourth channel is the coverage of each pixel by the object.
         background = background_term(rgba[:, 3:], adversary.background, encoding)
         rendered = encode(clamp(rgba[:, :3] + background), encoding)

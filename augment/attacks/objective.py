@@ -386,5 +386,8 @@ def _moved(
     sin = (1 + growth) * angle.sin()
     # `affine_grid` uses coordinates from -1 to 1. A shift by the whole image is therefore 2.
     matrices = torch.stack([cos, -sin, 2 * across, sin, cos, 2 * down], dim=1).view(-1, 2, 3)
+    # Rotations are those of square pixels.
+    aspect = images.shape[-1] / images.shape[-2]
+    matrices *= matrices.new_tensor([[1, 1 / aspect, 1], [aspect, 1, 1]])
     grid = F.affine_grid(matrices, list(images.shape), align_corners=False)
     return F.grid_sample(images, grid, padding_mode="border", align_corners=False)

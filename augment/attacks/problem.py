@@ -65,7 +65,7 @@ class SceneProblem:
     @torch.no_grad()
     def images(
         self, values: Values, examples: Int[Tensor, " A"] | None = None
-    ) -> Float[Tensor, "A V 3 size size"]:
+    ) -> Float[Tensor, "A V 3 height width"]:
         """Render the V views of examples without gradients, `group_size` examples at a time.
 
         The values are those of all E examples. `examples` are the indices of those to render, and

@@ -72,7 +72,7 @@ class AttackResult(ShortRepr):
         settings: Settings of the attack.
         seed: Seed of the attack.
         images_in_views_before: Images before the attack, in [0, 1] and not
-            rounded, shape (E, V, 3, size, size).
+            rounded, shape (E, V, 3, height, width).
         images_in_views: Images after the attack, with the same shape and range.
             Their shadows and bounces are those of the attacked shape and colors.
         evidence_in_views_before: How strongly each class is found in the
@@ -109,7 +109,7 @@ class AttackResult(ShortRepr):
     def images_before(self) -> Tensor:
         """Images before the attack in [0, 1], one row for each example.
 
-        The shape is (E, V, 3, size, size), or (E, 3, size, size) if an example has one view.
+        The shape is (E, V, 3, height, width), or (E, 3, height, width) if an example has one view.
         """
         return self.images_in_views_before.squeeze(1)
 
@@ -117,7 +117,7 @@ class AttackResult(ShortRepr):
     def images(self) -> Tensor:
         """Images after the attack in [0, 1], one row for each example.
 
-        The shape is (E, V, 3, size, size), or (E, 3, size, size) if an example has one view.
+        The shape is (E, V, 3, height, width), or (E, 3, height, width) if an example has one view.
         """
         return self.images_in_views.squeeze(1)
 
@@ -349,9 +349,15 @@ class AttackResult(ShortRepr):
         shown = torch.stack(images)
         logits = self.objective().evidence(shown[:, None])[:, 0]
         titles = _titles(logits, self.classifier.classes)
-        if shown.shape[-1] > MAX_SIDE:
-            size = (MAX_SIDE, MAX_SIDE)
-            shown = F.interpolate(shown.float(), size, mode="bilinear", antialias=True)
+        height, width = shown.shape[-2:]
+        scale = MAX_SIDE / max(height, width)
+        if scale < 1:
+            shown = F.interpolate(
+                shown.float(),
+                (max(1, round(scale * height)), max(1, round(scale * width))),
+                mode="bilinear",
+                antialias=True,
+            )
         tiles = tiles_of(shown.cpu().float(), [(title,) for title in titles], SIDE)
         ball_tiles = tiles_of(balls, [("light",)] * frame_count, SIDE)
         pairs = zip(tiles, ball_tiles, strict=True)

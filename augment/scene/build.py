@@ -35,7 +35,7 @@ from renderer.light.harmonics import degree_of, irradiance_error
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.ringing import highlight_error, required_degree
 from renderer.mesh import Mesh, require_mesh, subdivide
-from renderer.settings import MIN_ROUGHNESS, ImageSettings
+from renderer.settings import MIN_ROUGHNESS, ImageSettings, Size
 from renderer.surface.gloss import Gloss, smallest_roughness
 from renderer.visibility import choose
 
@@ -54,7 +54,7 @@ RENDERER_OPTIONS = {item.name for item in fields(RendererSettings)}
 
 def build_scene(
     meshes: Sequence[ObjectSettings | tuple[MeshSource, str | int]],
-    size: int,
+    size: Size,
     views: int = 1,
     *,
     cameras: Sequence[Camera] | None = None,
@@ -72,7 +72,8 @@ def build_scene(
     Args:
         meshes: Pairs of a mesh and the name or the index of its class, or
             `ObjectSettings`. A mesh is a file, solid:NAME or a `Mesh`.
-        size: Pixels per side of the images.
+        size: Pixels per side of the images, or (height, width). `width` and `fov`
+            of the cameras are horizontal.
         views: Number of cameras, which are placed on a circle around the mesh.
         cameras: Cameras to use instead of a circle, such as those of
             `nb.load_cameras`. `views` must then be left out.
@@ -131,7 +132,7 @@ def build_scene(
     errors.require_flag("normalize", normalize)
     given_cameras = _as_cameras(cameras, views, normalize)
     views = len(given_cameras) or views
-    ImageSettings(size)
+    image = ImageSettings(size)
     unknown = sorted(options.keys() - SCENE_OPTIONS - RENDERER_OPTIONS)
     if unknown:
         choices = ", ".join(sorted(SCENE_OPTIONS | RENDERER_OPTIONS))
@@ -149,7 +150,9 @@ def build_scene(
     if isinstance(environment, str | Path):
         material = attack.material if attack else None
         smoothest = reached_gloss(objects, material, vary.gloss if vary else None)
-        degree = degree_of_scene(smoothest, settings.degree, views * len(objects) * size**2)
+        degree = degree_of_scene(
+            smoothest, settings.degree, views * len(objects) * image.pixel_count
+        )
         environment = load_light(environment, degree, smoothest.gloss_roughness)
         _warn_of_wrong_irradiance(settings.light, environment, degree)
         if settings.degree is None:
@@ -254,10 +257,10 @@ def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
     return LOCAL_LIGHT_OF_SETTINGS[type(settings)].from_settings(settings)
 
 
-def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
+def load_backgrounds(choices: Sequence[float | str | Path], size: Size) -> Tensor:
     """Load the backgrounds of a scene.
 
-    The shape is (B, 3, size, size), or (B, 1, size, size) if all backgrounds are gray.
+    The shape is (B, 3, height, width), or (B, 1, height, width) if all backgrounds are gray.
     """
     expected = "gray values in [0, 1] or image files"
     choices = errors.as_list("backgrounds", choices, object, f"a list of {expected}")
@@ -420,7 +423,7 @@ def with_needed_degree(
     """
     smoothest = reached_gloss(scene.objects, material, layer)
     degree = harmonics_of(scene.basis).degree
-    needed = smoothest.affordable_degree(len(scene) * scene.views * scene.settings.size**2)
+    needed = smoothest.affordable_degree(len(scene) * scene.views * scene.settings.pixel_count)
     if needed <= degree:
         return scene
     if scene.lights_of_degree is not None:

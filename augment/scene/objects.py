@@ -372,7 +372,7 @@ class Conditions(ShortRepr):
         vertices: Positions of the vertices, shape (A, N, 3).
         albedo: Linear RGB that is added to the albedo of each face, shape (A, F, 3).
         pixels: Offsets that are added to the pixel values of the V images, shape
-            (A, V, 3, size, size).
+            (A, V, 3, height, width).
         positions: Positions of the L lamps, shape (A, L, 3).
         cameras: Change of the polar angle in degrees, change of the azimuth in degrees, and
             change of the logarithm of the distance, shape (A, 3). They apply to all V cameras of
@@ -386,7 +386,7 @@ class Conditions(ShortRepr):
     light: Float[Tensor, "... coefficients 3"]
     vertices: Float[Tensor, "... N 3"] | None = None
     albedo: Float[Tensor, "... F 3"] | None = None
-    pixels: Float[Tensor, "... V 3 size size"] | None = None
+    pixels: Float[Tensor, "... V 3 height width"] | None = None
     positions: Float[Tensor, "... L 3"] | None = None
     cameras: Float[Tensor, "... 3"] | None = None
     gloss: Float[Tensor, "... F 3"] | Float[Tensor, "... 1 3"] | None = None

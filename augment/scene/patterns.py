@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Generator, Tensor
 
 from renderer.image import LUMINANCE, decode, to_unit
+from renderer.settings import Size, height_and_width
 
 # Radius of a disc in the pattern `spots`, which has one disc in each square cell of width 1. The
 # discs cover half of the area.
@@ -71,13 +72,15 @@ def solid(points: Float[Tensor, "2 ..."], shift: Tensor | float = 0.0) -> Float[
 FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (stripes, checkers, spots, half, solid)
 
 
-def pixel_centers(size: int) -> Float[Tensor, "2 1 size size"]:
-    """Return the coordinates of the pixel centers of an image, which spans [-1, 1].
+def pixel_centers(size: Size) -> Float[Tensor, "2 1 height width"]:
+    """Return the coordinates of the pixel centers of an image, which spans [-1, 1] along x.
 
-    Row 0 is x to the right, row 1 is y down. The second axis is for several images.
+    Row 0 is x to the right, row 1 is y down, in the same unit. The second axis is for several
+    images.
     """
-    centers = (torch.arange(size) + 0.5) / size * 2 - 1
-    return torch.stack(torch.meshgrid(centers, centers, indexing="xy"))[:, None]
+    height, width = height_and_width(size)
+    x, y = ((torch.arange(count) + 0.5) / width * 2 - count / width for count in (width, height))
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"))[:, None]
 
 
 def turned(
@@ -105,10 +108,10 @@ def random_colors(draws: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3 1 1"]:
 
 def draw_patterns(
     count: int,
-    size: int,
+    size: Size,
     draws: Generator,
-    points: Float[Tensor, "2 count size size"] | None = None,
-) -> Float[Tensor, "count 3 size size"]:
+    points: Float[Tensor, "2 count height width"] | None = None,
+) -> Float[Tensor, "count 3 height width"]:
     """Draw random patterns in two colors: stripes, squares, discs, halves or one color.
 
     Kind, colors, angle, period and position are random. The result is linear light. `points` has x
@@ -132,10 +135,10 @@ def draw_patterns(
     turn, relative_period, *shifts = positions.T[:, :, None, None]
     period = MIN_PERIOD + (MAX_PERIOD - MIN_PERIOD) * relative_period
     angle = 2 * math.pi * turn
-    # Points of the pattern in units of its period, shape (2, count, size, size).
+    # Points of the pattern in units of its period, shape (2, count, height, width).
     rotated = turned(points / period, angle.cos(), angle.sin())
     shift = torch.stack(shifts)
-    # Weight of the first color at each pixel, shape (count, 1, size, size).
+    # Weight of the first color at each pixel, shape (count, 1, height, width).
     weight = torch.empty(count, 1, *points.shape[2:])
     for index, family in enumerate(FAMILIES):
         rows = torch.nonzero(family_of_pattern == index).squeeze(1)
@@ -147,8 +150,10 @@ def draw_patterns(
 
 
 def draw_photograph_patterns(
-    photographs: Float[Tensor, "N 3 H W"], points: Float[Tensor, "2 _ size size"], draws: Generator
-) -> Float[Tensor, "N 3 size size"]:
+    photographs: Float[Tensor, "N 3 H W"],
+    points: Float[Tensor, "2 _ height width"],
+    draws: Generator,
+) -> Float[Tensor, "N 3 height width"]:
     """Draw random patterns that are photographs, rotated, scaled and saturated at random.
 
     Beyond its border, a photograph is mirrored. Photographs are linear light. `points` has x and y
@@ -160,7 +165,8 @@ def draw_photograph_patterns(
     scale = MAX_ZOOM ** (2 * zoom - 1)
     rotated = turned(points * scale, angle.cos(), angle.sin())
     # `grid_sample` needs the coordinates on the last axis, shape (N, size, size, 2).
-    grid = rotated.permute(1, 2, 3, 0)
+    height, width = photographs.shape[-2:]
+    grid = rotated.permute(1, 2, 3, 0) * rotated.new_tensor([1, width / height])
     shown = F.grid_sample(photographs, grid, padding_mode="reflection", align_corners=False)
     # Change the saturation: scale the difference between each color and its gray value.
     gray = luminance(shown)
@@ -191,14 +197,14 @@ FAR = 100.0
 
 
 def draw_slides(
-    count: int, size: int, draws: Generator, photographs: UInt8[Tensor, "N 3 H W"] | None = None
-) -> Float[Tensor, "count 3 size size"]:
+    count: int, size: Size, draws: Generator, photographs: UInt8[Tensor, "N 3 H W"] | None = None
+) -> Float[Tensor, "count 3 height width"]:
     """Draw random slides, which are pictures that a projector shows.
 
     A slide has a two-color pattern, Voronoi cells, a smooth field or a photograph. Slides are
     linear light on the CPU.
     """
-    families: list[Callable[[int, int, Generator], Tensor]]
+    families: list[Callable[[int, Size, Generator], Tensor]]
     families = [draw_patterns, draw_cells, draw_fields]
     if photographs is not None:
         families.append(partial(draw_projected, photographs))
@@ -206,7 +212,7 @@ def draw_slides(
     weights = torch.tensor(PROBABILITIES[: len(families)])
     # Kind of each slide as an index of `families`, shape (count,).
     slide_to_family = torch.multinomial(weights, count, replacement=True, generator=draws)
-    slides = torch.empty(count, 3, size, size)
+    slides = torch.empty(count, 3, *height_and_width(size))
     for index, draw in enumerate(families):
         rows = torch.nonzero(slide_to_family == index).squeeze(1)
         if len(rows):
@@ -214,7 +220,7 @@ def draw_slides(
     return slides
 
 
-def draw_cells(count: int, size: int, draws: Generator) -> Float[Tensor, "count 3 size size"]:
+def draw_cells(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 3 height width"]:
     """Draw pictures of Voronoi cells, each cell in a random color.
 
     The centers of the cells are random points. A pixel belongs to the cell whose center is nearest.
@@ -222,23 +228,25 @@ def draw_cells(count: int, size: int, draws: Generator) -> Float[Tensor, "count 
     """
     cell_counts = torch.randint(MIN_CELLS, MAX_CELLS + 1, (count,), generator=draws)
     # Draw `MAX_CELLS` centers for each picture, and move those that are not needed far away.
+    height, width = height_and_width(size)
     centers = 2 * torch.rand(count, MAX_CELLS, 2, generator=draws) - 1
+    centers[..., 1] *= height / width
     is_unused = torch.arange(MAX_CELLS) >= cell_counts[:, None]
     centers[is_unused] = FAR
-    # Coordinates x and y of the pixel centers, shape (size², 2).
+    # Coordinates x and y of the pixel centers, shape (height · width, 2).
     pixels = pixel_centers(size).flatten(1).T
-    # Index of the cell of each pixel, which has the nearest center, shape (count, size²).
+    # Index of the cell of each pixel, which has the nearest center, shape (count, height · width).
     pixel_to_cell = torch.cdist(pixels.expand(count, -1, -1), centers).argmin(2)
 
     hue, saturation, brightness = torch.rand(3, count * MAX_CELLS, generator=draws)
     colors = random_colors(torch.stack([hue, saturation], dim=1))[:, :, 0, 0] * brightness[:, None]
     colors = colors.view(count, MAX_CELLS, 3)
-    # Color of each pixel, shape (count, size², 3).
+    # Color of each pixel, shape (count, height · width, 3).
     shown = colors.gather(1, pixel_to_cell[:, :, None].expand(-1, -1, 3))
-    return shown.transpose(1, 2).unflatten(2, (size, size))
+    return shown.transpose(1, 2).unflatten(2, (height, width))
 
 
-def draw_fields(count: int, size: int, draws: Generator) -> Float[Tensor, "count 3 size size"]:
+def draw_fields(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 3 height width"]:
     """Draw pictures of smooth random light, which differs between the three channels.
 
     Pictures are linear light.
@@ -252,18 +260,18 @@ def draw_fields(count: int, size: int, draws: Generator) -> Float[Tensor, "count
 
 
 def interpolate_smoothly(
-    values: Float[Tensor, "N C n n"], size: int
-) -> Float[Tensor, "N C size size"]:
+    values: Float[Tensor, "N C n n"], size: Size
+) -> Float[Tensor, "N C height width"]:
     """Interpolate the values of a coarse grid to the pixels of an image, by bicubic splines.
 
     Interpolated values may be outside of the range of the given values.
     """
-    return F.interpolate(values, (size, size), mode="bicubic", align_corners=True)
+    return F.interpolate(values, height_and_width(size), mode="bicubic", align_corners=True)
 
 
 def draw_projected(
-    photographs: UInt8[Tensor, "N 3 H W"], count: int, size: int, draws: Generator
-) -> Float[Tensor, "count 3 size size"]:
+    photographs: UInt8[Tensor, "N 3 H W"], count: int, size: Size, draws: Generator
+) -> Float[Tensor, "count 3 height width"]:
     """Choose photographs, and rotate, scale and saturate them at random.
 
     Beyond its border, a photograph is mirrored. Pictures are linear light on the CPU.

@@ -118,7 +118,7 @@ class OperatorRenderer:
         operator_of_view = {view: index for index, view in enumerate(self._views_of_operators)}
         # Index of the transfer operator that renders each image, shape (N,).
         self._operator_of_image = torch.tensor([operator_of_view[view] for view in self.views])
-        self._operators_per_stack = max(1, PIXELS_PER_STACK // self.settings.size**2)
+        self._operators_per_stack = max(1, PIXELS_PER_STACK // self.settings.pixel_count)
         # Index of the stack of operators that renders each image, shape (N,).
         self._stack_of_image = self._operator_of_image // self._operators_per_stack
         self._stack_count = math.ceil(len(self._views_of_operators) / self._operators_per_stack)
@@ -169,7 +169,8 @@ class OperatorRenderer:
                 stack_bytes = sum(tensor.nbytes for tensor in tensors)
                 needed = (self._stack_count - 1) * stack_bytes + self.attack_bytes
                 view_count = len(self._views_of_operators)
-                name = f"{view_count} views of {self.settings.size} pixels per side (views)"
+                height, width = self.settings.shape
+                name = f"{view_count} views of {height} × {width} pixels (views)"
                 require_memory(name, needed, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> _BuiltStack:
@@ -254,8 +255,8 @@ class FrozenTransport:
         if added_transfer is None:
             return
         # A slightly different shape may cover other pixels, so expand the radiance to all pixels
-        # of the image, shape (3, K, size²).
-        all_pixels = added_transfer.new_zeros(*added_transfer.shape[:2], fragments.size**2)
+        # of the image, shape (3, K, height · width).
+        all_pixels = added_transfer.new_zeros(*added_transfer.shape[:2], math.prod(fragments.shape))
         all_pixels[..., surface.fragments.pixels] = added_transfer
         # The method `radiance` scales the added radiance of a pixel by the ratio of its new albedo
         # to this albedo.
@@ -292,7 +293,7 @@ def _sum_by_pixel(fragments: Fragments, albedo: Float[Tensor, "S 3"]) -> Float[T
     """Sum the albedo of the samples in each pixel of an image."""
     # Row-major index of the pixel in which each sample lies, shape (S,).
     pixel_of_sample = fragments.pixels[fragments.sample_to_pixel]
-    sums = albedo.new_zeros(3, fragments.size**2)
+    sums = albedo.new_zeros(3, math.prod(fragments.shape))
     return sums.index_add(1, pixel_of_sample, albedo.T)
 
 
@@ -361,7 +362,7 @@ class DirectRenderer:
 
     def mask(
         self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"] | None = None
-    ) -> tuple[Bool[Tensor, "size size"], float]:
+    ) -> tuple[Bool[Tensor, "height width"], float]:
         """Find the pixels that an object without its props and its table covers to COVERED or more.
 
         Return also the fraction of the object that its props and its table do not hide. `vertices`
@@ -377,12 +378,12 @@ class DirectRenderer:
             [fragments] = build_fragments(*shown)
             own = item.own_faces[fragments.faces.numpy()][fragments.sample_to_seen_face.numpy()]
             pixels = fragments.pixels[fragments.sample_to_pixel][torch.from_numpy(own)]
-            counts.append(torch.bincount(pixels, minlength=self.settings.size**2))
+            counts.append(torch.bincount(pixels, minlength=self.settings.pixel_count))
             if item.own is None:
                 break
         fraction = float(counts[0].sum() / counts[-1].sum().clamp(min=1))
         is_covered = counts[0] >= COVERED * self.settings.samples**2
-        return is_covered.view(self.settings.size, self.settings.size), fraction
+        return is_covered.view(self.settings.shape), fraction
 
     def radiance(
         self,

@@ -56,8 +56,8 @@ class Scene:
     Args:
         objects: The objects.
         examples: The E examples, each with V cameras.
-        backgrounds: B backgrounds with values in [0, 1], shape (B, 3, size, size) or
-            (B, 1, size, size).
+        backgrounds: B backgrounds with values in [0, 1], shape (B, 3, height, width) or
+            (B, 1, height, width).
         lights: RGB coefficients of the light before any attack, shape (E, coefficients, 3), or
             (coefficients, 3) for all examples. Images have the dtype and the device of the
             lights.
@@ -66,7 +66,7 @@ class Scene:
         basis: Basis of the coefficients. By default, these are 49 spherical harmonics.
         camera_effects: A differentiable function that changes rendered images, such as one of
             `draw_camera_effects`. Its arguments are the images of A examples, shape
-            (A, V, 3, size, size), and the indices of these examples, shape (A,). None for no
+            (A, V, 3, height, width), and the indices of these examples, shape (A,). None for no
             effects.
         one_light: Whether each view is rendered in one light only. Then no transfer operators
             are built, because direct rendering takes less time.
@@ -140,14 +140,15 @@ class Scene:
         # Two axes of size 1 let the exposures multiply lights of shape (E, coefficients, 3).
         self._exposure = exposures.to(lights)[:, None, None]
 
-        pixels_per_example = self.views * settings.size**2
+        pixels_per_example = self.views * settings.pixel_count
         self.group_size = max(1, AT_ONCE // pixels_per_example)
         per_rendered_pixel = NUMBERS_WITH_CAMERA if camera_effects else NUMBERS_PER_RENDERED_PIXEL
         numbers = NUMBERS_PER_PIXEL * len(self) * pixels_per_example
         numbers += per_rendered_pixel * min(len(self), self.group_size) * pixels_per_example
         numbers += NUMBERS_PER_LIGHT_VALUE * self.lights.numel()
         self.attack_bytes = lights.element_size() * numbers
-        count = f"{len(self) * self.views} renders of {settings.size} pixels per side"
+        height, width = settings.shape
+        count = f"{len(self) * self.views} renders of {height} × {width} pixels"
         errors.require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
         self._operator_renderer = OperatorRenderer(
             self.objects,
@@ -183,12 +184,12 @@ class Scene:
             )
         errors.require_bounded(lights=lights)
         errors.require_shape("lights", lights, "...", self.basis.size, 3)
-        size = self.settings.size
-        is_image = backgrounds.shape[1:] in ((1, size, size), (3, size, size))
+        shape = self.settings.shape
+        is_image = backgrounds.shape[1:] in ((1, *shape), (3, *shape))
         if not (is_image and backgrounds.min() >= 0 and backgrounds.max() <= 1):
             raise InputError(
                 f"backgrounds has shape {tuple(backgrounds.shape)}, or values outside of [0, 1]: "
-                f"give images of shape (count, 3, {size}, {size}) with values in [0, 1]"
+                f"give images of shape (count, 3, {shape[0]}, {shape[1]}) with values in [0, 1]"
             )
 
     @classmethod
@@ -209,7 +210,7 @@ class Scene:
         Args:
             objects: The objects.
             cameras: The cameras.
-            backgrounds: The backgrounds, shape (B, 3, size, size) or (B, 1, size, size).
+            backgrounds: The backgrounds, shape (B, 3, height, width) or (B, 1, height, width).
             of_scene: Further arguments of `Scene`, by position.
             shared: Whether all cameras are the views of one example, so that they share one light
                 and one shape. By default, each camera makes an example of its own.
@@ -315,7 +316,7 @@ class Scene:
 
     def render(
         self, conditions: Conditions, examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A V 3 size size"]:
+    ) -> Float[Tensor, "A V 3 height width"]:
         """Render the V views of examples, differentiable in the conditions.
 
         Args:
@@ -324,7 +325,7 @@ class Scene:
                 scene, shape (A,).
 
         Returns:
-            Images with values in [0, 1], shape (A, V, 3, size, size).
+            Images with values in [0, 1], shape (A, V, 3, height, width).
 
         Raises:
             InputError: If there is no such example, if the conditions do not have one light for
@@ -335,15 +336,14 @@ class Scene:
         errors.require_shape("conditions.light", conditions.light, "examples", self.basis.size, 3)
         examples = self._as_examples(examples, len(conditions.light))
         layers = list(self._layers(conditions, examples))
-        size = self.settings.size
-        # Start with the background of each image, shape (A · V, 3 or 1, size²). Then overwrite
-        # the pixels that objects cover.
+        # Start with the background of each image, shape (A · V, 3 or 1, height · width). Then
+        # overwrite the pixels that objects cover.
         image_to_background = self._background[examples].repeat_interleave(self.views)
         canvas = self.backgrounds.flatten(2).index_select(0, image_to_background)
         new_values = [encode(clamp(layer.composite), self.settings.encoding) for layer in layers]
         targets = [(layer.rows, layer.pixels) for layer in layers]
         images = ScatterLayers.apply(canvas.expand(-1, 3, -1).contiguous(), targets, *new_values)
-        images = images.view(len(examples), self.views, 3, size, size)
+        images = images.view(len(examples), self.views, 3, *self.settings.shape)
         if self.camera_effects:
             images = self.camera_effects(images, examples)
         if conditions.pixels is not None:
@@ -371,8 +371,8 @@ class Scene:
         rows = torch.arange(len(self)) if examples is None else self._as_examples(examples)
         if conditions is None:
             conditions = self.conditions(rows)
-        size = self.settings.size
-        masks = torch.zeros(len(rows), self.views, 1, size, size, dtype=torch.bool)
+        shape = (len(rows), self.views, 1, *self.settings.shape)
+        masks = torch.zeros(shape, dtype=torch.bool)
         visible = torch.zeros(len(rows), self.views, 1)
         for row, example in enumerate(rows.tolist()):
             index = self.examples[example].object

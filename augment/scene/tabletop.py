@@ -133,7 +133,7 @@ def irradiance(
     sky: Float[Tensor, "K 3"],
     lamp: Float[Tensor, " 3"],
     lights: Sequence[tuple[LocalBasis, Tensor]] = (),
-) -> Float[Tensor, "3 size size"]:
+) -> Float[Tensor, "3 height width"]:
     """Compute an image of the irradiance of a table and a wall, with the shadow of an object.
 
     The object itself is invisible. `lamp` is the unit direction towards a white lamp of irradiance
@@ -143,7 +143,7 @@ def irradiance(
     normals = _normals(camera)
     # Shadows of lamps have sharp edges, which need several samples per pixel.
     fine = image if lamp.any() or lights else replace(image, samples=1)
-    fine_points = _find_seen_points(camera, fine, room)
+    fine_points = _find_seen_points(camera, fine, room, image.shape)
     # Irradiance from the whole sky of the table, in row 0, and of the wall, in row 1. Only the
     # harmonics with the indices `nonzero` contribute irradiance.
     from_whole_sky = harmonics.irradiance(normals) @ sky[harmonics.nonzero]
@@ -156,8 +156,9 @@ def irradiance(
     lit = open_sky + (from_lamp + from_lights)
 
     # Irradiance from the part of the sky that the object blocks, in an image of fewer pixels.
-    coarse = replace(image, size=math.ceil(image.size / COARSE), samples=1)
-    coarse_points = _find_seen_points(camera, coarse, room)
+    size = tuple(math.ceil(side / COARSE) for side in image.shape)
+    coarse = replace(image, size=size, samples=1)
+    coarse_points = _find_seen_points(camera, coarse, room, image.shape)
     # The irradiance is the integral of radiance times cosine. The density of the directions is
     # proportional to the cosine, so each direction has the same share of π, the integral of the
     # cosine.
@@ -165,9 +166,9 @@ def irradiance(
     radiance = harmonics.radiance(directions.flatten(0, 1)) @ sky * (math.pi / DIRECTIONS)
     blocked = _blocked_sky(room, coarse_points, directions, radiance.unflatten(0, (2, -1)))
     blocked_image = F.interpolate(
-        blocked.T.unflatten(1, (coarse.size, -1))[None], image.size, mode="bilinear"
+        blocked.T.unflatten(1, coarse.shape)[None], image.shape, mode="bilinear"
     )[0]
-    return (lit.T.unflatten(1, (image.size, -1)) - blocked_image).clamp(min=0)
+    return (lit.T.unflatten(1, image.shape) - blocked_image).clamp(min=0)
 
 
 def _normals(camera: Camera) -> Float[Tensor, "2 3"]:
@@ -246,7 +247,7 @@ def _blocked_sky(
 
 def project_along_light(
     room: Room, mesh: Mesh, camera: Camera, image: ImageSettings, towards: Float[Tensor, " 3"]
-) -> Float[Tensor, "2 size size"]:
+) -> Float[Tensor, "2 height width"]:
     """Compute which point of a projected pattern each pixel of an image shows.
 
     A projector far away shines a pattern along parallel rays. A pixel shows a point of the object,
@@ -261,7 +262,7 @@ def project_along_light(
     right = F.normalize(right, dim=0)
     axes = torch.stack([right, torch.linalg.cross(towards, right)])
     coordinates = points @ axes.T / (camera.width / 2)
-    return coordinates.T.unflatten(1, (image.size, -1))
+    return coordinates.T.unflatten(1, image.shape)
 
 
 def _find_shown_points(
@@ -269,7 +270,8 @@ def _find_shown_points(
 ) -> Float[Tensor, "P 3"]:
     """Find the points of an object, a table or a wall that the centers of the pixels show."""
     # Points of table or wall that the pixels would show without the object, shape (P, 3).
-    points = _find_seen_points(camera, replace(image, samples=1), room).points[0]
+    centers = replace(image, samples=1)
+    points = _find_seen_points(camera, centers, room, image.shape).points[0]
     starts = _ray_starts(camera, points)
     forward = F.normalize(points - starts, dim=1)
     face_of_pixel = room.rays.first_hit(starts, forward)
@@ -325,15 +327,18 @@ def _directions(normals: Float[Tensor, "2 3"]) -> Float[Tensor, "2 D 3"]:
     )
 
 
-def _find_seen_points(camera: Camera, image: ImageSettings, room: Room) -> _SeenPoints:
+def _find_seen_points(
+    camera: Camera, image: ImageSettings, room: Room, frame: tuple[int, int]
+) -> _SeenPoints:
     """Find where the rays of a camera meet a table or a wall, if no object is in the way.
 
-    Each of the P = size² pixels has S = samples² rays.
+    Each of the P pixels has S = samples² rays. The image shows what one of the height and the
+    width `frame` shows.
     """
     # Each ray passes through a point of the plane through the origin that faces the camera. The
     # rows of `axes` point right, up and towards the camera.
     axes = torch.from_numpy(camera.axes())
-    right, up = _sample_positions(camera, image)
+    right, up = _sample_positions(camera, image, frame[0] / frame[1])
     ends = right * axes[0] + up * axes[1]
     starts = _ray_starts(camera, ends)
     forward = ends - starts
@@ -355,24 +360,35 @@ def _ray_starts(camera: Camera, points: Float[Tensor, "... 3"]) -> Float[Tensor,
     return points + FAR * torch.from_numpy(camera.axes()[2])
 
 
-def _sample_positions(camera: Camera, image: ImageSettings) -> tuple[Tensor, Tensor]:
+def _sample_positions(
+    camera: Camera, image: ImageSettings, relative_height: float
+) -> tuple[Tensor, Tensor]:
     """Compute where the samples of an image lie in the plane through the origin.
 
-    The plane faces the camera. Return the distances to the right and up in world units, each of
-    shape (S, P, 1) for S samples of each of P pixels.
+    The plane faces the camera. `relative_height` is the height of what the image shows, divided by
+    its width. Return the distances to the right and up in world units, each of shape (S, P, 1) for
+    S samples of each of P pixels.
     """
-    count = image.size * image.samples
-    # Distances of the samples of a row or column from the center of the image, in world units.
-    centers = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * camera.width
+    # Distances of the rows down, and of the columns to the right, from the center of the image in
+    # world units.
+    down, right = (
+        ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * extent
+        for count, extent in zip(
+            (side * image.samples for side in image.shape),
+            (camera.width * relative_height, camera.width),
+            strict=True,
+        )
+    )
     # Measure from the principal point, which may be off the center of the image.
     half_width = camera.width / 2
-    up_of_rows = (-centers - camera.principal_up * half_width) / camera.pixel_aspect
-    right_of_columns = centers - camera.principal_right * half_width
+    up_of_rows = (-down - camera.principal_up * half_width) / camera.pixel_aspect
+    right_of_columns = right - camera.principal_right * half_width
     up, right = torch.meshgrid(
         up_of_rows - camera.up, right_of_columns - camera.right, indexing="ij"
     )
     # Split rows and columns of samples: (2, pixel row, sample row, pixel column, sample column).
-    split = 2 * (image.size, image.samples)
+    height, width = image.shape
+    split = (height, image.samples, width, image.samples)
     by_pixel = torch.stack([right, up]).view(2, *split)
     # Bring the two axes of samples to the front, and join each pair of axes.
     right, up = by_pixel.permute(0, 2, 4, 1, 3).reshape(2, image.samples**2, -1, 1)

@@ -26,7 +26,7 @@ from renderer.light.basis import harmonics_of, split_light
 from renderer.light.files import directional, load_light
 from renderer.light.harmonics import degree_of
 from renderer.operators.rays import Rays
-from renderer.settings import ImageSettings
+from renderer.settings import ImageSettings, Size
 from renderer.surface.gloss import Gloss
 from renderer.vectors import rotation_matrices
 
@@ -227,7 +227,7 @@ class _Variation:
         environment = torch.where(is_chosen.to(environment.device), dimmed, environment)
         return environment, directions * is_chosen[:, 0]
 
-    def _draw_background_albedo(self) -> Float[Tensor, "E _ size size"]:
+    def _draw_background_albedo(self) -> Float[Tensor, "E _ height width"]:
         """Convert the background of each example to an albedo, and multiply it by a random color.
 
         The values of a background are taken as its albedo. The result is linear.
@@ -243,14 +243,14 @@ class _Variation:
 
     def _light_backgrounds(
         self,
-        albedo: Float[Tensor, "E _ size size"],
+        albedo: Float[Tensor, "E _ height width"],
         environment: Float[Tensor, "E K 3"],
         directions: Float[Tensor, "E 3"],
     ) -> tuple[Tensor, Tensor | None]:
         """Compute the background images of all examples from their albedo and their lighting.
 
         Return the images, and the x and y of the point of a projected pattern that each pixel
-        shows, shape (2, E, size, size), or None without tables.
+        shows, shape (2, E, height, width), or None without tables.
         """
         scene = self.scene
         # If backgrounds are not lit, an irradiance of 1 leaves the albedo as it is.
@@ -369,7 +369,7 @@ def _light_room(
     wall_distance: float,
     environment: Float[Tensor, "K 3"],
     direction: Float[Tensor, " 3"],
-) -> tuple[Float[Tensor, "3 size size"], Float[Tensor, "2 size size"]]:
+) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "2 height width"]]:
     """Light a table and a wall in an example, and find where a projected pattern falls.
 
     The pattern falls on table, wall and object along the directional light of the example or, if it
@@ -396,17 +396,17 @@ def draw_camera_effects(
     image: ImageSettings,
     draws: Generator,
     device: torch.device | str = "cpu",
-    points: Float[Tensor, "2 count size size"] | None = None,
+    points: Float[Tensor, "2 count height width"] | None = None,
 ) -> Callable[[Tensor, Tensor], Tensor]:
     """Draw the effects of a camera and of a projector for the images of each example.
 
     The linear light of an image is multiplied by a random pattern, as of a projector, and by a
     random white balance. Then the image is blurred, and noise is added. The returned function takes
-    images of A examples, shape (A, V, 3, size, size), and their indices. `points` are x and y in
+    images of A examples, shape (A, V, 3, height, width), and their indices. `points` are x and y in
     [-1, 1] of the point of the pattern that each pixel shows. None lets the pattern fill the image.
     """
     size = image.size
-    # Relative light of the projector at each pixel, shape (count, 3, size, size).
+    # Relative light of the projector at each pixel, shape (count, 3, height, width).
     light = patterns.draw_patterns(count, size, draws, points)
     if settings.slides is not None:
         is_photograph = torch.rand(count, generator=draws) < PHOTOGRAPH_PROBABILITY
@@ -427,12 +427,12 @@ def draw_camera_effects(
     stops = settings.white_balance * (2 * torch.rand(count, 3, 1, 1, generator=draws) - 1)
     deviations = (settings.blur * torch.rand(count, generator=draws)).to(device)
     noise_deviations = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
-    noises = (noise_deviations * torch.randn(count, 3, size, size, generator=draws)).to(device)
+    noises = (noise_deviations * torch.randn(count, 3, *image.shape, generator=draws)).to(device)
     gains = (pattern_gains * 2**stops).to(device)
 
     def apply_effects(
-        images: Float[Tensor, "A V 3 size size"], examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A V 3 size size"]:
+        images: Float[Tensor, "A V 3 height width"], examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A V 3 height width"]:
         """Apply the effects to images."""
         gained = decode(images, image.encoding) * gains[examples, None]
         blurred = _blur(gained, deviations[examples])
@@ -443,33 +443,34 @@ def draw_camera_effects(
 
 
 def _blur(
-    images: Float[Tensor, "A V 3 size size"], deviations: Float[Tensor, " A"]
-) -> Float[Tensor, "A V 3 size size"]:
+    images: Float[Tensor, "A V 3 height width"], deviations: Float[Tensor, " A"]
+) -> Float[Tensor, "A V 3 height width"]:
     """Blur the images of each example by a Gaussian of its own width.
 
     The pixels at the border of an image are repeated beyond the border. Deviations are in pixels.
     """
     count = len(images)
-    size = images.shape[-1]
     # A pixel is averaged over the N pixels with these offsets from it.
     offsets = torch.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, device=images.device)
     # Weight of each offset in each example, shape (A, N).
     weights = torch.exp(-0.5 * (offsets / deviations.clamp(min=MIN_BLUR)[:, None]) ** 2)
     weights = (weights / weights.sum(1, keepdim=True)).to(images)
-    # Position along a row or a column of the N pixels around each pixel, shape (size, N).
-    pixels = torch.arange(size, device=images.device)
-    neighbors = (pixels[:, None] + offsets).clamp(0, size - 1).expand(count, -1, -1)
-    # One matrix for each example. Its row i has the weights of all pixels in the average for
-    # pixel i, along one axis of the image. Shape (A, size, size).
-    matrices = images.new_zeros(count, size, size)
-    matrices.scatter_add_(2, neighbors, weights[:, None].expand(-1, size, -1))
     # A Gaussian blur is separable: the first matrix blurs along columns, the second along rows.
-    return torch.einsum("aij,avcjk,alk->avcil", matrices, images, matrices)
+    by_axis = []
+    for side in images.shape[-2:]:
+        # Position along the axis of the N pixels around each pixel, shape (side, N).
+        pixels = torch.arange(side, device=images.device)
+        neighbors = (pixels[:, None] + offsets).clamp(0, side - 1).expand(count, -1, -1)
+        # One matrix for each example. Its row i has the weights of all pixels in the average for
+        # pixel i, along one axis of the image. Shape (A, side, side).
+        matrices = images.new_zeros(count, side, side)
+        by_axis.append(matrices.scatter_add_(2, neighbors, weights[:, None].expand(-1, side, -1)))
+    return torch.einsum("aij,avcjk,alk->avcil", by_axis[0], images, by_axis[1])
 
 
 def _draw_image_files(
-    folder: str | Path, key: str, count: int, size: int, draws: Generator
-) -> Float[Tensor, "count 3 size size"]:
+    folder: str | Path, key: str, count: int, size: Size, draws: Generator
+) -> Float[Tensor, "count 3 height width"]:
     """Read randomly chosen images of a folder, with replacement."""
     files = sorted(path for path in Path(folder).rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:

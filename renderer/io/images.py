@@ -30,7 +30,7 @@ from PIL.TiffImagePlugin import BITSPERSAMPLE, PHOTOMETRIC_INTERPRETATION, TiffI
 
 from renderer.errors import InputError, require_file
 from renderer.io.files import atomic_write
-from renderer.settings import REC_709
+from renderer.settings import REC_709, Size, height_and_width
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,12 +52,12 @@ MIN_DECODED_RATIO = 16
 MAX_STEP = 4
 
 
-def read_image(path: str | Path, size: int) -> Float[Tensor, "3 size size"]:
-    """Read the central square of an image file as RGB values in [0, 1]."""
+def read_image(path: str | Path, size: Size) -> Float[Tensor, "3 height width"]:
+    """Read the center of an image file, in the shape of `size`, as RGB values in [0, 1]."""
     require_file(path, "give an image file")
     # Pillow can raise almost any exception for a damaged file.
     try:
-        square = read_square(path, size)
+        square = read_center(path, size)
     except Exception as error:
         raise InputError(
             f"{path} cannot be read as an image ({error}): give another one"
@@ -68,8 +68,10 @@ def read_image(path: str | Path, size: int) -> Float[Tensor, "3 size size"]:
     return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
 
 
-def gray_or_image(name: str, choice: float | str | Path, size: int) -> Float[Tensor, "_ size size"]:
-    """Create a gray image from a value in [0, 1] or its text, or read the square of an image."""
+def gray_or_image(
+    name: str, choice: float | str | Path, size: Size
+) -> Float[Tensor, "_ height width"]:
+    """Create a gray image from a value in [0, 1] or its text, or read the center of an image."""
     try:
         # `float` would accept True as 1.
         gray = math.nan if isinstance(choice, bool) else float(choice)  # type: ignore[arg-type]
@@ -86,13 +88,13 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Float[Ten
         raise InputError(f"{name}={reprlib.repr(choice)} is no image: {advice}")
     import torch
 
-    return torch.full((1, size, size), gray)
+    return torch.full((1, *height_and_width(size)), gray)
 
 
-def read_square(path: str | Path, size: int) -> UInt8[np.ndarray, "size size 3"]:
-    """Read the central square of an image file with 8 bits per channel."""
-    image = read_rgb(path, MIN_DECODED_RATIO * size)
-    return np.asarray(central_square(image, size))
+def read_center(path: str | Path, size: Size) -> UInt8[np.ndarray, "height width 3"]:
+    """Read the center of an image file, in the shape of `size`, with 8 bits per channel."""
+    image = read_rgb(path, MIN_DECODED_RATIO * max(height_and_width(size)))
+    return np.asarray(crop_center(image, size))
 
 
 @contextmanager
@@ -166,9 +168,9 @@ def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None
     return image.convert("L" if is_gray else "RGB"), None
 
 
-def central_square(image: Image.Image, size: int) -> Image.Image:
-    """Cut out the central square of an image and resize it."""
-    return ImageOps.fit(image, (size, size), Image.Resampling.LANCZOS)
+def crop_center(image: Image.Image, size: Size) -> Image.Image:
+    """Cut out the largest central part of an image that has the shape of `size`, and resize it."""
+    return ImageOps.fit(image, height_and_width(size)[::-1], Image.Resampling.LANCZOS)
 
 
 def eight_bits(image: Image.Image) -> Image.Image:

@@ -214,6 +214,7 @@ def export_mesh(
     normals: str = "smooth",
     cameras: Sequence[Camera] = (),
     first: int | None = None,
+    aspect: float = 1.0,
 ) -> None:
     """Write a mesh to a .glb file.
 
@@ -231,6 +232,7 @@ def export_mesh(
         cameras: Cameras to write as nodes of the file, in this order.
         first: Number of faces at the beginning of the mesh that are written
             before all other faces. None sorts all faces by texture and gloss.
+        aspect: Width of the images of the cameras, divided by their height.
 
     Raises:
         InputError: If an argument is invalid, or if the file cannot be written.
@@ -248,7 +250,7 @@ def export_mesh(
     unit_normals = mesh.written_normals(normals)
     if path.suffix.lower() != ".glb":
         raise InputError(f"{path} cannot be written as a mesh: choose a name that ends in .glb")
-    content = _glb(mesh, unit_normals, cameras, len(mesh.faces) if first is None else first)
+    content = _glb(mesh, unit_normals, cameras, len(mesh.faces) if first is None else first, aspect)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(path, content)
@@ -306,7 +308,11 @@ class _Tree(dict[str, Any]):
 
 
 def _glb(
-    mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], cameras: Sequence[Camera], first_count: int
+    mesh: Mesh,
+    normals: Float[np.ndarray, "F 3 3"],
+    cameras: Sequence[Camera],
+    first_count: int,
+    aspect: float,
 ) -> bytes:
     """Create the content of a .glb file, with y up and linear colors."""
     tree = _Tree()
@@ -337,7 +343,7 @@ def _glb(
         # The axes of a camera in glTF are the same as ours: right, up and back. glTF stores
         # matrices column by column.
         matrix = (Y_UP_TO_Z_UP.T @ camera.pose()).T.ravel().tolist()
-        lens = tree.add("cameras", _gltf_camera(camera))
+        lens = tree.add("cameras", _gltf_camera(camera, aspect))
         tree.add("nodes", {"camera": lens, "name": f"view {index}", "matrix": matrix})
     tree["scene"] = tree.add("scenes", {"nodes": list(range(len(tree["nodes"])))})
     return tree.content()
@@ -361,21 +367,21 @@ def _add_material(tree: _Tree, mesh: Mesh, texture_id: int, gloss: list[float]) 
     return tree.add("materials", material)
 
 
-def _gltf_camera(camera: Camera) -> dict[str, Any]:
+def _gltf_camera(camera: Camera, aspect: float) -> dict[str, Any]:
     """Describe a camera as glTF does: its image is larger if the principal point is off-center."""
     planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):
         # Half of the width and of the height that the image shows at a depth
         # of 1. Both grow with the distance of the principal point from the center.
         half_width = math.tan(math.radians(camera.angle) / 2)
-        half_height = half_width / camera.pixel_aspect * (1 + abs(camera.principal_up))
+        half_height = half_width / camera.pixel_aspect * (1 / aspect + abs(camera.principal_up))
         half_width *= 1 + abs(camera.principal_right)
         vertical_angle = 2 * math.atan(half_height)
         aspect_ratio = half_width / half_height
         perspective = {"yfov": vertical_angle, "aspectRatio": aspect_ratio, **planes}
         return {"type": "perspective", "perspective": perspective}
     half_width = camera.width / 2
-    orthographic = {"xmag": half_width, "ymag": half_width, **planes}
+    orthographic = {"xmag": half_width, "ymag": half_width / aspect, **planes}
     return {"type": "orthographic", "orthographic": orthographic}
 
 

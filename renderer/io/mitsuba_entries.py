@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from renderer.camera import Camera, PerspectiveCamera
+from renderer.settings import Size, height_and_width
 
 # Type of a Mitsuba scene, and of an entry of
 # the scene such as a camera: a dictionary.
@@ -59,20 +60,21 @@ def projector(pose: Pose, fov: float, pattern: Scene, scale: float) -> Scene:
 
 
 def sensor(
-    pose: Pose, size: int, lens: Scene, pixel_format: str = "rgba", pixel_aspect: float = 1.0
+    pose: Pose, size: Size, lens: Scene, pixel_format: str = "rgba", pixel_aspect: float = 1.0
 ) -> Scene:
     """Describe a camera for Mitsuba, which calls it a sensor.
 
     The lens is {"type": "perspective", "fov": horizontal angle in degrees}, or, for x and y from
     -1 to 1 without perspective, {"type": "orthographic"}. Mitsuba has square pixels, so the number
-    of rows is size divided by `pixel_aspect`.
+    of rows is divided by `pixel_aspect`.
     """
-    film = {"type": "hdrfilm", "width": size, "height": max(1, round(size / pixel_aspect))}
+    height, width = height_and_width(size)
+    film = {"type": "hdrfilm", "width": width, "height": max(1, round(height / pixel_aspect))}
     film |= {"pixel_format": pixel_format, "rfilter": {"type": "box"}}
     return {**lens, "to_world": pose, "film": film}
 
 
-def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
+def sensor_of(camera: Camera, size: Size, pixel_format: str = "rgba") -> Scene:
     """Convert a camera of this renderer to a camera of Mitsuba."""
     if not isinstance(camera, PerspectiveCamera):
         pose = pose_of(camera, camera.width / 2)
@@ -80,9 +82,11 @@ def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
     lens: Scene = {"type": "perspective", "fov": camera.angle}
     if camera.principal_right or camera.principal_up:
         # The principal point is measured from the image center in halves of the image, and
-        # Mitsuba measures the image center from the principal point, right and down.
+        # Mitsuba measures the image center from the principal point, right and down, in widths
+        # and heights of the image. Ours are in halves of its width.
+        height, width = height_and_width(size)
         lens["principal_point_offset_x"] = -camera.principal_right / 2
-        lens["principal_point_offset_y"] = camera.principal_up / 2
+        lens["principal_point_offset_y"] = camera.principal_up / 2 * (width / height)
     return sensor(pose_of(camera), size, lens, pixel_format, camera.pixel_aspect)
 
 

@@ -119,7 +119,7 @@ class TransferOperator:
 
     def image(
         self, lights: Float[Tensor, "*lights coefficients 3"], background: float | Tensor = 0.5
-    ) -> Float[Tensor, "*lights 3 size size"]:
+    ) -> Float[Tensor, "*lights 3 height width"]:
         """Render one image under each light.
 
         The images are differentiable with respect to the lights and the
@@ -133,7 +133,7 @@ class TransferOperator:
 
         Returns:
             Images in [0, 1] in the dtype of the lights,
-            shape (..., 3, size, size).
+            shape (..., 3, height, width).
 
         Raises:
             InputError: If `lights` has NaN or another number of coefficients
@@ -156,7 +156,7 @@ class TransferOperator:
         lights: Float[Tensor, "*lights coefficients 3"],
         loss_gradient: Callable[[Tensor], Tensor],
         background: float | Tensor = 0.5,
-    ) -> tuple[Float[Tensor, "*lights 3 size size"], Float[Tensor, "*lights coefficients 3"]]:
+    ) -> tuple[Float[Tensor, "*lights 3 height width"], Float[Tensor, "*lights coefficients 3"]]:
         """Render images, and compute the gradient of a loss with respect to the lights.
 
         The gradient is computed without autograd. The results equal those of
@@ -167,7 +167,7 @@ class TransferOperator:
             lights: Coefficients in the basis of the operator,
                 shape (..., coefficients, 3).
             loss_gradient: Function that takes the images, shape
-                (..., 3, size, size), and returns the gradient of the loss with
+                (..., 3, height, width), and returns the gradient of the loss with
                 respect to the images, in the same shape.
                 `torch.func.grad(loss)` makes such a function from a loss.
             background: Gray value, color or images in [0, 1]. See
@@ -176,7 +176,7 @@ class TransferOperator:
         Returns:
             A tuple of
 
-            - the images in [0, 1], shape (..., 3, size, size);
+            - the images in [0, 1], shape (..., 3, height, width);
             - the gradient of the loss with respect to the lights, in the shape
               of `lights`.
 
@@ -274,12 +274,12 @@ class TransferOperator:
         images = canvas.clone(memory_format=torch.contiguous_format)
         # `scatter_` takes half the time of `index_copy_` on a CPU.
         images.scatter_(-1, self.pixels.expand(*batch_shape, COLORS, -1), encoded)
-        size = self.settings.size
-        return images.view(*batch_shape, COLORS, size, size), is_unclamped, clamped_values
+        image_shape = (*batch_shape, COLORS, *self.settings.shape)
+        return images.view(image_shape), is_unclamped, clamped_values
 
     def _gradient_of_images(
         self,
-        image_gradient: Float[Tensor, "... 3 size size"],
+        image_gradient: Float[Tensor, "... 3 height width"],
         is_unclamped: PixelValues,
         clamped_values: PixelValues,
     ) -> Lights:
@@ -446,7 +446,7 @@ class _Image(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, lights: Lights, operator: TransferOperator, background: tuple[Tensor, Tensor]
-    ) -> Float[Tensor, "... 3 size size"]:
+    ) -> Float[Tensor, "... 3 height width"]:
         """Render one image under each light."""
         images, is_unclamped, clamped_values = operator._images(lights, background)
         ctx.operator = operator
@@ -456,7 +456,9 @@ class _Image(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Float[Tensor, "... 3 size size"]) -> tuple[Tensor, None, None]:
+    def backward(
+        ctx: Any, upstream: Float[Tensor, "... 3 height width"]
+    ) -> tuple[Tensor, None, None]:
         """Compute the gradient with respect to the lights."""
         gradient = ctx.operator._gradient_of_images(upstream, ctx.is_unclamped, ctx.clamped_values)
         return gradient, None, None

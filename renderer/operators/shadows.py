@@ -118,7 +118,7 @@ class Patches:
         patch_count = int(sample_to_patch[-1]) + 1
         patch_areas = areas.new_zeros(patch_count).index_add_(0, sample_to_patch, areas)
         view = Fragments(
-            size=1,
+            shape=(1, 1),
             samples=1,
             pixels=torch.arange(patch_count),
             coverage=torch.ones_like(patch_areas),

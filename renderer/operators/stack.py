@@ -111,7 +111,7 @@ class TransferOperators(Sequence[TransferOperator]):
         background: float | Tensor = 0.5,
         *,
         light_per_view: bool = False,
-    ) -> Float[Tensor, "... 3 size size"]:
+    ) -> Float[Tensor, "... 3 height width"]:
         """Render all V views under one or more lights.
 
         The result is differentiable with respect to the lights and the
@@ -122,12 +122,12 @@ class TransferOperators(Sequence[TransferOperator]):
             lights: Coefficients of the lights, shape (..., coefficients, 3).
                 Every view is rendered under every light.
             background: Gray value, color, or images in [0, 1] that broadcast to
-                (V, ..., 3, size, size).
+                (V, ..., 3, height, width).
             light_per_view: True if each view has its own lights. The lights then
                 have the shape (V, ..., coefficients, 3).
 
         Returns:
-            Images in [0, 1], shape (V, ..., 3, size, size).
+            Images in [0, 1], shape (V, ..., 3, height, width).
 
         Raises:
             InputError: If `lights` has NaN, or another number of coefficients
@@ -145,7 +145,7 @@ class TransferOperators(Sequence[TransferOperator]):
             )
         # One entry along the first axis for each view.
         view_lights = lights if light_per_view else lights.expand(len(self), *lights.shape)
-        image_shape = (*view_lights.shape[:-2], COLORS, first.settings.size, first.settings.size)
+        image_shape = (*view_lights.shape[:-2], COLORS, *first.settings.shape)
         backgrounds = as_background(background, first.settings.size, lights)
         if backgrounds.ndim > 3:
             try:
@@ -171,25 +171,25 @@ class TransferOperators(Sequence[TransferOperator]):
         background: float | Tensor = 0.5,
         *,
         light_per_view: bool = False,
-    ) -> tuple[Float[Tensor, "... 3 size size"], Float[Tensor, "*lights coefficients 3"]]:
+    ) -> tuple[Float[Tensor, "... 3 height width"], Float[Tensor, "*lights coefficients 3"]]:
         """Render all V views, and compute the gradient of a loss with respect to the lights.
 
         Args:
             lights: Coefficients of the lights, shape (..., coefficients, 3), or
                 (V, ..., coefficients, 3) with `light_per_view`.
             loss_gradient: Function that takes the images, shape
-                (V, ..., 3, size, size), and returns the gradient of the loss
+                (V, ..., 3, height, width), and returns the gradient of the loss
                 with respect to the images, in the same shape.
                 `torch.func.grad(loss)` makes such a function from a loss.
             background: Gray value, color, or images in [0, 1] that broadcast to
-                (V, ..., 3, size, size).
+                (V, ..., 3, height, width).
             light_per_view: True if each view has its own lights. False renders
                 every view under every light.
 
         Returns:
             A tuple of
 
-            - the images in [0, 1], shape (V, ..., 3, size, size);
+            - the images in [0, 1], shape (V, ..., 3, height, width);
             - the gradient of the loss with respect to the lights, in the shape
               of `lights`.
 
@@ -211,8 +211,7 @@ class TransferOperators(Sequence[TransferOperator]):
     @property
     def _operators_per_stack(self) -> int:
         """Number of operators in a full stack. The last stack may hold fewer."""
-        pixels_per_image = self._operators[0].settings.size ** 2
-        return max(1, PIXELS_PER_STACK // pixels_per_image)
+        return max(1, PIXELS_PER_STACK // self._operators[0].settings.pixel_count)
 
     @cached_property
     def _stacks(self) -> list[OperatorStack]:
@@ -232,7 +231,7 @@ class TransferOperators(Sequence[TransferOperator]):
         self,
         view_lights: Float[Tensor, "V ... coefficients 3"],
         backgrounds: Float[Tensor, "*lights 3 pixels"],
-    ) -> Float[Tensor, "V ... 3 size size"]:
+    ) -> Float[Tensor, "V ... 3 height width"]:
         """Render all V views, with one batched matrix product for each stack of operators."""
         settings = self._operators[0].settings
         # One light for each image. All images of the first view come first.
@@ -260,7 +259,7 @@ class TransferOperators(Sequence[TransferOperator]):
         canvas = backgrounds.expand(len(lights), -1, -1)
         canvas = canvas.clone(memory_format=torch.contiguous_format)
         images = ScatterLayers.apply(canvas, targets, *covered_values)
-        return images.view(*view_lights.shape[:-2], COLORS, settings.size, settings.size)
+        return images.view(*view_lights.shape[:-2], COLORS, *settings.shape)
 
 
 def _select_pixels(images: Images, pixels: Int[Tensor, " P"]) -> Float[Tensor, "N 3 P"]:

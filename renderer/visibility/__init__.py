@@ -4,17 +4,17 @@ There are three: opengl, numpy and numba.
 
 Each module of this package has a function
 
-    rasterize(points, faces, resolution, closed) -> ids
+    rasterize(points, faces, shape, closed) -> ids
 
 with these arguments:
 
 - points: The V vertices as N views project them, float64, shape (N, V, 3). The
-  image is [-1, 1] in x (to the right) and y (up). The third coordinate is the
-  depth, which is smaller for nearer points. Surfaces outside the depths [-1, 1)
-  are clipped.
+  image is [-1, 1] in x (to the right), and samples are as far apart in y (up) as in
+  x. The third coordinate is the depth, which is smaller for nearer points. Surfaces
+  outside the depths [-1, 1) are clipped.
 - faces: Vertex indices of the faces, shape (F, 3).
-- resolution: Number R of samples per side of an image. The sample in row i and
-  column j lies at x = (2 j + 1) / R - 1 and y = 1 - (2 i + 1) / R.
+- shape: Numbers R and C of rows and columns of samples. The sample in row i and
+  column j lies at x = (2 j + 1) / C - 1 and y = (R - 2 i - 1) / C.
 - closed: False draws faces from both sides. True promises that the mesh is
   watertight, that it lies within the range of depths, and that its faces are
   counter-clockwise seen from outside. Faces that are clockwise in the image are
@@ -23,7 +23,7 @@ with these arguments:
   nearest face up to rounding, such as along silhouettes.
 
 The result is the index of the nearest face at each sample, or -1 if there is
-none, int32, shape (N, R, R). Row 0 is at the top. If two faces have the same
+none, int32, shape (N, R, C). Row 0 is at the top. If two faces have the same
 depth, the face with the lower index is returned.
 
 All rasterizers round vertices to 1/256 of a sample. A sample at the common edge
@@ -39,7 +39,7 @@ import torch
 from jaxtyping import Float, Int
 
 from renderer.errors import InputError, require_choice, require_memory
-from renderer.settings import RASTERIZERS
+from renderer.settings import RASTERIZERS, Size, height_and_width
 from renderer.visibility import opengl
 
 # `Rasterizer.rasterize` clips projected points to a square around the image center. This
@@ -66,23 +66,25 @@ class Rasterizer:
         self,
         points: Float[np.ndarray, "N V 3"],
         faces: Int[np.ndarray, "F 3"],
-        resolution: int,
+        resolution: Size,
         closed: bool = False,
-    ) -> Int[np.ndarray, "N R R"]:
+    ) -> Int[np.ndarray, "N R C"]:
         """Find the nearest face at each sample of N images, or -1.
 
-        x and y of the points are in [-1, 1] in the image, and the third coordinate is the
-        depth. `closed` leaves out faces that are seen from behind.
+        `resolution` is the number of samples per side, or of rows and columns. x of the points is
+        in [-1, 1] in the image, and the third coordinate is the depth. `closed` leaves out faces
+        that are seen from behind.
         """
+        rows, columns = height_and_width(resolution)
         # Larger coordinates would not fit into the integers of the rasterizers.
-        limit = SPAN / resolution
+        limit = SPAN / columns
         if np.abs(points).max(initial=0) > limit:
             points = np.clip(points, -limit, limit)
-        needed = (4 * len(points) + SHADED_BYTES) * int(resolution) ** 2
-        name = f"{len(points)} views of {resolution} samples per side"
+        needed = (4 * len(points) + SHADED_BYTES) * rows * columns
+        name = f"{len(points)} views of {rows} × {columns} samples"
         require_memory(name, needed, torch.device("cpu"))
         module = import_module(f"renderer.visibility.{self.name}")
-        return module.rasterize(points, faces, resolution, closed)
+        return module.rasterize(points, faces, (rows, columns), closed)
 
 
 def choose(rasterizer: str = "auto") -> Rasterizer:

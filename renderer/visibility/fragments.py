@@ -1,6 +1,6 @@
 """Surface samples that a camera sees of a mesh, found once by rasterization.
 
-An image of size² pixels has s² samples per pixel, where s is
+An image of height × width pixels has s² samples per pixel, where s is
 `Fragments.samples`. The samples that show the mesh are kept in `Fragments`,
 with the pixel and the face of each. They stay fixed while the lighting, the
 albedo or the vertex positions are differentiated.
@@ -9,6 +9,7 @@ Shapes use these letters: a view has S covered samples in P pixels, and they
 show G of the F faces of the mesh.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -58,7 +59,7 @@ class Fragments:
     all tensors of shape (S,). The faces that samples show are called seen.
 
     Attributes:
-        size: Width and height of the image in pixels.
+        shape: Height and width of the image in pixels.
         samples: Number of samples along one side of a pixel.
         pixels: Row-major indices of the P pixels with covered samples,
             ascending, int64, shape (P,). Row 0 is the top of the image.
@@ -71,8 +72,8 @@ class Fragments:
         facing: -1 for seen faces that the camera sees from behind, and 1 for
             the others, float64, shape (G, 1).
         outlines: Positions (x, y) of the three corners of each seen face in the
-            image, float64, shape (G, 3, 2). x points to the right and y up, and
-            the image is [-1, 1] in x and y.
+            image, float64, shape (G, 3, 2). x points to the right and y up. The
+            image is [-1, 1] in x, and [-height / width, height / width] in y.
         sample_to_pixel: Index into `pixels` of the pixel of each sample, int64,
             shape (S,).
         sample_to_seen_face: Index into `faces` of the face that each sample
@@ -84,7 +85,7 @@ class Fragments:
         camera: Camera of the view. None if the samples come from no camera.
     """
 
-    size: int
+    shape: tuple[int, int]
     samples: int
     pixels: Int[Tensor, " P"]
     coverage: Float[Tensor, " P"]
@@ -97,6 +98,11 @@ class Fragments:
     sample_numbers: Int[Tensor, " S"]
     depths: Float[Tensor, "G 3"] | None = None
     camera: Camera | None = None
+
+    @property
+    def sample_shape(self) -> tuple[int, int]:
+        """Numbers of rows and columns of samples."""
+        return self.shape[0] * self.samples, self.shape[1] * self.samples
 
     @property
     def eye(self) -> Tensor:
@@ -163,16 +169,17 @@ class Fragments:
     def positions(self) -> Float[Tensor, "S 2"]:
         """Compute the positions of the S covered samples in the image.
 
-        x points to the right and y up, and the image is [-1, 1] in both.
+        x points to the right and y up, and the image is [-1, 1] in x.
         """
-        resolution = self.size * self.samples
+        rows, columns = self.sample_shape
         # Dividing floating-point numbers takes a tenth of the time of dividing integers.
         numbers = self.sample_numbers.double()
-        row = (numbers / resolution).floor()
-        column = numbers - row * resolution
-        # The image [-1, 1] is divided into square cells of width 2 / resolution. A sample
-        # is the center of its cell.
-        return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
+        row = (numbers / columns).floor()
+        column = numbers - row * columns
+        # The image is divided into square cells of width 2 / columns. A sample is the center of
+        # its cell.
+        ends = torch.stack([2 * column + 1, 2 * (rows - row) - 1]).T / columns
+        return ends - ends.new_tensor([1, rows / columns])
 
     def by_sample(self) -> "Fragments":
         """Return a copy for a finer image, in which each sample is a pixel.
@@ -182,7 +189,7 @@ class Fragments:
         sample_count = len(self.sample_numbers)
         finer = replace(
             self,
-            size=self.size * self.samples,
+            shape=self.sample_shape,
             samples=1,
             pixels=self.sample_numbers,
             coverage=self.coverage.new_ones(sample_count),
@@ -197,9 +204,8 @@ class Fragments:
 
         Samples that show no mesh get the value `empty`. Row 0 is at the top.
         """
-        resolution = self.size * self.samples
-        image = values.new_full((resolution**2,), empty)
-        return image.index_copy_(0, self.sample_numbers, values).view(resolution, resolution)
+        image = values.new_full((math.prod(self.sample_shape),), empty)
+        return image.index_copy_(0, self.sample_numbers, values).view(self.sample_shape)
 
     def of_image(self, image: Float[Tensor, "_ _"]) -> Float[Tensor, " S"]:
         """Read the values of the covered samples from an image with one pixel per sample.
@@ -355,8 +361,8 @@ def build_fragments(
     # The third coordinate is the depth. It is less than -1 in front of the near plane,
     # which would cut the mesh open.
     is_uncut = bool((projected[..., 2] >= -1).all())
-    resolution = settings.size * settings.samples
-    face_ids = rasterizer.rasterize(projected, faces, resolution, closed and is_uncut)
+    shape = tuple(side * settings.samples for side in settings.shape)
+    face_ids = rasterizer.rasterize(projected, faces, shape, closed and is_uncut)
     views = []
     for camera, points, ids_of_view in zip(cameras, projected, face_ids, strict=True):
         depths = camera.depths(vertices)
@@ -373,18 +379,17 @@ def _fragments_of_view(
     settings: ImageSettings,
 ) -> Fragments:
     """Create fragments from face indices (-1: no face) and depths (None: no perspective)."""
-    size = settings.size
+    height, width = settings.shape
     samples = settings.samples
-    resolution = len(face_ids)
-    numbers = np.arange(resolution**2, dtype=np.int32).reshape(face_ids.shape)
+    numbers = np.arange(face_ids.size, dtype=np.int32).reshape(face_ids.shape)
     # Values of all samples of the first pixel, then of all samples of the second pixel, and so on.
     ids_by_pixel, numbers_by_pixel = (
-        values.reshape(size, samples, size, samples).swapaxes(1, 2).ravel()
+        values.reshape(height, samples, width, samples).swapaxes(1, 2).ravel()
         for values in (face_ids, numbers)
     )
     covered_samples = np.flatnonzero(ids_by_pixel >= 0)
     seen_faces, sample_to_seen_face = _compact(ids_by_pixel[covered_samples], len(faces))
-    counts_of_all_pixels = np.bincount(covered_samples // samples**2, minlength=size**2)
+    counts_of_all_pixels = np.bincount(covered_samples // samples**2, minlength=height * width)
     pixels = np.flatnonzero(counts_of_all_pixels)
     sample_count = counts_of_all_pixels[pixels]
     # One row for each corner, one column for each seen face. Rows are contiguous in
@@ -396,7 +401,7 @@ def _fragments_of_view(
     # A face is seen from behind if its corners are clockwise in the image.
     is_seen_from_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
     return Fragments(
-        size=size,
+        shape=settings.shape,
         samples=samples,
         pixels=torch.from_numpy(pixels),
         coverage=torch.from_numpy(sample_count / samples**2),

@@ -37,8 +37,11 @@ TYPES = (
 
 
 def rasterize(
-    points: Float[np.ndarray, "N V 3"], faces: Int[np.ndarray, "F 3"], resolution: int, closed: bool
-) -> Int[np.ndarray, "N R R"]:
+    points: Float[np.ndarray, "N V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    shape: tuple[int, int],
+    closed: bool,
+) -> Int[np.ndarray, "N R C"]:
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility` defines the
@@ -46,12 +49,12 @@ def rasterize(
     """
     # Unsigned indices are faster: compiled code checks signed indices for negative values.
     corners = np.ascontiguousarray(faces, dtype=np.int64).view(np.uint64)
-    ids = np.full((len(points), resolution, resolution), -1, dtype=np.int32)
+    ids = np.full((len(points), *shape), -1, dtype=np.int32)
     # Depths are whole numbers with 24 bits, which float32 can store exactly.
     nearest_depths = np.empty(ids.shape[1:], dtype=np.float32)
     for view_points, view_ids in zip(points, ids, strict=True):
         nearest_depths.fill(FAR)
-        positions, depths = to_fixed_point(view_points, resolution)
+        positions, depths = to_fixed_point(view_points, shape)
         _draw(positions, depths, corners, closed, SUBSAMPLE_BITS, view_ids, nearest_depths)
     return ids
 
@@ -78,7 +81,7 @@ def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
 
 @_njit
 def _covered_range(
-    coordinates: Any, a: int, b: int, c: int, bits: int, resolution: int
+    coordinates: Any, a: int, b: int, c: int, bits: int, count: int
 ) -> tuple[int, int]:
     """Find the range of rows, or of columns, in which a triangle can cover samples.
 
@@ -89,7 +92,7 @@ def _covered_range(
     greatest = max(coordinates[a], coordinates[b], coordinates[c])
     # The operator >> divides by 2^bits and rounds down. The two minus signs make it round
     # up.
-    return max(-(-least >> bits), 0), min(-(-greatest >> bits), resolution)
+    return max(-(-least >> bits), 0), min(-(-greatest >> bits), count)
 
 
 @_njit
@@ -122,15 +125,15 @@ def _draw(
     """Draw faces in place in ascending order, so that at equal depth the lower index stays."""
     x = positions[0]
     y = positions[1]
-    resolution = len(ids)
+    row_count, column_count = ids.shape
     subsamples = 1 << bits
     for index in range(len(faces)):
         i, j, k = faces[index]
         area = _doubled_area(x, y, i, j, k)
         if area == 0 or (closed and area > 0):
             continue
-        top, bottom = _covered_range(y, i, j, k, bits, resolution)
-        left, right = _covered_range(x, i, j, k, bits, resolution)
+        top, bottom = _covered_range(y, i, j, k, bits, row_count)
+        left, right = _covered_range(x, i, j, k, bits, column_count)
         if top >= bottom or left >= right:
             continue
         # Sort the corners, so that two faces with the same corners in another order get
@@ -160,7 +163,7 @@ def _draw(
                 else _crossing(bx, by, cx, cy, row_y, bits)
             )
             first = max(min(long_edge, short_edge), 0)
-            end = min(max(long_edge, short_edge), resolution)
+            end = min(max(long_edge, short_edge), column_count)
             for column in range(first, end):
                 sample = np.uint64(row), np.uint64(column)
                 depth = np.rint(row_depth + slope_x * (column - first_column))

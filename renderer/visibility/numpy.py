@@ -23,7 +23,6 @@ longest axis is the last axis of every array. An array of triangles has shape
 y down.
 """
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -50,27 +49,30 @@ ENTRIES_PER_BLOCK = 2**13
 
 
 def rasterize(
-    points: Float[np.ndarray, "N V 3"], faces: Int[np.ndarray, "F 3"], resolution: int, closed: bool
-) -> Int[np.ndarray, "N R R"]:
+    points: Float[np.ndarray, "N V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    shape: tuple[int, int],
+    closed: bool,
+) -> Int[np.ndarray, "N R C"]:
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility` defines the
     coordinates and the rounding. Samples without a face get -1.
     """
-    ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
+    ids = np.empty((len(points), *shape), dtype=np.int32)
     for view, view_ids in zip(points, ids, strict=True):
-        positions, depths = to_fixed_point(view, resolution)
-        keys = np.full(resolution * resolution, EMPTY_KEY)
+        positions, depths = to_fixed_point(view, shape)
+        keys = np.full(shape, EMPTY_KEY)
         for begin in range(0, len(faces), FACES_PER_BLOCK):
             block = np.ascontiguousarray(faces[begin : begin + FACES_PER_BLOCK].T)
             _draw(keys, positions, depths, block, begin, closed)
         # The conversion to int32 keeps the low 32 bits of each key, the face index.
-        view_ids[:] = keys.reshape(view_ids.shape)
+        view_ids[:] = keys
     return ids
 
 
 def _draw(
-    keys: Int[np.ndarray, " _"],
+    keys: Int[np.ndarray, "R C"],
     positions: Int[np.ndarray, "2 V"],
     depths: Float[np.ndarray, " V"],
     block: Int[np.ndarray, "3 F"],
@@ -83,7 +85,8 @@ def _draw(
     index. The smallest key therefore belongs to the nearest face. The first face has the index
     `begin`.
     """
-    resolution = math.isqrt(len(keys))
+    row_count, column_count = keys.shape
+    flat_keys = keys.ravel()
     # By the top-left rule, a sample on an edge belongs to the triangle to the right of the edge or,
     # if the edge is horizontal, to the triangle below it. A triangle therefore covers only samples
     # whose x and y are at least its smallest x and y, and less than its largest x and y.
@@ -92,7 +95,8 @@ def _draw(
     # First column and first row of samples in the bounding box of each triangle, as the
     # two rows of this array.
     first = _next_sample(triangles.min(axis=1)).clip(0, None)
-    counts = _next_sample(triangles.max(axis=1)).clip(None, resolution) - first
+    limits = np.array([[column_count], [row_count]])
+    counts = _next_sample(triangles.max(axis=1)).clip(None, limits) - first
     # y points down, so triangles that are counter-clockwise in the image have negative
     # areas.
     is_facing = areas < 0 if closed else areas != 0
@@ -115,14 +119,14 @@ def _draw(
         # Each row crosses an edge at the column -(slope · row + constant) / height. The first
         # column after it is this number, rounded up. The operator // rounds down, but the minus
         # sign before it makes the result round up.
-        columns = (-((slope * row + constant) // height)).clip(0, resolution)
+        columns = (-((slope * row + constant) // height)).clip(0, column_count)
         left, right = columns.min(axis=0), columns.max(axis=0)
         # Position and depth of the first corner, and slopes of the depth.
         x, y, depth, slope_x, slope_y = planes.take(triangle, axis=1)
         depth_at_row = depth + (row - y) * slope_y
         # Columns from the first corner to the first covered sample.
         first_offset = left - x
-        first_sample = row * resolution + left
+        first_sample = row * column_count + left
         face = drawn.take(triangle) + begin
         # One entry for each covered sample: the index of its pair of triangle and row, and
         # the number of steps from the first covered sample of the row.
@@ -134,11 +138,11 @@ def _draw(
             # larger than FAR, so they become FAR and are not drawn.
             clipped = np.minimum(rounded.view(np.uint64), FAR).view(np.int64)
             sample_keys = (clipped << FACE_BITS) | face.take(pair)
-            np.minimum.at(keys, first_sample.take(pair) + step, sample_keys)
+            np.minimum.at(flat_keys, first_sample.take(pair) + step, sample_keys)
 
 
 def to_fixed_point(
-    points: Float[np.ndarray, "V 3"], resolution: int
+    points: Float[np.ndarray, "V 3"], shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Convert projected points to integer positions and to depths from 0 to FAR.
 
@@ -146,13 +150,13 @@ def to_fixed_point(
     As on GPUs, positions in samples are computed with one multiplication and one
     addition, rounded to float32, and then rounded to subsamples. Positions are x to the
     right and y down from the center of the first sample. Points have the image in [-1, 1]
-    and the near plane at the depth -1.
+    along x and the near plane at the depth -1. `shape` is rows and columns of samples.
     """
-    half = resolution / 2
+    half_height, half_width = shape[0] / 2, shape[1] / 2
     # Positions from the top left corner of the image, in samples. The product with a
     # float64 array is float64, so that only the conversion to float32 below rounds.
-    window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half], [-half]])
-    window += half
+    window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half_width], [-half_width]])
+    window += [[half_width], [half_height]]
     snapped = window.astype(np.float32)
     snapped *= SUBSAMPLES
     positions = np.rint(snapped, out=snapped).astype(np.int64)

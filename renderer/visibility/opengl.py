@@ -57,8 +57,11 @@ FLOAT_BYTES = 4
 
 
 def rasterize(
-    points: Float[np.ndarray, "N V 3"], faces: Int[np.ndarray, "F 3"], resolution: int, closed: bool
-) -> Int[np.ndarray, "N R R"]:
+    points: Float[np.ndarray, "N V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    shape: tuple[int, int],
+    closed: bool,
+) -> Int[np.ndarray, "N R C"]:
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility` defines the
@@ -73,7 +76,7 @@ def rasterize(
     else:
         ordered = np.sort(faces, axis=1)
     with _context() as context:
-        return _draw(context, points, ordered, resolution, closed)
+        return _draw(context, points, ordered, shape, closed)
 
 
 def device() -> str:
@@ -120,7 +123,7 @@ def _check(context: moderngl.Context) -> None:
     faces = np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]])
     # Expected face at each of 4 × 4 samples. Face 0 is seen from behind and is left out.
     expected = [[2, 2, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]]
-    ids = _draw(context, points, faces, resolution=4, closed=True)
+    ids = _draw(context, points, faces, (4, 4), closed=True)
     if ids[0].tolist() != expected:
         name = context.info["GL_RENDERER"]
         raise InputError(f"the OpenGL driver {name} renders wrong faces: use the rasterizer numpy")
@@ -130,13 +133,14 @@ def _draw(
     context: moderngl.Context,
     points: Float[np.ndarray, "N V 3"],
     faces: Int[np.ndarray, "F 3"],
-    resolution: int,
+    shape: tuple[int, int],
     closed: bool,
-) -> Int[np.ndarray, "N R R"]:
+) -> Int[np.ndarray, "N R C"]:
     """Draw N views and read the face ids."""
     import moderngl
 
-    size = (resolution, resolution)
+    rows, columns = shape
+    size = (columns, rows)
     program = context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
     corners = context.buffer(reserve=faces.size * 3 * FLOAT_BYTES, dynamic=True)
     triangles = context.vertex_array(program, [(corners, "3f", "position")])
@@ -152,8 +156,10 @@ def _draw(
     # lower index stays if depths are equal.
     context.depth_func = "<"
 
-    ids_from_one = np.empty((len(points), *size), dtype=np.int32)
-    for view, view_ids in zip(points.astype(np.float32), ids_from_one, strict=True):
+    ids_from_one = np.empty((len(points), *shape), dtype=np.int32)
+    # The image of OpenGL is [-1, 1] along both axes.
+    scaled = (points * [1, columns / rows, 1]).astype(np.float32)
+    for view, view_ids in zip(scaled, ids_from_one, strict=True):
         corners.write(view[faces])
         framebuffer.clear()
         triangles.render(moderngl.TRIANGLES)

@@ -31,6 +31,7 @@ proportional to the depth, and 1 without perspective.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -144,10 +145,10 @@ class _ZerosWithGradient(torch.autograd.Function):
         """Compute the gradient with respect to the homogeneous positions."""
         (positions,) = ctx.saved_tensors
         view: _MovingView = ctx.view
-        # The factor size / (4 s) is a product of three: the image has the width 2, so a
-        # movement by 1 is size · s / 2 samples. A sample has the weight 1 / s² in its
+        # The factor width / (4 s) is a product of three: the image has the width 2, so a
+        # movement by 1 is width · s / 2 samples. A sample has the weight 1 / s² in its
         # pixel. Half of the difference of two samples belongs to each of them.
-        upstream = upstream * (view.fragments.size / 4 / view.fragments.samples)
+        upstream = upstream * (view.fragments.shape[1] / 4 / view.fragments.samples)
         gradient = view.gradient_of_surfaces(positions, upstream)
         ends, end_gradients = view.gradient_of_silhouettes(positions, upstream)
         return gradient.index_add_(0, ends, end_gradients), None
@@ -161,11 +162,11 @@ class _MovingView:
         fragments: The S covered samples in P pixels.
         crossings: Places where visible silhouettes pass between samples.
         sample_grid: Index of the covered sample at each sample of the image, or
-            NOT_COVERED, shape (size · s, size · s).
+            NOT_COVERED, shape (height · s, width · s).
         uncovered_pixels: Row-major indices of the E uncovered pixels into which
             silhouettes may move, shape (E,).
         radiance: Linear radiance at the covered samples, shape (3, S).
-        background: Linear background of all pixels, shape (3, size²).
+        background: Linear background of all pixels, shape (3, height · width).
     """
 
     fragments: Fragments
@@ -227,7 +228,7 @@ class _MovingView:
         grid = self.sample_grid
         # `gradient_of_silhouettes` computes the gradient where a silhouette passes between samples.
         is_along_axis = self.crossings.horizontal if axis == X else ~self.crossings.horizontal
-        crossed = list(_divmod(self.crossings.cells[0, is_along_axis], len(grid)))
+        crossed = list(_divmod(self.crossings.cells[0, is_along_axis], grid.shape[1]))
         if axis == Y:
             # Make rows of the image of its columns.
             weighted_image, grid = weighted_image.T, grid.T
@@ -267,7 +268,7 @@ class _MovingView:
         # which is to the right in a row, and down in a column.
         along = torch.where(crossings.horizontal, crossings.normal[0], -crossings.normal[1])
         # Index of the column of `upstream` for each pixel of the image, or -1 without a column.
-        column_of_pixel = torch.full((self.fragments.size**2,), -1, device=upstream.device)
+        column_of_pixel = torch.full((math.prod(self.fragments.shape),), -1, device=upstream.device)
         upstream_pixels = torch.cat([self.fragments.pixels, self.uncovered_pixels])
         column_of_pixel[upstream_pixels] = torch.arange(upstream.shape[1], device=upstream.device)
         # Gradient with respect to movements toward the second sample. The pixel of the first
@@ -316,8 +317,9 @@ def _divmod(numbers: Tensor, divisor: int) -> tuple[Tensor, Tensor]:
 def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
     """Find the row-major pixels to which samples, row-major in the whole image, belong."""
     samples = fragments.samples
-    row, column = _divmod(cells, fragments.size * samples)
-    return row // samples * fragments.size + column // samples
+    width = fragments.shape[1]
+    row, column = _divmod(cells, width * samples)
+    return row // samples * width + column // samples
 
 
 class _Silhouettes:
@@ -344,7 +346,7 @@ class _Silhouettes:
         x, y, w = positions.T
         points = np.stack([x / w, y / w, nearness]).T
         # Positions are rounded to subsamples as in rasterizers.
-        self.places = to_fixed_point(points, len(sample_grid))[0] / SUBSAMPLES
+        self.places = to_fixed_point(points, sample_grid.shape)[0] / SUBSAMPLES
         self.ends = _silhouette_edges(self.places, faces)
         if len(fragments.sample_to_seen_face) == 0:
             self.ends = self.ends[:, :0]  # If no sample shows the mesh, no silhouette is visible.
@@ -360,21 +362,23 @@ class _Silhouettes:
 
     def crossings_along(self, axis: int) -> tuple[np.ndarray, ...]:
         """Find the arrays of `Crossings` between neighbors in a row (`axis` is X) or column."""
-        resolution = len(self.sample_grid)
+        rows, columns = self.sample_grid.shape
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
         # Places (cuts) where edges cross rows of samples for the axis X, or columns for Y.
         across_and_along = [1 - axis, axis]
         edge, line, fraction, next_sample = _cut_edges(
-            start[across_and_along], end[across_and_along], resolution
+            start[across_and_along],
+            end[across_and_along],
+            (rows, columns) if axis == X else (columns, rows),
         )
         # Row-major indices of the first sample after each cut, and of the sample before.
         if axis == X:
-            after = line * resolution + next_sample
+            after = line * columns + next_sample
             before = after - 1
         else:
-            after = next_sample * resolution + line
-            before = after - resolution
+            after = next_sample * columns + line
+            before = after - columns
         cells = np.stack([before, after])
         # Indices among the covered samples before and after the cuts, or NOT_COVERED.
         samples = self.sample_grid.ravel()[cells].astype(np.int64)
@@ -434,12 +438,13 @@ class _Silhouettes:
 
 
 def _cut_edges(
-    start: Float[np.ndarray, "2 N"], end: Float[np.ndarray, "2 N"], resolution: int
+    start: Float[np.ndarray, "2 N"], end: Float[np.ndarray, "2 N"], shape: tuple[int, int]
 ) -> tuple[np.ndarray, ...]:
     """Find where N edges cross rows of samples, or columns of samples.
 
     Rows and columns are both called lines. The first coordinate of the ends of the edges is across
     the lines, and the second one along the lines, in units of samples. Line i has the coordinate i.
+    `shape` is the number of lines, and of samples in a line.
     Crossings before the first sample or after the last sample of a line are left out. The results
     are, for each of K crossings, the index of the edge, the index of the line, the position on the
     edge from 0 (start) to 1 (end), and the index in the line of the first sample at or after the
@@ -448,8 +453,8 @@ def _cut_edges(
     lower = np.minimum(start[0], end[0])
     upper = np.maximum(start[0], end[0])
     # Each edge crosses the lines from `first_line` to `end_line` - 1.
-    first_line = np.ceil(lower).clip(0, resolution).astype(np.int64)
-    end_line = np.ceil(upper).clip(0, resolution).astype(np.int64)
+    first_line = np.ceil(lower).clip(0, shape[0]).astype(np.int64)
+    end_line = np.ceil(upper).clip(0, shape[0]).astype(np.int64)
     cuts_per_edge = end_line - first_line
     # One entry for each pair of an edge and a line (row or column of samples) that the edge
     # crosses. The index of an edge is repeated for all lines that it crosses.
@@ -460,7 +465,7 @@ def _cut_edges(
     fraction = (line - start[0, edge]) / (end[0] - start[0])[edge]
     position = start[1, edge] + fraction * (end[1] - start[1])[edge]
     next_sample = np.ceil(position).astype(np.int64)
-    is_inside = (next_sample > 0) & (next_sample < resolution)
+    is_inside = (next_sample > 0) & (next_sample < shape[1])
     return edge[is_inside], line[is_inside], fraction[is_inside], next_sample[is_inside]
 
 

@@ -95,12 +95,12 @@ def test_an_attack_on_light_takes_half_to_all_of_the_memory_that_it_must_find_fr
 def test_renders_need_their_memory_before_any_is_made(monkeypatch):
     monkeypatch.setattr(errors, "free_memory", lambda device: 2**26)
     grays = (0, 0.25, 0.5, 0.75, 1)
-    with pytest.raises(InputError, match=r"^1000 renders of 64 pixels .* 0\.4 GB"):
+    with pytest.raises(InputError, match=r"^1000 renders of 64 × 64 pixels .* 0\.4 GB"):
         build_scene(ORANGE, 64, 200, backgrounds=grays, rasterizer="numpy")
 
 
 def test_views_need_their_memory_before_any_is_made(monkeypatch):
     shown = build_scene(ORANGE, 64, 100, rasterizer="numpy", samples=1)
     monkeypatch.setattr(errors, "free_memory", lambda device: 10**6)
-    with pytest.raises(InputError, match=r"^100 views of 64 pixels"):
+    with pytest.raises(InputError, match=r"^100 views of 64 × 64 pixels"):
         _ = shown.stacks

@@ -104,7 +104,7 @@ def path_traced(folder: Path, mesh: renderer.Mesh, camera: Camera, light: Tensor
     write_map(folder / "light.exr", mitsuba_map(light, 192))
     settings = ImageSettings(64, bounces=3)
     write_mitsuba_scene(folder, mesh, 1.0, [camera], settings, "light.exr")
-    [image] = render_mitsuba_scene(folder / SCENE, 1)
+    [image] = render_mitsuba_scene(folder / SCENE, 1, (64, 64))
     return image.double().clamp(0, 1)
 
 

@@ -113,7 +113,9 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, enc
     settings = ImageSettings(24, 8, encoding, normals)
     write_mitsuba_scene(tmp_path / "mitsuba", mesh, 2.0, CAMERAS, settings, "../light.exr")
     write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
-    expected_views = render_mitsuba_scene(tmp_path / "mitsuba" / SCENE, len(CAMERAS)).double()
+    expected_views = render_mitsuba_scene(
+        tmp_path / "mitsuba" / SCENE, len(CAMERAS), (24, 24)
+    ).double()
     operators = build_operators(mesh, CAMERAS, settings, choose("numpy"), 2.0)
     for operator, expected in zip(operators, expected_views, strict=True):
         found = render_operator(operator, light, size=24)
@@ -147,7 +149,7 @@ def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
     matte_image = render(textured)
     for name, mesh, largest_error in (("metal", metal, 0.05), ("varnish", varnished, 0.1)):
         write_mitsuba_scene(tmp_path / name, mesh, 1.0, CAMERAS[:1], settings, "../light.exr")
-        [rendered] = render_mitsuba_scene(tmp_path / name / SCENE, 1).double()
+        [rendered] = render_mitsuba_scene(tmp_path / name / SCENE, 1, (24, 24)).double()
         expected = rendered[:3]
         error = (render(mesh) - expected).norm() / expected.norm()
         matte_error = (matte_image - expected).norm() / expected.norm()
@@ -162,7 +164,7 @@ def test_a_scene_is_rendered_on_a_single_core_too(tmp_path):
     write_map(tmp_path / "light.exr", torch.ones(8, 16, 3))
     drjit.set_thread_count(1)
     faulthandler.dump_traceback_later(60, exit=True)
-    images = render_mitsuba_scene(tmp_path / SCENE, 1)
+    images = render_mitsuba_scene(tmp_path / SCENE, 1, (8, 8))
     faulthandler.cancel_dump_traceback_later()
     assert images.shape == (1, 4, 8, 8)
     assert images[:, 3].any()

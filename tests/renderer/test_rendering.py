@@ -250,5 +250,5 @@ def test_images_that_need_more_than_the_free_memory_are_refused(
     monkeypatch.setattr("renderer.errors.free_memory", lambda device: 10**6)
     arguments = (stone, CAMERAS, light)[: 3 if function == "render" else 2]
     getattr(renderer, function)(*arguments, **SMALL)
-    with pytest.raises(InputError, match=r"^3 views of 512 samples per side need"):
+    with pytest.raises(InputError, match=r"^3 views of 512 × 512 samples need"):
         getattr(renderer, function)(*arguments, size=256, rasterizer="numpy")

@@ -11,6 +11,7 @@ the subfolders are CLASSIFIER and HARDENED.
 """
 
 import json
+import math
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
@@ -28,6 +29,7 @@ from renderer.errors import InputError, keyed
 from renderer.io.files import atomic_write
 from renderer.light.files import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
+from renderer.settings import Size, height_and_width
 from train import console
 from train.auditing import lights, page, relit
 from train.auditing.network import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
@@ -118,7 +120,8 @@ def run_audit(
             (out / key).mkdir(exist_ok=True)
         if plan is not None:
             if plan.image_folders.get(LABORATORY) == renders:
-                size = max(network.size for network in networks.values())
+                sizes = [network.size for network in networks.values()]
+                size = max(sizes, key=lambda size: math.prod(height_and_width(size)))
                 _write_folder(renders, partial(_write_renders, settings, plan, size))
             plan.measure(networks, out)
         if settings.unlabeled:
@@ -310,7 +313,7 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
     write_config(out, settings, command=command_line("audit"))
 
 
-def _write_renders(settings: AuditSettings, plan: _Plan, size: int, out: Path) -> None:
+def _write_renders(settings: AuditSettings, plan: _Plan, size: Size, out: Path) -> None:
     """Render the path-traced test images on which an audit scores networks.
 
     They show the meshes and the hard negatives under each pattern of PATTERNS,

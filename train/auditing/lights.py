@@ -50,7 +50,7 @@ from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, with_local_lights
 from renderer.light.files import UNIFORM, load_light, perturb
 from renderer.rendering import light_sphere
-from renderer.settings import ImageSettings
+from renderer.settings import ImageSettings, Size, height_and_width
 from renderer.visibility import choose
 
 # Result file: in which environment lights a network recognizes each view.
@@ -174,7 +174,7 @@ class Views:
     exposure: float = 1.0
     size: float = 1.0
 
-    def scene(self, size: int, kind: str = "lighting") -> Scene:
+    def scene(self, size: Size, kind: str = "lighting") -> Scene:
         """Build a scene with one example for each view."""
         objects = [self.objects[index % len(self.objects)] for index in range(self.count)]
         local_lights = [build_local_light(light) for light in KINDS[kind].local]
@@ -183,7 +183,7 @@ class Views:
         scene = Scene.grid(
             objects,
             CAMERA,
-            torch.full((1, 1, size, size), BACKGROUND),
+            torch.full((1, 1, *height_and_width(size)), BACKGROUND),
             lights.to(self.device),
             ImageSettings(size, samples=2, encoding="srgb", normals="smooth"),
             choose("auto"),

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from PIL import Image
 
-from renderer.io.images import read_square
+from renderer.io.images import read_center
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, SIDE, STEPS
 from train.auditing.network import (
     CLASSIFIER,
@@ -314,7 +314,7 @@ def _worst(
             texts.append(f"{network.name}: {prediction.text}")
         photograph = networks[0].predictions(images).photograph[row]
         caption = f"{in_words(photograph.label)}, {photograph.source}: {'; '.join(texts)}"
-        image = Image.fromarray(read_square(folders[images] / photograph.path, SIDE))
+        image = Image.fromarray(read_center(folders[images] / photograph.path, SIDE))
         return encode_picture(image, caption, caption)
 
     galleries: dict[str, list[Picture]] = {}

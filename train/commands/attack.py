@@ -33,6 +33,7 @@ from augment.settings import ObjectSettings
 from augment.tasks.classification import ClassCriterion
 from augment.tasks.task import NO_CLASS
 from renderer.errors import InputError, keyed, keys_of
+from renderer.settings import Size
 from renderer.visibility import Rasterizer
 from train.auditing.relit import MODELED, attack_folder
 from train.checkpoints import load_chosen, load_network
@@ -221,7 +222,7 @@ def build_attacked(
     settings: AttackExperimentSettings,
     item: ObjectSettings,
     scene: AttackSceneSettings,
-    size: int,
+    size: Size,
     device: torch.device,
 ) -> Scene:
     """Build the scene in which one mesh is attacked.

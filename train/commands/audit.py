@@ -10,6 +10,7 @@ from augment.classifier import UNIT_RANGE, Classifier, Normalization, as_classif
 from augment.network import device_of, gradient_flags_kept
 from augment.settings import NormalizeLight
 from renderer.errors import as_list
+from renderer.settings import Size
 from train.auditing.audit import run_audit
 from train.auditing.network import CLASSIFIER, HARDENED, AuditReport
 from train.class_names import MeshItem, as_mappings
@@ -33,7 +34,7 @@ def audit(
     hard_negatives: Sequence[MeshItem] = (),
     hardened: Classifier | Callable[[Tensor], Tensor] | None = None,
     classes: Sequence[str] | None = None,
-    size: int | None = None,
+    size: Size | None = None,
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
     normalize_light: NormalizeLight = None,
@@ -64,7 +65,8 @@ def audit(
             beside `network`. None to audit one network.
         classes: Names of the classes of plain networks, in the order of their
             outputs. None for "0", "1" and so on.
-        size: Pixels per side of the images of plain networks. None for its own, or 224.
+        size: Pixels per side of the images of plain networks, or (height, width). None
+            for its own, or 224.
         normalization: "imagenet", or mean and standard deviation, as `attack`
             takes it.
         value_range: Values of black and white that plain networks take before

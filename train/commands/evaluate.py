@@ -12,6 +12,7 @@ from augment.files import as_facts, require_no_facts
 from augment.network import device_of, gradient_flags_kept
 from augment.settings import NormalizeLight
 from renderer.errors import as_folder, keyed
+from renderer.settings import Size
 from train.checkpoints import load_chosen, load_run
 from train.command_settings import EvaluateSettings, require_calibration
 from train.data.photographs import choose_labels, class_folders, require_outside
@@ -70,7 +71,7 @@ def evaluate(
     label: str | int | Sequence[str | int] | None = None,
     *,
     classes: Sequence[str] | None = None,
-    size: int | None = None,
+    size: Size | None = None,
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
     normalize_light: NormalizeLight = None,
@@ -98,7 +99,8 @@ def evaluate(
             finds. None for all classes that have a sub-folder.
         classes: Names of the classes of a plain network, in the order of its
             outputs. None for "0", "1" and so on.
-        size: Pixels per side of the images of a plain network. None for its own, or 224.
+        size: Pixels per side of the images of a plain network, or (height, width).
+            None for its own, or 224.
         normalization: "imagenet", or mean and standard deviation, as `attack`
             takes it.
         value_range: Values of black and white that a plain network takes before

@@ -22,7 +22,7 @@ from augment.classifier import (
 from augment.network import device_of, unwrapped
 from augment.settings import NormalizeLight, RendererSettings
 from renderer.errors import InputError, as_path, describe, require_kind
-from renderer.settings import Settings
+from renderer.settings import Settings, Size
 from train import class_names, console
 from train.__main__ import main
 from train.cli import read_settings
@@ -46,7 +46,7 @@ def harden(
     *,
     hard_negatives: Sequence[class_names.MeshItem] | None = None,
     classes: Sequence[str] | None = None,
-    size: int | None = None,
+    size: Size | None = None,
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
     normalize_light: NormalizeLight = None,

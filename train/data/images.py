@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from renderer.errors import InputError
-from renderer.io.images import central_square, read_rgb
+from renderer.io.images import crop_center, read_rgb
 from train import console
 
 # Data sets with at most 64 pixels per side are kept in memory. Larger ones stay
@@ -145,7 +145,7 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
                     continue
                 break
             if seed is None:
-                image = central_square(image, size)
+                image = crop_center(image, size)
             else:
                 with torch.random.fork_rng(devices=[]):
                     # `torch.manual_seed` would also seed the generators of GPUs.

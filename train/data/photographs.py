@@ -18,7 +18,8 @@ from torch import Tensor
 from augment.classifier import Label, class_index, nearest
 from augment.progress import progress
 from renderer.errors import InputError, composed, require_memory, single_line
-from renderer.io.images import read_square
+from renderer.io.images import read_center
+from renderer.settings import Size, height_and_width
 from train import console
 from train.data.photo import DESCRIPTION, TABLE, Photograph, split_sources
 from train.settings import OTHER_PREFIX, label_names
@@ -280,20 +281,21 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
 
 
 def load_photographs(
-    folder: Path, photographs: Sequence[Photograph], size: int = 32, skip_unreadable: bool = False
+    folder: Path, photographs: Sequence[Photograph], size: Size = 32, skip_unreadable: bool = False
 ) -> tuple[list[Photograph], Tensor, list[str]]:
     """Read photographs at the size of the input of a network.
 
     Each image is rotated as its EXIF orientation says, and converted to sRGB as its
     color profile says. Transparent pixels are blended with white, and 16-bit
-    channels are converted to 8 bits. The central square is reduced with Pillow's
-    Lanczos filter. The filter is wider for a larger reduction, which prevents
-    aliasing. Return the photographs that could be read, their uint8 sRGB images, and
-    the paths of the others.
+    channels are converted to 8 bits. The largest central part of the shape of `size`
+    is reduced with Pillow's Lanczos filter. The filter is wider for a larger
+    reduction, which prevents aliasing. Return the photographs that could be read,
+    their uint8 sRGB images, and the paths of the others.
     """
-    shape = (len(photographs), 3, size, size)
+    height, width = height_and_width(size)
+    shape = (len(photographs), 3, height, width)
     cpu = torch.device("cpu")
-    require_memory(f"{len(photographs)} photographs of {size} pixels per side", prod(shape), cpu)
+    require_memory(f"{len(photographs)} photographs of {height} × {width} pixels", prod(shape), cpu)
     images = torch.empty(shape, dtype=torch.uint8)
     paths = [folder / photograph.path for photograph in photographs]
     # Threads read in parallel, because Pillow releases Python's global lock while
@@ -319,11 +321,11 @@ def load_photographs(
     return [photographs[index] for index in readable], images, unreadable_paths
 
 
-def _read_image(image: UInt8[Tensor, "3 size size"], path: Path) -> Exception | None:
-    """Read the central square of a photograph into a tensor."""
+def _read_image(image: UInt8[Tensor, "3 height width"], path: Path) -> Exception | None:
+    """Read the center of a photograph into a tensor."""
     try:
         # `np.array` copies the pixels, because the memory of Pillow is read-only.
-        pixels = np.array(read_square(path, image.shape[-1]))
+        pixels = np.array(read_center(path, image.shape[-2:]))
     # Pillow raises errors of almost any type for a damaged file.
     except Exception as error:
         return error

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from renderer.io.images import read_square
+from renderer.io.images import read_center
 from train.data.photo import DESCRIPTION
 from train.results import compare
 from train.results.pictures import Picture, encode_picture
@@ -318,7 +318,7 @@ def _draw_images(before: Predictions, after: Predictions, images: Path) -> list[
         subject = ", ".join(map(in_words, filter(None, (photograph.label, photograph.source))))
         original, hardened = (describe_prediction(item, row) for item in (before, after))
         alt = f"{subject}; original network: {original.text}; hardened network: {hardened.text}"
-        pixels = Image.fromarray(read_square(images / photograph.path, SIDE))
+        pixels = Image.fromarray(read_center(images / photograph.path, SIDE))
         drawn.append(ComparedImage(encode_picture(pixels, alt), subject, original, hardened))
     return drawn
 

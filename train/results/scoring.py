@@ -27,6 +27,7 @@ from augment.tasks.classification import Classification
 from renderer.errors import InputError, ShortRepr, require_choice
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
+from renderer.settings import Size, as_size
 from train.data.photo import TABLE, Photograph
 from train.data.photographs import (
     find_photographs,
@@ -97,13 +98,13 @@ class Predictor:
             the shape (N, len(classes)). A module is called in eval mode. Its
             mode is restored afterwards.
         classes: Names of the classes of the model.
-        size: Pixels per side of the images.
+        size: Pixels per side of the images, or height and width.
         device: Device of the model.
     """
 
     model: Model
     classes: Sequence[str]
-    size: int = 32
+    size: Size = 32
     device: str | torch.device = "cpu"
 
     def predict(
@@ -290,7 +291,7 @@ class Scores(ShortRepr):
         points = self.point_entries
         summary: dict[str, Any] = {
             "label": labels if self.by_label else labels[0],
-            "size": predicted.images.shape[-1],
+            "size": as_size("size", predicted.images.shape[-2:]),
             "images": predicted.images_hash,
             **self.overall.to_summary(),
             "n": {

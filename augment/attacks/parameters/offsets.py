@@ -130,8 +130,7 @@ class Pixels(Parameter):
     fits_other_views = False
 
     def __init__(self, scene: Scene, settings: StepSettings):
-        size = scene.settings.size
-        self._images_shape = (scene.views, 3, size, size)
+        self._images_shape = (scene.views, 3, *scene.settings.shape)
         start = scene.lights.new_zeros(len(scene), math.prod(self._images_shape))
         super().__init__(settings, start)
 
@@ -140,6 +139,6 @@ class Pixels(Parameter):
     ) -> Conditions:
         """Return a copy of the conditions with an offset for each pixel value.
 
-        The values are in the order (V, 3, size, size) of the images.
+        The values are in the order (V, 3, height, width) of the images.
         """
         return replace(conditions, pixels=values.unflatten(1, self._images_shape))

@@ -26,7 +26,7 @@ ours = nb.render(cup, cameras, light, 128, 0.0, normals="flat", samples=8, bounc
 folder = Path(mkdtemp())
 write_map(folder / "light.exr", mitsuba_map(light, 64).clamp(min=0))
 write_mitsuba_scene(folder, cup, 1.0, cameras, settings, "light.exr")
-theirs = render_mitsuba_scene(folder / "scene.xml", 1)[0, :3].clamp(0, 1)
+theirs = render_mitsuba_scene(folder / "scene.xml", 1, (128, 128))[0, :3].clamp(0, 1)
 difference = (10 * (ours - theirs)).abs()
 
 plt.imshow(torch.cat([ours, theirs, difference], 2).clamp(0, 1).permute(1, 2, 0))

@@ -92,7 +92,7 @@ def mitsuba_image(folder: Path, mesh: Mesh, basis: LocalBasis, light: Tensor) ->
     for placed in lights:
         settings = ImageSettings(SIZE)
         write_mitsuba_scene(folder, mesh, 1.0, [CAMERA], settings, "light.exr", [placed])
-        total += render_mitsuba_scene(folder / SCENE, 1)[0, :3]
+        total += render_mitsuba_scene(folder / SCENE, 1, (SIZE, SIZE))[0, :3]
     return total.permute(1, 2, 0).numpy()
 
 

@@ -72,7 +72,7 @@ def photograph(folder: Path, mesh: Mesh, camera: Camera, radiance: Tensor, encod
     write_map(folder / "light.exr", radiance)
     settings = ImageSettings(SIZE, bounces=3, encoding=encoding)
     write_mitsuba_scene(folder, mesh, 1.0, [camera], settings, "light.exr")
-    traced = render_mitsuba_scene(folder / SCENE, 1)[0].double()
+    traced = render_mitsuba_scene(folder / SCENE, 1, (SIZE, SIZE))[0].double()
     share = traced[3].clamp(0, 1)
     image = encode((traced[:3] + 0.3 * (1 - share)).clamp(0, 1), encoding)
     for name, values in (("photo.png", image), ("mask.png", share.expand(3, -1, -1))):

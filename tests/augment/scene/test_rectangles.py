@@ -1,0 +1,233 @@
+"""A rectangular image is the center of the larger square image of the same pixels."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import norm_balls as nb
+from augment.attacks.files import save
+from augment.augmentation_settings import CameraEffectSettings, VariationSettings
+from augment.photographs import draw_shading
+from augment.random_streams import generator
+from augment.scene import patterns
+from augment.scene.vary import _blur, vary
+from renderer.camera import OrthographicCamera, PerspectiveCamera
+from renderer.light.environment import write_map
+from renderer.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
+from renderer.pinhole import PinholeCamera
+from renderer.settings import ImageSettings
+from renderer.visibility import choose
+
+CAMERAS = {
+    "parallel": OrthographicCamera(63.0, 22.9, 2.4, 0.1, -0.2),
+    "perspective": PerspectiveCamera(63.0, 22.9, 2.4, 0.1, -0.2, distance=5.0),
+    "pinhole": PinholeCamera(
+        polar=80.2,
+        azimuth=17.2,
+        width=2.4,
+        distance=3.2,
+        roll=34.0,
+        principal_right=0.3,
+        principal_up=-0.2,
+        pixel_aspect=1.1,
+    ),
+}
+SHAPES = [(12, 20), (20, 12)]
+each_shape = pytest.mark.parametrize("shape", SHAPES, ids=["wide", "tall"])
+each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+CUP = nb.solid("cup")
+LIGHT = nb.load_light("grace")
+
+
+def around(camera, shape):
+    """Return the camera and the side of the square image whose center has this shape."""
+    width = shape[1]
+    side = max(shape)
+    wider = replace(camera, width=camera.width * side / width)
+    if isinstance(camera, PinholeCamera):
+        offsets = (camera.principal_right, camera.principal_up)
+        right, up = (offset * width / side for offset in offsets)
+        wider = replace(wider, principal_right=right, principal_up=up)
+    return wider, side
+
+
+def center(image, shape):
+    """Cut out the center of an image."""
+    top, left = ((side - cut) // 2 for side, cut in zip(image.shape[-2:], shape, strict=True))
+    return image[..., top : top + shape[0], left : left + shape[1]]
+
+
+@pytest.mark.parametrize("rasterizer", ["numpy", "numba", "opengl"])
+@each_camera
+@each_shape
+def test_a_rectangle_is_the_center_of_a_square(shape, camera, rasterizer):
+    try:
+        choose(rasterizer)
+    except nb.InputError as error:
+        pytest.skip(str(error))
+    background = torch.rand(3, 20, 20, generator=torch.Generator().manual_seed(0))
+    wider, side = around(camera, shape)
+    options = {"rasterizer": rasterizer, "encoding": "srgb"}
+    whole = nb.render(CUP, wider, LIGHT, side, background, **options)
+    cut = nb.render(CUP, camera, LIGHT, shape, center(background, shape), **options)
+    assert (cut - center(background, shape)).abs().max() > 0.1
+    torch.testing.assert_close(cut, center(whole, shape), atol=1e-5, rtol=0)
+
+
+@each_camera
+@each_shape
+def test_gradients_at_silhouettes_are_those_of_the_square(shape, camera):
+    wider, side = around(camera, shape)
+    # Silhouettes at the border of the rectangle move into pixels outside of it.
+    inner = (3, shape[0] - 2, shape[1] - 2)
+    weights = torch.rand(inner, generator=torch.Generator().manual_seed(1)).double()
+    weights = torch.nn.functional.pad(weights, (1, 1, 1, 1))
+    gradients = []
+    for seen, size in ((camera, shape), (wider, side)):
+        vertices = torch.from_numpy(CUP.vertices).requires_grad_()
+        image = nb.render(
+            CUP,
+            seen,
+            LIGHT.double(),
+            size,
+            vertices=vertices,
+            silhouettes=True,
+            samples=3,
+            rasterizer="numpy",
+        )
+        (center(image, shape) * weights).sum().backward()
+        gradients.append(vertices.grad)
+    assert gradients[0].abs().max() > 0.01
+    torch.testing.assert_close(*gradients, atol=1e-4, rtol=1e-4)
+
+
+def test_a_point_is_seen_where_its_intrinsics_say():
+    """A small ball at (x, y, z) is seen at (fx x / z + cx, fy y / z + cy)."""
+    view = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
+    camera = nb.PinholeCamera.from_matrix(view, [[60, 0, 16], [0, 66, 16], [0, 0, 1]], size=32)
+    ball = nb.solid("ball")
+    small = replace(ball, vertices=0.1 * ball.vertices + [0.8, 0.4, 0.0])
+    image = 1 - nb.render(small, camera, 0 * LIGHT, (24, 32), 1.0, samples=8)[0]
+    rows, columns = np.mgrid[:24, :32] + 0.5
+    weights = image.numpy() / image.sum().item()
+    # The square of 32 rows begins 4 rows above this image.
+    assert (weights * columns).sum() == pytest.approx(60 * 0.8 / 5 + 16, abs=0.05)
+    assert (weights * rows).sum() == pytest.approx(66 * 0.4 / 5 + 16 - 4, abs=0.05)
+
+
+@each_shape
+def test_the_camera_of_a_whole_photograph_shows_all_of_it(shape):
+    """The center of a ball is seen at the pixel that the intrinsics say."""
+    height, width = shape
+    view = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
+    intrinsics = [[20, 0, width - 5], [0, 22, height - 5], [0, 0, 1]]
+    camera = nb.PinholeCamera.from_matrix(view, intrinsics, (width, height), whole=True)
+    ball = nb.solid("ball")
+    ball = replace(ball, vertices=0.3 * ball.vertices)
+    image = 1 - nb.render(ball, camera, 0 * LIGHT, shape, 1.0, samples=8)[0]
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    weights = image.numpy() / image.sum().item()
+    assert (weights * columns).sum() == pytest.approx(width - 5, abs=0.05)
+    assert (weights * rows).sum() == pytest.approx(height - 5, abs=0.05)
+
+
+@each_camera
+@each_shape
+def test_mitsuba_agrees(tmp_path, shape, camera):
+    pytest.importorskip("mitsuba")
+    settings = ImageSettings(shape, 8)
+    camera = replace(camera, pixel_aspect=1.0) if isinstance(camera, PinholeCamera) else camera
+    light = torch.zeros(49, 3)
+    light[0] = 1.0
+    write_map(tmp_path / "light.exr", mitsuba_map(light, 32))
+    write_mitsuba_scene(tmp_path, CUP, 1.0, [camera], settings, "light.exr")
+    [theirs] = render_mitsuba_scene(tmp_path / SCENE, 1, shape)
+    coverage = 1 - nb.render(CUP, camera, 0 * light, shape, 1.0, samples=8)[0]
+    assert theirs.shape[-2:] == shape
+    assert 0.1 < coverage.mean() < 0.9
+    torch.testing.assert_close(theirs[3], coverage, atol=0.13, rtol=0)
+    assert (theirs[3] - coverage).abs().mean() < 0.01
+
+
+@each_shape
+def test_patterns_and_slides_are_the_center_of_the_square(shape):
+    width = shape[1]
+    points = patterns.pixel_centers(shape)
+    whole = patterns.pixel_centers(max(shape)) * (max(shape) / width)
+    torch.testing.assert_close(points, center(whole, shape))
+    drawn = patterns.draw_slides(8, shape, generator(0, "slides"))
+    assert drawn.shape == (8, 3, *shape)
+    assert draw_shading(2, shape, generator(0, "shading")).shape == (2, 1, *shape)
+
+
+def test_a_photograph_in_a_pattern_keeps_its_proportions():
+    """A disk in a wide photograph stays a disk."""
+    rows, columns = np.mgrid[:40, :80] + 0.5
+    disk = torch.from_numpy((rows - 20) ** 2 + (columns - 40) ** 2 < 15**2).float()
+    points = patterns.pixel_centers((60, 120))
+    draws = generator(3, "photograph")
+    shown = patterns.draw_photograph_patterns(disk.expand(1, 3, -1, -1), points, draws)[0, 1]
+    rows, columns = torch.nonzero(shown[10:50, 40:80] > 0.5).T.double()
+    assert rows.std().item() == pytest.approx(columns.std().item(), rel=0.05)
+
+
+@each_shape
+def test_a_blur_is_that_of_the_square_away_from_the_border(shape):
+    images = torch.rand(1, 1, 3, 40, 40, generator=torch.Generator().manual_seed(2))
+    larger = (shape[0] + 18, shape[1] + 18)
+    deviations = torch.tensor([1.5])
+    blurred = center(_blur(center(images, larger), deviations), shape)
+    torch.testing.assert_close(blurred, center(_blur(images, deviations), shape))
+
+
+@each_shape
+def test_varied_scenes_have_tables_and_effects_of_the_size(shape):
+    scene = nb.build_scene([("solid:cup", "cup")], shape, 2, rasterizer="numpy", width=3.0)
+    settings = VariationSettings(
+        tables=1.0, lit_background=True, camera=CameraEffectSettings(blur=1.0, pattern_fraction=1.0)
+    )
+    varied = vary(scene, settings, generator(0, "vary"))
+    examples = torch.arange(2)
+    images = varied.render(varied.conditions(examples), examples)
+    assert images.shape == (2, 1, 3, *shape)
+
+
+def logits(images):
+    """Return logits that depend on the brightness of the images."""
+    mean = images.mean((1, 2, 3))
+    return torch.stack([mean, 0.3 + 0 * mean], dim=1)
+
+
+def attacked(shape, **settings):
+    """Attack a cup in images of this shape."""
+    scene = nb.build_scene([("solid:cup", "0")], shape, rasterizer="numpy", samples=1)
+    return nb.attack(logits, scene, settings=nb.AttackSettings(max_steps=2, **settings))
+
+
+@each_shape
+def test_an_attack_is_saved_and_read_again(tmp_path, shape):
+    result = attacked(
+        shape, lighting=nb.StepSettings(step_size=0.5), pixels=nb.StepSettings(step_size=0.1)
+    )
+    assert result.images.shape == (1, 3, *shape)
+    save(result, tmp_path)
+    adversary = nb.reload(tmp_path / "example_000")
+    torch.testing.assert_close(adversary.render(), result.images[0], atol=2e-3, rtol=0)
+    assert adversary.settings.shape == shape
+    result.save_animation(tmp_path / "attack.gif", frame_count=2)
+    result.plot()
+
+
+def test_a_classifier_of_rectangles_refuses_other_images():
+    classifier = nb.Classifier(logits, (8, 12), ["0", "1"])
+    assert classifier(torch.zeros(2, 3, 8, 12)).shape == (2, 2)
+    with pytest.raises(nb.InputError, match=r"\(N, 3, 8, 12\), not \(2, 3, 12, 8\)"):
+        classifier(torch.zeros(2, 3, 12, 8))
+
+
+@pytest.mark.parametrize("size", [0, 2.5, (8,), (8, 8, 8), (8, 0), "8", (8, True), None])
+def test_another_size_is_refused_in_one_sentence(size):
+    with pytest.raises(nb.InputError, match=r"^size is .*: give a whole number from 1 to"):
+        nb.build_scene([("solid:cup", "0")], size)
