@@ -267,14 +267,14 @@ class _Target(NamedTuple):
         and the mask is the share of each pixel that the object covers.
         """
         # 1 in pixels that the object covers completely, and 0 elsewhere, shape (1, H, H).
-        is_inside = (mask > WHOLE_PIXEL).double()[None]
+        inside_mask = (mask > WHOLE_PIXEL).double()[None]
         # Side of the square of pixels around each pixel over which colors are averaged.
         side = 2 * BORDER + 1
-        mean_color = F.avg_pool2d(photograph * is_inside, side, 1, BORDER)
-        inside_fraction = F.avg_pool2d(is_inside, side, 1, BORDER)
+        mean_color = F.avg_pool2d(photograph * inside_mask, side, 1, BORDER)
+        inside_fraction = F.avg_pool2d(inside_mask, side, 1, BORDER)
         # Mean color of those pixels of the square that lie inside of the object.
         border_color = mean_color / inside_fraction.clamp(min=1e-9)
-        color = torch.where(is_inside > 0, photograph, border_color)
+        color = torch.where(inside_mask > 0, photograph, border_color)
         object_image = F.interpolate((color * mask)[None], (size, size), mode="area")[0]
         mask = F.interpolate(mask[None][None], (size, size), mode="area")[0]
         # The background becomes black behind a bright object, and white behind a dark one, so that

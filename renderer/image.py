@@ -116,16 +116,16 @@ class _Clamp(torch.autograd.Function):
         # 1.0 for values that clamping did not change, and 0.0
         # for other values. A product with booleans would be
         # several times slower than a product with numbers.
-        is_unclamped = torch.eq(values, clamped, out=torch.empty_like(values))
-        ctx.save_for_backward(is_unclamped)
+        unclamped_mask = torch.eq(values, clamped, out=torch.empty_like(values))
+        ctx.save_for_backward(unclamped_mask)
         return clamped
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         """Compute the gradient of the loss, which is 0 for values that clamping changed."""
-        (is_unclamped,) = ctx.saved_tensors
-        return upstream * is_unclamped, None
+        (unclamped_mask,) = ctx.saved_tensors
+        return upstream * unclamped_mask, None
 
 
 def encode(linear: Float[Tensor, " ..."], encoding: str) -> Tensor:

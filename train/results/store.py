@@ -216,8 +216,7 @@ def trained_labels(folder: Path) -> list[str]:
         return []
     if run.settings.get("label") is not None:
         return label_names(cast(Any, run.settings["label"]))
-    scored = [[*scores.labels] for scores in run.photographs.values()]
-    return scored[0] if scored else []
+    return next(([*scores.labels] for scores in run.photographs.values()), [])
 
 
 def _read(folder: Path) -> RunSummary | None:

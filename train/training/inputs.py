@@ -111,7 +111,7 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     if settings.weights is not None:
         raise InputError(
             f"weights={settings.weights} cannot replace the weights of "
-            f"network={name}: leave weights out",
+            f"network={name}, which is a training run: leave weights out",
             "weights",
         )
     # The network of a run has its own classes and its own normalization.
@@ -162,7 +162,7 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         weights = None if settings.weights is None else as_path("weights", settings.weights)
         classifier = load_source(name, weights, facts, settings.trust)
     network = cast(nn.Module, classifier.network)
-    if not list(network.parameters()):
+    if not list(network.parameters()):  # ONNX and quantized networks have none.
         raise InputError(
             f"network={name} is a network without weights that can be trained: "
             "give a file of the network in the format of TorchScript or torch.export",
