@@ -341,7 +341,7 @@ def _doubled_areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
 
 
-def _clip_ears(points: Float[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], bool]:
+def _clip_ears(points: Num[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], bool]:
     """Divide a counter-clockwise polygon into triangles, and tell whether it intersects itself."""
     count = len(points)
     ends = np.array([count], dtype=np.uint32)

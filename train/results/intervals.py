@@ -24,6 +24,8 @@ MAX_PARTS = 30
 # Smallest ratio of the errors without a part to all errors. It keeps the logit finite if all
 # errors are in one part.
 MIN_RATIO = 0.2
+# Start of `Jackknife.over` if the last group of units is that of several training runs.
+SEEDS = "seeds and "
 
 
 class Units(NamedTuple):
@@ -171,7 +173,7 @@ def average(runs: Sequence[Jackknife]) -> Jackknife:
     over = runs[0].over
     if len(runs) > 1:  # The means of the other runs, without each run.
         without.append(np.moveaxis((values.sum(axis=0) - values) / (len(runs) - 1), 0, -1))
-        over = f"seeds and {over}"
+        over = f"{SEEDS}{over}"
     all_ends = [run.at_ends for run in runs if run.at_ends is not None]
     at_ends = np.mean(all_ends, axis=0) if all_ends else None  # Shape (2, ...).
     return Jackknife(values.mean(axis=0), without, runs[0].unit_count, over, at_ends)
@@ -198,8 +200,8 @@ def change_ends(one: Jackknife, other: Jackknife, is_paired: bool = True) -> np.
     value = one.value - other.value
     if min((item.shape[-1] for item in [*one.without, *other.without]), default=0) < 2:
         return np.stack([np.full_like(value, -1), np.full_like(value, 1)])
-    # Runs that are not paired are the last group.
-    group_count = len(one.without) if is_paired else -1
+    # The last group of several runs is that of the runs (`average`). It may not be paired.
+    group_count = None if is_paired or not one.over.startswith(SEEDS) else -1
     pairs = list(zip(one.without[:group_count], other.without, strict=False))
     product = _Spread.of(one.without).variance * _Spread.of(other.without).variance
     covariance = np.sum([_covariance(*pair) for pair in pairs], axis=0)

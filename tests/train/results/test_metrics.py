@@ -127,6 +127,16 @@ def test_without_pairs_the_interval_over_seeds_adds_the_variances_of_both_means(
     assert gain.over == "seeds and objects"
 
 
+def test_two_runs_of_other_seeds_are_still_paired_by_their_images():
+    draws = np.random.default_rng(0)
+    positives, negatives = draws.normal(1, 1, 40), draws.normal(0, 1, 40)
+    units = Units([np.arange(40), np.arange(40)], "images")
+    after = leave_out_of_roc(positives + 0.1 * draws.normal(size=40), negatives, units)
+    before = leave_out_of_roc(positives, negatives, units)
+    for one, other in zip(after, before, strict=True):
+        assert change([one], [other], is_paired=False) == change([one], [other])
+
+
 @pytest.mark.parametrize("objects", [(5, 5), (9, 9)])
 def test_intervals_of_few_objects_cover_the_truth(objects):
     """0.9 is 2.5 standard errors of 120 draws below 0.95."""
