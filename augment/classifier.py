@@ -195,7 +195,7 @@ class TaskNetwork(CheckedNetwork):
 
     def with_network(self, network: nn.Module, normalize_light: NormalizeLight = None) -> Self:
         """Return a copy with another network of the same images, and without operating points."""
-        options = {} if isinstance(self, Classifier) else {"task": self.task}
+        options: dict[str, Any] = {} if isinstance(self, Classifier) else {"task": self.task}
         given = self.size, self.classes, self.name, normalize_light
         made = type(self)(network, *given, **options)
         made.inputs = self.inputs

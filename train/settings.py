@@ -56,8 +56,9 @@ MESHES = (
 )
 # Values of the setting `network`.
 NETWORKS = (
-    "efficientnet_lite0 to 2, torchvision:NAME, timm:NAME, run:FOLDER, squeezenet_caffe or "
-    "python:package.module:function, or a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
+    "efficientnet_lite0 to 2, torchvision:NAME, timm:NAME, hf:FOLDER_OR_NAME, run:FOLDER, "
+    "squeezenet_caffe or python:package.module:function, or a file of TorchScript, torch.export "
+    "(.pt2) or ONNX (.onnx)"
 )
 # Default name of an output folder: the time at which the command starts. Hydra
 # replaces "${now:...}".
@@ -66,7 +67,7 @@ TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"
 # its folder and its device. Two runs that differ only in these settings are equal.
 CIRCUMSTANCES = (
     *("sweep", "out", "device", "launcher", "compare", "command", "working_folder"),
-    *("hardware", "versions", "inputs", "test_images", "overwrite", "train.cache"),
+    *("hardware", "versions", "inputs", "images", "test_images", "overwrite", "train.cache"),
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 
@@ -171,6 +172,11 @@ class NetworkSettings(Settings):
         "units of [0, 1], such as [[0,0,0],[1,1,1]] for none. null: that of its source, and none "
         "before a file's network.",
         is_text=True,
+    )
+    prompt: str | None = setting(
+        None,
+        "Text with {} for the name of a class, for a zero-shot network (hf:). "
+        "null: a photo of a {}.",
     )
     normalize_light: Any = setting(
         None,

@@ -1,5 +1,6 @@
 """Networks of each source get images in their own units, and wrong files are refused."""
 
+import importlib
 import os
 import re
 import sys
@@ -289,3 +290,29 @@ def test_most_oranges_are_classified_correctly_unless_red_and_blue_are_exchanged
     images = oranges(classifier.size)
     assert fraction_of_oranges(classifier, images) > least
     assert fraction_of_oranges(classifier, images.flip(1)) < most_in_bgr
+
+
+def test_a_network_of_timm_comes_from_a_repository_of_the_hub(tmp_path, monkeypatch, caplog):
+    timm = pytest.importorskip("timm")
+    hub = importlib.import_module("timm.models._hub")
+    torch.manual_seed(0)
+    options = {"pretrained_cfg_overlay": {"input_size": (3, 64, 64), "mean": (0.1, 0.2, 0.3)}}
+    published = timm.create_model("test_efficientnet", num_classes=3, **options).eval()
+    names = ["orange", "apple", "cup"]
+    hub.save_for_hf(
+        published, tmp_path, safe_serialization=True, model_config={"label_names": names}
+    )
+
+    def download(repo_id, filename, **_):
+        return str(tmp_path / filename)
+
+    monkeypatch.setattr(hub, "hf_hub_download", download)
+    classifier = load_classifier("timm:hf-hub:someone/tiny")
+    assert (classifier.size, list(classifier.classes)) == (64, names)
+    assert caplog.text.count("stated by timm") == 3
+    images = torch.rand(2, 3, 64, 64)
+    std = torch.tensor(published.pretrained_cfg["std"]).view(3, 1, 1)
+    expected = published((images - torch.tensor([0.1, 0.2, 0.3]).view(3, 1, 1)) / std)
+    torch.testing.assert_close(classifier(images), expected)
+    with pytest.raises(InputError, match="has 3 classes"):
+        load_classifier("timm:hf-hub:someone/tiny", classes=["orange", "apple"])

@@ -34,7 +34,8 @@ def run(settings: EvaluateSettings) -> None:
     else:
         # The file of a training run has its classes, size and normalization. These settings
         # are therefore an error here.
-        given_values = as_facts(settings.classes, settings.size, settings.normalization)
+        facts = settings.classes, settings.size, settings.normalization, settings.prompt
+        given_values = as_facts(*facts)
         require_no_facts(f"run={settings.run}", given_values)
         loaded = load_run(settings.run, settings.weights, settings.network, settings.trust)
         # The returned copy normalizes the light of each image, unless the setting is None.

@@ -115,7 +115,7 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
             "weights",
         )
     # The network of a run has its own classes and its own normalization.
-    given = as_facts(settings.classes, None, settings.normalization)
+    given = as_facts(settings.classes, None, settings.normalization, settings.prompt)
     require_no_facts(f"network={name}", given)
     with keyed(run="network"):
         path, state = checkpoints.load_selected(source)
@@ -158,7 +158,8 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     with keyed(name="network", size="size"):
         # A file may not record the size of its images, so it gets the size of the settings.
         # Any other classifier has a size of its own.
-        facts = as_facts(settings.classes, size if is_file else None, settings.normalization)
+        given_size = size if is_file else None
+        facts = as_facts(settings.classes, given_size, settings.normalization, settings.prompt)
         weights = None if settings.weights is None else as_path("weights", settings.weights)
         classifier = load_source(name, weights, facts, settings.trust)
     network = cast(nn.Module, classifier.network)

@@ -1,0 +1,224 @@
+"""Networks of Hugging Face's transformers, by the name of their folder or of their repository.
+
+Classifiers give logits, and zero-shot networks such as CLIP classify by prompts. Detectors and
+segmenters give the output of transformers, which a task reads.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor, nn
+
+from augment.classifier import IMAGENET, USUAL_SIZE, TaskNetwork, as_network, mean_and_std
+from augment.files import NetworkFacts, import_package, name_error, weights_error
+from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network
+from renderer.errors import InputError, single_line
+from renderer.settings import Size, height_and_width
+
+# Default prompt of a zero-shot network, in which {} stands for the name of a class.
+PROMPT = "a photo of a {}"
+# File that states how the images of a network are prepared.
+PREPROCESSOR = "preprocessor_config.json"
+# Pixels per side of two images that are prepared to find out to which size.
+PROBED = (600, 300)
+# Logits of a zero-shot network may differ by this much from those of transformers.
+TOLERANCE = 1e-3
+# Tasks of transformers whose models the library reads.
+_TASKS = (
+    *("IMAGE_CLASSIFICATION", "OBJECT_DETECTION", "IMAGE_SEGMENTATION"),
+    *("SEMANTIC_SEGMENTATION", "INSTANCE_SEGMENTATION", "UNIVERSAL_SEGMENTATION"),
+)
+
+
+class ZeroShot(nn.Module):
+    """Classifier by texts: logits are the scaled cosines of an image and the prompt of each class.
+
+    Attributes:
+        model: Model of transformers without its text encoder.
+        text: Last layer. Its weights are the vectors of the prompts, times the scale of the model.
+    """
+
+    def __init__(self, model: Any, class_count: int, dimension: int):
+        super().__init__()
+        has_bias = getattr(model, "logit_bias", None) is not None
+        model.text_model = None
+        self.model = model
+        self.text = nn.Linear(dimension, class_count, bias=has_bias)
+
+    def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N C"]:
+        """Compute the logits of normalized images."""
+        features = self.model.get_image_features(pixel_values=images)
+        # The method returned the vectors themselves before version 5.
+        vectors = getattr(features, "pooler_output", features)
+        return self.text(F.normalize(vectors, dim=-1))
+
+
+def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool) -> TaskNetwork:
+    """Load or build a network of transformers: a folder, or a repository of the Hub."""
+    name = f"hf:{model}"
+    if weights is not None:
+        reason = f"cannot be combined with {name}, which has weights: leave weights out"
+        raise weights_error(weights, reason)
+    library = import_package("transformers", name, 'install "parametric-norm-balls[hf]"')
+    try:
+        config = library.AutoConfig.from_pretrained(model)
+    except Exception as error:  # The folder, its files or the connection may have any fault.
+        advice = "give a folder that save_pretrained wrote, or a repository of the Hugging Face Hub"
+        raise name_error(name, f"cannot be read ({single_line(error)}): {advice}") from error
+    architecture = (config.architectures or [""])[0]
+    auto = library.models.auto.modeling_auto
+    zero_shot = auto.MODEL_FOR_ZERO_SHOT_IMAGE_CLASSIFICATION_MAPPING_NAMES.values()
+    is_zero_shot = architecture in zero_shot
+    if not is_zero_shot and architecture not in _architectures(auto, _TASKS):
+        kinds = "image classification, zero-shot classification, detection or segmentation"
+        raise name_error(
+            name, f"is {architecture or config.model_type}: give a network for {kinds}"
+        )
+    if is_zero_shot and not facts.classes:
+        raise name_error(name, f"finds classes by their names: set classes=, and prompt='{PROMPT}'")
+    if facts.prompt is not None and (not is_zero_shot or "{}" not in facts.prompt):
+        reason = "lacks {} for the class" if is_zero_shot else f"is not for {name}, which has names"
+        raise InputError(
+            f"prompt={facts.prompt} {reason}: give '{PROMPT}', or leave it out", "prompt"
+        )
+
+    network = _model(getattr(library, architecture), model, config, name, is_random)
+    size, mean, std, is_bgr, inputs = _read_preprocessor(library, model, config, name)
+    if facts.normalization is not None:
+        mean, std = mean_and_std(facts.normalization)
+        inputs = replace(inputs, normalization=YOU, value_range=YOU)
+    if facts.size is not None:
+        size, inputs = facts.size, replace(inputs, size=YOU)
+    normalization = ChannelNormalization(mean, std, is_bgr)
+    classes: Sequence[str] | None = facts.classes
+    if is_zero_shot:
+        network = _zero_shot(library, network, model, facts, normalization, size, is_random)
+    elif architecture in _architectures(auto, _TASKS[:1]):
+        classes = classes or _class_names(config.id2label)
+    normalized = Network(network.eval(), [normalization])
+    made = as_network(normalized, size, classes, name=name, says=False)
+    made.inputs = inputs
+    return made
+
+
+def _architectures(auto: Any, tasks: Sequence[str]) -> set[str]:
+    """Return the names of the classes of transformers for some tasks."""
+    known: set[str] = set()
+    for task in tasks:
+        for names in getattr(auto, f"MODEL_FOR_{task}_MAPPING_NAMES").values():
+            known |= {names} if isinstance(names, str) else {*names}
+    return known
+
+
+def _model(kind: Any, model: str, config: Any, name: str, is_random: bool) -> Any:
+    """Load a model of transformers in single precision, or build it with random weights."""
+    if is_random:
+        return kind._from_config(config)
+    try:
+        loaded, report = kind.from_pretrained(model, output_loading_info=True)
+    except Exception as error:  # The folder, its files or the connection may have any fault.
+        reason = f"cannot be loaded ({single_line(error)}): check the files of its weights"
+        raise name_error(name, reason) from error
+    if missing := sorted(report["missing_keys"]):
+        raise name_error(
+            name, f"lacks weights, such as {missing[0]}: give a trained {kind.__name__}"
+        )
+    return loaded.float()
+
+
+def _class_names(names: dict[int, str]) -> list[str]:
+    """Return the names of classes in their order. A name that occurs twice gets its index."""
+    count = Counter(names.values())
+    ordered = sorted(names.items())
+    return [name if count[name] == 1 else f"{name} ({index})" for index, name in ordered]
+
+
+def _read_preprocessor(
+    library: Any, model: str, config: Any, name: str
+) -> tuple[Size, Sequence[float], Sequence[float], bool, Inputs]:
+    """Find out how the images of a network are prepared, and who states it.
+
+    Return the size, mean and standard deviation in units of [0, 1], and whether blue is the first
+    channel. Images of one color are prepared, so that rescaling, shifts and the order of
+    the channels count, however the processor defines them.
+    """
+    try:
+        processor: Any = library.AutoImageProcessor.from_pretrained(model)
+        source: str | None = PREPROCESSOR
+    except (OSError, ValueError):
+        mapping = library.models.auto.image_processing_auto.IMAGE_PROCESSOR_MAPPING
+        kinds = mapping.get(type(config), {})
+        kind = next(iter(kinds.values()), None) if isinstance(kinds, dict) else None
+        processor, source = None if kind is None else kind(), None
+
+    def prepare(color: Sequence[int], side: int) -> Tensor:
+        image = Image.fromarray(np.full((side, side, 3), color, np.uint8))
+        return processor(images=image, return_tensors="pt")["pixel_values"][0]
+
+    vision = getattr(config, "vision_config", config)
+    of_config = getattr(vision, "image_size", None)
+    size: Size = of_config if isinstance(of_config, int) else USUAL_SIZE
+    sizer = FILE if isinstance(of_config, int) else None
+    if processor is None:
+        return size, *mean_and_std(IMAGENET), False, Inputs(sizer, None, None)
+    shapes = {tuple(prepare((0, 0, 0), side).shape) for side in PROBED}
+    if source and len(shapes) == 1:
+        _, height, width = shapes.pop()
+        size, sizer = height if height == width else (height, width), source
+    colors = [prepare(color, PROBED[1]) for color in ((0, 0, 0), *np.eye(3, dtype=int) * 255)]
+    black, *gains = (
+        image[:, image.shape[1] // 2, image.shape[2] // 2].double() for image in colors
+    )
+    # Rows are channels of the network, and columns are red, green and blue.
+    gain = torch.stack(gains, 1) - black[:, None]
+    is_bgr = bool(gain[0, 2].abs() > gain[0, 0].abs())
+    own = (gain.flip(1) if is_bgr else gain).diagonal()
+    mean, std = (-black / own).tolist(), (1 / own).tolist()
+    return size, mean, std, is_bgr, Inputs(sizer, source, source)
+
+
+@torch.no_grad()
+def _zero_shot(
+    library: Any,
+    model: Any,
+    name: str,
+    facts: NetworkFacts,
+    normalization: nn.Module,
+    size: Size,
+    is_random: bool,
+) -> ZeroShot:
+    """Make a classifier of a model with an image and a text encoder."""
+    classes = facts.classes or ()
+    gray = normalization(torch.full((1, 3, *height_and_width(size)), 0.5))
+    if is_random:
+        features = model.eval().get_image_features(pixel_values=gray)
+        return ZeroShot(model, len(classes), getattr(features, "pooler_output", features).shape[-1])
+    prompts = [(facts.prompt or PROMPT).replace("{}", label) for label in classes]
+    # SigLIP was trained with texts of one length.
+    options: dict[str, Any] = {"padding": True}
+    if "siglip" in model.config.model_type:
+        options = {"padding": "max_length", "max_length": 64, "truncation": True}
+    try:
+        tokens = library.AutoTokenizer.from_pretrained(name)(
+            prompts, return_tensors="pt", **options
+        )
+        output = model.eval()(pixel_values=gray, **tokens)
+        vectors = F.normalize(output.text_embeds, dim=-1) * model.logit_scale.exp()
+        network = ZeroShot(model, *vectors.shape)
+    except Exception as error:  # Files of the tokenizer, or a model of another kind.
+        reason = f"is no zero-shot network like CLIP ({single_line(error)})"
+        raise name_error(f"hf:{name}", f"{reason}: use another network") from error
+    network.text.weight.copy_(vectors)
+    if network.text.bias is not None:
+        network.text.bias.fill_(model.logit_bias.item())
+    if not torch.allclose(network(gray), output.logits_per_image, rtol=TOLERANCE, atol=TOLERANCE):
+        raise name_error(f"hf:{name}", "has logits other than scaled cosines: use another network")
+    return network

@@ -1,0 +1,266 @@
+"""Networks of transformers: loaded from a folder, they give what its own pipelines give."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import norm_balls as nb
+from augment.huggingface import _read_preprocessor
+from augment.network import ChannelNormalization
+from augment.tasks import TASKS
+from renderer import InputError
+
+transformers = pytest.importorskip("transformers")
+pytestmark = [
+    pytest.mark.ecosystem,
+    pytest.mark.filterwarnings("ignore"),  # transformers warns of what it will change.
+]
+
+SIZE = 64
+CLASSES = ["orange", "apple", "cup"]
+LABELS = {"id2label": dict(enumerate(CLASSES)), "label2id": {c: i for i, c in enumerate(CLASSES)}}
+SMALL = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
+SMALL |= {"intermediate_size": 48}
+PATCHES = {"image_size": SIZE, "patch_size": 16}
+STAGES = {"embed_dim": 16, "depths": [1, 1], "num_heads": [2, 2], "window_size": 4}
+WIDTHS = {"hidden_sizes": [16, 24], "depths": [1, 1]}
+TEXT = SMALL | {"vocab_size": 16, "max_position_embeddings": 64}
+TEXT |= {"bos_token_id": 2, "eos_token_id": 3, "pad_token_id": 0}
+TOWERS = {"text_config": TEXT, "vision_config": SMALL | PATCHES}
+SQUARE = {"size": {"height": SIZE, "width": SIZE}}
+CROPPED = {"crop_size": {"height": SIZE, "width": SIZE}}
+# For each network: its class, its configuration, its image processor, and the pixels per side of an
+# image that the processor crops to SIZE without interpolation.
+CLASSIFIERS = {
+    "vit": ("ViTForImageClassification", SMALL | PATCHES, "ViT", SQUARE, SIZE),
+    "deit": (
+        *("DeiTForImageClassification", SMALL | PATCHES, "DeiT"),
+        *({"size": {"height": 80, "width": 80}} | CROPPED, 80),
+    ),
+    "swin": (
+        "SwinForImageClassification",
+        STAGES | {"image_size": SIZE, "patch_size": 4},
+        "ViT",
+        SQUARE | {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]},
+        SIZE,
+    ),
+    "convnext": (
+        *("ConvNextForImageClassification", WIDTHS | {"num_stages": 2}, "ConvNext"),
+        *({"size": {"shortest_edge": SIZE}, "crop_pct": 0.5}, 2 * SIZE),
+    ),
+    "dinov2": (
+        *("Dinov2ForImageClassification", SMALL | PATCHES, "Bit"),
+        *({"size": {"shortest_edge": 80}} | CROPPED, 80),
+    ),
+    "resnet": (
+        *("ResNetForImageClassification", WIDTHS | {"embedding_size": 16}, "ConvNext"),
+        *({"size": {"shortest_edge": SIZE}, "crop_pct": 0.8}, 80),
+    ),
+    "mobilevit": (  # Blue is the first channel, and nothing is normalized.
+        "MobileViTForImageClassification",
+        {"hidden_sizes": [16, 24, 32], "neck_hidden_sizes": [8, 8, 8, 16, 16, 16, 32]}
+        | {"image_size": SIZE, "num_attention_heads": 2},
+        *("MobileViT", {"size": {"shortest_edge": SIZE}} | CROPPED, SIZE),
+    ),
+}
+ZERO_SHOT = {
+    "clip": (
+        *("CLIPModel", TOWERS | {"projection_dim": 24}, "CLIP"),
+        *({"size": {"shortest_edge": SIZE}} | CROPPED, SIZE),
+    ),
+    "siglip": ("SiglipModel", TOWERS, "Siglip", SQUARE, SIZE),
+}
+WITH_POSITIONS = {
+    "detr": (
+        "DetrForObjectDetection",
+        {"d_model": 32, "encoder_layers": 1, "decoder_layers": 1, "num_queries": 5}
+        | {"encoder_attention_heads": 2, "decoder_attention_heads": 2, "use_timm_backbone": False}
+        | {"encoder_ffn_dim": 32, "decoder_ffn_dim": 32, "use_pretrained_backbone": False},
+        *("Detr", {"size": {"shortest_edge": SIZE, "longest_edge": 96}}, SIZE),
+    ),
+    "segformer": (
+        "SegformerForSemanticSegmentation",
+        {"hidden_sizes": [8, 16, 16, 16], "depths": [1, 1, 1, 1], "decoder_hidden_size": 16},
+        *("Segformer", SQUARE, SIZE),
+    ),
+}
+
+
+@pytest.fixture
+def save(tmp_path):
+    """Function that saves a network with random weights and its processor, like a publisher."""
+
+    def save(entry, with_processor=True):
+        name, options, processor, prepared, _ = entry
+        torch.manual_seed(0)
+        kind = getattr(transformers, name)
+        if "detr" in name.lower():
+            options = options | {
+                "backbone_config": transformers.ResNetConfig(
+                    **WIDTHS, embedding_size=16, out_features=["stage2"]
+                )
+            }
+        network = kind(kind.config_class(**options, **({} if "Model" in name else LABELS))).eval()
+        for parameter in network.parameters():  # Outputs of networks as initialized hardly differ.
+            torch.nn.init.normal_(parameter, std=0.2) if parameter.ndim > 1 else None
+        network.save_pretrained(tmp_path)
+        if with_processor:
+            made = getattr(transformers, f"{processor}ImageProcessor")(**prepared)
+            made.save_pretrained(tmp_path)
+        return str(tmp_path)
+
+    return save
+
+
+@pytest.fixture
+def tokenizer(tmp_path):
+    """Save a tokenizer of a made vocabulary."""
+    from tokenizers import Tokenizer, models, pre_tokenizers, processors
+
+    words = ["<pad>", "<unk>", "<start>", "<end>", "a", "photo", "of", "the", *CLASSES]
+    made = Tokenizer(models.WordLevel({word: i for i, word in enumerate(words)}, "<unk>"))
+    made.pre_tokenizer = pre_tokenizers.Whitespace()
+    made.post_processor = processors.TemplateProcessing(
+        single="<start> $A <end>", special_tokens=[("<start>", 2), ("<end>", 3)]
+    )
+    special = {"pad_token": "<pad>", "unk_token": "<unk>", "eos_token": "<end>"}
+    fast = transformers.PreTrainedTokenizerFast(
+        tokenizer_object=made, bos_token="<start>", model_max_length=64, **special
+    )
+    fast.save_pretrained(tmp_path)
+
+
+def photograph(size: int) -> Image.Image:
+    return Image.fromarray(np.random.default_rng(0).integers(0, 256, (size, size, 3), np.uint8))
+
+
+def as_images(picture: Image.Image) -> torch.Tensor:
+    """Cut the center square of SIZE pixels, and return it as an image in [0, 1]."""
+    begin = (picture.width - SIZE) // 2
+    cut = np.asarray(picture)[begin : begin + SIZE, begin : begin + SIZE]
+    return torch.from_numpy(cut.copy()).permute(2, 0, 1)[None] / 255
+
+
+@pytest.mark.parametrize("name", CLASSIFIERS)
+def test_a_classifier_gives_the_scores_of_the_pipeline_of_transformers(name, save, caplog):
+    entry = CLASSIFIERS[name]
+    folder = save(entry)
+    caplog.set_level(logging.WARNING)
+    classifier = nb.load_classifier(f"hf:{folder}")
+    assert (classifier.size, list(classifier.classes)) == (SIZE, CLASSES)
+    assert caplog.text.count("stated by preprocessor_config.json") == 3
+    pipe = transformers.pipeline("image-classification", model=folder, device="cpu")
+    picture = photograph(entry[-1])
+    expected = {row["label"]: row["score"] for row in pipe(picture, top_k=3)}
+    images = as_images(picture).requires_grad_()
+    logits = classifier(images)
+    torch.testing.assert_close(
+        logits.softmax(1)[0].detach(),
+        torch.tensor([expected[c] for c in CLASSES]),
+        atol=1e-4,
+        rtol=0,
+    )
+    (gradient,) = torch.autograd.grad(logits[0, 0], images)
+    assert gradient.abs().max() > 0
+
+
+@pytest.mark.parametrize("name", ZERO_SHOT)
+def test_a_zero_shot_network_finds_classes_by_prompts_as_the_pipeline_does(name, save, tokenizer):
+    folder = save(ZERO_SHOT[name])
+    options = {"classes": CLASSES, "prompt": "photo of the {}"}
+    classifier = nb.load_classifier(f"hf:{folder}", **options)
+    pipe = transformers.pipeline("zero-shot-image-classification", model=folder, device="cpu")
+    picture = photograph(SIZE)
+    rows = pipe(picture, candidate_labels=CLASSES, hypothesis_template=options["prompt"])
+    expected = torch.tensor([{r["label"]: r["score"] for r in rows}[c] for c in CLASSES])
+    logits = classifier(as_images(picture))[0]
+    scores = logits.sigmoid() if name == "siglip" else logits.softmax(0)
+    torch.testing.assert_close(scores, expected, atol=1e-4, rtol=0)
+    other = nb.load_classifier(f"hf:{folder}", classes=CLASSES)(as_images(picture))[0]
+    assert (other - logits).abs().max() > 1e-3
+    with pytest.raises(InputError, match="classes="):
+        nb.load_classifier(f"hf:{folder}")
+
+
+@pytest.mark.parametrize("name", WITH_POSITIONS)
+def test_a_detector_or_segmenter_returns_the_output_of_transformers(name, save):
+    entry = WITH_POSITIONS[name]
+    if not any(entry[0].lower().endswith(task.name) for task in TASKS):
+        pytest.skip("The library has no such task.")
+    folder = save(entry)
+    network = nb.load_classifier(f"hf:{folder}")
+    assert network.size == SIZE
+    picture = photograph(SIZE)
+    processor = transformers.AutoImageProcessor.from_pretrained(folder)
+    raw = getattr(transformers, entry[0]).from_pretrained(folder).eval()
+    with torch.no_grad():
+        expected = raw(**processor(images=picture, return_tensors="pt"))
+        output = network.network(as_images(picture))
+    for key in ("logits", "pred_boxes"):
+        if hasattr(expected, key):
+            torch.testing.assert_close(output[key], expected[key], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("EfficientNet", {"rescale_offset": True, "rescale_factor": 1 / 127.5}),
+        ("MobileViT", {}),
+        ("Siglip", {}),
+        ("Beit", {"do_rescale": False}),
+        ("Segformer", {"image_mean": [0.1, 0.2, 0.3], "image_std": [1, 2, 3]}),
+    ],
+)
+def test_images_are_prepared_as_the_processor_states(kind, options, tmp_path):
+    config = transformers.ViTConfig()
+    config.save_pretrained(tmp_path)
+    processor = getattr(transformers, f"{kind}ImageProcessor")(**options)
+    processor.save_pretrained(tmp_path)
+    folder = str(tmp_path)
+    size, mean, std, is_bgr, inputs = _read_preprocessor(transformers, folder, config, "hf:x")
+    picture = photograph(2 * size)
+    expected = processor(images=picture, return_tensors="pt")["pixel_values"]
+    plain = getattr(transformers, f"{kind}ImageProcessor")(
+        **options
+        | {"do_normalize": False, "do_rescale": True, "rescale_factor": 1 / 255}
+        | {"rescale_offset": False, "include_top": False, "do_flip_channel_order": False}
+    )
+    images = plain(images=picture, return_tensors="pt")["pixel_values"]
+    got = ChannelNormalization(mean, std, is_bgr)(images)
+    torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
+    assert inputs.size == inputs.normalization == "preprocessor_config.json"
+
+
+def test_without_a_processor_the_normalization_is_assumed(save, caplog):
+    folder = save(CLASSIFIERS["vit"], with_processor=False)
+    nb.load_classifier(f"hf:{folder}")
+    assert f"{SIZE} × {SIZE} pixels, stated by the file" in caplog.text
+    assert "std (0.5, 0.5, 0.5), assumed" in caplog.text
+
+
+def test_missing_weights_are_refused(save, tmp_path):
+    import safetensors.torch
+
+    folder = save(CLASSIFIERS["vit"])
+    path = tmp_path / "model.safetensors"
+    state = safetensors.torch.load_file(path)
+    del state["classifier.weight"]
+    safetensors.torch.save_file(state, path, {"format": "pt"})
+    with pytest.raises(InputError, match=r"classifier\.weight"):
+        nb.load_classifier(f"hf:{folder}")
+
+
+def test_logits_of_a_plain_model_of_transformers_are_read_in_an_attack(save):
+    folder = save(CLASSIFIERS["vit"])
+    network = transformers.ViTForImageClassification.from_pretrained(folder).eval()
+    scene = nb.build_scene([("solid:orange", "orange")], SIZE)
+    settings = nb.AttackSettings(lighting=nb.StepSettings(), max_steps=2)
+    options = {"settings": settings, "force": True}
+    result = nb.attack(
+        network, scene, classes=CLASSES, normalization=([0.5] * 3, [0.5] * 3), **options
+    )
+    expected = nb.attack(nb.load_classifier(f"hf:{folder}"), scene, **options)
+    torch.testing.assert_close(result.logits, expected.logits, rtol=1e-3, atol=1e-4)
