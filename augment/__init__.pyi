@@ -35,7 +35,6 @@ from augment.settings import MeshSettings as MeshSettings
 from augment.settings import NormalizedLightSettings as NormalizedLightSettings
 from augment.settings import ObjectSettings as ObjectSettings
 from augment.settings import ProjectorSettings as ProjectorSettings
-from augment.settings import PropSettings as PropSettings
 from augment.settings import RendererSettings as RendererSettings
 from augment.settings import SceneSettings as SceneSettings
 from augment.sources import load_classifier as load_classifier

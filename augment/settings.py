@@ -30,7 +30,7 @@ from renderer.settings import (
 )
 
 UP_AXES = ("auto", "y", "z")
-PROP_DISTANCES = (-10.0, 10.0)  # Range of the coordinates of meshes beside an object.
+OBJECT_DISTANCES = (-10.0, 10.0)  # Range of the coordinates of objects beside the first one.
 MAX_PROJECTOR_PIXELS = 256  # per side
 
 
@@ -72,37 +72,46 @@ def _is_gloss(values: object) -> bool:
 
 
 @dataclass
-class PropSettings(MeshSettings):
-    """A prop: a mesh beside the object, on the same ground. It is never attacked."""
-
-    at: list[float] = setting(
-        REQUIRED, "x and y of its centroid in world units.", length=2, within=PROP_DISTANCES
-    )
-    scale: float = setting(1.0, "Its largest coordinate. The object has 1.", within=(0.1, 10))
-    azimuth: float = setting(0.0, "Rotation about the vertical.", "degrees", within=(-360, 360))
-
-
-@dataclass
 class ObjectSettings(MeshSettings):
-    """One object of a scene.
+    """One object of a scene, which may have others beside it on the same ground.
 
-    It may have props, which are meshes beside it. They are rendered with their shadows, but they
-    are never attacked.
+    All objects of an entry are rendered with their shadows. Attacks on shape and colors act on the
+    first one, attacks on light on the whole image. A list of objects is short for the first one
+    with the others.
 
     >>> import norm_balls as nb
     >>> nb.ObjectSettings("solid:orange", label="orange").albedo_scale
     1.0
     """
 
-    label: str = setting(REQUIRED, "Name of its class. It may be empty.", may_be_empty=True)
+    label: str = setting("", "Name of its class. Empty for no class.", may_be_empty=True)
     albedo_scale: float = setting(1.0, "Factor of its albedo.", within=(1 / MAX_SCALE, MAX_SCALE))
-    props: list[Any] = setting([], "Meshes beside the object, as mappings or PropSettings.")
+    at: list[float] | None = setting(
+        None,
+        "x and y of its center on the ground, in units in which the first object spans [-1, 1]. "
+        "null: beside the objects before it, without touching them.",
+        length=2,
+        within=OBJECT_DISTANCES,
+    )
+    scale: float = setting(1.0, "Its largest coordinate. The first has 1.", within=(0.1, 10))
+    azimuth: float = setting(0.0, "Rotation about the vertical.", "degrees", within=(-360, 360))
+    others: list[Any] = setting([], "Objects beside it, as mappings or ObjectSettings.")
 
     def __post_init__(self) -> None:
-        """Convert the props, which are meshes beside the object, to settings."""
+        """Convert the other objects to settings, and check what only one kind of object has."""
         super().__post_init__()
-        for index, prop in enumerate(self.props):
-            self.props[index] = settings_from(PropSettings, prop, f"props[{index}]")
+        for index, other in enumerate(self.others):
+            key = f"others[{index}]"
+            self.others[index] = item = settings_from(ObjectSettings, other, key)
+            if item.others or item.albedo_scale != 1:
+                advice = "give others and albedo_scale to the first object"
+                raise InputError(
+                    f"{key} has others or albedo_scale={item.albedo_scale}: {advice}", key
+                )
+        if self.others and (self.scale != 1 or any(self.at or ())):
+            given = f"at={self.at} and scale={self.scale}"
+            reason = f"{given} of the first object do not fit: it has the scale 1 at [0, 0]"
+            raise InputError(f"{reason}, and the other objects are placed beside it", "at")
 
 
 @dataclass

@@ -18,7 +18,6 @@ from augment import ParameterSettings as ParameterSettings
 from augment import PhotographAttackResult as PhotographAttackResult
 from augment import PoseSettings as PoseSettings
 from augment import ProjectorSettings as ProjectorSettings
-from augment import PropSettings as PropSettings
 from augment import RandomLightSettings as RandomLightSettings
 from augment import RelightingSettings as RelightingSettings
 from augment import RendererSettings as RendererSettings

@@ -96,9 +96,11 @@ OPERATORS: dict[str, tuple[str, Any, dict[str, Any]]] = {
 }
 LIGHTS_OF_OPERATORS = ("grace", "skylight", "environment")
 
-CUP = augment.PropSettings("solid:cup:0", at=[0.9, 0.6], scale=0.6, azimuth=30.0)
-LEMON = augment.PropSettings("solid:lemon:1", at=[-0.9, 0.4], scale=0.4)
-AMONG_PROPS = augment.ObjectSettings("solid:pear:0", "orange", albedo_scale=0.9, props=[CUP, LEMON])
+CUP = augment.ObjectSettings("solid:cup:0", at=[0.9, 0.6], scale=0.6, azimuth=30.0)
+LEMON = augment.ObjectSettings("solid:lemon:1", at=[-0.9, 0.4], scale=0.4)
+AMONG_PROPS = augment.ObjectSettings(
+    "solid:pear:0", "orange", albedo_scale=0.9, others=[CUP, LEMON]
+)
 PROJECTOR = augment.ProjectorSettings(pixels=6, polar=50.0, azimuth=20.0, power=2.0, pattern=0.5)
 LAMPS = augment.LampsSettings([[2.0, 1.0, 2.0], [-2.0, 0.5, 1.5]], power=8.0, start=3.0)
 DISCS = augment.LampsSettings(

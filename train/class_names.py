@@ -183,6 +183,12 @@ def as_mappings(
     mappings = []
     for index, item in enumerate(as_list(name, meshes, kinds, EXPECTED)):
         mapping: dict[str, Any]
+        if isinstance(item, list) and any(
+            isinstance(part, tuple | ObjectSettings) for part in item
+        ):
+            mapping, *others = as_mappings(f"{name}[{index}]", item, classifier)
+            mappings.append(mapping | {"others": [*mapping.get("others", ()), *others]})
+            continue
         if isinstance(item, ObjectSettings):
             mapping = asdict(item)
         else:

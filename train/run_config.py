@@ -245,10 +245,10 @@ def fingerprints(settings: Any) -> dict[str, str]:
 def _collect_texts(value: Any) -> set[str]:
     """Collect the texts in a setting that may be paths of input files.
 
-    An object can have a "mesh" and "props", which are other meshes beside it.
+    An object can have a "mesh" and "others", which are other objects beside it.
     """
     if isinstance(value, dict):
-        value = [value.get("mesh"), value.get("props")]
+        value = [value.get("mesh"), value.get("others")]
     if isinstance(value, list):
         return set().union(*map(_collect_texts, value))
     return {value} if isinstance(value, str) else set()

@@ -52,7 +52,8 @@ MAX_SEED = 2**63 - 1
 MESHES = (
     "Objects: mesh files, solid:NAME:SEED, or mappings {mesh, label, up: auto|y|z, "
     "albedo_scale, color, gloss: [roughness, metallic, specular factor] or file, "
-    "props: [{mesh, at: [x, y], scale, azimuth, up, color, gloss}, ...]}."
+    "azimuth}, or lists of such objects on the same ground, [{mesh, label}, {mesh, label, "
+    "at: [x, y], scale, azimuth}, ...], of which the first is attacked."
 )
 # Values of the setting `network`.
 NETWORKS = (
@@ -409,14 +410,22 @@ def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, Object
 def read_object(item: Any, label: str, key: str) -> ObjectSettings:
     """Read one object in the settings of a scene.
 
-    `item` is a file, "solid:NAME", or a mapping with fields of `ObjectSettings`, which can have its
-    own class.
+    `item` is a file, "solid:NAME", a mapping with fields of `ObjectSettings`, which can have its
+    own class, or a list of them on the same ground. Only the first of a list gets `label`.
     """
-    values = {"label": label, **(item if isinstance(item, dict) else {"mesh": item})}
-    # The name of a class can be a number, which YAML reads as one.
-    if is_whole(values["label"]):
-        values["label"] = str(values["label"])
+    first, *others = item or [None] if isinstance(item, list) else [item]
+    values = {"label": label, **_as_mapping(first)}
+    if others:
+        values["others"] = [*values.get("others", ()), *map(_as_mapping, others)]
     return settings_from(ObjectSettings, values, key)
+
+
+def _as_mapping(item: Any) -> dict[str, Any]:
+    """Convert a mesh or a mapping to a mapping. The name of a class can be a number in YAML."""
+    values = dict(item) if isinstance(item, dict) else {"mesh": item}
+    if is_whole(values.get("label")):
+        values["label"] = str(values["label"])
+    return values
 
 
 def solid_name(mesh: str) -> str:

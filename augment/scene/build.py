@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,14 @@ from torch import Tensor
 from augment.attack_settings import AttackSettings, MaterialSettings
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 from augment.progress import progress
-from augment.scene.objects import ROUGHNESS, SceneObject, add_table, initial_materials, load_object
+from augment.scene.objects import (
+    ROUGHNESS,
+    SceneObject,
+    add_table,
+    initial_materials,
+    load_object,
+    name_mesh,
+)
 from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
 from renderer import errors
@@ -34,8 +41,8 @@ from renderer.light.files import load_light
 from renderer.light.harmonics import degree_of, irradiance_error
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.ringing import highlight_error, required_degree
-from renderer.mesh import Mesh, require_mesh, subdivide
-from renderer.settings import MIN_ROUGHNESS, ImageSettings, Size
+from renderer.mesh import Mesh, require_mesh
+from renderer.settings import MIN_ROUGHNESS, ImageSettings, Size, settings_from
 from renderer.surface.gloss import Gloss, smallest_roughness
 from renderer.visibility import choose
 
@@ -46,6 +53,9 @@ OPERATOR_BYTES = 8
 LOCAL_LIGHT_OF_SETTINGS = {LOCAL_LIGHT_SETTINGS[name]: kind for name, kind in LOCAL_LIGHTS.items()}
 # A mesh is given as the path of its file, as "solid:NAME", or as a `Mesh`.
 MeshSource = str | Path | Mesh
+MeshItem = ObjectSettings | tuple[MeshSource, str | int]
+# Example of an entry of `build_scene` in messages.
+EXAMPLE = "such as ('solid:orange', 'orange')"
 # Names of the fields of `SceneSettings` and `RendererSettings` that `build_scene` takes as keyword
 # arguments.
 SCENE_OPTIONS = {item.name for item in fields(SceneSettings)} - {"views"}
@@ -53,7 +63,7 @@ RENDERER_OPTIONS = {item.name for item in fields(RendererSettings)}
 
 
 def build_scene(
-    meshes: Sequence[ObjectSettings | tuple[MeshSource, str | int]],
+    meshes: Sequence[MeshItem | Sequence[MeshItem]],
     size: Size,
     views: int = 1,
     *,
@@ -71,7 +81,9 @@ def build_scene(
 
     Args:
         meshes: Pairs of a mesh and the name or the index of its class, or
-            `ObjectSettings`. A mesh is a file, solid:NAME or a `Mesh`.
+            `ObjectSettings`. A mesh is a file, solid:NAME or a `Mesh`. An entry may
+            also be a list of several objects on the same ground, of which attacks
+            on shape and colors change the first.
         size: Pixels per side of the images, or (height, width). `width` and `fov`
             of the cameras are horizontal.
         views: Number of cameras, which are placed on a circle around the mesh.
@@ -180,34 +192,46 @@ def build_scene(
 
 
 def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
-    """Load the objects of the argument `meshes` of `build_scene`, and put a table under each."""
-    example = "such as ('solid:orange', 'orange')"
-    expected = f"a list of pairs {example}, or of nb.ObjectSettings"
+    """Load the entries of the argument `meshes` of `build_scene`, and put a table under each."""
+    expected = f"a list of pairs {EXAMPLE}, of nb.ObjectSettings, or of lists of them"
     members = errors.as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
     if not members:
-        raise InputError(f"meshes is empty: give pairs {example}")
+        raise InputError(f"meshes is empty: give pairs {EXAMPLE}")
     objects = []
     for index, member in enumerate(progress(members, "reading meshes")):
         name = f"meshes[{index}]"
-        if isinstance(member, ObjectSettings):
-            item = load_object(member, settings.vertices)
-        elif len(member) != 2:
-            given = errors.describe(member)
-            raise InputError(f"{name} is {given}: give a pair of a mesh and a label, {example}")
-        else:
-            mesh, label = member
-            if not errors.is_whole(label):
-                expected = "the name of a class, or its index"
-                errors.require_kind(f"{name}: its label", label, str, expected)
-            if isinstance(mesh, str | Path):
-                item = load_object(ObjectSettings(str(mesh), ""), settings.vertices)
-            else:
-                require_mesh(name, mesh)
-                item = SceneObject.from_mesh("", subdivide(mesh, settings.vertices))
-            # An index remains a number, because a class may have this number as its name.
-            item = replace(item, label=label if isinstance(label, str) else int(label))
-        objects.append(add_table(item, settings.ground))
+        is_list = isinstance(member, list | tuple) and any(
+            isinstance(part, ObjectSettings | tuple | list | Mapping) for part in member
+        )
+        given = enumerate(member) if is_list else ()
+        parts = [_as_object(f"{name}[{part}]", item) for part, item in given]
+        (first, label), *others = parts or [_as_object(name, member)]
+        together = replace(first, others=[*first.others, *(other for other, _ in others)])
+        item = load_object(together, settings.vertices)
+        # An index remains a number, because a class may have this number as its name.
+        labels = [*item.labels[1 : 1 + len(first.others)], *(label for _, label in others)]
+        pairs = [(of, mesh) for of, (_, mesh) in zip(labels, item.others, strict=True)]
+        objects.append(add_table(replace(item, label=label, others=pairs), settings.ground))
     return objects
+
+
+def _as_object(name: str, given: Any) -> tuple[ObjectSettings, str | int]:
+    """Convert settings, or a pair of a mesh and a label, to settings and the label."""
+    if isinstance(given, Mapping):
+        given = settings_from(ObjectSettings, given, name)
+    if isinstance(given, ObjectSettings):
+        return given, given.label
+    if not isinstance(given, tuple | list) or len(given) != 2:
+        shown = errors.describe(given)
+        raise InputError(f"{name} is {shown}: give a pair of a mesh and a label, {EXAMPLE}")
+    mesh, label = given
+    if not errors.is_whole(label):
+        expected = "the name of a class, or its index"
+        errors.require_kind(f"{name}: its label", label, str, expected)
+    if not isinstance(mesh, str | Path):
+        require_mesh(name, mesh)
+        mesh = name_mesh(mesh)
+    return ObjectSettings(str(mesh)), label if isinstance(label, str) else int(label)
 
 
 def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
@@ -334,7 +358,7 @@ def reached_gloss(
 ) -> Smoothest:
     """Find the smoothest surface that objects have, or get by an attack or a random variation.
 
-    Surfaces of props count, too. None stands for no attack or no variation.
+    Surfaces of all objects count. None stands for no attack or no variation.
     """
     candidates = [Smoothest(MATTE, "")]
     for item in objects:
@@ -349,7 +373,7 @@ def _reached_roughness(
 ) -> float:
     """Compute the lowest roughness that an attack or a random variation can give to an object.
 
-    It is `MATTE` if neither changes the gloss. Props and table do not count.
+    It is `MATTE` if neither changes the gloss. Other objects and the table do not count.
     """
     if layer is not None and not any(layer.specular_factor):
         layer = None

@@ -1,7 +1,8 @@
 """What a scene shows: objects, examples and conditions.
 
-An object is a mesh with the name of its class, props beside it and a table. An example is an object
-seen by cameras. Conditions are the light, the shape and the colors with which it is rendered.
+An object is a mesh with the name of its class, others beside it and a table. An example is such an
+object seen by cameras. Conditions are the light, the shape and the colors with which it is
+rendered.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from augment.settings import MeshSettings, ObjectSettings, PropSettings
+from augment.settings import MeshSettings, ObjectSettings
 from renderer.camera import Camera
 from renderer.errors import InputError, ShortRepr, as_tensor
 from renderer.mesh import Mesh, center_and_extent, concatenate, normalize, select_faces, subdivide
@@ -27,25 +28,28 @@ from renderer.surface.gloss import Gloss
 
 # Smallest distance of the sides of a table from its center below the object, in world units.
 MIN_TABLE_REACH = 1.2
-# Smallest distance by which a table extends beyond the object and its props, in world units.
+# Smallest distance by which a table extends beyond all objects on it, in world units.
 TABLE_MARGIN = 0.2
+# Smallest distance between objects that have no position, in world units.
+GAP = 0.2
 # Meshes that callers of Python functions gave, by the names of `name_mesh`.
 MESHES_IN_MEMORY: WeakValueDictionary[str, Mesh] = WeakValueDictionary()
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """An object of a scene, with its props (meshes beside it) and its table.
+    """The objects of an entry of a scene, of which the first is attacked, and their table.
 
     Attributes:
-        label: Name or index of its class.
-        mesh: One mesh of all faces: first those of the object, which spans
-            [-1, 1], then those of the props and of the table.
+        label: Name or index of the class of the first object.
+        mesh: One mesh of all faces: first those of the first object, which spans
+            [-1, 1], then those of the others and of the table.
         albedo_scale: Factor that multiplies the albedo of all faces.
         name: Name of the object in messages.
-        own: Number of faces of the object itself. None if the mesh has no props
+        own: Number of faces of the first object. None if the mesh has no others
             and no table.
-        props: Meshes of the props, each of which stands on the plane z = 0.
+        others: Label, empty for none, and mesh of each other object. They stand on
+            the plane z = 0.
         ground: Color of the table. None for no table.
         center: Center of the mesh before normalization, shape (3,).
         extent: Scale of the mesh before normalization. A vertex v of `mesh` was
@@ -57,7 +61,7 @@ class SceneObject:
     albedo_scale: float = 1.0
     name: str = "the mesh"
     own: int | None = None
-    props: Sequence[Mesh] = ()
+    others: Sequence[tuple[str | int, Mesh]] = ()
     ground: Sequence[float] | None = None
     center: Sequence[float] = (0.0, 0.0, 0.0)
     extent: float = 1.0
@@ -76,7 +80,7 @@ class SceneObject:
             name: Name of the object in messages.
 
         Returns:
-            The object, without props and table.
+            The object, without others and table.
         """
         center, extent = center_and_extent(given)
         place, mesh = tuple(center.tolist()), normalize(given)
@@ -86,29 +90,40 @@ class SceneObject:
     def own_faces(self) -> np.ndarray:
         """Return a mask of the faces that belong to the object itself, shape (F,).
 
-        The other faces belong to props (meshes beside the object) or to a table.
+        The other faces belong to other objects or to a table.
         """
         face_count = len(self.mesh.faces)
         own_count = face_count if self.own is None else self.own
         return np.arange(face_count) < own_count
 
     @property
+    def labels(self) -> list[str | int]:
+        """Return the labels of the first and the other objects, which are empty for none."""
+        return [self.label, *(label for label, _ in self.others)]
+
+    @property
+    def ends(self) -> np.ndarray:
+        """Return the number of faces up to the end of each object, shape (O,)."""
+        counts = [int(self.own_faces.sum()), *(len(mesh.faces) for _, mesh in self.others)]
+        return np.cumsum(counts)
+
+    @property
     def own_vertices(self) -> np.ndarray:
         """Return a mask of the vertices that belong to the object itself, shape (V,).
 
-        The other vertices belong to faces of props (meshes beside the object) or of a table.
+        The other vertices belong to faces of other objects or of a table.
         """
         corners_of_others = self.mesh.faces[~self.own_faces]
         return ~np.isin(np.arange(len(self.mesh.vertices)), corners_of_others)
 
     @property
     def own_mesh(self) -> Mesh:
-        """Return the mesh of the object itself, whose faces come first, without props and table."""
+        """Return the mesh of the first object, whose faces come first, without others and table."""
         return select_faces(self.mesh, slice(self.own))
 
     @cached_property
     def radius(self) -> float:
-        """Return the largest distance of a vertex from the origin, including props and table."""
+        """Return the largest distance of a vertex from the origin, including others and table."""
         # Index by faces, to ignore vertices that no face uses.
         return float(np.linalg.norm(self.mesh.vertices, axis=1)[self.mesh.faces].max())
 
@@ -135,7 +150,7 @@ class SceneObject:
         """Append the faces of other meshes to the mesh of the object.
 
         Args:
-            others: Meshes of props or of a table. Their faces do not count as
+            others: Meshes of other objects or of a table. Their faces do not count as
                 faces of the object itself.
 
         Returns:
@@ -165,23 +180,39 @@ def name_mesh(mesh: Mesh) -> str:
 
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
-    """Load an object and its props (meshes beside it).
+    """Load an object and the others beside it.
 
-    The object spans [-1, 1]. It is subdivided until it has more than `vertices` vertices.
+    The first object spans [-1, 1]. It is subdivided until it has more than `vertices` vertices.
+    Objects without a position stand to the right and to the left of all before them, by turns.
     """
     mesh = subdivide(_load(item), vertices)
     loaded = SceneObject.from_mesh(item.label, mesh, item.albedo_scale, item.mesh)
-    return with_props(loaded, [_load_prop(prop) for prop in item.props])
+    if item.azimuth:
+        loaded = rotated(loaded, _turn(item.azimuth))
+    others = [_load_other(other) for other in item.others]
+    # Smallest and largest y of all objects with a position. The first may turn about the origin.
+    spans = [_span_of_y(mesh) for mesh, given in zip(others, item.others, strict=True) if given.at]
+    left = min(-loaded.radius, *(low for low, _ in spans), 0)
+    right = max(loaded.radius, *(high for _, high in spans), 0)
+    for index, given in enumerate(item.others):
+        if given.at is None:
+            low, high = _span_of_y(others[index])
+            shift = left - GAP - high if index % 2 else right + GAP - low
+            left, right = min(left, low + shift), max(right, high + shift)
+            moved = others[index].vertices + np.array([0, shift, 0])
+            others[index] = replace(others[index], vertices=moved)
+    labels = [other.label for other in item.others]
+    return with_others(loaded, [*zip(labels, others, strict=True)])
 
 
-def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
-    """Put props, which are meshes that are never attacked, beside an object.
+def with_others(item: SceneObject, others: Sequence[tuple[str | int, Mesh]]) -> SceneObject:
+    """Put labeled meshes, which attacks do not change, beside an object.
 
-    Props stand on the plane z = 0 and are moved to the height of the lowest vertex of the object.
+    They stand on the plane z = 0 and are moved to the height of the lowest vertex of the object.
     """
     offset = np.array([0, 0, item.lowest])
-    raised = [replace(prop, vertices=_rounded(prop.vertices + offset)) for prop in props]
-    return replace(item.joined(raised), props=props)
+    raised = [replace(mesh, vertices=_rounded(mesh.vertices + offset)) for _, mesh in others]
+    return replace(item.joined(raised), others=others)
 
 
 def _rounded(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
@@ -190,7 +221,7 @@ def _rounded(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
 
 
 def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
-    """Put a table under an object and its props.
+    """Put a table under all objects of an entry.
 
     The color is sRGB-encoded. None stands for no table.
     """
@@ -223,7 +254,7 @@ def resample_instance(item: SceneObject, seed: int) -> SceneObject:
 
 
 def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObject:
-    """Rotate an object about the origin. Its props and its table do not rotate.
+    """Rotate an object about the origin. The others and the table do not rotate.
 
     They stand at the height of its new lowest vertex.
     """
@@ -232,21 +263,31 @@ def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObjec
 
 
 def with_own_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
-    """Return a copy of an object with another mesh. Its props and its table keep their own."""
-    without_props = replace(item, mesh=mesh, own=None)
-    return add_table(with_props(without_props, item.props), item.ground)
+    """Return a copy with another mesh of the first object. The others and the table stay."""
+    alone = replace(item, mesh=mesh, own=None)
+    return add_table(with_others(alone, item.others), item.ground)
 
 
-def _load_prop(item: PropSettings) -> Mesh:
-    """Load the mesh of a prop (a mesh beside an object), and put it on the plane z = 0."""
-    mesh = normalize(_load(item))
-    angle = math.radians(item.azimuth)
+def _turn(azimuth: float) -> Float[np.ndarray, "3 3"]:
+    """Return the matrix of a rotation about the vertical, by an angle in degrees."""
+    angle = math.radians(azimuth)
     cosine = math.cos(angle)
     sine = math.sin(angle)
-    rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-    turned = item.scale * mesh.vertices @ rotation.T
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+
+
+def _load_other(item: ObjectSettings) -> Mesh:
+    """Load the mesh of an object beside another one, and put it on the plane z = 0."""
+    mesh = normalize(_load(item))
+    turned = item.scale * mesh.vertices @ _turn(item.azimuth).T
     lowest = turned[mesh.faces, 2].min()
-    return replace(mesh, vertices=turned + np.array([*item.at, -lowest]))
+    return replace(mesh, vertices=turned + np.array([*(item.at or (0.0, 0.0)), -lowest]))
+
+
+def _span_of_y(mesh: Mesh) -> tuple[float, float]:
+    """Return the smallest and the largest y of the faces of a mesh."""
+    y = mesh.vertices[mesh.faces, 1]
+    return float(y.min()), float(y.max())
 
 
 def _load(item: MeshSettings) -> Mesh:
@@ -298,7 +339,7 @@ SPECULAR_LAYER = (0.5, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class FaceMaterials:
-    """Specular materials of the F faces of a mesh: an object, its props and its table.
+    """Specular materials of the F faces of a mesh: objects and their table.
 
     Attributes:
         face_gloss: Roughness, metallic and specular factor of each face.
@@ -327,7 +368,7 @@ def initial_materials(item: SceneObject) -> FaceMaterials:
 
     They are those of the mesh. If the object is matte (metallic and specular
     factor are zero on all its faces), its faces get the material
-    `SPECULAR_LAYER`. Props and table keep their materials.
+    `SPECULAR_LAYER`. Others and table keep their materials.
     """
     object_mask = torch.from_numpy(item.own_faces)
     face_gloss = torch.tensor([MATTE]).expand(len(object_mask), 3)

@@ -360,30 +360,43 @@ class DirectRenderer:
             self._local_views[key] = LocalLightView(rays, mesh, fragments, self.settings)
         return self._local_views[key]
 
-    def mask(
+    def masks(
         self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"] | None = None
-    ) -> tuple[Bool[Tensor, "height width"], float]:
-        """Find the pixels that an object without its props and its table covers to COVERED or more.
+    ) -> tuple[Bool[Tensor, "O height width"], Float[Tensor, " O"]]:
+        """Find the pixels of which the visible part of each object covers COVERED or more.
 
-        Return also the fraction of the object that its props and its table do not hide. `vertices`
-        None are those of the unmoved object.
+        Return also the fraction of each object that nothing hides. It is 0 outside of the view.
+        `vertices` None are those of the unmoved objects.
         """
         item = self.objects[object_index]
         positions = item.mesh.vertices
         if vertices is not None:
             positions = vertices.detach().cpu().double().numpy()
-        counts = []
-        for faces in (item.mesh.faces, item.mesh.faces[item.own_faces]):
+
+        def fragments_of(faces: Int[np.ndarray, "F 3"]) -> Fragments:
             shown = (positions, faces, [camera], self.settings, self.rasterizer)
-            [fragments] = build_fragments(*shown)
-            own = item.own_faces[fragments.faces.numpy()][fragments.sample_to_seen_face.numpy()]
-            pixels = fragments.pixels[fragments.sample_to_pixel][torch.from_numpy(own)]
-            counts.append(torch.bincount(pixels, minlength=self.settings.pixel_count))
-            if item.own is None:
-                break
-        fraction = float(counts[0].sum() / counts[-1].sum().clamp(min=1))
-        is_covered = counts[0] >= COVERED * self.settings.samples**2
-        return is_covered.view(self.settings.shape), fraction
+            return build_fragments(*shown)[0]
+
+        seen = fragments_of(item.mesh.faces)
+        # Index of the object that each sample shows. The table comes after the objects.
+        owner_of_face = np.searchsorted(item.ends, seen.faces.numpy(), side="right")
+        owner = torch.from_numpy(owner_of_face)[seen.sample_to_seen_face]
+        pixel_count = self.settings.pixel_count
+        keys = owner * pixel_count + seen.pixels[seen.sample_to_pixel]
+        owner_count = len(item.ends)
+        counts = torch.bincount(keys, minlength=(owner_count + 1) * pixel_count)
+        counts = counts.view(-1, *self.settings.shape)[:owner_count]
+        own_counts = counts.sum((1, 2))
+        if item.own is not None:
+            starts = [0, *item.ends[:-1]]
+            alone = [
+                len(fragments_of(item.mesh.faces[start:end]).sample_numbers)
+                for start, end in zip(starts, item.ends, strict=True)
+            ]
+            visible = own_counts / torch.tensor(alone).clamp(min=1)
+        else:
+            visible = (own_counts > 0).float()
+        return counts >= COVERED * self.settings.samples**2, visible
 
     def radiance(
         self,

@@ -13,10 +13,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from augment.network import say_once
 from augment.progress import progress
 from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.render import DirectRenderer, Layer, OperatorRenderer
-from augment.scene.truth import Truth, boxes_of
+from augment.scene.truth import LEAST_VISIBLE, NO_OBJECT, Truth, boxes_of
 from renderer import errors
 from renderer.camera import Camera
 from renderer.errors import InputError
@@ -366,22 +367,41 @@ class Scene:
             conditions: Shape and pose of the A examples. None for those of the scene.
 
         Returns:
-            The truth, with one object for each example.
+            The truth, with the first object of each example and all others that have a label.
+            Objects of which a view shows less than LEAST_VISIBLE are left out of it, which is
+            logged.
         """
         rows = torch.arange(len(self)) if examples is None else self._as_examples(examples)
         if conditions is None:
             conditions = self.conditions(rows)
-        shape = (len(rows), self.views, 1, *self.settings.shape)
-        masks = torch.zeros(shape, dtype=torch.bool)
-        visible = torch.zeros(len(rows), self.views, 1)
-        for row, example in enumerate(rows.tolist()):
+        items = [self.objects[self.examples[example].object] for example in rows.tolist()]
+        # Indices among the objects of each example of those in the truth.
+        kept = [[0, *(i for i, of in enumerate(item.labels) if i and of != "")] for item in items]
+        most = max(map(len, kept))
+        labels = torch.full((len(rows), self.views, most), NO_OBJECT)
+        masks = torch.zeros((*labels.shape, *self.settings.shape), dtype=torch.bool)
+        visible = torch.zeros(labels.shape)
+        for row, (example, item) in enumerate(zip(rows.tolist(), items, strict=True)):
             index = self.examples[example].object
-            vertices = conditions.row(row, self.mesh(example)).vertices
+            vertices = conditions.row(row, item.mesh).vertices
+            count = len(kept[row])
+            labels[row, :, :count] = torch.tensor([index_of(item.labels[i]) for i in kept[row]])
             for view, camera in enumerate(self.cameras_under(conditions, row, example)):
-                found = self._direct_renderer.mask(index, camera.fixed(), vertices)
-                masks[row, view, 0], visible[row, view, 0] = found
-        labels = torch.tensor([index_of(self.labels[example]) for example in rows.tolist()])
-        truth = (labels[:, None, None].expand(-1, self.views, 1), boxes_of(masks), masks, visible)
+                found = self._direct_renderer.masks(index, camera.fixed(), vertices)
+                masks[row, view, :count], visible[row, view, :count] = (
+                    part[kept[row]] for part in found
+                )
+        is_hidden = (labels != NO_OBJECT) & (visible < LEAST_VISIBLE)
+        if is_hidden.any():
+            row, view, kept_index = is_hidden.nonzero()[0].tolist()
+            say_once(
+                f"objects are left out of the truth of {int(is_hidden.any(2).sum())} views, which "
+                f"show less than {LEAST_VISIBLE:.0%} of them: the first is object "
+                f"{kept[row][kept_index]} of example {int(rows[row])} in view {view}"
+            )
+        labels[is_hidden] = NO_OBJECT
+        masks[is_hidden] = False
+        truth = (labels, boxes_of(masks), masks, visible)
         return Truth(*(part.to(self.lights.device) for part in truth))
 
     def _as_examples(self, examples: object, count: int | None = None) -> Int[Tensor, " A"]:

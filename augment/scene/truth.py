@@ -12,6 +12,8 @@ from torch import Tensor
 NO_OBJECT = -1
 # A pixel belongs to an object that covers at least this fraction of it.
 COVERED = 0.5
+# An object is left out of the truth of a view that shows less than this fraction of it.
+LEAST_VISIBLE = 0.1
 
 
 @dataclass(frozen=True)
@@ -22,10 +24,12 @@ class Truth:
     origin is the upper left corner of the image.
 
     Attributes:
-        labels: Indices of classes. NO_OBJECT stands for no object.
+        labels: Indices of classes. NO_OBJECT stands for no object, or one of which less
+            than LEAST_VISIBLE is visible.
         boxes: Left, top, right and bottom side of the box of the visible part. 0 without one.
         masks: Pixels of which the object covers at least half.
-        visible: Fraction of the object that no other object hides, in [0, 1].
+        visible: Fraction of the object that no other object hides, in [0, 1]. It is 0
+            outside of the view.
     """
 
     labels: Int[Tensor, "E V O"]

@@ -82,7 +82,7 @@ def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
     "override",
     [
         *("meshes=[{}]", "hard_negatives=[{{mesh: {}, label: apple}}]"),
-        *("meshes=[{{mesh: solid:orange, props: [{{mesh: {}, at: [1, 1]}}]}}]", "scene.light={}"),
+        *("meshes=[[solid:orange, {{mesh: {}, at: [1, 1]}}]]", "scene.light={}"),
         *("scene.backgrounds=[0.5,{}]", "augment.vary.environments=[{}]", "network={}"),
         *("network={0.parent}", "data.path={}", "data.path={0.parent}"),
         "augment.folder={0.parent}",

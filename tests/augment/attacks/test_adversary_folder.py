@@ -13,7 +13,7 @@ import torch
 import augment
 from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
-from augment.scene.objects import Example, SceneObject, add_table, with_props
+from augment.scene.objects import Example, SceneObject, add_table, with_others
 from augment.scene.scene import Scene
 from renderer.errors import InputError
 from renderer.mesh import Mesh, normalize
@@ -144,7 +144,7 @@ def pear_with_prop() -> SceneObject:
     smaller = 0.3 * solid("pear").vertices + np.array([0.7, 0.7, 0.3])
     prop = replace(textured_pear(), vertices=smaller)
     item = SceneObject("orange", normalize(textured_pear()))
-    return add_table(with_props(item, [prop]), BROWN)
+    return add_table(with_others(item, [("", prop)]), BROWN)
 
 
 def points(item: SceneObject, own: bool) -> set[tuple[float, ...]]:

@@ -16,7 +16,7 @@ from augment.augmentation_settings import SpecularLayerSettings, VariationSettin
 from augment.scene.build import Smoothest, build_scene, degree_of_scene, reached_gloss
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
-from augment.settings import ObjectSettings, PropSettings
+from augment.settings import ObjectSettings
 from renderer.light.basis import Harmonics, harmonics_of
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import directional, load_light, probe
@@ -113,8 +113,8 @@ def test_an_attack_starts_from_the_smoothest_varnish_that_is_drawn():
 
 
 def test_the_gloss_of_props_counts():
-    mug = PropSettings("solid:cup", at=[0.9, 0.6], gloss=[0.25])
-    scene, _ = scene_of(ObjectSettings("solid:pear", "pear", props=[mug]))
+    mug = ObjectSettings("solid:cup", at=[0.9, 0.6], gloss=[0.25])
+    scene, _ = scene_of(ObjectSettings("solid:pear", "pear", others=[mug]))
     assert scene.basis == Harmonics(required_degree(0.25))
 
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from augment.scene.objects import add_table, load_object, resample_instance, rotated
-from augment.settings import ObjectSettings, PropSettings
+from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.mesh import normalize
 from renderer.solids import solid
@@ -35,8 +35,8 @@ def test_a_mesh_without_colors_takes_the_given_one_which_a_metal_needs(plain_mes
 
 def test_props_stand_on_the_objects_ground_shifted_and_turned():
     """A quarter turn takes x to y, and y to -x."""
-    prop = PropSettings("solid:cup:1", [0.9, -0.2], scale=0.5, azimuth=90)
-    item = load_object(ObjectSettings("solid:apple", "apple", props=[prop]))
+    prop = ObjectSettings("solid:cup:1", at=[0.9, -0.2], scale=0.5, azimuth=90)
+    item = load_object(ObjectSettings("solid:apple", "apple", others=[prop]))
     apple = normalize(solid("apple"))
     cup = normalize(solid("cup", 1))
     np.testing.assert_array_equal(item.mesh.faces[item.own_faces], apple.faces)
@@ -51,8 +51,8 @@ def test_props_stand_on_the_objects_ground_shifted_and_turned():
 
 @pytest.mark.parametrize("at", [[0.1, 0.0], [-3.0, 0.4], [0.7, 2.0]])
 def test_a_table_reaches_under_everything_that_stands_on_it(at):
-    prop = PropSettings("solid:cup", at, scale=0.5)
-    item = load_object(ObjectSettings("solid:apple", "apple", props=[prop]))
+    prop = ObjectSettings("solid:cup", at=at, scale=0.5)
+    item = load_object(ObjectSettings("solid:apple", "apple", others=[prop]))
     above = item.mesh.vertices
     table = add_table(item, GRAY).mesh.vertices[len(above) :]
     assert table.shape == (4, 3)
@@ -67,10 +67,10 @@ def test_a_table_reaches_under_everything_that_stands_on_it(at):
 
 
 def test_another_instance_has_the_same_props():
-    props = [PropSettings("solid:cup", [1.0, 0.0], 0.5)]
-    item = add_table(load_object(ObjectSettings("solid:apple", "apple", props=props)), GRAY)
+    props = [ObjectSettings("solid:cup", at=[1.0, 0.0], scale=0.5)]
+    item = add_table(load_object(ObjectSettings("solid:apple", "apple", others=props)), GRAY)
     other = resample_instance(item, 5)
-    settings = ObjectSettings("solid:apple:5", "apple", props=props)
+    settings = ObjectSettings("solid:apple:5", "apple", others=props)
     expected = add_table(load_object(settings), GRAY)
     np.testing.assert_array_equal(other.mesh.vertices, expected.mesh.vertices)
     np.testing.assert_array_equal(other.own_faces, expected.own_faces)
@@ -88,8 +88,8 @@ def test_another_instance_has_the_same_props():
     ids=["loaded", "another instance", "rotated"],
 )
 def test_an_object_has_the_gloss_that_it_is_given_and_its_props_stay_matte(change: Callable):
-    props = [PropSettings("solid:cup", [1, 0])]
-    item = load_object(ObjectSettings("solid:pear", "pear", gloss=[0.3, 0, 0.5], props=props))
+    props = [ObjectSettings("solid:cup", at=[1, 0])]
+    item = load_object(ObjectSettings("solid:pear", "pear", gloss=[0.3, 0, 0.5], others=props))
     shown = change(item)
     own = shown.mesh.gloss[shown.own_faces]
     of_props = shown.mesh.gloss[~shown.own_faces]

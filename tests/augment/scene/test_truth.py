@@ -1,11 +1,15 @@
 """The truth of the images of a scene: masks, boxes and visible fractions."""
 
+import itertools
 import math
 
+import numpy as np
+import pytest
 import torch
 
 import norm_balls as nb
-from augment.scene.truth import boxes_of
+from augment.scene.truth import NO_OBJECT, boxes_of
+from renderer.mesh import select_faces
 
 
 def test_the_mask_of_a_ball_is_its_disc_and_the_box_contains_the_mask():
@@ -25,3 +29,86 @@ def test_the_mask_of_a_ball_is_its_disc_and_the_box_contains_the_mask():
 
 def test_the_box_of_an_empty_mask_is_zero():
     assert boxes_of(torch.zeros(2, 5, 4, dtype=torch.bool)).tolist() == [[0.0] * 4] * 2
+
+
+def test_boxes_and_fractions_of_two_balls_are_those_of_overlapping_discs():
+    """Seen from +x, a disc of radius 1 hides its area of one of radius 1.5 on the same ground."""
+    balls = [("solid:ball", 3), nb.ObjectSettings("solid:ball", "big", at=[-2.6, 0.0], scale=1.5)]
+    scene = nb.build_scene([balls], 128, width=6.0, polar=90.0, samples=4)
+    truth = scene.truth(lambda label: 5 if label == "big" else label)
+    assert truth.labels.tolist() == [[[3, 5]]]
+    assert truth.visible[0, 0].tolist() == [1.0, pytest.approx(1 - 1 / 1.5**2, abs=0.01)]
+    pixel = 128 / 6
+    expected = [64 - 1.5 * pixel, 64 - 2 * pixel, 64 + 1.5 * pixel, 64 + 1 * pixel]
+    assert truth.boxes[0, 0, 1].tolist() == pytest.approx(expected, abs=2)
+    # Only pixels of which both cover exactly half belong to both.
+    assert (truth.masks[0, 0, 0] & truth.masks[0, 0, 1]).sum() < 10
+
+
+def test_a_mask_is_that_of_the_object_alone_without_what_others_hide():
+    cup = nb.ObjectSettings("solid:cup", "cup", at=[-1.2, 0.3], scale=0.9, azimuth=40.0)
+    scene = nb.build_scene(
+        [[("solid:pear", "pear"), cup, ("solid:lemon", "")]],
+        (64, 96),
+        width=6.0,
+        fov=30.0,
+        samples=1,
+    )
+    truth = scene.truth(["pear", "cup"].index)
+    assert truth.labels.tolist() == [[[0, 1]]]  # The lemon has no class.
+    item = scene.objects[0]
+    starts = [0, *item.ends]
+    alone = []
+    for start, end in itertools.pairwise(starts):
+        mesh = select_faces(item.mesh, slice(start, end))
+        image = nb.render(mesh, scene.cameras[0][0], None, (64, 96), 1.0, samples=1)
+        alone.append(image[0] < 1)
+    pear, cup, lemon = alone
+    assert torch.equal(truth.masks[0, 0, 0], pear)
+    assert (pear & cup).any()
+    assert torch.equal(truth.masks[0, 0, 1], cup & ~pear & ~lemon)
+    assert truth.visible[0, 0, 1].item() == pytest.approx(
+        ((cup & ~pear & ~lemon).sum() / cup.sum()).item(), abs=1e-6
+    )
+
+
+def test_a_hidden_object_and_one_outside_of_the_view_are_left_out_and_said(caplog):
+    behind = nb.ObjectSettings("solid:ball", "hidden", at=[-2.0, 0.0], scale=0.5)
+    outside = nb.ObjectSettings("solid:ball", "outside", at=[0.0, 8.0])
+    scene = nb.build_scene([[("solid:ball", "ball"), behind, outside]], 32, polar=90.0)
+    truth = scene.truth(["ball", "hidden", "outside"].index)
+    assert truth.labels.tolist() == [[[0, NO_OBJECT, NO_OBJECT]]]
+    assert not truth.masks[0, 0, 1:].any()
+    assert truth.boxes[0, 0, 1:].eq(0).all()
+    assert "left out of the truth of 1 views" in caplog.text
+
+
+def test_objects_without_a_position_do_not_touch_and_stand_on_one_ground():
+    kinds = ["pear", "cup", "ball", "table", "orange"]
+    scene = nb.build_scene([[(f"solid:{kind}", kind) for kind in kinds]], 8)
+    item = scene.objects[0]
+    parts = [
+        item.mesh.vertices[item.mesh.faces[a:b]] for a, b in itertools.pairwise([0, *item.ends])
+    ]
+    heights = [part[..., 2].min() for part in parts]
+    assert np.ptp(heights) < 1e-6
+    spans = sorted((part[..., 1].min(), part[..., 1].max()) for part in parts)
+    assert all(after[0] - before[1] > 0.1 for before, after in itertools.pairwise(spans))
+
+
+def test_an_attack_on_shape_moves_the_first_object_only():
+    scene = nb.build_scene(
+        [[("solid:pear", "pear"), ("solid:cup", "cup")]], 32, width=6.0, rasterizer="numpy"
+    )
+    settings = nb.AttackSettings(geometry=nb.StepSettings(step_size=0.05), max_steps=1)
+    result = nb.attack(
+        lambda images: torch.stack([images.mean((1, 2, 3)), 0.9 + images[:, 0, 0, 0]], 1),
+        scene,
+        settings=settings,
+        classes=["pear", "cup"],
+        force=True,
+    )
+    moved = (result.conditions.vertices[0] - scene.vertices[0]).abs().amax(1) > 0
+    is_first = torch.from_numpy(scene.objects[0].own_vertices)
+    assert moved[is_first].any()
+    assert not moved[~is_first].any()

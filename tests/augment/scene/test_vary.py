@@ -19,7 +19,7 @@ from augment.scene.objects import Conditions
 from augment.scene.patterns import draw_patterns, draw_photograph_patterns, pixel_centers
 from augment.scene.scene import Scene
 from augment.scene.vary import draw_camera_effects, vary
-from augment.settings import LampsSettings, ObjectSettings, ProjectorSettings, PropSettings
+from augment.settings import LampsSettings, ObjectSettings, ProjectorSettings
 from renderer.errors import InputError
 from renderer.image import decode, encode
 from renderer.io.images import read_image
@@ -120,8 +120,8 @@ def test_views_in_perspective_have_the_lens_drawn_and_the_width_of_their_own():
 
 
 def test_each_object_is_turned_about_an_axis_of_its_own_and_its_props_stay_on_the_ground():
-    prop = PropSettings(mesh="solid:ball", at=[2.0, 0.0])
-    pear = ObjectSettings("solid:pear:1", "pear", props=[prop])
+    prop = ObjectSettings(mesh="solid:ball", at=[2.0, 0.0])
+    pear = ObjectSettings("solid:pear:1", "pear", others=[prop])
     scene = augment.build_scene([pear], 8, 6, rasterizer="numpy")
     item = scene.objects[0]
     before = item.mesh.vertices[item.mesh.faces[: item.own]].reshape(-1, 3)
@@ -148,8 +148,8 @@ VARNISHED = {"gloss": SPECULAR_LAYER, "rotation": 90.0, "instances": True}
 @pytest.fixture(scope="module")
 def pears() -> Scene:
     """Return a scene of four views of a pear with a glossy prop."""
-    prop = PropSettings(mesh="solid:ball", at=[2.0, 0.0], gloss=[0.9])
-    pear = ObjectSettings("solid:pear", "pear", props=[prop])
+    prop = ObjectSettings(mesh="solid:ball", at=[2.0, 0.0], gloss=[0.9])
+    pear = ObjectSettings("solid:pear", "pear", others=[prop])
     return augment.build_scene([pear], 8, 4, rasterizer="numpy", samples=1)
 
 
@@ -308,8 +308,8 @@ LOCAL_LIGHTS = {
 @pytest.mark.parametrize("name", LOCAL_LIGHTS)
 def test_local_lights_light_a_drawn_table_as_they_do_a_ground_of_triangles(name):
     """The object and its prop throw their shadows on both."""
-    prop = PropSettings(mesh="solid:ball", at=[0.7, -0.4], scale=0.3)
-    meshes = [ObjectSettings("solid:pear:1", "pear", props=[prop])]
+    prop = ObjectSettings(mesh="solid:ball", at=[0.7, -0.4], scale=0.3)
+    meshes = [ObjectSettings("solid:pear:1", "pear", others=[prop])]
     options = {
         "rasterizer": "numpy",
         "light": torch.zeros(49, 3),

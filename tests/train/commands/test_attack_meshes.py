@@ -96,9 +96,9 @@ def test_a_rasterizer_that_does_not_start_is_an_error_of_its_key(monkeypatch, ti
         (["attack.restarts=2"], "restarts draws from the norm-balls"),
         (["target=[lime]", "scene.views=2", "attack.shared=true"], "one for each of the 2 views"),
         (["meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"meshes\[0\]"),
-        (["meshes=[{mesh: a, props: [solid:cup]}]"], r"^meshes\[0\]\.props\[0\] is 'solid:cup'"),
-        (["meshes=[{mesh: a, props: [{mesh: b}]}]"], r"meshes\[0\].*at is not set"),
-        (["meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"], r"props\[0\]\.at=\[1\]"),
+        (["meshes=[[{mesh: a}, {mesh: 3}]]"], r"^meshes\[0\]\.others\[0\]\.mesh is"),
+        (["meshes=[[{mesh: a, at: [1, 0]}, b]]"], r"^meshes\[0\]\.at"),
+        (["meshes=[[a, {mesh: b, at: [1]}]]"], r"others\[0\]\.at=\[1\]"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
