@@ -134,6 +134,39 @@ def unwrapped(network: Any) -> Any:
     return network
 
 
+def text_vectors(network: nn.Module, class_count: int) -> list[str]:
+    """Return the names of matrices with a row or column for each class, outside of layers of torch.
+
+    A zero-shot network multiplies them by the features of an image.
+    """
+    return [
+        f"{prefix}.{name}".lstrip(".")
+        for prefix, module in network.named_modules()
+        if not type(module).__module__.startswith(("torch.nn.", "torch.jit."))
+        for name, value in {**vars(module), **module._buffers, **module._parameters}.items()
+        if isinstance(value, Tensor) and value.is_floating_point()
+        if value.ndim == 2 and class_count in value.shape
+    ]
+
+
+def keep_text_vectors(network: nn.Module, class_count: int, kind: type[Tensor] = Tensor) -> None:
+    """Register text vectors that are plain tensors as buffers, so that they are saved and copied.
+
+    With `nn.Parameter` as the kind, the last of them becomes a parameter.
+    """
+    names = text_vectors(network, class_count)
+    for full_name in names[-1:] if kind is nn.Parameter else names:
+        prefix, _, name = full_name.rpartition(".")
+        module = network.get_submodule(prefix)
+        value = getattr(module, name)
+        if kind is nn.Parameter and not isinstance(value, nn.Parameter):
+            delattr(module, name)
+            module.register_parameter(name, nn.Parameter(value.detach().clone()))
+        elif name in vars(module):
+            delattr(module, name)
+            module.register_buffer(name, value.detach().clone())
+
+
 class ChannelNormalization(nn.Module):
     """Transform RGB images in [0, 1] to (x − mean) / std.
 

@@ -25,6 +25,7 @@ from augment.network import (
     ChannelNormalization,
     Inputs,
     Network,
+    keep_text_vectors,
     own_size,
     say_inputs,
     unwrapped,
@@ -330,7 +331,10 @@ def _python(name: str, weights: Path | None, *_: object) -> Classifier:
     if weights is not None:
         reason = f"cannot be combined with python:{name}, a function that loads the weights itself"
         raise files.weights_error(weights, f"{reason}: leave weights out")
-    return Classifier(*call_python(name), f"python:{name}")
+    network, size, classes = call_python(name)
+    if isinstance(network, nn.Module):
+        keep_text_vectors(network, len(classes))
+    return Classifier(network, size, classes, f"python:{name}")
 
 
 # Functions that make the classifiers of a source, such as torchvision. Their arguments are the

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torch import nn
+from torch import Tensor, nn
 
 from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import (
@@ -19,7 +19,7 @@ from augment.classifier import (
     as_classifier,
     require_evaluation_mode,
 )
-from augment.network import device_of, unwrapped
+from augment.network import device_of, keep_text_vectors, unwrapped
 from augment.settings import NormalizeLight, RendererSettings
 from renderer.errors import InputError, as_path, describe, require_kind
 from renderer.settings import Settings, Size
@@ -103,7 +103,9 @@ def harden(
 
     Returns:
         The hardened copy, of the same class and in evaluation mode. Its state
-        dict has the names and shapes of the state dict of `network`.
+        dict has the names and shapes of the state dict of `network`, and text
+        vectors of a zero-shot network, which are its last layer, even if they
+        are plain tensors there.
 
     Raises:
         InputError: If an input cannot be read, if the network lacks a class, or
@@ -132,6 +134,7 @@ def harden(
         )
         if next(classifier.parameters(), None) is None:
             raise InputError("network has no parameters: give a network that can be trained")
+        keep_text_vectors(classifier.network, len(classifier.classes))
         items = class_names.as_mappings("meshes", meshes, classifier)
         changes: dict[str, Any] = {
             "out": str(folder.absolute()),
@@ -161,7 +164,8 @@ def harden(
             run.train()
             if out is not None:
                 console.info("%s", report_of([folder], folder))
-    copy = deepcopy(network)
+    copy = _trainable_copy(network)
+    keep_text_vectors(copy, len(classifier.classes))
     target = copy
     if isinstance(network, Classifier):
         # A returned classifier has no operating points, because its logits differ.
@@ -175,7 +179,10 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
     """Copy a network, and check that the weights of the copy can be trained."""
     if not isinstance(network, Classifier):
         require_evaluation_mode(network, "network")
-    copy = deepcopy(network)
+    # Vectors of texts may be results of a text encoder, which have a graph and cannot be copied.
+    values = [value for module in network.modules() for value in vars(module).values()]
+    results = [value for value in values if isinstance(value, Tensor) and not value.is_leaf]
+    copy = deepcopy(network, {id(value): value.detach().clone() for value in results})
     # An optimizer can change a parameter only if it is a leaf of the autograd graph.
     if not all(weight.is_leaf for weight in copy.parameters()):
         raise InputError(

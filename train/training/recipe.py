@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from augment.classifier import log_odds, nearest
-from augment.network import eval_mode
+from augment.network import eval_mode, keep_text_vectors, plain_outputs, text_vectors
 from augment.tasks.classification import is_correct, label_loss
 from renderer.errors import InputError
 from renderer.image import to_unit
@@ -80,8 +80,8 @@ def last_layer(network: nn.Module) -> str:
     return _module_of(names[-1])
 
 
-def _last_called_layer(network: nn.Module, size: int) -> str:
-    """Return the name of the layer with a matrix or kernels that a network calls last.
+def _last_called_layer(network: nn.Module, size: int) -> tuple[str, int]:
+    """Return the name of the layer with a matrix that a network calls last, and its class count.
 
     The order of the calls may differ from the order of the parameters, which is
     that of the definitions. Normalizations and activations with parameters do not
@@ -98,11 +98,11 @@ def _last_called_layer(network: nn.Module, size: int) -> str:
             hooks.append(module.register_forward_hook(lambda *_, call=call: called.append(call)))
     device = next(network.parameters()).device
     with eval_mode(network), torch.no_grad():
-        network(torch.full((1, 3, size, size), 0.5, device=device))
+        logits = plain_outputs(network(torch.full((1, 3, size, size), 0.5, device=device)))
     for hook in hooks:
         hook.remove()
     names = [name for has_matrix, name in called if has_matrix] or [name for _, name in called]
-    return names[-1] if names else last_layer(network)
+    return names[-1] if names else last_layer(network), logits.shape[1]
 
 
 def _module_of(parameter: str) -> str:
@@ -113,12 +113,19 @@ def _module_of(parameter: str) -> str:
 def freeze(network: nn.Module, stage: str, size: int) -> None:
     """Freeze the parameters of a network from its first parameter to the last one of a module.
 
-    The stage "all_but_last" leaves only the layer that the network calls last.
+    The stage "all_but_last" leaves only the layer that the network calls last or, of a zero-shot
+    network, the vectors of its texts.
     """
     if stage == ALL_BUT_LAST:
-        last = _last_called_layer(network, size)
+        last, class_count = _last_called_layer(network, size)
+        named = network.named_parameters()
+        weights = [weight for name, weight in named if _module_of(name) == last]
+        is_zero_shot = not any(class_count in weight.shape for weight in weights)
+        texts = text_vectors(network, class_count)[-1:] if is_zero_shot else []
+        if texts:
+            keep_text_vectors(network, class_count, nn.Parameter)
         for name, parameter in network.named_parameters():
-            parameter.requires_grad_(_module_of(name) == last)
+            parameter.requires_grad_(name in texts if texts else _module_of(name) == last)
         return
     names = [name for name, _ in network.named_parameters()]
     chosen = [name for name in names if name.startswith(f"{stage}.")]
@@ -182,7 +189,7 @@ def feature_norm(network: nn.Module, images: Float[Tensor, "N 3 H W"]) -> float:
     """
     name = last_layer(network)
     layer = network.get_submodule(name)
-    weights = [parameter for parameter in layer.parameters() if parameter.ndim > 1]
+    weights = [one for one in layer.parameters() if one.ndim > 1 and one.requires_grad]
     squares = []
     with eval_mode(network):
         for image in images.split(1):

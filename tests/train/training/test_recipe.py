@@ -9,8 +9,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from augment import distributed
+from augment.network import keep_text_vectors
 from renderer.errors import InputError
 from renderer.image import to_unit
+from train.commands.harden import _trainable_copy
 from train.device import MixedPrecision
 from train.networks import WideResNet
 from train.train_settings import TRANSFORMS, TrainSettings
@@ -346,3 +348,38 @@ def test_a_teacher_with_other_features_or_more_layers_computes_its_own(changes, 
     pupil, teacher = pair(*layers_after)
     settings = TrainSettings(**LAST_LAYER_ONLY | changes)
     assert share_layers(settings, pupil, teacher, TINY) is teacher
+
+
+class ByText(nn.Module):
+    """Zero-shot network: logits are the scaled cosines of an image and a text for each class."""
+
+    def __init__(self, kind: str):
+        super().__init__()
+        self.encoder, self.projection = nn.Conv2d(3, 6, 3), nn.Linear(6, 8)
+        text = F.normalize(nn.Linear(4, 8)(torch.rand(3, 4)), dim=1)
+        if kind == "buffer":
+            self.register_buffer("text", text.detach())
+        else:
+            self.text = nn.Parameter(text.detach()) if kind == "parameter" else text
+        self.scale = nn.Parameter(torch.tensor(3.0))
+
+    def forward(self, images: Tensor) -> Tensor:
+        features = self.projection(self.encoder(images).mean((2, 3)))
+        return self.scale.exp() * F.normalize(features, dim=1) @ self.text.T
+
+
+@pytest.mark.parametrize("kind", ["buffer", "parameter", "result of an encoder"])
+def test_the_last_layer_of_a_zero_shot_network_is_a_copy_of_its_text_vectors(kind):
+    network = ByText(kind).eval()
+    images = torch.rand(2, 3, 8, 8)
+    copy = _trainable_copy(network)
+    keep_text_vectors(copy, 3)
+    freeze(copy, "all_but_last", 8)
+    trained = [name for name, weight in copy.named_parameters() if weight.requires_grad]
+    assert trained == ["text"]
+    assert torch.equal(copy(images), network(images))
+    # The gradient of a logit with respect to its text is the scale times a vector of length 1.
+    assert feature_norm(copy, images) == pytest.approx(np.exp(3), rel=1e-5)
+    with torch.no_grad():
+        copy.text.add_(1)
+    assert not torch.equal(copy.text, network.text)
