@@ -22,11 +22,12 @@ from train.settings import (
 
 # File of a mesh, solid:NAME, or the mesh itself.
 MeshSource = str | Path | Mesh
-# A mesh as an argument: alone, in a pair with its class, or as settings.
-MeshItem = MeshSource | tuple[MeshSource, str | int] | ObjectSettings
+# A mesh as an argument: alone, in a pair with its class, as settings, or a list of pairs and
+# settings of several objects on the same ground.
+MeshItem = MeshSource | tuple[MeshSource, str | int] | ObjectSettings | list[Any]
 EXPECTED = (
     "a list of files, of solids such as 'solid:orange', of nb.Mesh, of pairs of these and a class "
-    "such as ('orange.glb', 'orange'), or of nb.ObjectSettings"
+    "such as ('orange.glb', 'orange'), of nb.ObjectSettings, or of lists of pairs and settings"
 )
 
 

@@ -18,7 +18,7 @@ from augment.scene.scene import Scene
 from augment.service import AugmentationService
 from augment.sources import load_source
 from augment.tasks.classification import complementary_label
-from renderer.errors import InputError, as_path, keyed, keys_of, require_range
+from renderer.errors import InputError, as_path, is_whole, keyed, keys_of, require_range
 from renderer.settings import MAX_SIZE
 from train import checkpoints, console
 from train.class_names import class_of_name, name_of_mesh, require_others, with_class_names
@@ -68,7 +68,11 @@ class Initial:
     @property
     def size(self) -> int:
         """Pixels per side of the images that the network takes."""
-        return self.architecture["size"]
+        size = self.architecture["size"]
+        if not is_whole(size):
+            reason = f"size={size} of {self.source} is rectangular, but training takes squares"
+            raise InputError(f"{reason}: give a network of square images, and one number", "size")
+        return size
 
     @property
     def is_classifier(self) -> bool:

@@ -10,6 +10,8 @@ import torch
 import norm_balls as nb
 from augment.scene.truth import NO_OBJECT, boxes_of
 from renderer.mesh import select_faces
+from train.class_names import as_mappings
+from train.settings import read_objects
 
 
 def test_the_mask_of_a_ball_is_its_disc_and_the_box_contains_the_mask():
@@ -112,3 +114,28 @@ def test_an_attack_on_shape_moves_the_first_object_only():
     is_first = torch.from_numpy(scene.objects[0].own_vertices)
     assert moved[is_first].any()
     assert not moved[~is_first].any()
+
+
+def test_a_list_of_objects_in_settings_and_arguments_is_one_entry():
+    classifier = nb.Classifier(lambda x: x.mean((2, 3)), 8, ["pear", "cup", "lemon"])
+    cup = nb.ObjectSettings("solid:cup", "cup", at=[1.0, 2.0])
+    mappings = as_mappings("meshes", [[("solid:pear", 0), cup], "solid:pear"], classifier)
+    written = ["solid:pear", {"mesh": "solid:cup", "label": "cup", "at": [1.0, 2.0]}]
+    for given in (mappings, [written, "solid:pear"]):
+        read = read_objects(given, "pear", "meshes")
+        assert read["meshes[0]"] == nb.ObjectSettings("solid:pear", "pear", others=[cup])
+        assert read["meshes[1]"] == nb.ObjectSettings("solid:pear", "pear")
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ([("solid:pear", "pear"), "solid:cup"], r"^meshes\[0\]\[1\] is 'solid:cup': give a pair"),
+        ([nb.ObjectSettings("solid:pear", at=[1.0, 0.0]), ("solid:cup", 1)], r"^at=\[1\.0, 0\.0\]"),
+        ([("solid:pear", "pear"), ("solid:cup", 1.5)], r"^meshes\[0\]\[1\]: its label"),
+        ([], r"^meshes\[0\] is "),
+    ],
+)
+def test_a_wrong_list_of_objects_is_refused_in_one_sentence(entry, message):
+    with pytest.raises(nb.InputError, match=message):
+        nb.build_scene([entry], 8)
