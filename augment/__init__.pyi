@@ -39,5 +39,7 @@ from augment.settings import RendererSettings as RendererSettings
 from augment.settings import SceneSettings as SceneSettings
 from augment.sources import load_classifier as load_classifier
 from augment.tasks.classification import Classification as Classification
+from augment.tasks.detection import Detection as Detection
+from augment.tasks.segmentation import Segmentation as Segmentation
 
 __version__: str

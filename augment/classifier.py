@@ -44,6 +44,8 @@ OVERSHOOT = 0.1
 # Pixel value of the gray image with which a function is called to find out whether it has
 # gradients.
 GRAY = 0.5
+# Number of images of a scene with which a function of another task is called for that.
+MAX_PROBED = 8
 
 
 @dataclass(frozen=True)
@@ -210,16 +212,20 @@ class TaskNetwork(CheckedNetwork):
 
         A network of torch with weights is assumed to have differentiable
         outputs. Any other function is called with a gray image to find out.
+        Other tasks show it some of the images, because a detector finds
+        nothing in a gray one.
 
         Args:
-            like: Tensor with the dtype and the device of the image.
+            like: Images, or a tensor with their dtype and their device.
         """
         if next(self.parameters(), None) is not None:
             return True
-        gray = like.new_full((1, 3, *height_and_width(self.size)), GRAY, requires_grad=True)
+        shown = like.new_full((1, 3, *height_and_width(self.size)), GRAY)
+        if like.ndim == 4 and not isinstance(self.task, Classification):
+            shown = like[:MAX_PROBED].clone()
         try:
             with torch.enable_grad():
-                return self.task.has_gradient(super().forward(gray))
+                return self.task.has_gradient(super().forward(shown.requires_grad_()))
         except InputError:
             # A function that converts images to NumPy fails on images with gradients.
             return False
@@ -404,7 +410,7 @@ def log_odds(logits: Float[Tensor, "N classes"], label: int) -> Float[Tensor, " 
 
 def as_classifier(network: Any, *options: Any, **named: Any) -> Classifier:
     """Make a classifier of a plain network. See `as_network` for the options."""
-    made = as_network(network, *options, **named, task=Classification())
+    made = as_network(network, *options, **named | {"task": Classification()})
     assert isinstance(made, Classifier)
     return made
 
@@ -481,17 +487,17 @@ def as_network(
         task = recognized_task(outputs, argument)
         if not isinstance(task, Classification):
             wrappers.say_once(f"network {name}: its outputs are of {task}")
-    count = task.output_count(task.reader(argument)(outputs, images))
+    count = task.output_count(network, task.reader(argument)(outputs, images))
     if names is not None and count not in (None, len(names)):
         reason = f"classes has {len(names)} names, but the network returns {count} outputs"
         raise InputError(f"{reason}: give one name per output")
-    names = names or task.class_names(network, count)
-    if names is None:
+    known = names or task.class_names(network, count)
+    if known is None:
         raise InputError("classes is None, but the network does not name its classes: give them")
     if isinstance(task, Classification):
-        made: TaskNetwork = Classifier(function, size, names, name, normalize_light)
+        made: TaskNetwork = Classifier(function, size, known, name, normalize_light)
     else:
-        made = TaskNetwork(function, size, names, name, normalize_light, task)
+        made = TaskNetwork(function, size, known, name, normalize_light, task)
     made.inputs = inputs
     return made
 

@@ -7,6 +7,7 @@ from augment import CameraEffectSettings as CameraEffectSettings
 from augment import Classification as Classification
 from augment import Classifier as Classifier
 from augment import Conditions as Conditions
+from augment import Detection as Detection
 from augment import EOTSettings as EOTSettings
 from augment import Example as Example
 from augment import LampsSettings as LampsSettings
@@ -24,6 +25,7 @@ from augment import RendererSettings as RendererSettings
 from augment import Scene as Scene
 from augment import SceneObject as SceneObject
 from augment import SceneSettings as SceneSettings
+from augment import Segmentation as Segmentation
 from augment import SkylightSettings as SkylightSettings
 from augment import SpecularLayerSettings as SpecularLayerSettings
 from augment import StepSettings as StepSettings

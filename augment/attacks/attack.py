@@ -168,7 +168,12 @@ def _attack(
 ) -> AttackResult:
     """Attack a classifier whose arguments have been checked. See `attack`."""
     settings.require_parameters()
-    has_gradients = classifier.is_differentiable(scene.lights)
+    scene = with_needed_degree(scene, settings.material)
+    problem = build_problem(settings, scene)
+    warn_of_changed_light(scene, problem.scene, stacklevel=4)
+    images_before = problem.images(problem.start)
+
+    has_gradients = classifier.is_differentiable(images_before.flatten(0, 1))
     if settings.optimizer is None and not has_gradients:
         settings = replace(settings, optimizer=RANDOM_SEARCH)
         # `stacklevel` makes Python name the user's call of `attack` in the warning.
@@ -183,11 +188,6 @@ def _attack(
     if not has_gradients:
         # Classify each image once only, because a function without gradients may be slow.
         classifier = classifiers.remembering(classifier)
-    scene = with_needed_degree(scene, settings.material)
-    problem = build_problem(settings, scene)
-    warn_of_changed_light(scene, problem.scene, stacklevel=4)
-
-    images_before = problem.images(problem.start)
     source = source_labels(scene, images_before.device, classifier)
     phases = Phases(images_before.device)
     truth = partial(scene.truth, classifier.label)

@@ -19,13 +19,13 @@ from augment.attacks.loop import minimize
 from augment.attacks.objective import Examples, Images, Objective, Values
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import SceneProblem, build_problem
-from augment.attacks.result import AttackResult, predictions, require_result
-from augment.classifier import UNIT_RANGE, Classifier, Normalization, as_classifier
+from augment.attacks.result import AttackResult, require_result
+from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
 from augment.network import gradient_flags_kept
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject
-from augment.tasks.classification import ClassCriterion
+from augment.scene.truth import Truth, unlabeled
 from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, as_list, require_number
 from renderer.settings import Size, height_and_width
 
@@ -237,10 +237,10 @@ def transfer(
     for index, network in enumerate(networks):
         with gradient_flags_kept(network):
             classifier = network
-            if not isinstance(network, Classifier):
-                name = f"classifiers[{index}]"
+            if not isinstance(network, TaskNetwork):
                 options: dict[str, Any] = {"dtype": images.dtype, "size_from": "the attack"}
-                classifier = as_classifier(network, *given, name, **options)
+                name = f"classifiers[{index}]"
+                classifier = as_network(network, *given, name, task=attacked.task, **options)
             resized = partial(_resized, size=classifier.size)
             rows.append({"network": classifier.name, **classify(classifier, resized)})
     for azimuth in azimuths:
@@ -369,7 +369,7 @@ def _classify(
     result: AttackResult,
     examples: Examples,
     adversaries: Sequence[Adversary],
-    classifier: Classifier,
+    classifier: TaskNetwork,
     change: Callable[[Adversary], Adversary],
 ) -> dict[str, Any]:
     """Change adversaries, and classify their images by class names, since orders may differ."""
@@ -382,26 +382,36 @@ def _classify(
     target = criterion.target
     if target is not None:
         target = target.cpu().apply_(lambda index: classifier.label(classes[index]))
-    criterion = ClassCriterion(source[:, None].expand(-1, criterion.view_count), target)
-    criterion = criterion.map(lambda tensor: tensor.to(examples.device))
+    rasterizer = result.problem.scene.rasterizer
+
+    def truth_of(some: Sequence[Adversary]) -> Truth:
+        return Truth.join([item.scene(rasterizer).truth(unlabeled) for item in some])
+
+    task, count = classifier.task, len(examples)
+    source = source[:, None].expand(-1, criterion.view_count)
+    criterion = task.criterion(source, lambda: truth_of(changed[:count]), len(classifier.classes))
+    criterion = replace(criterion, target=target).map(lambda rows: rows.to(examples.device))
     objective = Objective(classifier, criterion, result.settings, result.seed)
     if len(examples):
         images = []
         for adversary in progress(changed, "transfer"):
-            images.append(adversary.render_views(result.problem.scene.rasterizer))
+            images.append(adversary.render_views(rasterizer))
         images_before, images_after = torch.stack(images).to(result.images_in_views).chunk(2)
-        logits_before = objective.evidence(images_before)
-        logits, fooled_in_views, without_noise = objective.judge(images_after, examples)
+        evidence_before = objective.evidence(images_before)
+        if criterion.needs_truth:
+            objective = objective.at(truth_of(changed[count:]))
+        evidence, fooled_in_views, without_noise = objective.judge(images_after, examples)
     else:
-        logits_before = logits = result.logits_in_views[examples]
+        evidence_before = evidence = result.evidence_in_views[examples]
         fooled_in_views = result.success_in_views[examples]
         without_noise = result.success_without_noise[examples]
+    predicted_before, predicted = map(criterion.predicted, (evidence_before, evidence))
     return {
-        "clean_correct": (logits_before.argmax(2) == criterion.source).all(1).tolist(),
+        "clean_correct": (predicted_before == criterion.source).all(1).tolist(),
         "success": fooled_in_views.all(1).tolist(),
         "success_without_noise": without_noise.tolist(),
-        **predictions(logits_before, classifier.classes, "_before"),
-        **predictions(logits, classifier.classes),
+        **task.found(evidence_before, predicted_before, classifier.classes, "_before"),
+        **task.found(evidence, predicted, classifier.classes),
     }
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from augment.attack_settings import LINES
 from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
 from augment.attacks.objective import as_jpeg
-from augment.attacks.result import AttackResult, predictions, require_result, warnings
+from augment.attacks.result import AttackResult, require_result, warnings
 from augment.progress import progress
 from augment.scene.objects import Conditions
 from renderer.errors import as_folder, as_list, require_choice
@@ -159,8 +159,8 @@ def _write_example(
         "cost_before": float(minimum.cost_before[example]),
         "cost": float(minimum.cost[example]),
         "label": [classes[index] for index in result.criterion.source[example].tolist()],
-        **predictions(result.logits_in_views_before[example], classes, "_before"),
-        **predictions(result.logits_in_views[example], classes),
+        **result.predictions(result.evidence_in_views_before[example], example, "_before"),
+        **result.predictions(result.evidence_in_views[example], example),
         "largest_change": {parameter.name: float(part.abs().max()) for parameter, part in parts},
         **light_numbers,
         "versions": {},
@@ -172,14 +172,14 @@ def _numbers_of_version(
 ) -> list[dict[str, Any]]:
     """Return successes, predictions and differences of another version for each example."""
     judged = result.objective().judge(images, result.problem.all_examples)
-    logits, fooled_in_views, without_noise = judged
+    evidence, fooled_in_views, without_noise = judged
     is_counted = ~result.success_before
     differences = (images - result.images_in_views).abs().flatten(1)
     return [
         {
             "success": bool((fooled_in_views.all(1) & is_counted)[example]),
             "success_without_noise": bool((without_noise & is_counted)[example]),
-            **predictions(logits[example], result.classifier.classes),
+            **result.predictions(evidence[example], example),
             "largest_difference": float(difference.max()),
             "mean_difference": float(difference.mean()),
         }
@@ -222,16 +222,17 @@ def figure(result: AttackResult, example: int) -> Image.Image:
     """
     before = result.images_in_views_before[example]
     after = result.images_in_views[example]
+    drawn = [torch.stack([*map(result.drawn, images)]) for images in (before, after)]
     differences = after - before
     largest = differences.abs().amax((1, 2, 3)).tolist()
     # Differences are enlarged by this factor, at most 255, to fill the range of an image.
     scale = 1 / max(1 / 255, *largest)
     captions = [(f"largest {value:.3f}", f"shown {scale:.3g} times") for value in largest]
-    predicted_before = _captions(result, result.logits_in_views_before, example)
-    predicted_after = _captions(result, result.logits_in_views, example)
+    captions_before = _captions(result, result.evidence_in_views_before[example], example)
+    captions_after = _captions(result, result.evidence_in_views[example], example)
     columns = {
-        "initial": tiles_of(before, predicted_before, SIDE),
-        "adversarial": tiles_of(after, predicted_after, SIDE),
+        "initial": tiles_of(drawn[0], captions_before, SIDE),
+        "adversarial": tiles_of(drawn[1], captions_after, SIDE),
         "difference": tiles_of((1 + scale * differences) / 2, captions, SIDE),
     }
     lights = [
@@ -249,18 +250,20 @@ def figure(result: AttackResult, example: int) -> Image.Image:
 
 
 def _captions(
-    result: AttackResult, logits: Float[Tensor, "E V C"], example: int
+    result: AttackResult, evidence: Float[Tensor, "V K"], example: int
 ) -> list[tuple[str, ...]]:
     """Return the captions of the V views of an example in the figure of an attack.
 
-    The first line has the probability and the name of the predicted class. If it is wrong, a second
+    The first line has the confidence and the name of the predicted class. If it is wrong, a second
     line has those of the true class.
     """
-    classes = result.classifier.classes
+    task, classes = result.classifier.task, result.classifier.classes
     labels = result.criterion.source[example].tolist()
+    found = result.predictions(evidence, example)
     captions = []
-    for probabilities, label in zip(logits[example].softmax(1), labels, strict=True):
+    columns = (task.confidences(evidence), found["predicted"], found["confidence"], labels)
+    for confidences, name, confidence, label in zip(*columns, strict=True):
         # A dictionary has each class once.
-        shown = dict.fromkeys([int(probabilities.argmax()), label])
-        captions.append(tuple(f"{probabilities[index]:.1%} {classes[index]}" for index in shown))
+        shown = {name: confidence} | {classes[label]: float(confidences[label])}
+        captions.append(tuple(f"{value:.1%} {text}" for text, value in shown.items()))
     return captions

@@ -147,9 +147,10 @@ class Objective:
         """Score single images, and write the gradients of their costs if a tensor is given."""
         batch = batch.detach().requires_grad_(gradients is not None)
         outputs = self._outputs(batch)
-        expected = average_transformed(
-            self.model, batch, outputs, self.settings.eot, self._transformations
-        )
+        expected = outputs
+        if self.settings.eot.draws:
+            averaged = (batch, outputs, self.settings.eot, self._transformations)
+            expected = average_transformed(self.model, *averaged)
         cost = criterion.cost(expected)
         if gradients is not None:
             # The network may return its gradient in another memory layout. The copy has the
@@ -323,11 +324,8 @@ def average_transformed(
     """Average predictions over random transformations of images (EOT, Athalye et al. 2018).
 
     The log-probabilities of each image and of its transformed copies are averaged. Gradients ignore
-    the JPEG compression (straight-through estimator). With 0 transformations, the given logits are
-    returned as they are.
+    the JPEG compression (straight-through estimator).
     """
-    if not settings.draws:
-        return logits
     log_probabilities = [logits.log_softmax(1)]
     for _ in range(settings.draws):
         transformed_logits = model(_transformed(images, settings, draws)).to(logits.dtype)

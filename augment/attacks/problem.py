@@ -18,7 +18,7 @@ from augment.progress import progress
 from augment.scene.build import MAX_IRRADIANCE_ERROR
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
-from augment.scene.truth import NO_OBJECT, Truth
+from augment.scene.truth import Truth, unlabeled
 from renderer.light.harmonics import irradiance_error
 
 
@@ -83,12 +83,12 @@ class SceneProblem:
         conditions = self.conditions(values, examples)
         if conditions.vertices is None and conditions.cameras is None:
             return self._still_truth.select(examples)
-        return self.scene.truth(_unlabeled, examples, conditions)
+        return self.scene.truth(unlabeled, examples, conditions)
 
     @cached_property
     def _still_truth(self) -> Truth:
         """Where the objects of all examples are before any attack."""
-        return self.scene.truth(_unlabeled)
+        return self.scene.truth(unlabeled)
 
     def scale_gradient(self, gradient: Values) -> Values:
         """Compute the step of each parameter that gradient descent subtracts from the values."""
@@ -126,11 +126,6 @@ class SceneProblem:
         """Split the attack values of examples into the values of each parameter."""
         parts = values.split(self._value_counts, dim=1)
         return list(zip(self.parameters, parts, strict=True))
-
-
-def _unlabeled(label: str | int) -> int:
-    """Return a label for a truth of which only positions are used."""
-    return NO_OBJECT
 
 
 def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -21,7 +21,7 @@ from augment.attacks.objective import Objective
 from augment.attacks.problem import SceneProblem
 from augment.classifier import TaskNetwork
 from augment.scene.objects import Conditions
-from augment.tasks.classification import ClassCriterion
+from augment.tasks.classification import ClassCriterion, Classification
 from augment.tasks.task import Criterion
 from renderer.errors import ShortRepr, as_path, require_choice, require_kind, require_whole
 from renderer.io.images import PAPER, draw_grid, tiles_of, write_image
@@ -243,14 +243,19 @@ class AttackResult(ShortRepr):
 
         example, view = self._shown_view(example, view)
         classes = self.classifier.classes
-        pair = self.logits_in_views_before[example, view], self.logits_in_views[example, view]
-        logits = torch.stack(pair).cpu()
-        before_title, after_title = _titles(logits, classes)
+        views = [
+            part[example, [view]]
+            for part in (self.evidence_in_views_before, self.evidence_in_views)
+        ]
+        evidence = torch.cat(views)
+        before_title, after_title = self._titles(evidence, example, view)
+        images = (self.images_in_views_before, self.images_in_views)
+        before_image, after_image = (self.drawn(part[example, view]) for part in images)
         light, basis = self.light(self.minimum.values, example)
         pictures = {
-            f"before: {before_title}": self.images_in_views_before[example, view],
+            f"before: {before_title}": before_image,
             "light after the attack": light_sphere(light, BALL_SIZE, basis=basis),
-            f"after: {after_title}": self.images_in_views[example, view],
+            f"after: {after_title}": after_image,
         }
         figure = Figure(figsize=(10, 2.6), layout="constrained")
         *panels, chart = figure.subplots(1, 4, width_ratios=[1, 1, 1, 1.2])
@@ -261,7 +266,7 @@ class AttackResult(ShortRepr):
             axes.set_title(title, fontsize=9)
             axes.axis("off")
 
-        before, after = logits.softmax(1).float()
+        before, after = self.classifier.task.confidences(evidence.cpu()).float()
         # Order the classes by the larger of their two probabilities.
         shown = before.maximum(after).topk(min(SHOWN_CLASSES, len(classes))).indices
         true_class = int(self.criterion.source[example, view])
@@ -274,7 +279,7 @@ class AttackResult(ShortRepr):
         chart.barh(heights - 0.2, after[ranked].numpy(), 0.4, color=AFTER_COLOR, label="after")
         chart.set_yticks(heights, [classes[index] for index in ranked.tolist()], fontsize=8)
         chart.set_xlim(0, 1)
-        chart.set_xlabel("probability", fontsize=8)
+        chart.set_xlabel(self.classifier.task.confidence, fontsize=8)
         chart.legend(fontsize=8, loc="lower right")
         return figure
 
@@ -337,18 +342,24 @@ class AttackResult(ShortRepr):
         require_whole("frame_count", frame_count, 2, MAX_FRAME_COUNT)
         start = self.problem.start
         change = self.minimum.values.to(start) - start
-        images, balls = [], []
+        examples = self.problem.all_examples[[example]]
+        images, evidence, balls = [], [], []
         for index in range(frame_count):
             values = start + index / (frame_count - 1) * change
-            rendered = self.problem.images(values, self.problem.all_examples[[example]])
-            images.append(rendered[0, view])
+            rendered = self.problem.images(values, examples)
+            if index == 0:
+                rendered = self.images_in_views_before[examples]
+            elif index == frame_count - 1:
+                rendered = self.images_in_views[examples]
+            images.append(self.drawn(rendered[0, view]))
+            objective = self.objective().select(examples)
+            if self.criterion.needs_truth:
+                objective = objective.at(self.problem.truth(values[examples], examples))
+            evidence.append(objective.evidence(rendered)[0, view])
             light, basis = self.light(values, example)
             balls.append(light_sphere(light, SIDE, basis=basis))
-        images[0] = self.images_in_views_before[example, view]
-        images[-1] = self.images_in_views[example, view]
+        titles = self._titles(torch.stack(evidence), example, view)
         shown = torch.stack(images)
-        logits = self.objective().evidence(shown[:, None])[:, 0]
-        titles = _titles(logits, self.classifier.classes)
         height, width = shown.shape[-2:]
         scale = MAX_SIDE / max(height, width)
         if scale < 1:
@@ -373,6 +384,40 @@ class AttackResult(ShortRepr):
         times = [PAUSE, *[FRAME_TIME] * (frame_count - 2), PAUSE]
         write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
 
+    def drawn(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+        """Draw what the network finds in an image, such as boxes, on the image."""
+        task = self.classifier.task
+        if isinstance(task, Classification):
+            return image
+        with torch.no_grad():
+            [output] = self.objective().model(image[None])
+        return task.draw(image, output, self.classifier.classes)
+
+    def predictions(
+        self, evidence: Float[Tensor, "V K"], example: int, when: str = ""
+    ) -> dict[str, Any]:
+        """Return what the network finds in the views of an example, for a JSON file.
+
+        `Task.found` explains the keys. Tasks with objects also have the confidence of the true
+        class.
+        """
+        task = self.classifier.task
+        criterion = self.criterion.map(lambda rows: rows[example])
+        predicted = criterion.predicted(evidence)
+        found = task.found(evidence, predicted, self.classifier.classes, when)
+        if criterion.needs_truth:
+            of_label = task.confidences(evidence).gather(1, criterion.source[:, None])[:, 0]
+            found[f"label_confidence{when}"] = of_label.tolist()
+        return found
+
+    def _titles(self, evidence: Float[Tensor, "F K"], example: int, view: int) -> list[str]:
+        """Write what is found in frames of a view, with its confidence, such as "orange 97%"."""
+        criterion = self.criterion.map(lambda rows: rows[example, [view] * len(evidence)])
+        predicted = criterion.predicted(evidence)
+        found = self.classifier.task.found(evidence, predicted, self.classifier.classes)
+        pairs = zip(found["predicted"], found["confidence"], strict=True)
+        return [f"{name} {confidence:.0%}" for name, confidence in pairs]
+
     def light(self, values: Float[Tensor, "E D"], example: int) -> tuple[Tensor, Basis]:
         """Return coefficients and basis of the light of an example with some attack values."""
         examples = self.problem.all_examples[[example]]
@@ -387,28 +432,9 @@ class AttackResult(ShortRepr):
         return content.getvalue()
 
 
-def _titles(logits: Float[Tensor, "N C"], classes: Sequence[str]) -> list[str]:
-    """Write the predicted class of each image with its probability, such as "orange 97%"."""
-    found = predictions(logits, classes)
-    pairs = zip(found["predicted"], found["confidence"], strict=True)
-    return [f"{name} {confidence:.0%}" for name, confidence in pairs]
-
-
 def require_result(result: object) -> None:
     """Check that a value is the result of an attack."""
     require_kind("result", result, AttackResult, "the result of norm_balls.attack")
-
-
-def predictions(
-    logits: Float[Tensor, "... C"], classes: Sequence[str], when: str = ""
-) -> dict[str, Any]:
-    """Return the names and the probabilities of the predicted classes, for a JSON file.
-
-    The suffix `when`, such as "_before", ends the two keys.
-    """
-    highest = logits.softmax(-1).max(-1)
-    names = np.asarray(classes)[highest.indices.cpu().numpy()]
-    return {f"predicted{when}": names.tolist(), f"confidence{when}": highest.values.tolist()}
 
 
 def warnings(checks: Mapping[str, Any]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -37,9 +38,19 @@ class Truth:
     masks: Bool[Tensor, "E V O H W"]
     visible: Float[Tensor, "E V O"]
 
+    @classmethod
+    def join(cls, parts: Sequence[Truth]) -> Truth:
+        """Return the examples of several parts, one after the other."""
+        return cls(*map(torch.cat, zip(*(vars(part).values() for part in parts), strict=True)))
+
     def select(self, examples: Int[Tensor, " A"]) -> Truth:
         """Return the truth of some examples."""
         return Truth(*(part[examples] for part in vars(self).values()))
+
+
+def unlabeled(label: str | int) -> int:
+    """Return a label for a truth of which only positions are used. Hidden objects still lose it."""
+    return 0
 
 
 def boxes_of(masks: Bool[Tensor, "... H W"]) -> Float[Tensor, "... 4"]:

@@ -52,6 +52,8 @@ class Classification(Task):
     name = "classification"
     returns = "a tensor of logits (N, C)"
     missed = "are not classified as their class"
+    measure = "logits"
+    confidence = "probability"
 
     def recognizes(self, outputs: Any) -> bool:
         """Return whether outputs are a tensor with two dimensions, such as logits."""
@@ -66,21 +68,9 @@ class Classification(Task):
         """Return a function that checks logits."""
         return _LogitReader(title, class_count)
 
-    def output_count(self, outputs: Tensor) -> int:
+    def output_count(self, network: Any, outputs: Tensor) -> int:
         """Return the number of logits of an image."""
         return outputs.shape[1]
-
-    def require_finite(self, outputs: Tensor, images: Tensor, title: str) -> None:
-        """Check logits of an attacked network."""
-        if not outputs.is_floating_point() or not outputs.isfinite().all():
-            raise InputError(f"{title} returned NaN or infinite logits: check its weights")
-        if torch.is_grad_enabled() and images.requires_grad and not outputs.requires_grad:
-            advice = "compute them in torch, or choose optimizer='random_search'"
-            raise InputError(f"{title} returned logits without a gradient: {advice}")
-
-    def has_gradient(self, outputs: Tensor) -> bool:
-        """Return whether logits have a gradient."""
-        return outputs.requires_grad
 
     def criterion(
         self, source: Int[Tensor, "E V"], truth: Callable[[], Truth], class_count: int
@@ -91,11 +81,9 @@ class Classification(Task):
     def require_target(self, target: Any) -> None:
         """Accept every target."""
 
-    def describe(self, evidence: Float[Tensor, " C"], classes: Sequence[str]) -> str:
-        """Return the five most probable classes with their probabilities."""
-        confidences = evidence.softmax(0)
-        indices = confidences.topk(min(5, len(confidences))).indices.tolist()
-        return ", ".join(f"{classes[i]} {confidences[i]:.1%}" for i in indices)
+    def confidences(self, evidence: Float[Tensor, "... C"]) -> Float[Tensor, "... C"]:
+        """Return the probability of each class."""
+        return evidence.softmax(-1)
 
 
 class _LogitReader:

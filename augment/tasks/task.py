@@ -12,15 +12,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from augment.scene.truth import Truth
+from renderer.errors import InputError
 
 # Index that stands for "no class" in attacks without a source or a target class. It differs from
 # all labels.
 NO_CLASS = -(10**9)
+# What is predicted if no class is found.
+NOTHING = "nothing"
 # Function from the outputs of a network, and from the images that it got, to outputs of a task.
 Reader = Callable[[Any, Tensor], Any]
 
@@ -97,7 +102,7 @@ class Criterion(Rows, ABC):
         """Return a mask of the views with so extreme values that noise must test a success."""
         return torch.zeros_like(evidence[..., 0], dtype=torch.bool)
 
-    def reached(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, " E"]:
+    def reached(self, predicted: Int[Tensor, " ..."]) -> Bool[Tensor, " E"]:
         """Return a mask of the examples that reach the criterion in all their views."""
         return self.reached_in_views(predicted).all(1)
 
@@ -111,6 +116,48 @@ class Criterion(Rows, ABC):
         return torch.where(is_untargeted, is_misclassified, predicted == self.target)
 
 
+@dataclass(frozen=True)
+class ObjectCriterion(Criterion):
+    """Criterion of an attack on an object in an image, which succeeds if its class is not found.
+
+    The evidence has a column for each of C classes, and then a limit. A class is found if its
+    evidence is at least the limit.
+    """
+
+    needs_truth = True
+
+    def split(self, evidence: Float[Tensor, "... K"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the evidence of the source class, the limit, and the evidence of the others.
+
+        The others (..., C) have −∞ for the source class.
+        """
+        source = self.source[..., None]
+        others = evidence[..., :-1].scatter(-1, source, -torch.inf)
+        return evidence.gather(-1, source)[..., 0], evidence[..., -1], others
+
+    def gap(self, evidence: Float[Tensor, "... K"]) -> Float[Tensor, " ..."]:
+        """Return how far the source class is below the limit."""
+        own, limit, _ = self.split(evidence)
+        return limit - own
+
+    def predicted(self, evidence: Float[Tensor, "... K"]) -> Int[Tensor, " ..."]:
+        """Return the source class if it is found, or else the best other class or C."""
+        own, limit, others = self.split(evidence)
+        best = torch.cat([others, limit[..., None]], dim=-1).argmax(-1)
+        return torch.where(own >= limit, self.source, best)
+
+
+def visible_boxes(truth: Truth) -> Float[Tensor, "E V 4"]:
+    """Return the box of the first object of each example, which must be in each view."""
+    boxes = truth.boxes[..., 0, :]
+    hidden = (~boxes.any(-1)).nonzero().tolist()
+    if hidden:
+        example, view = hidden[0]
+        reason = f"the object of example {example} is not in its view {view}"
+        raise InputError(f"{reason}: turn the camera to it, or remove the view")
+    return boxes
+
+
 class Task(ABC):
     """What the outputs of a network mean. A subclass is a task, such as detection.
 
@@ -118,11 +165,15 @@ class Task(ABC):
         name: Name of the task in messages.
         returns: What a network of the task returns, in messages.
         missed: What is said of images in which the true class is not found.
+        measure: The numbers that a network of the task returns, in messages.
+        confidence: What `confidences` are, on the axis of a chart.
     """
 
     name: ClassVar[str]
     returns: ClassVar[str]
     missed: ClassVar[str]
+    measure: ClassVar[str]
+    confidence: ClassVar[str]
 
     @abstractmethod
     def recognizes(self, outputs: Any) -> bool:
@@ -140,21 +191,29 @@ class Task(ABC):
         classes.
         """
 
-    def output_count(self, outputs: Any) -> int | None:
-        """Return the number of classes of outputs. None if they do not tell."""
-        return None
-
     @abstractmethod
+    def output_count(self, network: Any, outputs: Any) -> int | None:
+        """Return the number of classes of a network and its outputs. None if they do not tell."""
+
     def require_finite(self, outputs: Any, images: Tensor, title: str) -> None:
         """Check that outputs of an attacked network are finite, and have the gradient of images."""
+        values = [item for item in _tensors(outputs) if item.is_floating_point()]
+        if not values or not all(item.isfinite().all() for item in values):
+            raise InputError(f"{title} returned NaN or infinite {self.measure}: check its weights")
+        # A detector that finds nothing has no gradient.
+        is_empty = not any(item.numel() for item in values)
+        needs_gradient = torch.is_grad_enabled() and images.requires_grad and not is_empty
+        if needs_gradient and not self.has_gradient(outputs):
+            advice = "compute them in torch, or choose optimizer='random_search'"
+            raise InputError(f"{title} returned {self.measure} without a gradient: {advice}")
 
-    @abstractmethod
     def has_gradient(self, outputs: Any) -> bool:
         """Return whether outputs have a gradient."""
+        return any(item.requires_grad for item in _tensors(outputs))
 
     @abstractmethod
     def criterion(
-        self, source: Int[Tensor, "E V"], truth: Callable[[], Truth], class_count: int
+        self, source: Int[Tensor, " ..."], truth: Callable[[], Truth], class_count: int
     ) -> Criterion:
         """Return the criterion of an untargeted attack. `truth` computes where objects are."""
 
@@ -163,11 +222,40 @@ class Task(ABC):
         """Check that an attack of this task can have a target class."""
 
     @abstractmethod
+    def confidences(self, evidence: Float[Tensor, "... K"]) -> Float[Tensor, "... C"]:
+        """Return how surely each class is found, from 0 to 1."""
+
+    def found(
+        self,
+        evidence: Float[Tensor, "... K"],
+        predicted: Int[Tensor, " ..."],
+        classes: Sequence[str],
+        when: str = "",
+    ) -> dict[str, Any]:
+        """Return names and confidences of what is predicted, for a JSON file.
+
+        The confidence of nothing is that of the class that is found most. The suffix `when`, such
+        as "_before", ends the two keys.
+        """
+        confidences = self.confidences(evidence)
+        largest = confidences.amax(-1, keepdim=True)
+        values = torch.cat([confidences, largest], dim=-1).gather(-1, predicted[..., None])
+        names = np.asarray([*classes, NOTHING])[predicted.cpu().numpy()]
+        return {f"predicted{when}": names.tolist(), f"confidence{when}": values[..., 0].tolist()}
+
     def describe(self, evidence: Float[Tensor, " K"], classes: Sequence[str]) -> str:
-        """Return the classes that are found most in one image, with their confidences."""
+        """Return the five classes that are found most in one image, with their confidences."""
+        confidences = self.confidences(evidence)
+        indices = confidences.topk(min(5, len(confidences))).indices.tolist()
+        return ", ".join(f"{classes[i]} {confidences[i]:.1%}" for i in indices)
 
     def draw(
         self, image: Float[Tensor, "3 H W"], output: Any, classes: Sequence[str]
     ) -> Float[Tensor, "3 H W"]:
         """Draw the output of one image on it. By default, nothing is drawn."""
         return image
+
+
+def _tensors(outputs: Any) -> list[Tensor]:
+    """Return the tensors of outputs, also in lists and dictionaries."""
+    return [item for item in tree_leaves(outputs) if isinstance(item, Tensor)]

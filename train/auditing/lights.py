@@ -30,7 +30,7 @@ from augment.attacks.attack import EXPOSURES, attack
 from augment.attacks.checks import success_by_radius
 from augment.attacks.objective import Objective
 from augment.attacks.problem import build_problem
-from augment.attacks.result import AttackResult, predictions
+from augment.attacks.result import AttackResult
 from augment.augmentation_settings import VariationSettings
 from augment.classifier import Classifier
 from augment.network import compute_outputs
@@ -293,7 +293,7 @@ def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path)
     if is_wrong.any():
         example = int(is_wrong.nonzero()[0])
         logits = torch.stack([result.logits_before[example], result.logits[example]])
-        counts |= predictions(logits, classifier.classes)
+        counts |= classifier.task.found(logits, logits.argmax(1), classifier.classes)
         counts["slider"] = frames_of(result, example)
         both = torch.cat([result.images_before[example], result.images[example]], dim=2)
         pair = Image.fromarray(to_bytes(both.cpu()).permute(1, 2, 0).numpy())

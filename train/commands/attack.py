@@ -22,7 +22,7 @@ from augment.attacks.attack import attack, find_scene
 from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
 from augment.attacks.files import require_renderers, save
 from augment.attacks.objective import Objective, preprocessed_model
-from augment.attacks.result import ZERO_GRADIENT, AttackResult, predictions, warnings
+from augment.attacks.result import ZERO_GRADIENT, AttackResult, warnings
 from augment.classifier import Classifier
 from augment.network import compute_outputs
 from augment.random_streams import generator
@@ -308,7 +308,7 @@ def format_reloaded(
     is_same_with_noise = objective.fooled_in_views(images[None], predicted, example)[0]
     difference = images - adversary.images_in_views.to(images)
     levels = (255 * difference.abs().flatten(1).amax(1)).tolist()
-    named = predictions(logits[0], classifier.classes)
+    named = classifier.task.found(logits[0], predicted[0], classifier.classes)
     lines = []
     for view in range(len(images)):
         line = f"view {view}: {adversary.shown.label} is classified as {named['predicted'][view]}"

@@ -1,0 +1,437 @@
+"""Detection: a network returns boxes with classes and scores, and an attack hides an object.
+
+Scores are compared as log-odds log(s / (1 − s)), which have no bounds. The cost of an image is a
+smooth maximum of the log-odds of the true class over the candidates near the object:
+
+    cost = log Σ exp(log-odds)
+
+Candidates are the boxes before non-maximum suppression, if the network returns them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from augment.network import unwrapped
+from augment.scene.truth import Truth
+from augment.tasks.task import NO_CLASS, ObjectCriterion, Task, visible_boxes
+from renderer.errors import (
+    InputError,
+    as_tensor,
+    describe,
+    require_choice,
+    require_kind,
+    require_number,
+    single_line,
+)
+from renderer.image import to_bytes, to_unit
+
+# What an attack on a detector reaches: no box of the true class, or a box of another class.
+HIDE, MISLABEL = "hide", "mislabel"
+# Candidates are near an object if their IoU with its box is at least this fraction of `iou`.
+NEAR = 0.5
+# Scores closer to 0 or 1 than this have the log-odds of this score.
+SMALLEST_SCORE = 1e-6
+# Boxes that `decode` returns are removed if a better box of their class has a larger IoU.
+MAX_OVERLAP = 0.5
+# Name of the class that torchvision gives to numbers which COCO does not use.
+UNUSED = "N/A"
+# Largest number of classes if their number is not known.
+NO_LIMIT = 1e9
+# Keys of the candidates in an output: boxes (K, 4), and scores of all classes (K, C).
+CANDIDATE_BOXES, CANDIDATE_SCORES = "candidate_boxes", "candidate_scores"
+# Boxes of one image: "boxes" (n, 4) in pixels, "labels" (n,) and "scores" (n,), and candidates.
+Detections = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Detection(Task):
+    """Task of a network that returns boxes with classes and scores.
+
+    A network takes images (N, 3, H, W) in [0, 1]. It returns a list of a
+    dictionary for each image: "boxes" (left, top, right, bottom, in pixels),
+    "labels" and "scores". Detection models of torchvision do so, and the object
+    detectors of transformers are read as well. Labels are indices of the
+    argument `classes` of `nb.attack`. Detectors of torchvision for COCO and
+    those of transformers name their classes themselves.
+
+    Args:
+        threshold: Boxes with a lower score do not count.
+        iou: Boxes with a lower intersection over union with the box of the
+            object do not count.
+        goal: "hide" succeeds if no box of the true class counts. "mislabel"
+            succeeds if a box of another class counts, and has a higher score
+            than every such box of the true class.
+        decode: Function from the outputs of a raw network to such a list.
+            Instead of "labels", a dictionary may have scores (K, C) of all
+            classes, and each box is of its best class. Boxes that overlap a
+            better box of their class with an IoU above 0.5 are removed. The
+            attack lowers the scores of all boxes. None if the network needs no
+            function.
+
+    Raises:
+        InputError: If an argument is out of its range.
+
+    Example:
+        >>> import torch
+        >>> import norm_balls as nb
+        >>> def find_bright(images):
+        ...     box = torch.tensor([[0.0, 0.0, 16.0, 16.0]])
+        ...     label = torch.tensor([0])
+        ...     scores = images.mean((1, 2, 3))[:, None]
+        ...     return [{"boxes": box, "labels": label, "scores": score} for score in scores]
+        >>> scene = nb.build_scene([("solid:ball", "ball")], size=16, width=2)
+        >>> task = nb.Detection(threshold=0.2, iou=0.2)
+        >>> settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.5), max_steps=20)
+        >>> result = nb.attack(find_bright, scene, task=task, settings=settings, classes=["ball"])
+        >>> result.success
+        tensor([True])
+    """
+
+    name = "detection"
+    returns = "a list of a dictionary for each image (boxes, labels, scores)"
+    missed = "have no detection of the object"
+    measure = "scores"
+    confidence = "score at the object"
+
+    threshold: float = 0.4
+    iou: float = 0.5
+    goal: str = HIDE
+    decode: Callable[[Any], Any] | None = None
+
+    def __post_init__(self) -> None:
+        require_number("threshold", self.threshold, SMALLEST_SCORE, 1 - SMALLEST_SCORE)
+        require_number("iou", self.iou, 0.01, 1)
+        require_choice("goal", self.goal, (HIDE, MISLABEL))
+        require_kind("decode", self.decode, Callable | None, "a function of outputs of the network")
+
+    def recognizes(self, outputs: Any) -> bool:
+        """Return whether outputs are dictionaries of boxes, or those of a detection transformer."""
+        if _is_transformer(outputs):
+            return True
+        is_list = isinstance(outputs, list | tuple) and len(outputs) > 0
+        return is_list and all(isinstance(item, Mapping) and "boxes" in item for item in outputs)
+
+    def class_names(self, network: Any, count: int | None) -> Sequence[str] | None:
+        """Return the names of COCO for torchvision, or those that transformers stores."""
+        known = id2label(network)
+        names = [str(known[index]) for index in sorted(known)]
+        if not names and _torchvision_count(network) == len(_coco_names()):
+            names = _coco_names()
+        # Names that occur again get their number, because labels are found by name.
+        is_new = [name != UNUSED and name not in names[:i] for i, name in enumerate(names)]
+        unique = [
+            name if new else f"{name} {index}"
+            for index, (name, new) in enumerate(zip(names, is_new, strict=True))
+        ]
+        return unique or None
+
+    def output_count(self, network: Any, outputs: Any) -> int | None:
+        """Return the number of classes of the network, which may have a background as class 0."""
+        return len(id2label(network)) or _torchvision_count(network)
+
+    def reader(
+        self, title: str, class_count: int | None = None
+    ) -> Callable[[Any, Tensor], list[Detections]]:
+        """Return a function that brings outputs into the form of torchvision, and checks them."""
+        return partial(self._read, title, class_count)
+
+    def _read(
+        self, title: str, class_count: int | None, outputs: Any, images: Float[Tensor, "N 3 H W"]
+    ) -> list[Detections]:
+        if self.decode is not None:
+            given, title = outputs, f"decode of {title}"
+            try:
+                outputs = self.decode(given)
+            except Exception as error:  # Users' functions raise errors of many kinds.
+                kind = f"{type(error).__name__}: {single_line(error)}"
+                raise InputError(f"{title} fails on {describe(given)} ({kind})") from error
+        elif _is_transformer(outputs):
+            outputs = _of_transformer(outputs, images, title, class_count)
+        if not len(images):
+            return []
+        if not self.recognizes(outputs) or len(outputs) != len(images):
+            count = len(images)
+            reason = f"{title} returned {describe(outputs)} for {count} images"
+            raise InputError(f"{reason}: it must return {self.returns}")
+        return [self._detections(title, class_count, item, images) for item in outputs]
+
+    def _detections(
+        self, title: str, class_count: int | None, item: Mapping[str, Any], images: Tensor
+    ) -> Detections:
+        """Check the boxes of one image, and add the candidates if there are others."""
+        keys = ("boxes", "labels", "scores", CANDIDATE_BOXES, CANDIDATE_SCORES)
+        found = {key: as_tensor(key, item[key]).to(images.device) for key in keys if key in item}
+        found = {key: found[key] if key == "labels" else found[key].to(images) for key in found}
+        if not found["boxes"].numel():
+            found["boxes"] = found["boxes"].reshape(0, 4)
+        boxes = found["boxes"]
+        scores = found.setdefault("scores", boxes.new_zeros(()))
+        # Without labels, there is a score for each class.
+        has_labels = "labels" in found
+        columns = () if has_labels else (class_count or scores.shape[-1:].numel(),)
+        is_labeled = not has_labels or found["labels"].shape == boxes.shape[:1]
+        shape = (len(boxes), *columns)
+        if boxes.shape[1:] != (4,) or scores.shape != shape or not is_labeled:
+            shapes = ", ".join(f"{key} {tuple(value.shape)}" for key, value in found.items())
+            advice = f"labels (n,) and scores (n,), or scores (n, {class_count or 'classes'})"
+            raise InputError(f"{title} returned {shapes}: give boxes (n, 4), and {advice}")
+        if not has_labels:
+            found[CANDIDATE_BOXES], found[CANDIDATE_SCORES] = boxes, scores
+            found["scores"], found["labels"] = scores.max(1)
+        found["labels"] = found["labels"].long()
+        self._require_possible(found, title, class_count, images)
+        if self.decode is not None:
+            if CANDIDATE_BOXES not in found and class_count is not None:
+                found[CANDIDATE_BOXES] = boxes
+                found[CANDIDATE_SCORES] = _of_all_classes(found, class_count)
+            kept = _without_duplicates(found)
+            found |= {key: found[key][kept] for key in ("boxes", "labels", "scores")}
+        return found
+
+    def _require_possible(
+        self, found: Detections, title: str, class_count: int | None, images: Tensor
+    ) -> None:
+        """Check the ranges of scores and labels, and the boxes whose scores reach the threshold."""
+        height, width = images.shape[2:]
+        labels, scores = found["labels"], found["scores"].detach()
+        if not scores.isfinite().all() or not found["boxes"].isfinite().all():
+            raise InputError(f"{title} returned NaN or infinite scores or boxes: check its weights")
+        if len(scores) and not (scores.min() >= 0 and scores.max() <= 1):
+            span = f"from {float(scores.min()):g} to {float(scores.max()):g}"
+            raise InputError(f"{title} returned scores {span}: give probabilities from 0 to 1")
+        last = (class_count or int(NO_LIMIT)) - 1
+        if len(labels) and not (labels.min() >= 0 and labels.max() <= last):
+            span = f"from {int(labels.min())} to {int(labels.max())}"
+            advice = f"give indices of the {class_count} classes, from 0 to {last}"
+            raise InputError(f"{title} returned labels {span}: {advice}")
+        left, top, right, bottom = found["boxes"].detach()[scores >= self.threshold].unbind(1)
+        if (right < left).any() or (bottom < top).any():
+            advice = "give left, top, right, bottom, and not width and height"
+            raise InputError(f"{title} returned boxes that end before they begin: {advice}")
+        is_outside = (left >= width) | (right <= 0) | (top >= height) | (bottom <= 0)
+        is_fraction = len(right) > 0 and bool((right <= 1).all() & (bottom <= 1).all())
+        if is_outside.any() or (is_fraction and min(height, width) > 1):
+            reason = "fractions of the image" if is_fraction else "outside of the image"
+            advice = f"give pixels, up to {width} across and {height} down"
+            raise InputError(f"{title} returned boxes that are {reason}: {advice}")
+
+    def criterion(
+        self, source: Int[Tensor, "E V"], truth: Callable[[], Truth], class_count: int
+    ) -> DetectionCriterion:
+        """Return the criterion of an untargeted attack on the first object of each example."""
+        boxes = visible_boxes(truth())
+        return DetectionCriterion(source, task=self, class_count=class_count, boxes=boxes)
+
+    def require_target(self, target: Any) -> None:
+        """Check that boxes of another class are the goal of the attack."""
+        if self.goal != MISLABEL or target == "least_likely":
+            advice = "leave it out, or set goal='mislabel' and name a class"
+            raise InputError(f"target is {describe(target)}, and {self} hides objects: {advice}")
+
+    def confidences(self, evidence: Float[Tensor, "... K"]) -> Float[Tensor, "... C"]:
+        """Return the score of the best box of each class at the object."""
+        return evidence[..., :-1].sigmoid()
+
+    def draw(
+        self, image: Float[Tensor, "3 H W"], output: Detections, classes: Sequence[str]
+    ) -> Float[Tensor, "3 H W"]:
+        """Draw the boxes whose scores reach the threshold, with their classes and scores."""
+        from torchvision.utils import draw_bounding_boxes  # torchvision takes half a second.
+
+        is_drawn = output["scores"] >= self.threshold
+        scores, labels = output["scores"][is_drawn].tolist(), output["labels"][is_drawn].tolist()
+        if not scores:
+            return image
+        pairs = zip(labels, scores, strict=True)
+        names = [f"{classes[label]} {score:.0%}" for label, score in pairs]
+        boxes = output["boxes"][is_drawn].detach()
+        return to_unit(draw_bounding_boxes(to_bytes(image), boxes, names, colors="lime")).to(image)
+
+
+@dataclass(frozen=True)
+class DetectionCriterion(ObjectCriterion):
+    """Criterion of an attack on a detector: boxes near the true box of an object.
+
+    The evidence of a class is the log-odds of its best box whose IoU with the true box is at least
+    `task.iou`. The limit is the log-odds of the threshold.
+
+    Attributes:
+        task: Threshold, IoU and goal.
+        class_count: Number C of classes.
+        boxes: True box of each view, in pixels. 0 outside of the view, which counts as found.
+    """
+
+    task: Detection = field(kw_only=True)
+    class_count: int = field(kw_only=True)
+    boxes: Float[Tensor, "*E V 4"] = field(kw_only=True)
+
+    def at(self, truth: Truth) -> Self:
+        """Return a copy for other boxes."""
+        return replace(self, boxes=truth.boxes[..., 0, :])
+
+    def evidence(self, outputs: list[Detections]) -> Float[Tensor, "N K"]:
+        """Return the log-odds of each class at the object, and of the threshold."""
+        rows = []
+        views = zip(outputs, self.boxes, self.source.tolist(), strict=True)
+        for item, box, source in views:
+            scores = item["scores"].detach()
+            row = scores.new_full((self.class_count + 1,), SMALLEST_SCORE)
+            is_near = _iou(item["boxes"], box) >= self.task.iou
+            row.scatter_reduce_(0, item["labels"][is_near], scores[is_near], "amax")
+            row[-1] = self.task.threshold
+            if not box.any():
+                row[source] = 1.0
+            # In float64, log-odds differ where scores differ in their last digit.
+            rows.append(log_odds_of(row.double()))
+        empty = self.boxes.new_zeros(0, self.class_count + 1, dtype=torch.float64)
+        return torch.stack(rows) if rows else empty
+
+    def cost(self, outputs: list[Detections]) -> Float[Tensor, " N"]:
+        """Return the smooth maximum of the true class, minus that of the others to mislabel."""
+        columns = torch.arange(self.class_count, device=self.source.device)
+        targets = self.source if self.target is None else self.target
+        costs = []
+        for item, box, source, target in zip(
+            outputs, self.boxes, self.source, targets, strict=True
+        ):
+            boxes = item.get(CANDIDATE_BOXES, item["boxes"])
+            scores = item.get(CANDIDATE_SCORES)
+            if scores is None:
+                scores = _of_all_classes(item, self.class_count)
+            # The first row is the smallest score, so that an image without candidates has a cost.
+            smallest = scores.new_full((1, self.class_count), SMALLEST_SCORE)
+            is_near = _iou(boxes, box) >= NEAR * self.task.iou
+            odds = log_odds_of(torch.cat([smallest, scores[is_near]]))
+            cost = odds[:, source].logsumexp(0)
+            if self.task.goal == MISLABEL:
+                has_target = self.target is not None and target != NO_CLASS
+                others = columns[columns == target] if has_target else columns[columns != source]
+                cost = cost - odds[:, others].flatten().logsumexp(0)
+            costs.append(cost)
+        return torch.stack(costs)
+
+    def gap(self, evidence: Float[Tensor, "... K"]) -> Float[Tensor, " ..."]:
+        """Return the limit minus the true class or, to mislabel, another class minus both."""
+        if self.task.goal == HIDE:
+            return super().gap(evidence)
+        own, limit, others = self.split(evidence)
+        best = others.amax(-1)
+        if self.target is None:
+            return best - own.maximum(limit)
+        target = torch.where(self.target == NO_CLASS, others.argmax(-1), self.target)
+        rest = evidence.scatter(-1, target[..., None], -torch.inf).amax(-1)
+        return evidence.gather(-1, target[..., None])[..., 0] - rest
+
+    def predicted(self, evidence: Float[Tensor, "... K"]) -> Int[Tensor, " ..."]:
+        """Return the true class while it is found or, to mislabel, while no other is better."""
+        if self.task.goal == HIDE:
+            return super().predicted(evidence)
+        own, limit, others = self.split(evidence)
+        best, index = others.max(-1)
+        nothing = torch.full_like(index, self.class_count)
+        is_other = (best > own) & (best >= limit)
+        return torch.where(is_other, index, torch.where(own >= limit, self.source, nothing))
+
+    def reached_in_views(self, predicted: Int[Tensor, " ..."]) -> Tensor:
+        """Return a mask of the views that reach the criterion. Nothing is no other class."""
+        reached = super().reached_in_views(predicted)
+        return reached & (predicted != self.class_count) if self.task.goal == MISLABEL else reached
+
+
+def _iou(boxes: Float[Tensor, "K 4"], box: Float[Tensor, " 4"]) -> Float[Tensor, " K"]:
+    """Compute the intersection over union of boxes with a box, which is 0 without an area."""
+    boxes, box = boxes.detach(), box.to(boxes)
+    sides = torch.minimum(boxes[:, 2:], box[2:]) - torch.maximum(boxes[:, :2], box[:2])
+    common = sides.clamp(min=0).prod(1)
+    area = (boxes[:, 2:] - boxes[:, :2]).prod(1) + (box[2:] - box[:2]).prod()
+    return common / (area - common).clamp(min=torch.finfo(boxes.dtype).tiny)
+
+
+def log_odds_of(scores: Tensor) -> Tensor:
+    """Return log(s / (1 − s)) of scores, whose gradient does not vanish at scores of 0 and 1."""
+    limited = scores.clamp(SMALLEST_SCORE, 1 - SMALLEST_SCORE)
+    return torch.logit(scores + (limited - scores).detach())
+
+
+def _of_all_classes(found: Detections, class_count: int) -> Float[Tensor, "K C"]:
+    """Arrange the scores of labeled boxes as scores of all classes, which are 0 for the others."""
+    zeros = found["scores"].new_zeros(len(found["scores"]), class_count)
+    return zeros.scatter(1, found["labels"][:, None], found["scores"][:, None])
+
+
+def _without_duplicates(found: Detections) -> Int[Tensor, " n"]:
+    """Return the indices of the boxes that no better box of their class overlaps."""
+    from torchvision.ops import batched_nms  # torchvision takes half a second.
+
+    scores = found["scores"].detach()
+    return batched_nms(found["boxes"].detach(), scores, found["labels"], MAX_OVERLAP)
+
+
+def _is_transformer(outputs: Any) -> bool:
+    """Return whether outputs are those of an object detector of transformers."""
+    return hasattr(outputs, "pred_boxes") or (
+        isinstance(outputs, Mapping) and {"logits", "pred_boxes"} <= outputs.keys()
+    )
+
+
+def _of_transformer(
+    outputs: Any, images: Tensor, title: str, class_count: int | None
+) -> list[dict[str, Tensor]]:
+    """Read logits, and boxes as center and size in fractions of the image.
+
+    With a logit more than classes, the last is "no object", and each box has its best class.
+    Otherwise, logits of classes are independent, and the best pairs of box and class are returned.
+    """
+    given = outputs if isinstance(outputs, Mapping) else vars(outputs)
+    logits, fractions = given["logits"], given["pred_boxes"]
+    columns = logits.shape[-1]
+    if class_count not in (None, columns, columns - 1):
+        advice = f"give {columns - 1} names, or {columns} if there is no class for no object"
+        raise InputError(f"{title} returned {columns} logits for {class_count} classes: {advice}")
+    center, size = fractions[..., :2], fractions[..., 2:]
+    scale = fractions.new_tensor([images.shape[3], images.shape[2]] * 2)
+    boxes = torch.cat([center - size / 2, center + size / 2], dim=-1) * scale
+    if columns != class_count:
+        pairs = zip(boxes, logits.softmax(-1)[..., :-1], strict=True)
+        return [{"boxes": one, "scores": scores} for one, scores in pairs]
+    found = []
+    for one, scores in zip(boxes, logits.sigmoid(), strict=True):
+        best = scores.flatten().topk(len(one))
+        row = best.indices.div(columns, rounding_mode="floor")
+        chosen = {"boxes": one[row], "labels": best.indices % columns, "scores": best.values}
+        found.append(chosen | {CANDIDATE_BOXES: one, CANDIDATE_SCORES: scores})
+    return found
+
+
+def id2label(network: Any) -> Mapping[int, Any]:
+    """Return the names of the classes in the configuration of a network of transformers."""
+    return getattr(getattr(unwrapped(network), "config", None), "id2label", None) or {}
+
+
+def _torchvision_count(network: Any) -> int | None:
+    """Return the number of classes of a detector of torchvision, with the background as class 0."""
+    raw = unwrapped(network)
+    if not type(raw).__module__.startswith("torchvision.models.detection"):
+        return None
+    for module in raw.modules():
+        for name in ("num_classes", "num_columns"):
+            if isinstance(getattr(module, name, None), int):
+                return int(getattr(module, name))
+        if hasattr(module, "cls_score"):
+            return int(module.cls_score.out_features)
+    return None
+
+
+def _coco_names() -> list[str]:
+    """Return the names of COCO by the numbers that torchvision's detectors return."""
+    from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
+
+    return [*FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]]

@@ -1,0 +1,175 @@
+"""Segmentation: a network returns a logit for each class and pixel, and an attack hides an object.
+
+The evidence of a class is the intersection over union (IoU) of the mask of the object with the
+pixels of the class within the box of the mask. It is compared as log-odds, as a detector's scores.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Self
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from augment.network import plain_outputs
+from augment.scene.truth import Truth
+from augment.tasks.detection import id2label, log_odds_of
+from augment.tasks.task import ObjectCriterion, Task, visible_boxes
+from renderer.errors import InputError, describe, require_number
+
+# Opacity of the colors that are drawn over an image.
+OPACITY = 0.5
+
+
+@dataclass(frozen=True)
+class Segmentation(Task):
+    """Task of a network that returns logits (N, C, H, W), one for each class and pixel.
+
+    Outputs of torchvision (`out`) and of transformers (`logits`, which are
+    enlarged to the size of the images) are read as well.
+
+    Args:
+        iou: An attack succeeds if the intersection over union between the mask
+            of the object and the pixels of its class, within the box of the
+            mask, is below this number.
+
+    Raises:
+        InputError: If `iou` is not between 0.01 and 1.
+
+    Example:
+        >>> import torch
+        >>> import norm_balls as nb
+        >>> def find_bright(images):
+        ...     mean = images.mean(1)
+        ...     return torch.stack([0 * mean + 0.2, mean], dim=1)
+        >>> scene = nb.build_scene([("solid:ball", "ball")], size=16, backgrounds=[0.0])
+        >>> settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.5), max_steps=20)
+        >>> task, classes = nb.Segmentation(iou=0.5), ["dark", "ball"]
+        >>> result = nb.attack(find_bright, scene, task=task, settings=settings, classes=classes)
+        >>> result.success
+        tensor([True])
+    """
+
+    name = "segmentation"
+    returns = "a tensor of logits (N, C, H, W), or a dictionary with 'out'"
+    missed = "have no segment of the object"
+    measure = "logits"
+    confidence = "IoU at the object"
+
+    iou: float = 0.5
+
+    def __post_init__(self) -> None:
+        require_number("iou", self.iou, 0.01, 1)
+
+    def recognizes(self, outputs: Any) -> bool:
+        """Return whether outputs are a tensor of four dimensions, or have one as "out"."""
+        plain = _logits(outputs)
+        return isinstance(plain, Tensor) and plain.ndim == 4
+
+    def class_names(self, network: Any, count: int | None) -> Sequence[str] | None:
+        """Return the names that transformers stores. A network of another library has none."""
+        known = id2label(network)
+        return [str(known[index]) for index in sorted(known)] or None
+
+    def output_count(self, network: Any, outputs: Tensor) -> int:
+        """Return the number of logits of a pixel."""
+        return outputs.shape[1]
+
+    def reader(
+        self, title: str, class_count: int | None = None
+    ) -> Callable[[Any, Tensor], Float[Tensor, "N C H W"]]:
+        """Return a function that checks the logits of pixels."""
+        return partial(self._read, title, class_count)
+
+    def _read(
+        self, title: str, class_count: int | None, outputs: Any, images: Float[Tensor, "N 3 H W"]
+    ) -> Float[Tensor, "N C H W"]:
+        logits = _logits(outputs)
+        if isinstance(logits, Tensor) and logits is not outputs and logits.ndim == 4:
+            # Segmenters of transformers return smaller logits, which its own reader enlarges.
+            logits = F.interpolate(logits, images.shape[2:], mode="bilinear", align_corners=False)
+        count = class_count or "C"
+        is_tensor = isinstance(logits, Tensor) and logits.ndim == 4
+        expected = (
+            (len(images), class_count or logits.shape[1], *images.shape[2:]) if is_tensor else ()
+        )
+        if not is_tensor or logits.shape != expected:
+            shape = (len(images), count, *images.shape[2:])
+            raise InputError(f"{title} returned {describe(logits)}: it must return logits {shape}")
+        return logits
+
+    def criterion(
+        self, source: Int[Tensor, "E V"], truth: Callable[[], Truth], class_count: int
+    ) -> SegmentationCriterion:
+        """Return the criterion of an untargeted attack on the first object of each example."""
+        found = truth()
+        visible_boxes(found)
+        return SegmentationCriterion(source, task=self, masks=found.masks[..., 0, :, :])
+
+    def require_target(self, target: Any) -> None:
+        """Refuse a target, because an attack on a segmenter hides an object."""
+        raise InputError(f"target is {describe(target)}, and {self} hides objects: leave it out")
+
+    def confidences(self, evidence: Float[Tensor, "... K"]) -> Float[Tensor, "... C"]:
+        """Return the IoU of each class with the object."""
+        return evidence[..., :-1].sigmoid()
+
+    def draw(
+        self, image: Float[Tensor, "3 H W"], output: Float[Tensor, "C H W"], classes: Sequence[str]
+    ) -> Float[Tensor, "3 H W"]:
+        """Draw the classes of the pixels as colors, except the first, over the image."""
+        label = output.argmax(0)
+        # Hues that follow each other by the golden ratio are far from each other.
+        angle = 2 * torch.pi * 0.618 * label
+        colors = torch.stack([(angle + shift).cos() for shift in (0.0, 2.1, 4.2)]) / 2 + 0.5
+        return torch.where(label > 0, (1 - OPACITY) * image + OPACITY * colors.to(image), image)
+
+
+@dataclass(frozen=True)
+class SegmentationCriterion(ObjectCriterion):
+    """Criterion of an attack on a segmenter.
+
+    Attributes:
+        task: The IoU that is the limit.
+        masks: Mask of the object in each view. An empty one is outside, which counts as found.
+    """
+
+    task: Segmentation = field(kw_only=True)
+    masks: Bool[Tensor, "*E V H W"] = field(kw_only=True)
+
+    def at(self, truth: Truth) -> Self:
+        """Return a copy for other masks."""
+        return replace(self, masks=truth.masks[..., 0, :, :])
+
+    def evidence(self, outputs: Float[Tensor, "N C H W"]) -> Float[Tensor, "N K"]:
+        """Return the log-odds of the IoU of each class, and of the limit."""
+        masks = self.masks.to(outputs.device)
+        in_box = masks.any(1)[:, None] & masks.any(2)[:, :, None]
+        shown = F.one_hot(outputs.detach().argmax(1), outputs.shape[1]).movedim(-1, 1).bool()
+        shown = shown & in_box[:, None]
+        common = (shown & masks[:, None]).sum((2, 3)).double()
+        ratio = common / (shown | masks[:, None]).sum((2, 3)).clamp(min=1)
+        is_outside = ~masks.flatten(1).any(1)
+        ratio[is_outside, self.source[is_outside]] = 1.0
+        limit = torch.full_like(ratio[:, :1], self.task.iou)
+        return log_odds_of(torch.cat([ratio, limit], dim=1))
+
+    def cost(self, outputs: Float[Tensor, "N C H W"]) -> Float[Tensor, " N"]:
+        """Return the mean log-odds of the true class at the pixels of the object."""
+        source = self.source[:, None, None, None].expand(-1, 1, *outputs.shape[2:])
+        own = outputs.gather(1, source)[:, 0]
+        odds = own - outputs.scatter(1, source, -torch.inf).logsumexp(1)
+        masks = self.masks.to(odds)
+        # Pixels that are lost already count little, so that the attack goes on to the others.
+        return (F.softplus(odds) * masks).sum((1, 2)) / masks.sum((1, 2)).clamp(min=1)
+
+
+def _logits(outputs: Any) -> Any:
+    """Return the logits of pixels, which torchvision names "out"."""
+    has_out = isinstance(outputs, Mapping) and "out" in outputs
+    return outputs["out"] if has_out else plain_outputs(outputs)

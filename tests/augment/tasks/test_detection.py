@@ -1,0 +1,241 @@
+"""Detection: what a box, a success and a cost are, and which outputs are refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torchvision.models import detection as torchvision_models
+from torchvision.ops import batched_nms, box_iou
+
+import norm_balls as nb
+from augment.classifier import as_network
+from augment.scene.truth import Truth
+
+SIZE = 16
+TRUE_BOX = torch.tensor([2.0, 3.0, 10.0, 12.0])
+CLASSES = ["ball", "cup", "lamp"]
+
+
+def criterion(source: int = 0, target: int | None = None, box: Tensor = TRUE_BOX, **options):
+    masks = torch.zeros(1, 1, 1, SIZE, SIZE, dtype=torch.bool)
+    truth = Truth(torch.tensor([[[source]]]), box.view(1, 1, 1, 4), masks, torch.ones(1, 1, 1))
+    task = nb.Detection(**options)
+    found = task.criterion(torch.tensor([[source]]), lambda: truth, len(CLASSES))
+    if target is not None:
+        found = type(found)(
+            found.source,
+            torch.tensor([[target]]),
+            task=task,
+            class_count=found.class_count,
+            boxes=found.boxes,
+        )
+    return found.map(lambda rows: rows.flatten(0, 1))
+
+
+def drawn_boxes(seed: int) -> dict[str, Tensor]:
+    """Draw boxes near the true box, with labels and scores."""
+    draws = torch.Generator().manual_seed(seed)
+    boxes = TRUE_BOX + 3 * torch.randn(8, 4, generator=draws)
+    boxes = torch.cat([boxes[:, :2].minimum(boxes[:, 2:]), boxes[:, :2].maximum(boxes[:, 2:])], 1)
+    labels = torch.randint(3, (8,), generator=draws)
+    return {"boxes": boxes, "labels": labels, "scores": torch.rand(8, generator=draws)}
+
+
+@pytest.mark.parametrize("goal", ["hide", "mislabel"])
+def test_a_success_is_that_of_the_definition(goal):
+    outcomes = set()
+    for seed in range(200):
+        item = drawn_boxes(seed)
+        counts = (item["scores"] >= 0.4) & (box_iou(item["boxes"], TRUE_BOX[None])[:, 0] >= 0.5)
+        own = item["scores"][counts & (item["labels"] == 0)]
+        other = item["scores"][counts & (item["labels"] != 0)]
+        expected = not len(own)
+        if goal == "mislabel":
+            expected = len(other) > 0 and (not len(own) or bool(other.max() > own.max()))
+        rule = criterion(goal=goal)
+        evidence = rule.evidence([item])
+        reached = bool(rule.reached_in_views(rule.predicted(evidence)))
+        assert reached == expected
+        assert bool(rule.gap(evidence) > 0) == expected
+        was_found = len(own) > 0 and (goal == "hide" or not expected)
+        assert bool(rule.predicted(evidence) == 0) == was_found
+        outcomes.add(expected)
+    assert outcomes == {True, False}
+
+
+def test_a_score_at_the_threshold_counts_and_one_below_does_not():
+    item = {"boxes": TRUE_BOX[None], "labels": torch.tensor([0]), "scores": torch.tensor([0.4])}
+    rule = criterion()
+    assert rule.predicted(rule.evidence([item])) == 0
+    below = item | {"scores": torch.tensor([0.4]).nextafter(torch.tensor(0.0))}
+    assert rule.predicted(rule.evidence([below])) == len(CLASSES)
+
+
+def test_a_target_is_reached_by_its_own_box_alone():
+    item = {
+        "boxes": TRUE_BOX.expand(2, 4),
+        "labels": torch.tensor([1, 0]),
+        "scores": torch.tensor([0.9, 0.5]),
+    }
+    for target, expected in ((1, True), (2, False)):
+        rule = criterion(target=target, goal="mislabel")
+        evidence = rule.evidence([item])
+        assert bool(rule.reached_in_views(rule.predicted(evidence))) == expected
+        assert bool(rule.gap(evidence) > 0) == expected
+
+
+def test_an_object_that_leaves_the_view_is_no_success():
+    rule = criterion(box=TRUE_BOX)
+    gone = Truth(torch.zeros(1, 1), torch.zeros(1, 1, 4), torch.zeros(1, 1, 1, 1), torch.ones(1, 1))
+    rule = rule.at(gone)
+    nothing = {
+        "boxes": torch.zeros(0, 4),
+        "labels": torch.zeros(0).long(),
+        "scores": torch.zeros(0),
+    }
+    assert rule.predicted(rule.evidence([nothing])) == 0
+
+
+@pytest.mark.parametrize("goal", ["hide", "mislabel"])
+def test_the_gradient_of_the_cost_is_that_of_finite_differences(goal):
+    item = {name: value.double() for name, value in drawn_boxes(3).items()}
+    item["labels"] = item["labels"].long()
+    rule = criterion(goal=goal, box=TRUE_BOX.double())
+
+    def cost(scores: Tensor) -> Tensor:
+        return rule.cost([item | {"scores": scores}])
+
+    assert torch.autograd.gradcheck(cost, item["scores"].clone().requires_grad_())
+
+
+def test_the_cost_is_the_log_sum_of_the_odds_of_candidates_near_the_object():
+    item = drawn_boxes(1)
+    is_near = box_iou(item["boxes"], TRUE_BOX[None])[:, 0] >= 0.25
+    odds = (item["scores"] / (1 - item["scores"]))[is_near & (item["labels"] == 0)]
+    assert len(odds) > 1
+    torch.testing.assert_close(criterion().cost([item])[0], odds.sum().log(), rtol=0, atol=2e-5)
+
+
+def test_decoded_boxes_pass_class_wise_suppression():
+    draws = torch.Generator().manual_seed(2)
+    corners = 8 * torch.rand(30, 2, generator=draws)
+    boxes = torch.cat([corners, corners + 6], dim=1)
+    scores = torch.rand(30, 3, generator=draws)
+    task = nb.Detection(decode=lambda outputs: [{"boxes": boxes, "scores": outputs}])
+    [found] = task.reader("network", 3)(scores, torch.zeros(1, 3, SIZE, SIZE))
+    kept = batched_nms(boxes, scores.amax(1), scores.argmax(1), 0.5)
+    assert torch.equal(found["boxes"], boxes[kept])
+    assert torch.equal(found["labels"], scores.argmax(1)[kept])
+    assert torch.equal(found["candidate_scores"], scores)
+
+
+def ball_scene(size: int = SIZE, **options) -> nb.Scene:
+    return nb.build_scene([("solid:ball", "ball")], size=size, width=2.5, **options)
+
+
+def brightness_detector(images: Tensor) -> list[dict[str, Tensor]]:
+    """Return the box of the ball, with the brightness inside of it as the score."""
+    box = torch.tensor([1.0, 1.0, 15.0, 15.0])
+    scores = images[:, :, 4:12, 4:12].mean((1, 2, 3))
+    label = torch.tensor([0])
+    return [{"boxes": box[None], "labels": label, "scores": score[None]} for score in scores]
+
+
+SETTINGS = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.2), max_steps=40, margin=0.1)
+
+
+def test_an_attack_hides_what_is_as_bright_as_its_score():
+    scene, task = ball_scene(), nb.Detection(threshold=0.2)
+    result = nb.attack(brightness_detector, scene, task=task, settings=SETTINGS, classes=CLASSES)
+    before, after = (
+        images[0, :, 4:12, 4:12].mean() for images in (result.images_before, result.images)
+    )
+    assert before > 0.2 > after
+    assert result.clean_correct.all() and result.success.all()
+
+
+def test_a_list_of_boxes_is_recognized_and_said(caplog):
+    adapted = as_network(brightness_detector, SIZE, CLASSES, name="boxes of one")
+    assert adapted.task == nb.Detection()
+    assert "boxes of one: its outputs are of Detection(" in caplog.text
+
+
+def test_an_object_that_is_not_found_before_is_reported_and_no_success():
+    scene, task = ball_scene(), nb.Detection(threshold=0.9)
+    with pytest.raises(nb.InputError, match="no detection"):
+        nb.attack(brightness_detector, scene, task=task, settings=SETTINGS, classes=CLASSES)
+    options = {"task": task, "settings": SETTINGS, "classes": CLASSES, "force": True}
+    result = nb.attack(brightness_detector, scene, **options)
+    assert not result.clean_correct.any() and not result.success.any()
+
+
+BOX = {"boxes": [[2.0, 3.0, 10.0, 12.0]], "labels": [0], "scores": [0.9]}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scores": [float("nan")]}, "NaN"),
+        ({"boxes": [[2.0, 3.0, float("inf"), 12.0]]}, "NaN or infinite"),
+        ({"scores": [3.0]}, "from 0 to 1"),
+        ({"scores": [0.9, 0.8]}, "scores"),
+        ({"labels": [3]}, "from 0 to 2"),
+        ({"boxes": [[10.0, 12.0, 2.0, 3.0]]}, "not width and height"),
+        ({"boxes": [[20.0, 3.0, 30.0, 12.0]]}, "outside of the image"),
+        ({"boxes": [[0.1, 0.2, 0.6, 0.7]]}, "fractions of the image"),
+        ({"boxes": [[1.0, 2.0, 3.0]]}, r"boxes \(n, 4\)"),
+    ],
+)
+def test_impossible_boxes_are_refused(change, message):
+    item = {name: torch.tensor(value) for name, value in (BOX | change).items()}
+    with pytest.raises(nb.InputError, match=message):
+        nb.Detection().reader("network", 3)([item], torch.zeros(1, 3, SIZE, SIZE))
+
+
+@pytest.mark.parametrize(
+    ("decode", "message"),
+    [
+        (lambda outputs: outputs, "must return a list"),
+        (lambda outputs: [], "must return a list"),
+        (lambda outputs: [{"boxes": torch.zeros(5, 4), "scores": torch.zeros(5, 2)}], "scores"),
+        (lambda outputs: outputs["boxes"], "fails on"),
+    ],
+)
+def test_a_decode_function_of_other_shapes_is_refused(decode, message):
+    reader = nb.Detection(decode=decode).reader("network", 3)
+    with pytest.raises(nb.InputError, match=message):
+        reader(torch.zeros(1, 7, 4, 4), torch.zeros(1, 3, SIZE, SIZE))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"classes": None}, "classes is None"),
+        ({"classes": ["cup"]}, "'ball'"),
+        ({"target": "cup", "force": True}, "mislabel"),
+        ({"settings": replace(SETTINGS, eot=nb.EOTSettings(draws=1))}, "eot"),
+        ({"task": nb.Classification()}, "returned list"),
+    ],
+)
+def test_an_attack_that_fits_no_detector_is_refused(options, message):
+    given = {"classes": CLASSES, "settings": SETTINGS}
+    with pytest.raises(nb.InputError, match=message):
+        nb.attack(brightness_detector, ball_scene(), **given | options)
+
+
+def torchvision_detector(name: str, class_count: int = 91) -> torch.nn.Module:
+    options = {"weights": None, "weights_backbone": None, "num_classes": class_count}
+    return getattr(torchvision_models, name)(**options).eval()
+
+
+def test_a_detector_of_torchvision_names_the_classes_of_coco_itself():
+    network = torchvision_detector("ssdlite320_mobilenet_v3_large")
+    adapted = as_network(network, 64)
+    assert isinstance(adapted.task, nb.Detection)
+    assert (adapted.label("banana"), adapted.label("apple"), adapted.label("orange")) == (
+        52,
+        53,
+        55,
+    )
+    assert len(set(adapted.classes)) == 91

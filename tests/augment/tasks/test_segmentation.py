@@ -1,0 +1,75 @@
+"""Segmentation: when an object is lost, the gradient of the cost, and outputs of libraries."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import norm_balls as nb
+from augment.scene.truth import Truth, boxes_of
+
+SIZE = 12
+MASK = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+MASK[2:9, 3:8] = True
+MASK[2, 3] = False
+
+
+def criterion(iou: float = 0.5):
+    masks = MASK.view(1, 1, 1, SIZE, SIZE)
+    truth = Truth(torch.ones(1, 1, 1).long(), boxes_of(masks), masks, torch.ones(1, 1, 1))
+    rule = nb.Segmentation(iou).criterion(torch.tensor([[1]]), lambda: truth, 3)
+    return rule.map(lambda rows: rows.flatten(0, 1))
+
+
+def test_a_success_is_an_iou_within_the_box_below_the_limit():
+    outcomes = set()
+    for seed in range(100):
+        draws = torch.Generator().manual_seed(seed)
+        logits = torch.randn(1, 3, SIZE, SIZE, generator=draws)
+        # The class of the object reaches beyond the box, too, which does not count.
+        logits[:, 1] += 4 * torch.rand((), generator=draws)
+        is_class = (logits.argmax(1)[0] == 1)[2:9, 3:8]
+        mask = MASK[2:9, 3:8]
+        ratio = float((is_class & mask).sum() / (is_class | mask).sum())
+        rule = criterion()
+        evidence = rule.evidence(logits)
+        assert float(rule.task.confidences(evidence)[0, 1]) == pytest.approx(ratio, abs=1e-5)
+        reached = bool(rule.reached_in_views(rule.predicted(evidence)))
+        assert reached == (ratio < 0.5)
+        outcomes.add(reached)
+    assert outcomes == {True, False}
+
+
+def test_the_gradient_of_the_cost_is_that_of_finite_differences():
+    draws = torch.Generator().manual_seed(0)
+    logits = torch.randn(1, 3, SIZE, SIZE, generator=draws, dtype=torch.float64)
+    assert torch.autograd.gradcheck(criterion().cost, logits.requires_grad_())
+
+
+def bright(images: Tensor) -> Tensor:
+    mean = images.mean(1)
+    return torch.stack([0 * mean + 0.15, mean], dim=1)
+
+
+@pytest.mark.parametrize("wrap", [lambda logits: logits, lambda logits: {"out": logits}])
+def test_an_attack_darkens_an_object_until_its_segment_is_lost(wrap):
+    scene = nb.build_scene([("solid:ball", "ball")], size=SIZE, backgrounds=[0.0])
+    light = nb.StepSettings(step_size=0.3)
+    result = nb.attack(
+        lambda images: wrap(bright(images)),
+        scene,
+        settings=nb.AttackSettings(lighting=light, max_steps=60, margin=0.1),
+        classes=["dark", "ball"],
+    )
+    mask = scene.truth(lambda label: 1).masks[0, 0, 0]
+    kept = (result.images[0].mean(0) > 0.15) & mask
+    assert result.clean_correct.all() and result.success.all()
+    assert kept.sum() < 0.5 * mask.sum()
+
+
+@pytest.mark.parametrize(
+    "shape", [(1, 2, SIZE, SIZE), (2, 3, SIZE, SIZE), (1, 3, SIZE // 2, SIZE), (1, 3)]
+)
+def test_logits_of_another_size_are_refused(shape):
+    reader = nb.Segmentation().reader("network", 3)
+    with pytest.raises(nb.InputError, match=r"must return logits \(1, 3, 12, 12\)"):
+        reader(torch.zeros(shape), torch.zeros(1, 3, SIZE, SIZE))
