@@ -17,6 +17,7 @@ from augment.files import as_facts
 from augment.network import ChannelNormalization, Network, eval_mode, plain_outputs
 from augment.sources import build_classifier, call_python, require_architecture
 from renderer.errors import InputError, single_line
+from renderer.settings import Size
 from train.train_settings import WIDERESNET
 
 # The name of a network begins with this text if it is an architecture of torchvision.
@@ -240,7 +241,7 @@ def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Mo
 
 
 def describe(
-    network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any
+    network: nn.Module, classes: Sequence[str], size: Size, encoding: str, **shape: Any
 ) -> dict[str, Any]:
     """Describe a network by the arguments with which `build_network` builds it again.
 
