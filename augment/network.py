@@ -408,12 +408,14 @@ class Remembered(Network):
 
 @torch.no_grad()
 def compute_outputs(
-    network: Callable[[Tensor], Tensor],
+    network: Callable[[Tensor], Any],
     images: Tensor | Iterable[Tensor],
     batch_size: int = BATCH,
     device: torch.device | str | None = None,
-) -> Tensor:
+) -> Any:
     """Compute the outputs (..., *) of a network for many images (..., 3, H, W), without gradients.
+
+    Outputs that are lists, such as detections, become one list.
 
     The images are in [0, 1] or have 8 bits. They can also come as an iterable of batches
     (N, 3, H, W), which are read one after the other. A network of torch is in eval mode meanwhile.
@@ -423,18 +425,21 @@ def compute_outputs(
     batches: Iterable[Tensor] = images
     if isinstance(images, Tensor):
         batches = progress(images.flatten(0, -4).split(batch_size), "predictions")
-    outputs: list[Tensor] = []
+    outputs: list[Any] = []
     with eval_mode(network):
         for batch in batches:
             moved = batch if device is None else batch.to(device)
             shown = to_unit(moved) if moved.dtype == torch.uint8 else moved
 
-            def compute(rows: slice, shown: Tensor = shown) -> Tensor:
+            def compute(rows: slice, shown: Tensor = shown) -> Any:
+                result = network(shown[rows])
                 # The network may compute in half precision.
-                return network(shown[rows]).to(shown.dtype)
+                return result.to(shown.dtype) if isinstance(result, Tensor) else result
 
             # No images are a batch, too, which gives outputs their shape.
             outputs += limit.map(compute, len(shown) or 1)
+    if outputs and isinstance(outputs[0], list):
+        return [output for batch in outputs for output in batch]
     joined = torch.cat(outputs)
     return joined.unflatten(0, images.shape[:-3]) if isinstance(images, Tensor) else joined
 

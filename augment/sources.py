@@ -14,10 +14,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from augment import files, huggingface
-from augment.classifier import Classifier, Normalization, mean_and_std, nearest
+from augment.classifier import Classifier, Normalization, as_network, mean_and_std, nearest
 from augment.files import NetworkFacts
 from augment.network import (
     FILE,
@@ -25,6 +26,7 @@ from augment.network import (
     ChannelNormalization,
     Inputs,
     Network,
+    eval_mode,
     keep_text_vectors,
     own_size,
     say_inputs,
@@ -32,6 +34,8 @@ from augment.network import (
 )
 from augment.progress import progress_message
 from augment.settings import NormalizeLight
+from augment.tasks import recognized_task
+from augment.tasks.classification import Classification
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
 
 # Networks of torchvision that were trained with another normalization than that of ImageNet. They
@@ -334,7 +338,16 @@ def _python(name: str, weights: Path | None, *_: object) -> Classifier:
     network, size, classes = call_python(name)
     if isinstance(network, nn.Module):
         keep_text_vectors(network, len(classes))
-    return Classifier(network, size, classes, f"python:{name}")
+    title = f"{PYTHON}{name}"
+    gray = torch.full((1, 3, size, size), 0.5)
+    try:
+        with torch.no_grad(), eval_mode(network):
+            task = recognized_task(Network(network)(gray), title)
+    except Exception:  # A classifier reports its errors itself when it is used.
+        task = Classification()
+    if isinstance(task, Classification):
+        return Classifier(network, size, classes, title)
+    return as_network(network, size, classes, name=title)
 
 
 # Functions that make the classifiers of a source, such as torchvision. Their arguments are the

@@ -11,6 +11,7 @@ import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor, cuda, nn
 
-from augment.classifier import Classifier, Normalization, OperatingPoint
+from augment.classifier import Classifier, Normalization, OperatingPoint, TaskNetwork
 from augment.files import as_facts, is_network_file, require_no_facts
 from augment.network import FROM_FILE, say_inputs, unwrapped, with_normalized_light
 from augment.settings import NormalizeLight
@@ -29,7 +30,7 @@ from renderer.io.files import atomic_write
 from train.data.sets import content_hash
 from train.networks import PYTHON, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
-from train.settings import NetworkSettings, published_folder
+from train.settings import NetworkSettings, TaskSettings, published_folder
 
 # Key in a checkpoint. Its value is the hash of the other entries.
 HASH = "sha256"
@@ -168,11 +169,11 @@ def load_network(
     return load_classifier(name, *given)
 
 
-def load_chosen(settings: NetworkSettings) -> Classifier:
-    """Load the classifier that the settings of a command choose."""
+def load_chosen(settings: NetworkSettings) -> Any:
+    """Load the network that the settings of a command choose, with its task."""
     # Error messages about the argument `name` begin with the setting `network` instead.
     with keyed(name="network"):
-        return load_network(
+        network = load_network(
             str(settings.network),
             settings.weights,
             settings.classes,
@@ -182,6 +183,32 @@ def load_chosen(settings: NetworkSettings) -> Classifier:
             settings.trust,
             settings.prompt,
         )
+    return _with_task(network, settings) if isinstance(settings, TaskSettings) else network
+
+
+def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
+    """Return a network with the settings of its task that are given."""
+    own = network.task
+    if settings.task not in (None, own.name):
+        raise InputError(
+            f"task={settings.task}, but {network.title} returns {own.returns}: leave the task out",
+            "task",
+        )
+    given = {
+        name: getattr(settings, name)
+        for name in ("threshold", "iou", "goal")
+        if getattr(settings, name, None) is not None
+    }
+    unknown = [name for name in given if not hasattr(own, name)]
+    if unknown:
+        name = unknown[0]
+        raise InputError(f"{name}={given[name]} is no setting of {own.name}: leave it out", name)
+    if not given:
+        return network
+    options = network.network, network.size, network.classes, network.name
+    changed = TaskNetwork(*options, task=replace(own, **given))
+    changed.inputs = network.inputs
+    return changed
 
 
 def load_run(

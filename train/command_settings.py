@@ -32,6 +32,7 @@ from train.settings import (
     NETWORKS,
     TIME_FOLDER,
     NetworkSettings,
+    TaskSettings,
     label_names,
 )
 
@@ -348,11 +349,18 @@ class AuditSettings(NetworkSettings):
 
 
 @dataclass
-class EvaluateSettings(NetworkSettings):
+class EvaluateSettings(TaskSettings):
     """Settings of the command pnb-evaluate, which scores a network on photographs."""
 
     photos: str = setting(
-        REQUIRED, "Folder of photographs: a folder per class, or images of `label`."
+        REQUIRED,
+        "Folder of photographs: a folder per class, or images of `label`. Of a detector: a file of "
+        "COCO, or a folder of images with labels of YOLO.",
+    )
+    fit: str = setting(
+        "letterbox",
+        "How photographs of a detector get its size: letterbox (on gray borders) or stretch.",
+        choices=("letterbox", "stretch"),
     )
     run: str | None = setting(
         None,

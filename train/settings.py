@@ -203,6 +203,26 @@ class NetworkSettings(Settings):
         self.normalize_light = None if light is None else asdict(light)
 
 
+@dataclass(kw_only=True)
+class TaskSettings(NetworkSettings):
+    """Settings that choose a network, and say what its outputs mean."""
+
+    task: str | None = setting(
+        None,
+        "What the outputs of the network mean: classification, detection or segmentation. null: "
+        "what their type tells.",
+        choices=("classification", "detection", "segmentation"),
+    )
+    threshold: float | None = setting(
+        None, "Detections with a lower score do not count. null: 0.4.", within=(1e-6, 1 - 1e-6)
+    )
+    iou: float | None = setting(
+        None,
+        "Detections and masks with a lower intersection over union do not count. null: 0.5.",
+        within=(0.01, 1),
+    )
+
+
 @dataclass
 class ExperimentSettings(NetworkSettings):
     """Settings of one training run: all settings of the command pnb-train."""

@@ -3,26 +3,31 @@
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from augment.classifier import UNIT_RANGE, Classifier, Normalization, as_classifier
+from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
 from augment.files import as_facts, require_no_facts
 from augment.network import device_of, gradient_flags_kept
 from augment.settings import NormalizeLight
-from renderer.errors import as_folder, keyed
+from augment.tasks.detection import Detection
+from augment.tasks.task import Task
+from renderer.errors import InputError, as_folder, as_path, keyed, require_choice
 from renderer.settings import Size
 from train.checkpoints import load_chosen, load_run
 from train.command_settings import EvaluateSettings, require_calibration
+from train.data.annotations import FITS, LETTERBOX, read_annotations
 from train.data.photographs import choose_labels, class_folders, require_outside
 from train.device import MixedPrecision, choose_device, choose_precision
-from train.results import scoring
+from train.results import detection_scores, scoring
+from train.results.detection_scores import DetectionScores, evaluate_detector
 from train.results.overwrite import require_replaceable
 from train.results.scoring import Predictor, Scores, format_overall, format_scores
 from train.results.store import trained_labels
 from train.run_folder import sole_writer, writable_folder
-from train.settings import label_names, published_folder
+from train.settings import GROUPS, label_names, published_folder
 from train.system import is_verbose
 
 
@@ -55,10 +60,14 @@ def run(settings: EvaluateSettings) -> None:
         false_positive_rate=settings.false_positive_rate,
         skip_unreadable=settings.skip_unreadable,
         precision=settings.precision,
+        fit=settings.fit,
         device=choose_device(settings.device),
         out=settings.out,
         overwrite=settings.overwrite,
     )
+    if isinstance(scores, DetectionScores):
+        print(f"{scores}\nscores, detections and image: {Path(settings.out)}")
+        return
     if settings.label is None:
         source = "each class with a sub-folder" if label is None else f"those of {settings.run}"
         print(f"positive classes: {', '.join(scores.predicted.labels)} ({source})")
@@ -67,7 +76,7 @@ def run(settings: EvaluateSettings) -> None:
 
 
 def evaluate(
-    network: Classifier | Callable[[Tensor], Tensor],
+    network: TaskNetwork | Callable[[Tensor], Any],
     photos: str | Path,
     label: str | int | Sequence[str | int] | None = None,
     *,
@@ -81,20 +90,26 @@ def evaluate(
     false_positive_rate: float | None = None,
     skip_unreadable: bool = False,
     precision: str = "auto",
+    fit: str = LETTERBOX,
+    task: Task | None = None,
     device: torch.device | str | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
-) -> Scores:
+) -> Scores | DetectionScores:
     """Score a network on the photographs of a folder.
 
-    Nothing is written unless `out` is given.
+    Nothing is written unless `out` is given. A detector is scored on photographs
+    with boxes.
 
     Args:
-        network: A classifier, or a plain network from images to logits, such as
-            a `torch.nn.Module`.
-        photos: Folder with a sub-folder of photographs for each class. A
-            sub-folder of any other name holds negatives: photographs of other
-            objects. "pretrained/laboratory" is installed with the library.
+        network: A classifier or a detector, or a plain network from images to
+            logits or boxes, such as a `torch.nn.Module`.
+        photos: For a detector, a COCO file, a folder with one, or a folder of
+            images with label files of YOLO. Photographs are turned as their
+            EXIF orientation says. For a classifier, a folder with a sub-folder
+            of photographs for each class. A sub-folder of any other name holds
+            negatives: photographs of other objects. "pretrained/laboratory" is
+            installed with the library.
         label: Positive class, or several, by name or index. Recall is the
             fraction of the photographs of a positive class that the network
             finds. None for all classes that have a sub-folder.
@@ -118,16 +133,23 @@ def evaluate(
         false_positive_rate: False-positive rate of these thresholds, in (0, 1).
         skip_unreadable: Whether to leave out photographs that cannot be read.
         precision: "auto" (bfloat16 if the hardware computes in it), "bfloat16"
-            or "float32".
+            or "float32". A detector computes in float32.
+        fit: How photographs get the size of a detector: "letterbox" keeps their
+            aspect ratio and adds gray borders, "stretch" does not.
+        task: Task of the network, such as `nb.Detection(threshold=0.3)`. None if
+            its outputs tell.
         device: Device that computes. None for the device of the network.
         out: Folder to which tables and images of the scores are written. None to
             write no files.
         overwrite: Whether to replace results in `out`.
 
     Returns:
-        Scores. `overall` has the metrics of all photographs, `by_label` the
-        metrics of each positive class, and `by_class` the recall of each class
-        of the folder.
+        Scores of a detector: `overall` and `by_label` have the recall at the
+        threshold, AP50 and the false detections per image of the task, and
+        `by_source` the same for each folder of photographs. Intervals are over
+        photographs. Scores of a classifier: `overall` has the metrics of all
+        photographs, `by_label` the metrics of each positive class, and
+        `by_class` the recall of each class of the folder.
 
     Raises:
         InputError: If the network does not fit its arguments, if it lacks a
@@ -144,10 +166,11 @@ def evaluate(
         280
     """
     require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
-    folder = published_folder(as_folder("photos", photos))
+    require_choice("fit", fit, FITS)
+    folder = published_folder(as_path("photos", photos))
     device = device_of(network) if device is None else torch.device(device)
     with gradient_flags_kept(network):
-        classifier = as_classifier(
+        made = as_network(
             network,
             size,
             classes,
@@ -155,17 +178,32 @@ def evaluate(
             value_range,
             device,
             normalize_light=normalize_light,
-        )
-        labels = choose_labels(folder, classifier.classes, label)
-        model = MixedPrecision(classifier.to(device), choose_precision(precision, device))
-        predictor = Predictor(model, classifier.classes, classifier.size, device)
+            task=task,
+        ).to(device)
+        if isinstance(made.task, Detection):
+            if by != GROUPS[0] or calibrate is not None:
+                raise InputError("by and calibrate are for classifiers: leave them out")
+            annotations = read_annotations(folder)
+        elif not isinstance(made, Classifier):
+            raise InputError(f"photos cannot be scored for {made.task.name}: use them in Python")
+        else:
+            labels = choose_labels(as_folder("photos", folder), made.classes, label)
         target = None
         if out is not None:
             target = writable_folder(str(out), "out")
             require_replaceable(target, "out", overwrite)
-            require_outside(target, folder)
+            if folder.is_dir():
+                require_outside(target, folder)
         with sole_writer("out", target) if target else nullcontext():
-            stored = {point.label: point for point in classifier.operating_points}
+            if not isinstance(made, Classifier):
+                chosen = None if label is None else label_names(label)
+                found = evaluate_detector(made, annotations, chosen, fit, skip_unreadable, device)
+                if target:
+                    detection_scores.write(found, target)
+                return found
+            model = MixedPrecision(made, choose_precision(precision, device))
+            predictor = Predictor(model, made.classes, made.size, device)
+            stored = {point.label: point for point in made.operating_points}
             points = [stored[name] for name in labels] if stored.keys() >= set(labels) else []
             if calibrate is not None and false_positive_rate is not None:
                 negatives = published_folder(Path(calibrate))

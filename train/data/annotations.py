@@ -24,10 +24,7 @@ from train.data.photographs import SUFFIXES, find_unlabeled, visible_files
 
 # Ways to bring a photograph to the size of a network.
 LETTERBOX, STRETCH = "letterbox", "stretch"
-FITS = {
-    LETTERBOX: "reduced with their aspect ratio, on gray borders",
-    STRETCH: "resized without keeping their aspect ratio",
-}
+FITS = {LETTERBOX: "fitted into {} pixels with gray borders", STRETCH: "stretched to {} pixels"}
 # Gray of the borders, as in Ultralytics.
 BORDER = 114
 # The aspect ratio of a photograph may differ by this factor from that of its annotation.

@@ -197,10 +197,15 @@ class DetectionMetrics:
     false_per_image: Estimate
 
 
-def score(matches: Sequence[Matches], threshold: float) -> DetectionMetrics:
-    """Score the detections of one class, or of several, with intervals over images."""
+def score(
+    matches: Sequence[Matches], threshold: float, at_half: Sequence[Matches] | None = None
+) -> DetectionMetrics:
+    """Score the detections of one class, or of several, with intervals over images.
+
+    `at_half` are the matches of the same detections at an IoU of 0.5, if others are at another.
+    """
     joined = join(matches)
-    shown = [item for item in matches if len(item.object_score)]
+    shown = [item for item in at_half or matches if len(item.object_score)]
 
     def mean_precision(counts: np.ndarray) -> np.ndarray:
         values = np.stack([item.average_precision(counts) for item in shown])

@@ -1,0 +1,87 @@
+"""A detector is scored on photographs with boxes."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import norm_balls as nb
+from renderer.errors import InputError
+
+CLASSES = ["cat", "dog", "cow"]
+
+
+def _find_white(images):
+    """Detect the white rectangle of each image as a dog, and a cow in the upper left corner."""
+    outputs = []
+    for image in images:
+        rows, columns = torch.nonzero(image.amin(0) > 0.8, as_tuple=True)
+        boxes, labels, scores = [[0.0, 0, 4, 4]], [2], [0.5]
+        if len(rows):
+            box = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+            boxes, labels = [*boxes, [float(side) for side in box]], [2, 1]
+            scores = [0.5, float(image.max()) - 0.1]
+        output = {"boxes": torch.tensor(boxes), "labels": torch.tensor(labels)}
+        outputs.append(output | {"scores": torch.tensor(scores)})
+    return outputs
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    """Write two photographs in light, one of which is wide, and one in the dark."""
+    folder = tmp_path / "photographs"
+    images, annotations = [], []
+    sizes = {"light/a.png": (40, 80), "light/b.png": (60, 60), "dark/c.png": (60, 60)}
+    for key, (name, shape) in enumerate(sizes.items()):
+        pixels = np.zeros((*shape, 3), np.uint8)
+        pixels[10:30, 20:50] = 255 if name.startswith("light") else 90
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels).save(folder / name)
+        images.append({"id": key, "file_name": name, "width": shape[1], "height": shape[0]})
+        annotations.append({"image_id": key, "category_id": 18, "bbox": [20, 10, 30, 20]})
+    categories = [{"id": 18, "name": "dog"}, {"id": 21, "name": "Cow"}, {"id": 99, "name": "yak"}]
+    content = {"images": images, "annotations": annotations, "categories": categories}
+    (folder / "annotations.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.mark.parametrize("fit", ["letterbox", "stretch"])
+def test_recall_and_false_detections_are_the_counted_ones(photographs, fit):
+    scores = nb.evaluate(_find_white, photographs, classes=CLASSES, size=120, fit=fit)
+    assert scores.photograph_count == 3
+    assert scores.by_label["dog"].n == 3
+    assert scores.by_label["dog"].recall.value == pytest.approx(2 / 3)
+    assert scores.by_label["dog"].false_per_image.value == 0
+    assert scores.by_label["Cow"].recall.value is None
+    assert scores.by_label["Cow"].false_per_image.value == pytest.approx(1)
+    assert scores.overall.recall == scores.by_label["dog"].recall
+    recalls = {name: metrics["dog"].recall.value for name, metrics in scores.by_source.items()}
+    assert recalls == {"dark": 0, "light": 1}
+
+
+def test_scores_and_detections_are_written_in_pixels_of_the_photographs(photographs, tmp_path):
+    out = tmp_path / "out"
+    nb.evaluate(_find_white, photographs, classes=CLASSES, size=120, out=out)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["by_label"]["dog"]["recall"]["value"] == pytest.approx(2 / 3)
+    found = json.loads((out / "detections.json").read_text())
+    (box,) = (
+        item["bbox"]
+        for item in found
+        if item["file_name"] == "light/a.png" and item["category"] == "dog"
+    )
+    assert box == pytest.approx([20, 10, 30, 20], abs=1)
+    assert (out / "contact_sheet.png").is_file()
+
+
+def test_a_class_that_the_network_lacks_is_not_scored(photographs):
+    scores = nb.evaluate(_find_white, photographs, classes=CLASSES, size=120)
+    assert scores.labels == ["dog", "Cow"]
+    only = nb.evaluate(_find_white, photographs, "dog", classes=CLASSES, size=120)
+    assert only.labels == ["dog"]
+    with pytest.raises(InputError, match="no classes of the network"):
+        nb.evaluate(_find_white, photographs, "yak", classes=CLASSES, size=120)
+    with pytest.raises(InputError, match="marks no cat"):
+        nb.evaluate(_find_white, photographs, "cat", classes=CLASSES, size=120)
