@@ -330,7 +330,7 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     return network, size, classes
 
 
-def _python(name: str, weights: Path | None, *_: object) -> Classifier:
+def _python(name: str, weights: Path | None, *_: object) -> Any:
     """Load a classifier by a Python function that the user wrote, which chooses its weights."""
     if weights is not None:
         reason = f"cannot be combined with python:{name}, a function that loads the weights itself"

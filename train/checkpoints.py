@@ -188,7 +188,7 @@ def load_chosen(settings: NetworkSettings) -> Any:
 
 def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
     """Return a network with the settings of its task that are given."""
-    own = network.task
+    own: Any = network.task
     if settings.task not in (None, own.name):
         raise InputError(
             f"task={settings.task}, but {network.title} returns {own.returns}: leave the task out",

@@ -31,7 +31,6 @@ from train.settings import (
     MESHES,
     NETWORKS,
     TIME_FOLDER,
-    NetworkSettings,
     TaskSettings,
     label_names,
 )
@@ -130,7 +129,7 @@ class TransferSettings(Settings):
 
 
 @dataclass
-class AttackExperimentSettings(NetworkSettings):
+class AttackExperimentSettings(TaskSettings):
     """Settings of the command pnb-attack, which attacks one classifier.
 
     If the attack needs a projector or lamps and the scene has none, the scene gets them with
@@ -148,6 +147,12 @@ class AttackExperimentSettings(NetworkSettings):
         None,
         "Class to reach: null (any other), least_likely, a class, or a list, one per view.",
         is_text=True,
+    )
+    goal: str | None = setting(
+        None,
+        "What an attack on a detector reaches: hide (no detection of the class) or mislabel (a "
+        "better one of another class). null: hide.",
+        choices=("hide", "mislabel"),
     )
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
@@ -286,7 +291,7 @@ class LabSettings(Settings):
 
 
 @dataclass
-class AuditSettings(NetworkSettings):
+class AuditSettings(TaskSettings):
     """Settings of the command pnb-audit, which measures how safe a network is in unusual lighting.
 
     A mesh is a file, "solid:NAME:SEED" for a generated object, or a mapping with the fields of

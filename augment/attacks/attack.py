@@ -28,7 +28,7 @@ from augment.random_streams import generator
 from augment.scene.build import with_needed_degree
 from augment.scene.scene import Scene
 from augment.settings import NormalizeLight, SceneSettings
-from augment.tasks.classification import ClassCriterion, Classification
+from augment.tasks.classification import Classification
 from augment.tasks.task import Criterion, Task
 from renderer.errors import InputError, as_list, is_whole, require_flag, require_kind, require_whole
 from renderer.light.basis import harmonics_of
@@ -380,9 +380,13 @@ def _confidences(
     problem = build_problem(attack_settings, scene)
     images = problem.images(problem.start)
     labels = source_labels(scene, images.device, classifier)
-    # Probability of each of the C classes in each view of each example, shape (E, V, C).
-    objective = Objective(classifier, ClassCriterion(labels), attack_settings)
-    probabilities = objective.evidence(images).softmax(2)
-    confidence = probabilities.gather(2, labels[..., None])[..., 0]
-    is_correct = probabilities.argmax(2) == labels
+    # The objects of all groups are at the same places.
+    of_group = torch.arange(len(scene) // groups, device=images.device)
+    truth = partial(scene.truth, classifier.label, of_group)
+    criterion = classifier.task.criterion(labels[of_group], truth, len(classifier.classes))
+    criterion = criterion.map(lambda rows: rows.repeat(groups, *[1] * (rows.ndim - 1)))
+    evidence = Objective(classifier, criterion, attack_settings).evidence(images)
+    confidences = classifier.task.confidences(evidence)
+    confidence = confidences.gather(2, labels[..., None])[..., 0]
+    is_correct = criterion.predicted(evidence) == labels
     return (confidence * is_correct).view(groups, -1).amin(1)

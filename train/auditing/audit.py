@@ -25,17 +25,19 @@ import torch
 from augment.attack_settings import RelightingSettings
 from augment.classifier import Classifier
 from augment.scene.objects import load_object
+from augment.tasks.detection import Detection
 from renderer.errors import InputError, keyed
 from renderer.io.files import atomic_write
 from renderer.light.files import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
 from renderer.settings import Size, height_and_width
 from train import console
-from train.auditing import lights, page, relit
+from train.auditing import found, lights, page, relit
 from train.auditing.network import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
 from train.checkpoints import load_chosen, load_network
 from train.class_names import class_of_meshes, require_others, with_class_name
 from train.command_settings import AuditSettings, LabSettings
+from train.data.annotations import read_annotations
 from train.data.photographs import find_photographs, find_unlabeled
 from train.device import choose_device
 from train.laboratory.laboratory import write_laboratory
@@ -103,7 +105,7 @@ def run_audit(
     _require_continuable(out, settings.overwrite, is_named)
     renders = out / "renders"
     has_renders = renders.exists() and not settings.overwrite
-    if plan is not None and LABORATORY not in plan.image_folders:
+    if plan is not None and plan.has_classes and LABORATORY not in plan.image_folders:
         try:
             # `mitsuba` raises an InputError if Mitsuba, which renders, is not installed.
             with nullcontext() if has_renders else mitsuba():
@@ -197,6 +199,19 @@ class _Plan:
                 )
         self.items = [*meshes, *hard_negatives]
         folders = {LABORATORY: settings.laboratory, PHOTOGRAPHS: settings.photos}
+        self.has_classes = all(isinstance(network, Classifier) for network in networks.values())
+        self.annotations = None
+        if not self.has_classes:
+            tasks = {network.task.name for network in networks.values()}
+            if len(tasks) > 1:
+                raise InputError(f"hardened is of another task: {' and '.join(sorted(tasks))}")
+            if settings.laboratory or (settings.photos and tasks != {Detection.name}):
+                reason = f"laboratory and photos are no images for {tasks.pop()}"
+                raise InputError(f"{reason}: a detector takes photos with boxes")
+            if settings.photos:
+                with keyed("photos"):
+                    self.annotations = read_annotations(published_folder(Path(settings.photos)))
+            folders = {}
         self.image_folders = {
             name: published_folder(Path(folder)) for name, folder in folders.items() if folder
         }
@@ -215,6 +230,7 @@ class _Plan:
         self.environments = [UNIFORM, *settings.environments]
         self.random_light_count = settings.scale(RANDOM_LIGHT_COUNT)
         positives = objects[: len(meshes)]
+        self.negatives = objects[len(meshes) :]
         self.views, self.attacked_views = (
             lights.Views(positives, settings.scale(count), settings.seed, device)
             for count in (VIEW_COUNT, ATTACKED_COUNT)
@@ -247,12 +263,19 @@ class _Plan:
                 if other is not network:
                     arguments = (network, other, attacked_views, results)
                     _write_json(results / lights.TRANSFER, lights.transfer_success, *arguments)
+            if isinstance(network.task, Detection):
+                negatives = replace(views, objects=self.negatives)
+                lit = (network, views, attacked_views, negatives, *environments[1:], results)
+                _write_json(results / found.DETECTED, found.detect_in_lights, *lit)
         for key, network in {**networks, **normalizing(networks)}.items():
             for name, images in self.image_folders.items():
                 predictor = Predictor(network, network.classes, network.size, self.views.device)
                 # Unreadable photographs are left out.
                 evaluate = partial(evaluate_photographs, predictor, images, self.label)
                 _write_folder(out / key / name, partial(evaluate, skip_unreadable=True))
+            if self.annotations is not None:
+                write_scores = partial(found.score_photographs, network, self.annotations)
+                _write_folder(out / key / found.BOXED, write_scores)
 
 
 def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:

@@ -9,6 +9,7 @@ import base64
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +33,7 @@ from augment.attacks.objective import Objective
 from augment.attacks.problem import build_problem
 from augment.attacks.result import AttackResult
 from augment.augmentation_settings import VariationSettings
-from augment.classifier import Classifier
+from augment.classifier import TaskNetwork
 from augment.network import compute_outputs
 from augment.progress import progress
 from augment.random_streams import generator
@@ -41,7 +42,7 @@ from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
 from augment.settings import LampsSettings, ProjectorSettings
-from augment.tasks.classification import ClassCriterion
+from augment.tasks.task import Criterion
 from renderer.camera import orbit_cameras
 from renderer.errors import MAX_SCALE
 from renderer.image import to_bytes
@@ -194,10 +195,10 @@ class Views:
         return vary(scene, variation, generator(self.seed, "views"))
 
 
-def recognize_in_environments(
-    classifier: Classifier, views: Views, environments: Sequence[str], random_light_count: int
-) -> dict[str, list[bool]]:
-    """Test whether a classifier recognizes views in several environment lights."""
+def environment_lights(
+    views: Views, environments: Sequence[str], random_light_count: int
+) -> dict[str, Float[Tensor, "C K"]]:
+    """Return the environment lights of an audit by name, at the exposure of the views."""
     noise = generator(views.seed, "lights")
     random_lights = perturb(
         load_light(LIGHT), random_light_count, AMPLITUDE, radius=None, generator=noise
@@ -205,33 +206,48 @@ def recognize_in_environments(
     lights = {Path(name).stem: load_light(name) for name in environments}
     for number, light in enumerate(HARMONICS.project_nonnegative(random_lights), 1):
         lights[f"{RANDOM}{number}"] = light
+    return {name: views.exposure * light.to(views.device) for name, light in lights.items()}
+
+
+def recognize_in_environments(
+    classifier: TaskNetwork, views: Views, environments: Sequence[str], random_light_count: int
+) -> dict[str, list[bool]]:
+    """Test whether a classifier recognizes views in several environment lights."""
+    lights = environment_lights(views, environments, random_light_count)
     scene = views.scene(classifier.size)
+    criterion = criterion_of(classifier, scene)
     return {
-        name: _recognized(classifier, scene, views.exposure * light.to(scene.lights)).tolist()
+        name: is_found(classifier, criterion, render_in(scene, light)).tolist()
         for name, light in progress(lights.items(), "renders in other light")
     }
 
 
-def _recognized(
-    classifier: Classifier, scene: Scene, light: Float[Tensor, "C K"]
-) -> Bool[Tensor, " E"]:
-    """Render all examples in the same light, and test which of them a classifier recognizes."""
-    conditions = Conditions(light.expand(len(scene), -1, -1))
+@torch.no_grad()
+def render_in(scene: Scene, light: Float[Tensor, "C K"]) -> Float[Tensor, "E 1 3 H W"]:
+    """Render all examples of a scene in the same light."""
     examples = torch.arange(len(scene), device=light.device)
-    with torch.no_grad():
-        return is_correct(classifier, scene, scene.render(conditions, examples))
+    return scene.render(Conditions(light.expand(len(scene), -1, -1)), examples)
 
 
-def is_correct(
-    classifier: Classifier, scene: Scene, images: Float[Tensor, "E 1 3 H W"]
+def criterion_of(network: TaskNetwork, scene: Scene) -> Criterion:
+    """Return the criterion of an attack on the class of a scene, the same in all E examples."""
+    label = network.label(scene.labels[0])
+    source = torch.full((len(scene), 1), label, device=scene.lights.device)
+    truth = partial(scene.truth, network.label)
+    return network.task.criterion(source, truth, len(network.classes))
+
+
+def is_found(
+    network: TaskNetwork, criterion: Criterion, images: Float[Tensor, "E 1 3 H W"]
 ) -> Bool[Tensor, " E"]:
-    """Test whether a classifier predicts the class of a scene, the same in all E examples."""
-    logits = compute_outputs(classifier, images, BATCH)[:, 0]
-    return logits.argmax(1) == classifier.label(scene.labels[0])
+    """Test in which images a network finds the true class, such as a detection of the object."""
+    of_images = criterion.map(lambda rows: rows[:, 0])
+    outputs = compute_outputs(network, images[:, 0], BATCH)
+    return of_images.predicted(of_images.evidence(outputs)) == of_images.source
 
 
 def adversaries(
-    classifier: Classifier, views: Views, kind: str, additional: bool = False
+    classifier: TaskNetwork, views: Views, kind: str, additional: bool = False
 ) -> AttackResult:
     """Attack a classifier by one kind of lighting, within the largest radius of this kind.
 
@@ -263,7 +279,7 @@ def adversaries(
     )
 
 
-def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path) -> dict[str, Any]:
+def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path) -> dict[str, Any]:
     """Attack one kind of lighting, and count the misclassified views for each radius.
 
     The attacked lighting of the largest radius is written to out/KIND.npz, which `transfer_success`
@@ -292,10 +308,15 @@ def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path)
     atomic_write(out / f"{kind}.npz", content.getbuffer())
     if is_wrong.any():
         example = int(is_wrong.nonzero()[0])
-        logits = torch.stack([result.logits_before[example], result.logits[example]])
-        counts |= classifier.task.found(logits, logits.argmax(1), classifier.classes)
+        both_evidence = torch.cat(
+            [part[example] for part in (result.evidence_in_views_before, result.evidence_in_views)]
+        )
+        criterion = result.criterion.map(lambda rows: rows[[example, example], 0])
+        predicted = criterion.predicted(both_evidence)
+        counts |= classifier.task.found(both_evidence, predicted, classifier.classes)
         counts["slider"] = frames_of(result, example)
-        both = torch.cat([result.images_before[example], result.images[example]], dim=2)
+        shown = (result.images_before[example], result.images[example])
+        both = torch.cat([*map(result.drawn, shown)], dim=2)
         pair = Image.fromarray(to_bytes(both.cpu()).permute(1, 2, 0).numpy())
         # A small render is enlarged without smoothing, so that its pixels are visible.
         is_enlarged = pair.height < SIDE
@@ -305,7 +326,7 @@ def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path)
 
 
 def transfer_success(
-    attacked: Classifier, other: Classifier, views: Views, out: Path
+    attacked: TaskNetwork, other: TaskNetwork, views: Views, out: Path
 ) -> dict[str, dict[str, list[int]]]:
     """Test whether lighting that fools one classifier also fools another classifier.
 
@@ -321,10 +342,9 @@ def transfer_success(
     for kind in progress(KINDS, "transfer"):
         result = adversaries(attacked, views, kind, additional=True)
         problem = build_problem(result.settings, views.scene(other.size, kind))
-        label = other.label(problem.scene.labels[0])
-        criterion = ClassCriterion(torch.full_like(result.criterion.source, label))
+        criterion = criterion_of(other, problem.scene)
         objective = Objective(other, criterion, result.settings, result.seed)
-        recognized = is_correct(other, problem.scene, problem.images(problem.start))
+        recognized = is_found(other, criterion, problem.images(problem.start))
         lights = {"further": (result.clean_correct & result.success, result.minimum.values)}
         with np.load(out / f"{kind}.npz") as saved:
             lights["first"] = torch.from_numpy(saved["wrong"]), torch.from_numpy(saved["values"])
@@ -354,8 +374,8 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     with torch.no_grad():
         images = result.problem.render(values, examples)
         conditions = result.problem.conditions(values, examples)
-        logits = result.objective().evidence(images)[:, 0]
-    probabilities = logits.softmax(1).cpu()
+        evidence = result.objective().select(examples).evidence(images)[:, 0]
+    probabilities = result.classifier.task.confidences(evidence).cpu()
     label = int(result.criterion.source[example, 0])
     ranked = probabilities.amax(dim=0).argsort(descending=True).tolist()
     shown_classes = [label, *(index for index in ranked if index != label)][:CLASS_COUNT]
@@ -366,7 +386,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
         shown_probabilities = probabilities[index, shown_classes].tolist()
         frames.append(
             {
-                "image": _encode_jpeg(images[index, 0], SIDE),
+                "image": _encode_jpeg(result.drawn(images[index, 0]), SIDE),
                 "ball": _encode_jpeg(ball, BALL_SIDE),
                 "probabilities": [round(value, 4) for value in shown_probabilities],
             }
@@ -405,7 +425,7 @@ class PlainViews:
     recognized_as_given: int
 
 
-def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
+def find_plain_views(classifier: TaskNetwork, views: Views) -> PlainViews:
     """Find the plain light, exposure and size at which a classifier recognizes most views.
 
     All combinations are tried, until one is found at which the classifier recognizes a fraction of
@@ -417,7 +437,8 @@ def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
         candidate = replace(views, light=name, exposure=exposure, size=size)
         scene = candidate.scene(classifier.size)
         light = load_light(name).to(scene.lights) * exposure
-        recognized = int(_recognized(classifier, scene, light).sum())
+        criterion = criterion_of(classifier, scene)
+        recognized = int(is_found(classifier, criterion, render_in(scene, light)).sum())
         as_given = tried[0].recognized if tried else recognized
         tried.append(PlainViews(name, exposure, size, recognized, views.count, as_given))
         if recognized >= ENOUGH * views.count:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from PIL import Image
 
 from renderer.io.images import read_center
+from train.auditing import found
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, SIDE, STEPS
 from train.auditing.network import (
     CLASSIFIER,
@@ -138,6 +139,7 @@ def write_audit_page(
         screen=screen,
         caveats=[*caveats, *unreadable],
         agreement=_agreement(networks) if PHOTOGRAPHS in folders else Proportion(),
+        detections=found.sections({network.name: network.folder for network in networks}),
         relit=relit_sections({network.name: network.folder for network in networks}),
         config=read_config(out / CONFIG),
     )

@@ -2,13 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from augment.classifier import UNIT_RANGE, Classifier, Normalization, as_classifier
+from augment.classifier import UNIT_RANGE, Normalization, TaskNetwork, as_network
 from augment.network import device_of, gradient_flags_kept
 from augment.settings import NormalizeLight
+from augment.tasks.task import Task
 from renderer.errors import as_list
 from renderer.settings import Size
 from train.auditing.audit import run_audit
@@ -27,12 +29,12 @@ def run(settings: AuditSettings) -> None:
 
 
 def audit(
-    network: Classifier | Callable[[Tensor], Tensor],
+    network: TaskNetwork | Callable[[Tensor], Any],
     meshes: Sequence[MeshItem],
     label: str | int | None = None,
     *,
     hard_negatives: Sequence[MeshItem] = (),
-    hardened: Classifier | Callable[[Tensor], Tensor] | None = None,
+    hardened: TaskNetwork | Callable[[Tensor], Any] | None = None,
     classes: Sequence[str] | None = None,
     size: Size | None = None,
     normalization: Normalization = None,
@@ -42,6 +44,7 @@ def audit(
     laboratory: str | Path | None = None,
     environments: Sequence[str] = ENVIRONMENTS,
     budget: float = 1.0,
+    task: Task | None = None,
     seed: int = 0,
     device: torch.device | str | None = None,
     out: str | Path | None = None,
@@ -52,8 +55,8 @@ def audit(
     Nothing is written unless `out` is given.
 
     Args:
-        network: A classifier, or a plain network from images to logits, such as
-            a `torch.nn.Module`.
+        network: A classifier, a detector or a segmenter, or a plain network from
+            images to their outputs, such as a `torch.nn.Module`.
         meshes: Meshes of one class: files, solids such as "solid:orange",
             `nb.Mesh`, or pairs of these and the class.
         label: Class of all meshes, by name or index. None if each mesh is given
@@ -74,14 +77,17 @@ def audit(
         normalize_light: Normalization of the light of each image before it
             enters `network`, and `hardened` if that is a plain network. Values
             are as for `load_classifier`. Attacks take it into account.
-        photos: Folder of photographs with a sub-folder for each class, as
-            for `evaluate`. None to use no photographs.
+        photos: Folder of photographs with a sub-folder for each class or, for a
+            detector, photographs with boxes, as for `evaluate`. None to use no
+            photographs.
         laboratory: Folder of renders with a sub-folder for each class, such as
             "pretrained/laboratory". None to render them from the meshes, for
             which Mitsuba is needed.
         environments: Names of environment lightings, or files of maps.
         budget: Factor of the number of views, lightings and renders. With 1, a
             network of 224 pixels takes about 20 minutes on one core.
+        task: Task of the networks, such as `nb.Detection(threshold=0.3)`. None if
+            the outputs tell.
         seed: Seed of all random draws.
         device: Device that computes. None for the device of the network.
         out: Folder for the files of the audit. None to write no files.
@@ -108,15 +114,12 @@ def audit(
     device = device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with gradient_flags_kept(network), gradient_flags_kept(hardened):
-        networks = {CLASSIFIER: as_classifier(network, *options, normalize_light=normalize_light)}
+        named: dict[str, Any] = {"normalize_light": normalize_light, "task": task}
+        networks: dict[str, Any] = {CLASSIFIER: as_network(network, *options, **named)}
         if hardened is not None:
-            is_classifier = isinstance(hardened, Classifier)
-            networks[HARDENED] = as_classifier(
-                hardened,
-                *options,
-                argument="hardened",
-                normalize_light=None if is_classifier else normalize_light,
-            )
+            if isinstance(hardened, TaskNetwork):
+                named["normalize_light"] = None
+            networks[HARDENED] = as_network(hardened, *options, argument="hardened", **named)
         classifier = networks[CLASSIFIER]
         with folder_or_temporary(out) as folder:
             require_replaceable(folder, "out", overwrite)

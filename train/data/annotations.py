@@ -23,7 +23,8 @@ from train import console
 from train.data.photographs import SUFFIXES, find_unlabeled, visible_files
 
 # Ways to bring a photograph to the size of a network.
-LETTERBOX, STRETCH = "letterbox", "stretch"
+LETTERBOX = "letterbox"
+STRETCH = "stretch"
 FITS = {LETTERBOX: "fitted into {} pixels with gray borders", STRETCH: "stretched to {} pixels"}
 # Gray of the borders, as in Ultralytics.
 BORDER = 114
@@ -296,7 +297,7 @@ def fit(photograph: Annotated, size: tuple[int, int], how: str) -> Fitted:
     image = read_rgb(photograph.path, FULL_SIZE)
     upright = np.array(image.size, float)
     boxes = _upright_boxes(photograph, upright).clip(0, np.tile(upright, 2))
-    is_kept = (boxes[:, 2:] > boxes[:, :2]).all(1)
+    is_kept = np.all(boxes[:, 2:] > boxes[:, :2], axis=1)
     available = np.array(size[::-1])
     scale = available / upright
     if how == LETTERBOX:
@@ -349,11 +350,11 @@ def fit_batches(
     skip_unreadable: bool = False,
 ) -> Iterator[list[tuple[Annotated, Fitted]]]:
     """Read photographs in batches, by several threads. Unreadable ones are skipped, or an error."""
-    read = partial(_try_fit, size, how)
+    read_one = partial(_try_fit, size, how)
     with ThreadPoolExecutor() as pool:
         for start in range(0, len(photographs), batch_size):
             batch = photographs[start : start + batch_size]
-            results = [*zip(batch, pool.map(read, batch), strict=True)]
+            results = [*zip(batch, pool.map(read_one, batch), strict=True)]
             for item, result in results:
                 if isinstance(result, Fitted):
                     continue
@@ -363,7 +364,7 @@ def fit_batches(
                         "skip_unreadable=True"
                     )
                 console.warning("%s is skipped, because it cannot be read", item.path)
-            yield [pair for pair in results if isinstance(pair[1], Fitted)]
+            yield [(item, read) for item, read in results if isinstance(read, Fitted)]
 
 
 def _try_fit(size: tuple[int, int], how: str, photograph: Annotated) -> Fitted | Exception:

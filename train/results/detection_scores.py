@@ -92,7 +92,8 @@ class DetectionScores(ShortRepr):
                 if name != ALL or len(self.labels) > 1
             ]
         threshold, iou = self.task.threshold, self.task.iou
-        cells, shown = [], []
+        cells: list[list[object]] = []
+        shown: list[tables.Estimate] = []
         for title, metrics in rows:
             estimates = (metrics.recall, metrics.ap50, metrics.false_per_image)
             shown += estimates
@@ -150,7 +151,9 @@ def evaluate_detector(
             yield torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch]))
 
     outputs: Any = compute_outputs(network, batches(), BATCH, device)
-    found, marked, listed = [], [], []
+    found: list[Found] = []
+    marked: list[Marked] = []
+    listed: list[dict[str, Any]] = []
     pictures = {}
     for (item, fitted), output in zip(read, outputs, strict=True):
         if fitted.pixels.size:

@@ -179,6 +179,10 @@ def _sorted(image_count: int, detections: np.ndarray, objects: np.ndarray) -> Ma
     )
 
 
+# Names of the metrics of detections, in the order of tables.
+METRICS = ("recall", "ap50", "false_per_image")
+
+
 @dataclass(frozen=True)
 class DetectionMetrics:
     """Metrics of the detections of a class, or of all classes, with 95% intervals.
@@ -198,13 +202,19 @@ class DetectionMetrics:
 
 
 def score(
-    matches: Sequence[Matches], threshold: float, at_half: Sequence[Matches] | None = None
+    matches: Sequence[Matches],
+    threshold: float,
+    at_half: Sequence[Matches] | None = None,
+    units: Int[np.ndarray, " n"] | None = None,
+    over: str = PHOTOGRAPHS,
 ) -> DetectionMetrics:
     """Score the detections of one class, or of several, with intervals over images.
 
     `at_half` are the matches of the same detections at an IoU of 0.5, if others are at another.
+    The intervals can be over units that have several images: `units` has that of each image.
     """
     joined = join(matches)
+    units = np.arange(joined.image_count) if units is None else units
     shown = [item for item in at_half or matches if len(item.object_score)]
 
     def mean_precision(counts: np.ndarray) -> np.ndarray:
@@ -221,11 +231,13 @@ def score(
     recall, precision = Estimate(), Estimate()
     if shown:
         groups = _groups(joined)
-        recall = estimate(partial(joined.recall, threshold), groups)
-        precision = estimate(mean_precision, groups)
-    odds = estimate(false_odds, [np.arange(joined.image_count)])
-    ends = (None if end is None else end / (1 - end) for end in (odds.value, odds.low, odds.high))
-    false_detections = Estimate(*ends, odds.over)
+        recall = estimate(partial(joined.recall, threshold), groups, units, over)
+        precision = estimate(mean_precision, groups, units, over)
+    odds = estimate(false_odds, [np.arange(joined.image_count)], units, over)
+    value, low, high = (
+        None if end is None else end / (1 - end) for end in (odds.value, odds.low, odds.high)
+    )
+    false_detections = Estimate(value, low, high, odds.over)
     return DetectionMetrics(len(joined.object_score), recall, precision, false_detections)
 
 
@@ -243,12 +255,15 @@ def _groups(matches: Matches) -> list[np.ndarray]:
 
 
 def estimate(
-    statistic: Callable[[np.ndarray], np.ndarray], groups: Sequence[np.ndarray]
+    statistic: Callable[[np.ndarray], np.ndarray],
+    groups: Sequence[np.ndarray],
+    units: Int[np.ndarray, " n"],
+    over: str = PHOTOGRAPHS,
 ) -> Estimate:
-    """Compute a statistic in [0, 1] with its 95% interval over images.
+    """Compute a statistic in [0, 1] with its 95% interval over units of images.
 
-    The groups have the indices of all images. The interval is unknown if a group has one image, or
-    if the statistic is unknown without some images.
+    The groups have the indices of all images. The interval is unknown if a group has one unit, or
+    if the statistic is unknown without some units.
     """
 
     def of_groups(*counts: np.ndarray) -> np.ndarray:
@@ -257,9 +272,10 @@ def estimate(
             weights[:, images] = of_images
         return statistic(weights)[None]
 
-    units = Units([np.arange(len(images)) for images in groups], PHOTOGRAPHS)
-    (result,) = leave_out(of_groups, units)
-    if min(map(len, groups)) < 2 or not all(np.isfinite(item).all() for item in result.without):
+    # Units of a group count from 0.
+    unit_of_image = [np.unique(units[images], return_inverse=True)[1] for images in groups]
+    (result,) = leave_out(of_groups, Units(unit_of_image, over))
+    if result.unit_count < 2 or not all(np.isfinite(item).all() for item in result.without):
         return Estimate(float(result.value))
     return result.estimate
 
@@ -291,4 +307,6 @@ def mean_iou(
         return np.nanmean(by_class(counts), axis=-1)
 
     every_image = np.arange(len(masks))
-    return estimate(mean, [every_image]), by_class(np.ones((1, len(masks))))[0].tolist()
+    return estimate(mean, [every_image], every_image), by_class(np.ones((1, len(masks))))[
+        0
+    ].tolist()

@@ -278,9 +278,14 @@ def _read_run(folder: Path) -> RunSummary:
 
 
 def read_summaries(folder: Path) -> dict[str, StoredScores]:
-    """Read the scores on photographs in all sub-folders of a folder."""
-    paths = sorted(folder.glob(f"*/{SUMMARY}"))
-    return {path.parent.name: StoredScores.read(read_json(path)) for path in paths}
+    """Read the scores of a classifier on photographs in all sub-folders of a folder."""
+    contents = {path: read_json(path) for path in sorted(folder.glob(f"*/{SUMMARY}"))}
+    # Scores of a detector tell their task.
+    return {
+        path.parent.name: StoredScores.read(content)
+        for path, content in contents.items()
+        if "task" not in content
+    }
 
 
 def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:

@@ -1,0 +1,174 @@
+"""Score a detector on renders: in plain light, in unusual light, and after attacks.
+
+Only detections of the class of the meshes count. On renders of hard negatives, each is false.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.attack_settings import AttackSettings, SkylightSettings, StepSettings
+from augment.attacks.problem import build_problem
+from augment.classifier import TaskNetwork
+from augment.network import compute_outputs, device_of
+from augment.progress import progress
+from augment.scene.scene import Scene
+from augment.scene.truth import NO_OBJECT, Truth
+from renderer.light.files import load_light
+from train.auditing import lights
+from train.auditing.lights import BATCH, KINDS, RANDOM, Views
+from train.data.annotations import LETTERBOX, Annotations
+from train.results import detection_scores, detections
+from train.results.detection_scores import evaluate_detector
+from train.results.detections import Found, Marked, Matches
+from train.results.pictures import plot_curves
+from train.results.predictions import SUMMARY
+from train.results.tables import Estimate, Table, format_interval
+from train.run_folder import read_json
+
+# Result file: metrics in each group of lights, and recall against false detections per image.
+DETECTED = "detections.json"
+# Folder of the scores on photographs with boxes.
+BOXED = "photographs_with_boxes"
+# What the intervals are over.
+VIEWS = "views"
+# Number of points of the curve of recall against false detections.
+CURVE_POINTS = 50
+# End of the name of a folder of results with normalized light, and that of the title of a table.
+NORMALIZED, NORMAL = "_normalized_light", ", with normalized light"
+# Header of the table of metrics.
+HEADER = ("recall", "AP50", "false detections per image")
+
+
+def _detect(
+    network: TaskNetwork, scene: Scene, images: Float[Tensor, "E 1 3 H W"], truth: Truth | None
+) -> list[tuple[Found, Marked]]:
+    """Detect objects in renders. Without a truth, no object is of the class."""
+    pairs = []
+    for row, output in enumerate(compute_outputs(network, images[:, 0], BATCH)):
+        arrays = [output[name].cpu().numpy() for name in ("boxes", "labels", "scores")]
+        boxes, labels = np.zeros((0, 4)), np.zeros(0, int)
+        if truth is not None:
+            is_marked = truth.labels[row, 0] != NO_OBJECT
+            boxes = truth.boxes[row, 0][is_marked].cpu().double().numpy()
+            labels = truth.labels[row, 0][is_marked].cpu().numpy()
+        pairs.append((Found(*arrays), Marked(boxes, labels, np.zeros(len(labels), bool))))
+    return pairs
+
+
+def detect_in_lights(
+    network: TaskNetwork,
+    views: Views,
+    attacked_views: Views,
+    negatives: Views,
+    environments: Sequence[str],
+    random_light_count: int,
+    out: Path,
+) -> dict[str, Any]:
+    """Score a detector in all lights of an audit, after its attacks have been written to `out`."""
+    label = network.label(views.objects[0].label)
+    groups: dict[str, list[tuple[int, tuple[Found, Marked]]]] = {}
+
+    def add(title: str, first_view: int, pairs: list[tuple[Found, Marked]]) -> None:
+        numbered = enumerate(pairs, first_view)
+        groups.setdefault(title, []).extend(numbered)
+
+    plain = load_light(views.light).to(views.device) * views.exposure
+    unusual = lights.environment_lights(views, environments, random_light_count)
+    for shown, title in ((views, ""), (negatives, "hard negatives, ")):
+        scene = shown.scene(network.size)
+        truth = None if title else scene.truth(network.label)
+        # Views of hard negatives are other units than those of the class.
+        first = views.count if title else 0
+        for name, light in progress({"": plain, **unusual}.items(), "detections in other light"):
+            pairs = _detect(network, scene, lights.render_in(scene, light), truth)
+            group = "random light" if name.startswith(RANDOM) else "environments"
+            add(group if name else "plain light", first, pairs)
+    for kind, light_kind in KINDS.items():
+        scene = attacked_views.scene(network.size, kind)
+        of_kind = SkylightSettings if kind == "skylight" else StepSettings
+        settings: dict[str, Any] = {kind: of_kind("linf", light_kind.radii[-1])}
+        problem = build_problem(AttackSettings(**settings), scene)
+        with np.load(out / f"{kind}.npz") as saved:
+            values = torch.from_numpy(saved["values"]).to(problem.start)
+        with torch.no_grad():
+            images = problem.images(values)
+        pairs = _detect(network, scene, images, scene.truth(network.label))
+        add(f"attacked: {light_kind.title}", 0, pairs)
+    task: Any = network.task
+    metrics = {}
+    for title, numbered in groups.items():
+        units = np.array([unit for unit, _ in numbered])
+        at_iou, at_half = (
+            [_match([pair for _, pair in numbered], label, iou)] for iou in (task.iou, 0.5)
+        )
+        metrics[title] = asdict(
+            detections.score(at_iou, task.threshold, at_half, units, over=VIEWS)
+        )
+    every = [
+        pair
+        for title in ("plain light", "environments", "random light")
+        for _, pair in groups.get(title, [])
+    ]
+    return {"metrics": metrics, "curve": _curve(_match(every, label, task.iou))}
+
+
+def _match(pairs: Sequence[tuple[Found, Marked]], label: int, iou: float) -> Matches:
+    """Match the detections of one class."""
+    found, marked = zip(*pairs, strict=True)
+    return detections.match_images(found, marked, [label], iou)[label]
+
+
+def _curve(matches: Matches) -> list[tuple[float, float]]:
+    """Return false detections per image and recall at descending thresholds."""
+    every = np.ones((1, matches.image_count))
+    finite = matches.object_score[np.isfinite(matches.object_score)]
+    thresholds = np.unique([*finite, *matches.score])[::-1]
+    chosen = np.linspace(0, len(thresholds) - 1, min(CURVE_POINTS, len(thresholds)))
+    return [
+        (
+            float(matches.false_per_image(threshold, every)[0]),
+            float(matches.recall(threshold, every)[0]),
+        )
+        for threshold in thresholds[chosen.round().astype(int)]
+    ]
+
+
+def score_photographs(network: TaskNetwork, annotations: Annotations, out: Path) -> None:
+    """Score a detector on photographs with boxes. Unreadable ones are left out."""
+    device = device_of(network)
+    scores = evaluate_detector(network, annotations, None, LETTERBOX, True, device)
+    detection_scores.write(scores, out)
+
+
+def sections(networks: Mapping[str, Path]) -> list[dict[str, Any]]:
+    """Make a section of a report about each network, whose results are in a folder."""
+    made = []
+    for name, folder in networks.items():
+        if not (folder / DETECTED).exists():
+            continue
+        content = read_json(folder / DETECTED)
+        tables = [_table(content["metrics"], f"renders; 95% intervals over {VIEWS}", "light")]
+        for path, title in ((folder, ""), (folder.with_name(f"{folder.name}{NORMALIZED}"), NORMAL)):
+            if (path / BOXED / SUMMARY).exists():
+                by_label = read_json(path / BOXED / SUMMARY)["by_label"]
+                tables.append(_table(by_label, f"photographs{title}", "class"))
+        points = {name: [[(x, y) for x, y in content["curve"]]]}
+        chart = plot_curves(points, "recall", "false detections per image")
+        made.append({"name": name, "tables": tables, "charts": [chart] if chart else []})
+    return made
+
+
+def _table(metrics_of: Mapping[str, Any], title: str, first: str) -> Table:
+    """Make a table of metrics from a file, with a row for each light or class."""
+    rows = []
+    for name, metrics in metrics_of.items():
+        estimates = [Estimate(**metrics[metric]) for metric in detections.METRICS]
+        rows.append([name, *map(format_interval, estimates)])
+    return Table(title, [first, *HEADER], rows)
