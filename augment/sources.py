@@ -37,6 +37,7 @@ from augment.settings import NormalizeLight
 from augment.tasks import recognized_task
 from augment.tasks.classification import Classification
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
+from renderer.settings import Size, height_and_width
 
 # Networks of torchvision that were trained with another normalization than that of ImageNet. They
 # convert their images if the argument `transform_input` is True.
@@ -66,7 +67,7 @@ def _classifier(
     network: nn.Module,
     name: str,
     facts: NetworkFacts,
-    size: int,
+    size: Size,
     classes: Sequence[str],
     mean: Sequence[float],
     std: Sequence[float],
@@ -170,7 +171,8 @@ def _with_weights(
                 "classes",
             )
         if facts.size is None:
-            told = replace(told, size=_size_for_positions(classifier.size, own_state, state))
+            own_height, _ = height_and_width(classifier.size)
+            told = replace(told, size=_size_for_positions(own_height, own_state, state))
         if count != len(classifier.classes):
             told = replace(told, classes=tuple(map(str, range(count))))
     if told != facts:

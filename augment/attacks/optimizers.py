@@ -125,6 +125,10 @@ class NormBalls:
         if used_mask is not None and used_mask.all():
             self.used_mask = None
 
+    def truth(self, values: Values, examples: Examples) -> Truth:
+        """Refuse: nobody knows where objects are in images that were not rendered."""
+        raise NotImplementedError
+
     def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
         """Find the nearest feasible values. By default, all values are feasible.
 
