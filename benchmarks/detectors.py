@@ -20,6 +20,7 @@ from torch import Tensor, nn
 import norm_balls as nb
 from augment.attack_settings import GRADIENT, RANDOM_SEARCH
 from benchmarks.common import machine
+from train.results import tables
 from train.results.detections import estimate
 from train.results.tables import Estimate
 
@@ -96,7 +97,8 @@ def fraction(counts: Sequence[Counts]) -> Estimate:
     def of_objects(weights: np.ndarray) -> np.ndarray:
         return (weights @ hidden) / (weights @ detected)
 
-    return estimate(of_objects, [np.arange(len(counts))])
+    objects = np.arange(len(counts))
+    return estimate(of_objects, [objects], objects, tables.OBJECTS)
 
 
 def table(results: Mapping[tuple[str, float], Mapping[str, Sequence[Counts]]]) -> str:

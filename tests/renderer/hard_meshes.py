@@ -1,5 +1,6 @@
 """Meshes that are hard to shade, with one color per face, and a rasterizer that shows any face."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -8,6 +9,7 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from renderer.mesh import Mesh, concatenate
+from renderer.settings import Size, height_and_width
 from renderer.visibility import Rasterizer
 
 NO_FACE = -1
@@ -21,11 +23,12 @@ class Chart(Rasterizer):
     description: str = "a chart of the faces"
 
     def rasterize(
-        self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False
+        self, points: np.ndarray, faces: np.ndarray, resolution: Size, closed: bool = False
     ) -> np.ndarray:
-        ids = np.full((len(points), resolution**2), NO_FACE, dtype=np.int32)
+        shape = height_and_width(resolution)
+        ids = np.full((len(points), math.prod(shape)), NO_FACE, dtype=np.int32)
         ids[:, : len(faces)] = np.arange(len(faces))
-        return ids.reshape(-1, resolution, resolution)
+        return ids.reshape(-1, *shape)
 
 
 def painted(vertices: ArrayLike, faces: Sequence[Sequence[int]] | np.ndarray) -> Mesh:
