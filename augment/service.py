@@ -21,13 +21,14 @@ from augment.attacks.loop import minimize
 from augment.attacks.objective import Objective, preprocessed_model
 from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed_light
 from augment.augmentation_settings import AugmentationSettings
-from augment.classifier import CheckedNetwork
+from augment.classifier import CheckedNetwork, class_index
 from augment.network import compute_outputs, frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
-from augment.scene.build import MeshSource, build_scene, with_needed_degree
+from augment.scene.build import MeshItem, build_scene, with_needed_degree
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
+from augment.scene.truth import NO_OBJECT, Truth
 from augment.scene.vary import vary
 from augment.tasks.classification import (
     ClassCriterion,
@@ -36,7 +37,7 @@ from augment.tasks.classification import (
     label_loss,
     require_known,
 )
-from augment.tasks.task import NO_CLASS
+from augment.tasks.task import NO_CLASS, Criterion, Task
 from renderer.errors import InputError, as_integers, describe, require_kind, require_whole
 from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
@@ -71,7 +72,7 @@ class AttackExamples:
 
 
 @dataclass(frozen=True)
-class Renders(Dataset[tuple[Tensor, int]]):
+class Renders(Dataset[tuple[Tensor, Any]]):
     """Labeled renders for training, as a data set of PyTorch.
 
     An item is a pair of an image on the CPU and a label as an int. The data set
@@ -79,26 +80,37 @@ class Renders(Dataset[tuple[Tensor, int]]):
     tensors, as in a `TensorDataset`, must be converted to ints before, because
     PyTorch's `DataLoader` cannot mix both types in a batch.
 
+    For a detector or a segmenter, an item is an image and its target, as the
+    detectors of torchvision take them in training. The `DataLoader` then needs
+    `collate_fn=lambda batch: tuple(zip(*batch))`.
+
     Attributes:
         images: Images in [0, 1], shape (E, 3, H, W).
         labels: Labels, shape (E,), int64.
         diagnostics: Numbers about the attack, such as its success rate, by name.
         attack_examples: A few successfully attacked renders, before and after
-            the attack. None if nothing is rendered.
+            the attack. None if nothing is rendered, and for detectors and segmenters.
+        targets: For a detector or a segmenter, the n visible objects of each
+            image that have a class, on the CPU: "boxes" (n, 4) float32, which
+            are left, top, right and bottom in pixels, "labels" (n,) int64, and
+            "masks" (n, H, W) uint8. An image may show none. None for a
+            classifier.
     """
 
     images: Float[Tensor, "E 3 H W"]
-    labels: Int[Tensor, " E"]
+    labels: Shaped[Tensor, "E ..."]
     diagnostics: Mapping[str, float]
     attack_examples: AttackExamples | None = None
+    targets: Sequence[dict[str, Tensor]] | None = None
 
     def __len__(self) -> int:
         """Return the number of examples."""
         return len(self.labels)
 
-    def __getitem__(self, index: int) -> tuple[Tensor, int]:
-        """Return an image (3, H, W) in [0, 1] on the CPU, and its label."""
-        return self.images[index].cpu(), int(self.labels[index])
+    def __getitem__(self, index: int) -> tuple[Tensor, Any]:
+        """Return an image (3, H, W) in [0, 1] on the CPU, and its label or its target."""
+        target = int(self.labels[index]) if self.targets is None else self.targets[index]
+        return self.images[index].cpu(), target
 
 
 @dataclass(eq=False, repr=False)
@@ -126,6 +138,11 @@ class AugmentationService:
         world_size: Number of these processes.
         images: Images of a folder that replace the renders with
             `mode="folder"`, shape (E, 3, H, W), uint8.
+        task: Task of the network: classification, detection or segmentation.
+            Without classification, the renders have targets, and a negative
+            label stands for an object that has no class.
+        classes: Names of the classes of a detector or a segmenter, in the order
+            of its labels.
     """
 
     settings: AugmentationSettings
@@ -137,6 +154,8 @@ class AugmentationService:
     rank: int = 0
     world_size: int = 1
     images: Tensor | None = None
+    task: Task = field(default_factory=Classification)
+    classes: Sequence[str] = ()
     _last_values: Tensor | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
@@ -146,6 +165,7 @@ class AugmentationService:
         require_whole("seed", self.seed)
         require_kind("scene", self.scene, Scene | None, "the scene of build_scene, or None")
         require_kind("phases", self.phases, Phases, "augment.progress.Phases()")
+        require_kind("task", self.task, Task, "a task, such as nb.Detection()")
         self.labels = as_integers("labels", self.labels)
         self.positive_classes = as_integers("positive_classes", self.positive_classes).tolist()
         if self.scene is not None and self.labels.shape != (len(self.scene),):
@@ -158,6 +178,12 @@ class AugmentationService:
             if self.images.dtype != torch.uint8 or self.images.shape[:2] != (len(self.labels), 3):
                 given = describe(self.images)
                 raise InputError(f"images is {given}: give bytes (E, 3, H, W), one for each label")
+        if self._finds_objects and self.settings.mode == "folder":
+            reason = f"mode=folder has images without boxes, but the task is {self.task.name}"
+            raise InputError(f"{reason}: choose random or adversarial")
+        if self._finds_objects and max(self.labels.tolist(), default=-1) >= len(self.classes):
+            reason = f"classes has {len(self.classes)} names, fewer than labels"
+            raise InputError(f"{reason}: name all classes in the order of the network's labels")
         source = "images" if self.settings.mode == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
             raise InputError(f"{source} is None, but mode={self.settings.mode} needs it: give one")
@@ -170,11 +196,13 @@ class AugmentationService:
     @classmethod
     def from_meshes(
         cls,
-        meshes: Sequence[tuple[MeshSource, int]],
+        meshes: Sequence[MeshItem | Sequence[MeshItem]],
         size: Size,
         settings: AugmentationSettings | None = None,
         *,
         seed: int = 0,
+        task: Task | None = None,
+        classes: Sequence[str] = (),
         **of_scene: Any,
     ) -> AugmentationService:
         """Build a source of renders for any training loop.
@@ -183,10 +211,15 @@ class AugmentationService:
 
         Args:
             meshes: Pairs of a mesh and the index of its class. A mesh is a
-                file, solid:NAME or a `Mesh`.
+                file, solid:NAME or a `Mesh`. With a task that finds objects,
+                entries are those of `build_scene`: a class may have its name,
+                "" and −1 stand for no class, and a list has several objects.
             size: Pixels per side of the renders, or (height, width).
             settings: Settings of the augmentation.
             seed: Seed of all random numbers.
+            task: Task of the network, such as `nb.Detection()`, for which the
+                renders get boxes and masks. None for classification.
+            classes: Names of the classes of a detector or a segmenter.
             of_scene: Further arguments of `build_scene`. By default, there are
                 10 views, 5 gray backgrounds, 8 × 8 samples per pixel and flat
                 shading.
@@ -210,15 +243,22 @@ class AugmentationService:
         expected = "nb.AugmentationSettings(...) or None"
         require_kind("settings", settings, AugmentationSettings | None, expected)
         require_whole("seed", seed)
-        paper: dict[str, Any] = {"views": 10, "samples": 8, "normals": "flat"}
+        views = 1 if of_scene.get("cameras") else 10
+        paper: dict[str, Any] = {"views": views, "samples": 8, "normals": "flat"}
         options = paper | {"backgrounds": [0.0, 0.25, 0.5, 0.75, 1.0]} | of_scene
         settings = settings or AugmentationSettings()
         scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **options)
-        for item in scene.objects:
-            require_whole(f"meshes: the label of {item.name}", item.label)
-        labels = torch.tensor(scene.labels, device=scene.lights.device)
+        task = task or Classification()
+        names: Sequence[Any] = scene.labels
+        if isinstance(task, Classification):
+            for item in scene.objects:
+                require_whole(f"meshes: the label of {item.name}", item.label)
+        else:
+            names = [_index_of(label, classes) for label in names]
+        labels = torch.tensor(names, device=scene.lights.device)
         settings = replace(settings, examples=len(scene))
-        return cls(settings, scene, labels, seed, Phases(labels.device))
+        service = (settings, scene, labels, seed, Phases(labels.device))
+        return cls(*service, task=task, classes=classes)
 
     def __len__(self) -> int:
         """Return the number of renders that `regenerate` returns."""
@@ -245,9 +285,9 @@ class AugmentationService:
         Raises:
             InputError: If the network fails, or has no logit for a label.
         """
-        require_kind("model", model, nn.Module, "a torch.nn.Module from images to logits")
+        require_kind("model", model, nn.Module, "a torch.nn.Module from images to outputs")
         require_whole("number", number)
-        model = CheckedNetwork(model, "model", Classification())
+        model = CheckedNetwork(model, "model", self.task, len(self.classes) or None)
         if self.images is not None and self.settings.renders:
             return self._from_folder(model, self.images, number)
         if self.scene is None or not self.settings.renders:
@@ -256,10 +296,14 @@ class AugmentationService:
         draws = generator(self.seed, number, "rows")
         scene = vary(self.scene, self.settings.vary, draws, once=is_random)
         problem = build_problem(self.settings.attack, scene)
-        shard = distributed.shard(len(scene), self.rank, self.world_size).to(scene.lights.device)
         if is_random:
-            return self._random(model, problem, number, shard)
-        return self._adversarial(model, problem, number, shard)
+            return self._random(model, problem, number)
+        return self._adversarial(model, problem, number)
+
+    @property
+    def _finds_objects(self) -> bool:
+        """Whether the network finds objects in images, whose boxes and masks are the targets."""
+        return not isinstance(self.task, Classification)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the state of the service, so that a run can be resumed with it.
@@ -330,16 +374,54 @@ class AugmentationService:
         _, diagnostics = self._classify(model, selected, labels)
         return Renders(selected, labels, diagnostics)
 
-    def _random(
-        self, model: nn.Module, problem: SceneProblem, number: int, shard: Int[Tensor, " A"]
-    ) -> Renders:
+    def _random(self, model: nn.Module, problem: SceneProblem, number: int) -> Renders:
         """Render all examples with random values of the parameters, such as random lighting."""
         values = self._random_values(problem, number)
-        images = self._gather(problem.images(values, shard)[:, 0], shard)
+        own = self._own_rows(len(self.labels))
+        images = self._gather(problem.images(values, own)[:, 0], own, len(self.labels))
+        if self._finds_objects:
+            truth = self._truth(problem, values)
+            diagnostics = self._find(model, images, truth) | _changes(problem, values)
+            return Renders(images, self.labels, diagnostics, targets=truth.targets())
         is_error, diagnostics = self._classify(model, images, self.labels)
         examples = select_examples_to_log(model, problem, values, is_error, self.labels)
         diagnostics |= _changes(problem, values)
         return Renders(images, self.labels, diagnostics, examples)
+
+    def _truth(self, problem: SceneProblem, values: Float[Tensor, "E D"]) -> Truth:
+        """Find the objects with a class that all images show."""
+        known = dict(zip(problem.scene.labels, self.labels.tolist(), strict=True))
+
+        def index_of(label: str | int) -> int:
+            return known[label] if label in known else _index_of(label, self.classes)
+
+        every = problem.all_examples
+        truth = problem.scene.truth(index_of, every, problem.conditions(values, every))
+        return replace(truth, labels=truth.labels.clamp(min=NO_OBJECT))
+
+    def _find(
+        self, model: nn.Module, images: Float[Tensor, "E 3 H W"], truth: Truth
+    ) -> dict[str, float]:
+        """Measure in how many of up to `CLASSIFIED` images the first object is not found."""
+        rows = self._shown(truth)
+        if not len(rows):
+            return {}
+        chosen = torch.linspace(0, len(rows) - 1, min(CLASSIFIED, len(rows))).round().long()
+        rows = rows[chosen.to(rows.device)]
+        criterion = self._criterion(truth, rows)
+        objective = Objective(model, criterion, self.settings.attack, phases=self.phases)
+        with frozen_eval_mode(model):
+            score, _ = objective.score(images[rows, None], needs_gradient=False)
+        return {"attack_success": _mean(score.is_success), "loss": -_mean(score.cost)}
+
+    def _shown(self, truth: Truth) -> Int[Tensor, " A"]:
+        """Return the examples whose first object is visible and has a class."""
+        return torch.nonzero((self.labels >= 0) & truth.is_shown[:, 0, 0]).squeeze(1)
+
+    def _criterion(self, truth: Truth, rows: Int[Tensor, " A"]) -> Criterion:
+        """Return the criterion that the first objects of examples are not found."""
+        source = self.labels[rows, None]
+        return self.task.criterion(source, lambda: truth.select(rows), len(self.classes))
 
     def _classify(
         self, model: nn.Module, images: Float[Tensor, "E 3 H W"], labels: Int[Tensor, " E"]
@@ -363,26 +445,42 @@ class AugmentationService:
         is_error = is_error.index_copy(0, rows, is_misclassified)
         return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
 
-    def _adversarial(
-        self, model: nn.Module, problem: SceneProblem, number: int, shard: Int[Tensor, " A"]
-    ) -> Renders:
-        """Attack the examples of this process, `shard`, and gather those of all processes."""
+    def _adversarial(self, model: nn.Module, problem: SceneProblem, number: int) -> Renders:
+        """Attack the examples, of which each process has a part.
+
+        Examples that show a detector no object with a class get random values instead.
+        """
         attack = self.settings.attack
         seed = stream_seed(self.seed, number)
-        criterion = self._attack_criterion().select(shard)
-        objective = Objective(model, criterion, attack, seed, self.phases)
-        start = self._attack_start(problem, number)
+        start = values = self._attack_start(problem, number)
+        # Indices of the attacked examples.
+        attacked = problem.all_examples
+        if self._finds_objects:
+            values = self._random_values(problem, number)
+            truth = self._truth(problem, start)
+            attacked = self._shown(truth)
+            if not len(attacked):
+                return self._random(model, problem, number)
+            criterion = self._criterion(truth, attacked)
+        else:
+            criterion = self._attack_criterion()
+        own = self._own_rows(len(attacked))
+        shard = attacked[own]
+        objective = Objective(model, criterion.select(own), attack, seed, self.phases)
         draws = generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
         result = minimize(problem, objective, examples=shard, start=start[shard], restarts=restarts)
+        if criterion.needs_truth:
+            objective = objective.at(problem.truth(result.values, shard))
         with frozen_eval_mode(model), self.phases("attack_classifier"):
             is_fooled = objective.fooled_in_views(result.images, result.predicted, shard)
         # Examples that are misclassified before the attack count as successes.
-        success = self._gather(is_fooled.all(1) | result.success_before, shard)
+        success = self._gather(is_fooled.all(1) | result.success_before, own, len(attacked))
         # Replace the result of this process by the results of all processes.
-        result = result.map(lambda part: self._gather(part, shard))
+        result = result.map(lambda part: self._gather(part, own, len(attacked)))
+        values = values.index_copy(0, attacked, result.values)
         if self.settings.warm_start:
-            self._last_values = result.values
+            self._last_values = values
         max_steps = attack.max_steps * (1 + attack.restarts)
         diagnostics = {
             "attack_success_before": _mean(result.success_before),
@@ -395,17 +493,24 @@ class AugmentationService:
         }
         if attack.sensor_noise:
             diagnostics["attack_success_without_noise"] = _mean(result.success)
-        diagnostics |= _changes(problem, result.values)
+        diagnostics |= _changes(problem, values)
+        if self._finds_objects:
+            images = problem.images(values, problem.all_examples)[:, 0]
+            targets = self._truth(problem, values).targets()
+            return Renders(images, self.labels, diagnostics, targets=targets)
         is_new_success = success & ~result.success_before
-        values = result.values
         examples = select_examples_to_log(model, problem, values, is_new_success, self.labels)
         return Renders(result.images[:, 0], self.labels, diagnostics, examples)
 
+    def _own_rows(self, count: int) -> Int[Tensor, " A"]:
+        """Return the indices of those of some examples that this process renders or attacks."""
+        return distributed.shard(count, self.rank, self.world_size).to(self.labels.device)
+
     def _gather(
-        self, part: Shaped[Tensor, "A ..."], shard: Int[Tensor, " A"]
+        self, part: Shaped[Tensor, "A ..."], own: Int[Tensor, " A"], count: int
     ) -> Shaped[Tensor, "E ..."]:
-        """Collect from all processes what each computed for its `shard` of the E examples."""
-        return distributed.all_gather_rows(part, shard, len(self.labels), self.world_size)
+        """Collect from all processes what each computed for its `_own_rows` of the examples."""
+        return distributed.all_gather_rows(part, own, count, self.world_size)
 
     def _attack_criterion(self) -> ClassCriterion:
         """Return the source and the target class of the attack on each example.
@@ -455,6 +560,11 @@ class AugmentationService:
                 draws = generator(self.seed, number, parameter.name)
                 parts.append(parameter.sample(draws).to(start))
         return problem.project(torch.cat(parts, dim=1), problem.all_examples)
+
+
+def _index_of(label: str | int, classes: Sequence[str]) -> int:
+    """Return the index of the class of an object, which "" and −1 say to have none."""
+    return NO_OBJECT if label in ("", NO_OBJECT) else class_index(classes, label, "meshes")
 
 
 def _describe_scene(scene: Scene) -> list[object]:

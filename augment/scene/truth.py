@@ -47,6 +47,25 @@ class Truth:
         """Return the truth of some examples."""
         return Truth(*(part[examples] for part in vars(self).values()))
 
+    @property
+    def is_shown(self) -> Bool[Tensor, "E V O"]:
+        """Mask of the objects that cover a pixel."""
+        return self.boxes.any(-1)
+
+    def targets(self) -> list[dict[str, Tensor]]:
+        """Return the objects with a class in each of the E · V images, as torchvision takes them.
+
+        They have "boxes" (n, 4) float32, "labels" (n,) int64 and "masks" (n, H, W) uint8, on the
+        CPU.
+        """
+        is_used = (self.is_shown & (self.labels != NO_OBJECT)).flatten(0, 1).cpu()
+        parts = (self.boxes.float(), self.labels.long(), self.masks.byte())
+        images = zip(is_used, *(part.flatten(0, 1).cpu() for part in parts), strict=True)
+        return [
+            {"boxes": boxes[used], "labels": labels[used], "masks": masks[used]}
+            for used, boxes, labels, masks in images
+        ]
+
 
 def unlabeled(label: str | int) -> int:
     """Return a label for a truth of which only positions are used. Hidden objects still lose it."""

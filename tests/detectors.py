@@ -1,0 +1,78 @@
+"""Small detectors for tests."""
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+def small_detector(class_count: int, size: int) -> nn.Module:
+    """Return a RetinaNet of torchvision with a backbone of two layers and two anchors."""
+    from torchvision.models.detection import RetinaNet
+    from torchvision.models.detection.anchor_utils import AnchorGenerator
+    from torchvision.models.detection.retinanet import RetinaNetHead
+
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        backbone = nn.Sequential(
+            nn.Conv2d(3, 8, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(8, 16, 3, stride=2, padding=1),
+            nn.ReLU(),
+        )
+        backbone.out_channels = 16
+        options = {
+            "anchor_generator": AnchorGenerator(((size / 2, 0.8 * size),), ((1.0,),)),
+            "head": RetinaNetHead(16, 2, class_count),
+            **{"min_size": size, "max_size": size, "image_mean": [0.5] * 3, "image_std": [1.0] * 3},
+        }
+        network = RetinaNet(backbone, class_count, **options)
+    return network.eval()
+
+
+class BrightBox(nn.Module):
+    """Detector of one class whose only box has the mean of the image as its score."""
+
+    def __init__(self, box: tuple[float, float, float, float], label: int = 1):
+        super().__init__()
+        self.box = torch.tensor([box])
+        self.label = torch.tensor([label])
+
+    def forward(self, images: Tensor) -> list[dict[str, Tensor]]:
+        scores = images.mean((1, 2, 3))
+        return [
+            {"boxes": self.box, "labels": self.label, "scores": score[None]} for score in scores
+        ]
+
+
+class OneBox(nn.Module):
+    """Detector of one object of class 1, whose box and score are linear in 8 × 8 pixels.
+
+    As the detectors of torchvision, it takes targets and returns losses in training mode.
+    """
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.size = size
+        self.layer = nn.Linear(3 * 8 * 8, 5)
+        nn.init.zeros_(self.layer.weight)
+        nn.init.zeros_(self.layer.bias)
+
+    def forward(self, images: Tensor, targets=None) -> Any:
+        values = self.layer(F.adaptive_avg_pool2d(images, 8).flatten(1))
+        score, ends = values[:, 0], values[:, 1:] + torch.tensor([0.3, 0.3, 0.7, 0.7])
+        box = ends.unflatten(1, (2, 2)).sort(1).values.flatten(1)
+        if self.training:
+            is_shown = torch.tensor([float(len(item["labels"]) > 0) for item in targets])
+            loss = {"objectness": F.binary_cross_entropy_with_logits(score, is_shown)}
+            for index, item in enumerate(targets):
+                for true in item["boxes"]:
+                    distance = (box[index] - true / self.size).abs().mean()
+                    loss["box"] = loss.get("box", 0) + distance / len(images)
+            return loss
+        boxes = self.size * box.clamp(0, 1)
+        return [
+            {"boxes": one[None], "scores": value[None].sigmoid(), "labels": torch.tensor([1])}
+            for one, value in zip(boxes, score, strict=True)
+        ]
