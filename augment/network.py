@@ -105,11 +105,14 @@ class Network(nn.Module):
         for part in (self, self.transforms, *self.transforms):
             part.training = module.training
 
-    def forward(self, images: Tensor) -> Any:
-        """Compute the outputs of RGB images (N, 3, H, W) in [0, 1]."""
+    def forward(self, images: Tensor, *targets: Any) -> Any:
+        """Compute the outputs of RGB images (N, 3, H, W) in [0, 1].
+
+        A detector in training mode also takes targets.
+        """
         for transform in self.transforms:
             images = transform(images)
-        return self.network(images)
+        return self.network(images, *targets)
 
 
 def plain_outputs(outputs: Any) -> Any:

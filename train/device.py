@@ -147,12 +147,15 @@ class MixedPrecision(Network):
         super().__init__(network.to(memory_format=torch.channels_last))
         self.precision = precision
 
-    def forward(self, images: Tensor) -> Tensor:
+    def forward(self, images: Tensor, targets: Any = None) -> Any:
+        """Compute outputs or, if a detector gets targets in training mode, its losses."""
         images = images.contiguous(memory_format=torch.channels_last)
+        inputs = (images,) if targets is None else (images, targets)
         dtype = PRECISIONS[self.precision]
         is_mixed = dtype != torch.float32
         with torch.autocast(images.device.type, dtype, enabled=is_mixed):
-            return plain_outputs(self.network(images)).float()
+            outputs = plain_outputs(self.network(*inputs))
+        return outputs.float() if isinstance(outputs, Tensor) else outputs
 
 
 @functools.cache

@@ -21,8 +21,10 @@ ALL_BUT_LAST = "all_but_last"
 TRANSFORMS = ("color_jitter", "trivial_augment", "augmix", "color_jitter+augmix")
 # Augmentation by the light of a projector; see `train.training.augmentations`.
 RELIGHT = "relight"
+# Augmentation by low light with the noise of a camera, alone or for every second image.
+LOW_LIGHT, RELIGHT_AND_LOW_LIGHT = "low_light", "relight+low_light"
 # Choices of train.augmentation.
-AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT)
+AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT, LOW_LIGHT, RELIGHT_AND_LOW_LIGHT)
 # Choices of train.optimizer.
 OPTIMIZERS = ("sgd", "adamw")
 
@@ -91,7 +93,8 @@ class TrainSettings(Settings):
     )
     augmentation: str = setting(
         "none",
-        "Augmentation of every training image. relight: random light of a projector.",
+        "Augmentation of every training image. relight: random light of a projector. low_light: "
+        "few photons and noise. relight+low_light: either, in turn.",
         choices=AUGMENTATIONS,
     )
     relight_gain: float = setting(

@@ -16,11 +16,15 @@ from augment.classifier import (
     UNIT_RANGE,
     Classifier,
     Normalization,
-    as_classifier,
+    TaskNetwork,
+    as_network,
     require_evaluation_mode,
 )
 from augment.network import device_of, keep_text_vectors, unwrapped
 from augment.settings import NormalizeLight, RendererSettings
+from augment.tasks.classification import Classification
+from augment.tasks.detection import Detection
+from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, describe, require_kind
 from renderer.settings import Settings, Size
 from train import class_names, console
@@ -31,6 +35,7 @@ from train.results.page import report_of
 from train.run_folder import folder_or_temporary, sole_writer
 from train.settings import DataSettings, ExperimentSettings, TrainingSceneSettings
 from train.train_settings import TrainSettings
+from train.training.detection import require_losses
 from train.training.inputs import initial_of, load_data
 from train.training.run import Run
 
@@ -55,6 +60,7 @@ def harden(
     scene: TrainingSceneSettings | Section = None,
     renderer: RendererSettings | Section = None,
     data: DataSettings | Section = None,
+    task: Task | None = None,
     seed: int = 0,
     device: torch.device | str | None = None,
     out: str | Path | None = None,
@@ -66,18 +72,25 @@ def harden(
     learns from renders, while the predictions for photographs stay nearly the
     same.
 
+    A detector in the format of torchvision learns its own losses on the renders
+    (experiment=detector). On the photographs, it keeps the boxes that it finds
+    before the training, also in the light of a projector and in low light.
+
     Args:
         network: A plain network from images to logits, in evaluation mode, or
-            a `Classifier` that contains one. It stays as it is.
+            a `Classifier` that contains one. Or a detector that takes images
+            and targets in training mode, and returns its losses by name. It
+            stays as it is.
         meshes: Meshes of the class: files, solids such as "solid:orange",
             `nb.Mesh`, or pairs of these and the class. Meshes of several
             classes harden all of them.
         unlabeled: Folder of any photographs, with labels or without.
         label: Class of all meshes, by name or index. None if each mesh is given
             in a pair with its class, or if its name is the class, as in
-            "orange.glb".
+            "orange.glb". A detector may be trained without meshes.
         hard_negatives: Meshes of other classes, which the network must not
-            confuse with the class. None for generated fruit.
+            confuse with the class. None for generated fruit or, for a detector,
+            none.
         classes: Names of the classes of a plain network, in the order of its
             outputs. None for "0", "1" and so on.
         size: Pixels per side of the images of a plain network. None for its own, or 224.
@@ -96,6 +109,8 @@ def harden(
         scene: Fields of `TrainingSceneSettings`, such as {"views": 4}.
         renderer: Fields of `RendererSettings`.
         data: Fields of `DataSettings`.
+        task: Task of the network, such as `nb.Detection(threshold=0.5)`. None
+            recognizes it by the outputs.
         seed: Seed of all random draws.
         device: Device that computes. None for the device of the network.
         out: Folder for the files of the training. None for a temporary folder.
@@ -128,10 +143,16 @@ def harden(
     device = device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with folder_or_temporary(out) as folder:
-        require_new_run(folder, "out", overwrite, resume=False)
-        classifier = as_classifier(
-            _trainable_copy(network), *options, normalize_light=normalize_light
+        given = asdict(train) if isinstance(train, TrainSettings) else train
+        resumes = isinstance(given, Mapping) and bool(given.get("resume"))
+        require_new_run(folder, "out", overwrite, resumes)
+        classifier = as_network(
+            _trainable_copy(network), *options, normalize_light=normalize_light, task=task
         )
+        is_detector = isinstance(classifier.task, Detection)
+        if not (is_detector or isinstance(classifier.task, Classification)):
+            reason = f"network is a network of {classifier.task.name}"
+            raise InputError(f"{reason}: give a classifier or a detector")
         if next(classifier.parameters(), None) is None:
             raise InputError("network has no parameters: give a network that can be trained")
         keep_text_vectors(classifier.network, len(classifier.classes))
@@ -147,15 +168,20 @@ def harden(
             "data": {"name": "unlabeled"},
             "train": {"device": str(device)},
         }
+        if is_detector:
+            require_losses(classifier)
+            if not meshes:
+                changes["augment"] = {"mode": "none"}
         if hard_negatives is not None:
             negatives = class_names.as_mappings("hard_negatives", hard_negatives, classifier)
             changes["hard_negatives"] = negatives
         if out is None:
             changes["train"]["cache"] = None
-        settings = _read_settings(
-            changes, train=train, augment=augment, scene=scene, renderer=renderer, data=data
-        )
-        if settings.label is None:
+        experiment = "detector" if is_detector else "classifier"
+        sections = {"train": train, "augment": augment, "scene": scene}
+        sections |= {"renderer": renderer, "data": data}
+        settings = _read_settings(experiment, changes, sections)
+        if settings.label is None and meshes:
             settings = class_names.with_class_names(settings, classifier.classes)
         with sole_writer("out", folder), _restores_torch():
             initial = initial_of(classifier, settings.size)
@@ -167,7 +193,7 @@ def harden(
     copy = _trainable_copy(network)
     keep_text_vectors(copy, len(classifier.classes))
     target = copy
-    if isinstance(network, Classifier):
+    if isinstance(network, Classifier) and isinstance(classifier, Classifier):
         # A returned classifier has no operating points, because its logits differ.
         target = deepcopy(classifier.network)
         copy = classifier.with_network(target)
@@ -177,7 +203,7 @@ def harden(
 
 def _trainable_copy(network: nn.Module) -> nn.Module:
     """Copy a network, and check that the weights of the copy can be trained."""
-    if not isinstance(network, Classifier):
+    if not isinstance(network, TaskNetwork):
         require_evaluation_mode(network, "network")
     # Vectors of texts may be results of a text encoder, which have a graph and cannot be copied.
     values = [value for module in network.modules() for value in vars(module).values()]
@@ -193,13 +219,14 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
 
 
 def _read_settings(
-    changes: Mapping[str, Any], **sections: Settings | Section
+    experiment: str, changes: Mapping[str, Any], sections: Mapping[str, Settings | Section]
 ) -> ExperimentSettings:
-    """Combine the settings of the experiment "classifier" with the arguments of `harden`.
+    """Combine the settings of an experiment with the arguments of `harden`.
 
     `sections`, which the caller gave, win over `changes`, and these win over the experiment.
     """
-    composed = cast(dict[str, Any], OmegaConf.to_container(main.compose(["experiment=classifier"])))
+    config = main.compose([f"experiment={experiment}"])
+    composed = cast(dict[str, Any], OmegaConf.to_container(config))
     names = [item.name for item in fields(ExperimentSettings)]
     settings = OmegaConf.create({name: composed[name] for name in names})
     # `harden` returns only the network, so scores on test renders are not needed.

@@ -10,11 +10,12 @@ from collections.abc import Iterator
 from typing import NamedTuple, cast
 
 import torch
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from augment import distributed
 from augment.random_streams import generator
+from augment.scene.truth import NO_OBJECT
 from train.data.images import ImageFiles
 from train.data.sets import Split
 
@@ -22,8 +23,8 @@ from train.data.sets import Split
 # A larger image is shifted by at most a sixteenth of its side.
 SMALL_IMAGE_SHIFT = 4
 
-# Images, uint8, shape (B, 3, H, W); their labels, shape (B,); and whether each
-# image is a render, bool, shape (B,).
+# Images, uint8, shape (B, 3, H, W); their labels, shape (B,), or tables of the boxes
+# in renders, shape (B, O, 5); and whether each image is a render, bool, shape (B,).
 Batch = tuple[Tensor, Tensor, Tensor]
 
 
@@ -134,7 +135,13 @@ def training_batches(
             render = render[places]
             pixels = cast(Tensor, renders.images)
             shown[places] = crop_and_flip(pixels, render, shift[:, places], flip[places])
-            labels[places] = renders.labels[render]
+            shown_labels = renders.labels[render]
+            if shown_labels.ndim > 1:
+                # The labels of a detector are tables of boxes. A photograph has none.
+                moves = (shift[:, places], flip[places], *pixels.shape[2:])
+                shown_labels = move_boxes(shown_labels, *moves)
+                labels = torch.full_like(shown_labels[:1], NO_OBJECT).repeat(own_size, 1, 1)
+            labels[places] = shown_labels
         yield shown, labels, mask
 
 
@@ -201,6 +208,28 @@ def crop_and_flip(
         source_rows[:, None, :, None],
         source_columns[:, None, None, :],
     ]
+
+
+def move_boxes(
+    tables: Float[Tensor, "B O 5"],
+    shifts: Int[Tensor, "2 B"],
+    flips: Bool[Tensor, " B"],
+    height: int,
+    width: int,
+) -> Float[Tensor, "B O 5"]:
+    """Move boxes as `crop_and_flip` moves images. A box outside of the image is no object.
+
+    The columns of a table are class, left, top, right and bottom.
+    """
+    down, right = shifts[:, :, None, None]
+    label, left, top, right_side, bottom = tables.split(1, dim=-1)
+    is_flipped = flips[:, None, None]
+    new_left = torch.where(is_flipped, width - right_side + right, left - right)
+    new_right = torch.where(is_flipped, width - left + right, right_side - right)
+    sides = [new_left.clamp(0, width), (top - down).clamp(0, height)]
+    sides += [new_right.clamp(0, width), (bottom - down).clamp(0, height)]
+    is_shown = (sides[2] > sides[0]) & (sides[3] > sides[1])
+    return torch.cat([torch.where(is_shown, label, NO_OBJECT), *sides], dim=-1)
 
 
 def _reflect(index: Tensor, size: int) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Shaped, UInt8
 from torch import Tensor
 
 from augment.classifier import class_index
@@ -65,11 +65,12 @@ class Split:
     Attributes:
         images: Images, uint8 RGB, shape (N, 3, H, W). If they stay on disk,
             their files.
-        labels: Index of the class of each image, int64, shape (N,).
+        labels: Index of the class of each image, int64, shape (N,). For renders with
+            boxes, their tables, shape (N, O, 5).
     """
 
     images: Tensor | ImageFiles
-    labels: Int[Tensor, " N"]
+    labels: Shaped[Tensor, "N ..."]
 
     def __len__(self) -> int:
         return len(self.labels)

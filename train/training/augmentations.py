@@ -22,7 +22,7 @@ from augment.photographs import RelitPhotographs, draw_projected_light
 from augment.random_streams import generator, stream_seed
 from augment.tasks.classification import ClassCriterion, label_loss
 from renderer.errors import MAX_SCALE
-from renderer.image import decode, to_bytes, to_unit
+from renderer.image import clamp, decode, encode, to_bytes, to_unit
 from renderer.vectors import Ball, nearest_in_box
 from train.train_settings import TrainSettings
 
@@ -30,6 +30,11 @@ from train.train_settings import TrainSettings
 # 8/255 on CIFAR-10.
 PGD = StepSettings(norm="linf", radius=2 / 255, step="sign", step_size=1 / 255)
 PGD_STEPS = 3
+# Low light has up to so many stops less: its sRGB values then fall from 200 to about 15.
+LOW_STOPS = 7.0
+# Largest variance of the noise of photons, in units of the linear light, and largest standard
+# deviation of the noise of the electronics.
+SHOT_NOISE, READ_NOISE = 2e-4, 2e-3
 
 
 @dataclass
@@ -177,6 +182,33 @@ class RelitBatches:
             values = _attack(problem, values, self.model, criterion, steps)
         with torch.no_grad():
             return to_bytes(light.expose(albedo, problem.log_gain(values)))
+
+
+@dataclass
+class LowLight:
+    """Augmentation that shows the images of a batch in low light, with the noise of a camera.
+
+    The linear light is divided by up to LOW_STOPS powers of two. Photons and electronics add noise
+    with the variance shot · light + read². With `others`, every second image is instead augmented
+    by them.
+    """
+
+    seed: int
+    others: RelitBatches | None = None
+
+    def apply(
+        self, images: UInt8[Tensor, "B 3 H W"], labels: Tensor, step: int
+    ) -> UInt8[Tensor, "B 3 H W"]:
+        """Show each image of a batch in a low light of its own."""
+        draws = generator(self.seed, step, "low light", distributed.rank())
+        stops, shot, read = torch.rand(3, len(images), 1, 1, 1, generator=draws).to(images.device)
+        light = decode(to_unit(images), "srgb") * 0.5 ** (LOW_STOPS * stops)
+        deviation = (SHOT_NOISE * shot * light + (READ_NOISE * read) ** 2).sqrt()
+        noise = torch.randn(images.shape, generator=draws).to(images.device)
+        dark = to_bytes(encode(clamp(light + deviation * noise), "srgb"))
+        if self.others is not None:
+            dark[::2] = self.others.apply(images, labels, step)[::2]
+        return dark
 
 
 def _attack(

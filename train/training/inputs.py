@@ -1,7 +1,7 @@
 """The inputs of a run: its initial network, its data set, and the service that renders images."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.classifier import Classifier, class_index
+from augment.classifier import TaskNetwork, class_index
 from augment.files import as_facts, is_network_file, require_no_facts
 from augment.network import FROM_FILE, YOU, Inputs, without_normalized_light
 from augment.progress import Phases
@@ -17,7 +17,8 @@ from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
 from augment.sources import load_source
-from augment.tasks.classification import complementary_label
+from augment.tasks.classification import Classification, complementary_label
+from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, is_whole, keyed, keys_of, require_range
 from renderer.settings import MAX_SIZE
 from train import checkpoints, console
@@ -52,6 +53,7 @@ class Initial:
         network: The network itself, of which the run trains a copy. None if
             `build_network` can build it from the description.
         inputs: Who states the size and the normalization of its images.
+        task: What its outputs mean.
     """
 
     source: Path
@@ -59,6 +61,7 @@ class Initial:
     weights: dict[str, Tensor]
     network: nn.Module | None = None
     inputs: Inputs = FROM_FILE
+    task: Task = field(default_factory=Classification)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -180,10 +183,10 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     return Initial(Path(name), architecture, network.state_dict(), inputs=inputs)
 
 
-def initial_of(classifier: Classifier, size: int | None) -> Initial:
-    """Use a classifier in memory as the initial network of a run.
+def initial_of(classifier: TaskNetwork, size: int | None) -> Initial:
+    """Use a network in memory as the initial network of a run.
 
-    `size` is None for the size that the classifier takes.
+    `size` is None for the size that the network takes.
     """
     network = without_normalized_light(classifier.network)
     shape: dict[str, Any] = {"name": classifier.name, CLASSIFIER: True}
@@ -192,7 +195,8 @@ def initial_of(classifier: Classifier, size: int | None) -> Initial:
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
     inputs = classifier.inputs if size is None else replace(classifier.inputs, size=YOU)
     source = Path(classifier.name)
-    return Initial(source, architecture, network.state_dict(), network, inputs)
+    weights = network.state_dict()
+    return Initial(source, architecture, weights, network, inputs, classifier.task)
 
 
 def choose_validation(
@@ -327,12 +331,13 @@ def describe_test_images(settings: ExperimentSettings, data: sets.DataSet) -> st
 
 
 def build_service(
-    settings: ExperimentSettings, data: sets.DataSet, device: torch.device
+    settings: ExperimentSettings, data: sets.DataSet, device: torch.device, task: Task
 ) -> AugmentationService:
     """Build the service that renders the training images of a run anew in each round.
 
     It has no images if the run trains without renders.
     """
+    is_classifier = isinstance(task, Classification)
     scene: Scene | None = None
     images: Tensor | None = None
     labels = torch.zeros(0, dtype=torch.int64, device=device)
@@ -340,7 +345,7 @@ def build_service(
     names = [] if settings.label is None else label_names(settings.label)
     # The ranking loss compares images of a positive class with images of other classes. It
     # needs both.
-    is_ranked = bool(settings.hard_negatives) or len(names) > 1
+    is_ranked = is_classifier and (bool(settings.hard_negatives) or len(names) > 1)
     positive_classes: list[int] = []
     if is_ranked or settings.augment.renders:
         positive_classes = [class_index(data.classes, name, "label") for name in names]
@@ -364,7 +369,8 @@ def build_service(
         labels = torch.tensor([label_of_class[name] for name in scene.labels], device=device)
 
     has_complementary_labels = (labels < 0).any()
-    if len(positive_classes) == len(data.classes) and has_complementary_labels:
+    has_all = is_classifier and len(positive_classes) == len(data.classes)
+    if has_all and has_complementary_labels:
         raise InputError(
             f"label={settings.label} has all classes of the network, but some renders show none "
             "of them: remove the objects without a class, or give them a label"
@@ -372,7 +378,7 @@ def build_service(
     rendered = (settings.augment, scene, labels, settings.seed, phases)
     ranked = positive_classes if is_ranked else ()
     processes = (distributed.rank(), distributed.world_size())
-    return AugmentationService(*rendered, ranked, *processes, images)
+    return AugmentationService(*rendered, ranked, *processes, images, task, data.classes)
 
 
 def _build_scene(

@@ -23,6 +23,7 @@ from augment.network import compute_outputs
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from augment.service import AugmentationService, Renders
+from augment.tasks.detection import Detection
 from renderer.errors import InputError, single_line
 from renderer.image import to_bytes, to_unit
 from train import checkpoints, console, run_folder
@@ -33,6 +34,7 @@ from train.device import MixedPrecision, SignalHandler, all_reduce_sum
 from train.run_folder import PHASES
 from train.train_settings import TrainSettings
 from train.training.averages import Averages
+from train.training.detection import box_tables, validate
 from train.training.recipe import set_training_mode
 from train.training.run_log import RunLog, epoch_metrics, format_epoch
 from train.training.step import TrainingStep, fitting_batch_size, require_equal_shares
@@ -148,6 +150,11 @@ class Trainer:
         self.step = TrainingStep(settings, model, self.averages, teacher, service, size, labeled)
 
     @property
+    def is_detector(self) -> bool:
+        """Whether the network finds boxes. It has no accuracy on test images then."""
+        return isinstance(self.service.task, Detection)
+
+    @property
     def selected(self) -> MixedPrecision:
         """Network that is validated after each epoch: an average, or the network in training."""
         return self.averages.selected
@@ -217,7 +224,7 @@ class Trainer:
             shown = Split(to_bytes(state.renders.images), state.renders.labels)
             images = TrainingImages(split, rows, shown)
             with self.phases("training"):
-                set_training_mode(self.model, settings)
+                set_training_mode(self.model, settings, self.is_detector)
                 batches = training_batches(
                     images, settings.batch_size, self.seed, now, settings.flips, first
                 )
@@ -240,6 +247,8 @@ class Trainer:
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
             renders = self.service.regenerate(self.step.attacked, now.number)
+        if renders.targets is not None:
+            renders = replace(renders, labels=box_tables(renders.targets).to(self.device))
         if self._log and renders.attack_examples:
             # The images are written now, because a run that is resumed within this round
             # does not attack the renders again.
@@ -255,7 +264,11 @@ class Trainer:
         loss_sum, hits = all_reduce_sum(state.sums).tolist()
         self.averages.end_epoch()
         with self.phases("evaluation"):
-            validated = evaluate(self.step.validated, split, rows)
+            task, teacher = self.service.task, self.initial
+            if isinstance(task, Detection) and teacher is not None:
+                validated = validate(self.step.validated, teacher, task, split, rows)
+            else:
+                validated = evaluate(self.step.validated, split, rows)
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
         # The network of this epoch replaces the selected network if it is better, or if the

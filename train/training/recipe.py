@@ -31,6 +31,8 @@ STEP_FACTOR = 0.2
 # reaches the highest learning rate after the fraction WARMUP of the training.
 START_FACTOR = 0.1
 WARMUP = 0.2
+# Modules whose outputs differ in training mode: by statistics of the batch, or at random.
+RANDOM = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._DropoutNd)
 
 
 def learning_rate(settings: TrainSettings, done: float) -> float:
@@ -140,17 +142,20 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
         parameter.requires_grad_(False)
 
 
-def set_training_mode(network: nn.Module, settings: TrainSettings) -> None:
+def set_training_mode(
+    network: nn.Module, settings: TrainSettings, returns_losses: bool = False
+) -> None:
     """Put a network in training mode, except the modules that should not change.
 
     Modules of frozen parameters stay in evaluation mode, so that the statistics
     of their batch normalization do not change either. With the setting `eval_mode`, no module is in
-    training mode.
+    training mode or, if the network `returns_losses` in this mode, no module of RANDOM.
     """
-    network.train(not settings.eval_mode)
+    network.train(returns_losses or not settings.eval_mode)
     for module in network.modules():
         parameters = list(module.parameters())
-        if parameters and not any(parameter.requires_grad for parameter in parameters):
+        is_frozen = parameters and not any(parameter.requires_grad for parameter in parameters)
+        if is_frozen or (settings.eval_mode and isinstance(module, RANDOM)):
             module.eval()
 
 

@@ -16,6 +16,7 @@ from augment import distributed
 from augment import network as wrappers
 from augment.network import FROM_DATA, say_inputs
 from augment.random_streams import stream_seed
+from augment.tasks.classification import Classification
 from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
 from train import checkpoints, console, run_folder
@@ -155,11 +156,12 @@ class Run:
         log = RunLog(self.folder, trainer.history) if is_first else None
         if is_first:
             self._render_kept_aside()
-        scores = self._score_initial(trainer.initial) if trainer.initial else {}
+        has_labels = not trainer.is_detector
+        scores = self._score_initial(trainer.initial) if trainer.initial and has_labels else {}
         split = self.data.train.to(trainer.device)  # `_score_initial` may have replaced its labels.
         with keyed(**keys_of("train", self.settings.train)):
             trainer.fit(split, self.held_out, log)
-        scores |= self._score()
+        scores |= self._score() if has_labels else {}
         if log:  # Only the first process has a log.
             scores |= self._score_photographs(trainer.selected, self.folder)
             log.scalars(scores)
@@ -395,7 +397,8 @@ def _build_trainer(
         recipe = replace(recipe, learning_rate=rate)
     inner = wrappers.without_normalized_light(network)
     description = describe(inner, **facts, validation=validation)
-    service = inputs.build_service(settings, data, device)
+    task = initial.task if initial else Classification()
+    service = inputs.build_service(settings, data, device, task)
     has_initial = initial is not None
     return Trainer(recipe, model, description, service, folder, data.labeled, has_initial)
 

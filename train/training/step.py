@@ -1,7 +1,7 @@
 """One training step: augment a batch, compute the gradient of its loss, and change the weights."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from typing import Any
 
@@ -13,13 +13,15 @@ from augment import distributed
 from augment.network import eval_mode
 from augment.progress import progress_message
 from augment.service import AugmentationService
+from augment.tasks.detection import Detection
 from renderer.errors import InputError, keyed, require_memory
 from train import console
 from train.data.batches import Batch
 from train.device import GraphedNetwork, MixedPrecision, compiles, wrap_ddp
-from train.train_settings import RELIGHT, TrainSettings
-from train.training.augmentations import Baseline, RelitBatches
+from train.train_settings import LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, TrainSettings
+from train.training.augmentations import Baseline, LowLight, RelitBatches
 from train.training.averages import Averages
+from train.training.detection import DetectionLoss
 from train.training.recipe import TrainingLoss, build_optimizer, learning_rate, share_layers
 
 
@@ -61,20 +63,32 @@ class TrainingStep:
         is_scaled = model.precision == "float16"
         self.scaler = torch.amp.GradScaler(self._device.type, enabled=is_scaled)
         positive_classes = service.positive_classes
-        self._augmentation: Baseline | RelitBatches
+        is_detector = isinstance(service.task, Detection)
+        if is_detector and settings.relight_steps:
+            raise InputError("relight_steps attacks classifiers: set it to 0", "relight_steps")
+        self._augmentation: Baseline | RelitBatches | LowLight
         if settings.augmentation == RELIGHT:
             self._augmentation = RelitBatches(settings, model, teacher, service.seed)
+        elif settings.augmentation in (LOW_LIGHT, RELIGHT_AND_LOW_LIGHT):
+            relit = None
+            if settings.augmentation == RELIGHT_AND_LOW_LIGHT:
+                relit = RelitBatches(settings, model, teacher, service.seed)
+            self._augmentation = LowLight(service.seed, relit)
         else:
             name, absent = settings.augmentation, positive_classes[1:]
             self._augmentation = Baseline(name, model, service.seed, absent)
         with keyed(choice="compile"):
-            is_compiled = compiles(settings.compile, self._device)
+            is_compiled = compiles(settings.compile, self._device) and not is_detector
         # Module that computes the logits of the teacher. It may take the features from
         # the network in training.
         pupil: nn.Module | None = teacher
-        if teacher is not None and not is_compiled:
+        if teacher is not None and not is_compiled and not is_detector:
             pupil = share_layers(settings, model, teacher, size)
-        self._loss = TrainingLoss(replica, settings, positive_classes, pupil, labeled).compute
+        self._loss: Callable[..., tuple[Tensor, Tensor]]
+        if isinstance(service.task, Detection):
+            self._loss = DetectionLoss(replica, settings, teacher, service.task).compute
+        else:
+            self._loss = TrainingLoss(replica, settings, positive_classes, pupil, labeled).compute
         self.attacked = model
         self.validated = averages.selected
         if is_compiled:

@@ -3,11 +3,13 @@ import torch
 import torch.nn.functional as F
 from scipy.stats import binomtest, chisquare
 
+from augment.scene.truth import NO_OBJECT, boxes_of
 from train.data.batches import (
     SMALL_IMAGE_SHIFT,
     Round,
     TrainingImages,
     crop_and_flip,
+    move_boxes,
     rounds_of_epoch,
     training_batches,
 )
@@ -144,3 +146,18 @@ class TestRounds:
         (everything,) = rounds_of_epoch(98, 2, 0, 3, images_per_epoch, None)
         assert (everything.number, everything.epoch) == (3, 3)
         assert everything.rows.tolist() == list(range(100))
+
+
+def test_boxes_move_with_the_image_and_are_no_objects_outside_of_it():
+    masks = torch.zeros(4, 3, 12, 16, dtype=torch.uint8)
+    masks[:3, :, 4:9, 5:8] = 1
+    # The box of the last image leaves the image. Its pixels at the border are then mirrored.
+    masks[3, :, 4:9, 14:16] = 1
+    shifts = torch.tensor([[0, 2, -3, 0], [0, -3, 2, -3]])
+    flips = torch.tensor([False, False, True, False])
+    boxes = boxes_of(masks[:, 0].bool())
+    tables = torch.cat([torch.ones(4, 1), boxes], dim=1)[:, None]
+    moved = move_boxes(tables, shifts, flips, 12, 16)[:, 0]
+    shown = boxes_of(crop_and_flip(masks, torch.arange(4), shifts, flips)[:, 0].bool())
+    assert torch.equal(moved[:3, 1:], shown[:3])
+    assert moved[:, 0].tolist() == [1, 1, 1, NO_OBJECT]

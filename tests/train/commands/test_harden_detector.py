@@ -1,0 +1,147 @@
+"""`nb.harden` trains detectors of torchvision on boxes in renders, and keeps those in photographs.
+
+The detector of these tests is trained for a second to find a bottle in natural light.
+"""
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor, nn
+from torchvision.ops import box_iou
+
+import norm_balls as nb
+from augment.augmentation_settings import AugmentationSettings
+from augment.service import AugmentationService
+from augment.tasks.detection import Detection
+from renderer.errors import InputError
+from renderer.image import to_bytes, to_unit
+from tests.detectors import BrightBox, OneBox, small_detector
+from train.training.augmentations import LowLight
+from train.training.detection import detected, losses_of
+from train.training.loop import Trainer
+
+SIZE = 32
+CLASSES = ["background", "bottle"]
+TASK = Detection(threshold=0.4)
+SHORT = {
+    "train": {"epochs": 2, "batch_size": 8, "learning_rate": 0.001},
+    "scene": {"views": 4, "backgrounds": [0.5]},
+    "renderer": {"rasterizer": "numpy", "samples": 1},
+    "data": {"workers": 0},
+    "augment": {"mode": "random"},
+}
+
+
+def renders(seed: int) -> tuple[torch.Tensor, list[dict[str, torch.Tensor]]]:
+    settings = AugmentationSettings(mode="random")
+    options = {"views": 6, "samples": 1, "rasterizer": "numpy", "task": TASK, "classes": CLASSES}
+    meshes = [("solid:bottle", 1), ("solid:ball", -1)]
+    service = AugmentationService.from_meshes(meshes, SIZE, settings, seed=seed, **options)
+    made = service.regenerate(BrightBox((0, 0, SIZE, SIZE)), 0)
+    return made.images, made.targets
+
+
+@pytest.fixture(scope="module")
+def detector() -> nn.Module:
+    network = OneBox(SIZE).train()
+    images, targets = renders(0)
+    optimizer = torch.optim.Adam(network.parameters(), lr=0.01)
+    for _ in range(200):
+        optimizer.zero_grad()
+        sum(network(images, targets).values()).backward()
+        optimizer.step()
+    return network.eval()
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """Return a folder of pictures that show bottles, or none."""
+    folder = tmp_path_factory.mktemp("photographs")
+    for index, image in enumerate(to_bytes(renders(1)[0])):
+        pixels = np.asarray(image.permute(1, 2, 0))
+        Image.fromarray(pixels).save(folder / f"{index:02}.png")
+    return folder
+
+
+def harden(network, photographs, meshes=("solid:bottle",), **options):
+    given = {"classes": CLASSES, "size": SIZE, "task": TASK} | SHORT | options
+    return nb.harden(network, meshes, photographs, **given)
+
+
+def as_batch(folder) -> torch.Tensor:
+    arrays = [np.asarray(Image.open(path)) for path in sorted(folder.glob("*.png"))]
+    return torch.tensor(np.stack(arrays)).permute(0, 3, 1, 2)
+
+
+def kept(detector: nn.Module, hardened: nn.Module, images: Tensor) -> float:
+    """Return the fraction of the boxes of a detector that a hardened one finds, too."""
+    pairs = zip(detected(detector, images, TASK), detected(hardened, images, TASK), strict=True)
+    overlaps = [
+        box_iou(old["boxes"], new["boxes"]).amax() if len(new["boxes"]) else torch.tensor(0.0)
+        for old, new in pairs
+        if len(old["boxes"])
+    ]
+    assert len(overlaps) >= 5
+    return float((torch.stack(overlaps) >= TASK.iou).float().mean())
+
+
+def test_the_loss_in_low_light_falls_and_boxes_in_unchanged_light_stay(detector, photographs):
+    weights = deepcopy(detector.state_dict())
+    train = {"epochs": 10, "batch_size": 12, "learning_rate": 0.001, "augmentation": "low_light"}
+    hardened = harden(detector, photographs, (), train=train, augment=None)
+    assert all(value.equal(weights[name]) for name, value in detector.state_dict().items())
+    assert type(hardened) is type(detector) and not hardened.training
+    images = as_batch(photographs)
+    boxes = detected(detector, images, TASK)
+    dark = to_unit(LowLight(seed=9).apply(images, torch.zeros(len(images)), 0))
+    losses = [
+        losses_of(deepcopy(network).train(), dark, boxes).item() for network in (detector, hardened)
+    ]
+    assert losses[1] < losses[0]
+    assert kept(detector, hardened, images) >= 0.8
+
+
+def test_without_the_boxes_of_the_teacher_renders_change_those_in_photographs(
+    detector, photographs
+):
+    train = SHORT["train"] | {"learning_rate": 0.003}
+    free = train | {"distillation_weight": 1e-9, "consistency_weight": 0.0}
+    both = (harden(detector, photographs, train=one) for one in (train, free))
+    with_teacher, without = (kept(detector, one, as_batch(photographs)) for one in both)
+    assert with_teacher > without
+
+
+def test_a_resumed_run_gives_the_weights_of_a_run_without_a_break(
+    detector, photographs, tmp_path, monkeypatch
+):
+    def fail_after_an_epoch(trainer: Trainer, *options) -> bool:
+        if trainer.epoch:
+            raise KeyboardInterrupt
+        return train_epoch(trainer, *options)
+
+    whole = harden(detector, photographs)
+    train_epoch = Trainer._train_epoch
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Trainer, "_train_epoch", fail_after_an_epoch)
+        harden(detector, photographs, out=tmp_path)
+    train = SHORT["train"] | {"resume": True}
+    resumed = harden(detector, photographs, train=train, out=tmp_path)
+    assert torch.equal(resumed.layer.weight, whole.layer.weight)
+
+
+def test_a_detector_of_torchvision_is_trained_without_meshes(photographs):
+    network = small_detector(len(CLASSES), SIZE)
+    hardened = harden(network, photographs, (), augment=None)
+    assert hardened.state_dict().keys() == network.state_dict().keys()
+    weights = zip(hardened.parameters(), network.parameters(), strict=True)
+    assert not all(torch.equal(*pair) for pair in weights)
+
+
+def test_a_detector_without_losses_is_refused(photographs):
+    network = BrightBox((0, 0, SIZE, SIZE)).eval()
+    network.register_parameter("weight", nn.Parameter(torch.ones(1)))
+    with pytest.raises(InputError, match="training mode"):
+        harden(network, photographs)
