@@ -1,4 +1,4 @@
-"""Labeled renders for a training loop, which are rendered again from time to time.
+"""Source of renders for a training loop, which are rendered again from time to time.
 
 Each such regeneration attacks the current weights of the network, or draws the lighting at random.
 """
@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor, nn
-from torch.utils.data import Dataset
 
 from augment import distributed
 from augment.attacks.loop import minimize
@@ -25,6 +24,7 @@ from augment.classifier import CheckedNetwork, class_index
 from augment.network import compute_outputs, frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
+from augment.renders import AttackExamples, Renders
 from augment.scene.build import MeshItem, build_scene, with_needed_degree
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
@@ -40,7 +40,6 @@ from augment.tasks.classification import (
 from augment.tasks.task import NO_CLASS, Criterion, Task
 from renderer.errors import InputError, as_integers, describe, require_kind, require_whole
 from renderer.image import to_unit
-from renderer.light.basis import HARMONICS, Basis
 from renderer.light.files import perturb
 from renderer.settings import Size
 
@@ -50,67 +49,6 @@ SHOWN_EXAMPLES = 4
 # Largest number of random renders that are classified to estimate the error rate. The standard
 # error of this estimate is at most 0.032.
 CLASSIFIED = 250
-
-
-@dataclass(frozen=True)
-class AttackExamples:
-    """S renders for which an attack during training succeeded, to be shown in figures.
-
-    The first axis of images, lights and predictions is the time: index 0 is before the attack,
-    and index 1 is after it. Images are in [0, 1]. Lights are RGB coefficients in the basis.
-    Predictions are probabilities of the C classes.
-    """
-
-    images: Float[Tensor, "2 S 3 H W"]
-    lights: Float[Tensor, "2 S _ 3"]
-    predictions: Float[Tensor, "2 S C"]
-    labels: Int[Tensor, " S"]
-    basis: Basis = HARMONICS
-
-    def __len__(self) -> int:
-        return len(self.labels)
-
-
-@dataclass(frozen=True)
-class Renders(Dataset[tuple[Tensor, Any]]):
-    """Labeled renders for training, as a data set of PyTorch.
-
-    An item is a pair of an image on the CPU and a label as an int. The data set
-    can be concatenated with other data whose labels are ints. Labels that are
-    tensors, as in a `TensorDataset`, must be converted to ints before, because
-    PyTorch's `DataLoader` cannot mix both types in a batch.
-
-    For a detector or a segmenter, an item is an image and its target, as the
-    detectors of torchvision take them in training. The `DataLoader` then needs
-    `collate_fn=lambda batch: tuple(zip(*batch))`.
-
-    Attributes:
-        images: Images in [0, 1], shape (E, 3, H, W).
-        labels: Labels, shape (E,), int64.
-        diagnostics: Numbers about the attack, such as its success rate, by name.
-        attack_examples: A few successfully attacked renders, before and after
-            the attack. None if nothing is rendered, and for detectors and segmenters.
-        targets: For a detector or a segmenter, the n visible objects of each
-            image that have a class, on the CPU: "boxes" (n, 4) float32, which
-            are left, top, right and bottom in pixels, "labels" (n,) int64, and
-            "masks" (n, H, W) uint8. An image may show none. None for a
-            classifier.
-    """
-
-    images: Float[Tensor, "E 3 H W"]
-    labels: Shaped[Tensor, "E ..."]
-    diagnostics: Mapping[str, float]
-    attack_examples: AttackExamples | None = None
-    targets: Sequence[dict[str, Tensor]] | None = None
-
-    def __len__(self) -> int:
-        """Return the number of examples."""
-        return len(self.labels)
-
-    def __getitem__(self, index: int) -> tuple[Tensor, Any]:
-        """Return an image (3, H, W) in [0, 1] on the CPU, and its label or its target."""
-        target = int(self.labels[index]) if self.targets is None else self.targets[index]
-        return self.images[index].cpu(), target
 
 
 @dataclass(eq=False, repr=False)

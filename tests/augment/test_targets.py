@@ -2,14 +2,15 @@
 
 import pytest
 import torch
-from augment.tasks.detection import Detection
 from torch.utils.data import DataLoader
 from torchvision.ops import masks_to_boxes
 
 import norm_balls as nb
 from augment.attack_settings import StepSettings
 from augment.augmentation_settings import AugmentationSettings, TrainingAttackSettings
-from augment.service import AugmentationService, Renders
+from augment.renders import Renders
+from augment.service import AugmentationService
+from augment.tasks.detection import Detection
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from tests.detectors import BrightBox, small_detector
@@ -84,7 +85,8 @@ def test_all_objects_of_an_image_are_targets_except_those_without_a_class():
     )
     (target,) = service.regenerate(BrightBox((0, 0, SIZE, SIZE)), 0).targets
     assert target["labels"].tolist() == [2, 1]
-    assert torch.equal(target["boxes"], masks_to_boxes(target["masks"]) + torch.tensor([0, 0, 1, 1]))
+    corners = masks_to_boxes(target["masks"]) + torch.tensor([0, 0, 1, 1])
+    assert torch.equal(target["boxes"], corners)
     assert not target["masks"].prod(0).any()
 
 

@@ -119,9 +119,7 @@ class DetectionLoss:
 
 
 @torch.no_grad()
-def detected(
-    network: nn.Module, images: UInt8[Tensor, "N 3 H W"], task: Detection
-) -> list[Target]:
+def detected(network: nn.Module, images: UInt8[Tensor, "N 3 H W"], task: Detection) -> list[Target]:
     """Return the boxes in images that a network finds with a score of at least the threshold."""
     unit = to_unit(images)
     with eval_mode(network):

@@ -22,7 +22,8 @@ from augment import distributed
 from augment.network import compute_outputs
 from augment.progress import progress
 from augment.random_streams import stream_seed
-from augment.service import AugmentationService, Renders
+from augment.renders import Renders
+from augment.service import AugmentationService
 from augment.tasks.detection import Detection
 from renderer.errors import InputError, single_line
 from renderer.image import to_bytes, to_unit

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 from tqdm import tqdm
 
-from augment.service import AttackExamples
+from augment.renders import AttackExamples
 from renderer.image import to_bytes
 from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import draw_grid, tiles_of, write_image

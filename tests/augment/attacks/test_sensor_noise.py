@@ -13,7 +13,7 @@ from augment.attacks.loop import minimize
 from augment.attacks.objective import NOISE_DRAWS, Objective, add_sensor_noise
 from augment.attacks.result import AttackResult
 from augment.augmentation_settings import TrainingAttackSettings
-from augment.service import Renders
+from augment.renders import Renders
 from augment.tasks.classification import ClassCriterion
 from augment.tasks.task import NO_CLASS
 
