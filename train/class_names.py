@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from augment.classifier import Classifier, class_index, nearest
+from augment.classifier import TaskNetwork, class_index, nearest
 from augment.scene.objects import MESHES_IN_MEMORY, name_mesh
 from augment.settings import ObjectSettings
 from renderer.errors import InputError, as_list, describe
@@ -174,7 +174,7 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
 
 
 def as_mappings(
-    name: str, meshes: Sequence[MeshItem], classifier: Classifier
+    name: str, meshes: Sequence[MeshItem], classifier: TaskNetwork
 ) -> list[dict[str, Any]]:
     """Convert the meshes of a caller to mappings with the fields of `ObjectSettings`.
 

@@ -178,7 +178,7 @@ def harden(
         if out is None:
             changes["train"]["cache"] = None
         experiment = "detector" if is_detector else "classifier"
-        sections = {"train": train, "augment": augment, "scene": scene}
+        sections: dict[str, Any] = {"train": train, "augment": augment, "scene": scene}
         sections |= {"renderer": renderer, "data": data}
         settings = _read_settings(experiment, changes, sections)
         if settings.label is None and meshes:
