@@ -48,8 +48,8 @@ def renders(seed: int) -> tuple[torch.Tensor, list[dict[str, torch.Tensor]]]:
 def detector() -> nn.Module:
     network = OneBox(SIZE).train()
     images, targets = renders(0)
-    optimizer = torch.optim.Adam(network.parameters(), lr=0.01)
-    for _ in range(200):
+    optimizer = torch.optim.Adam(network.parameters(), lr=0.02)
+    for _ in range(80):
         optimizer.zero_grad()
         sum(network(images, targets).values()).backward()
         optimizer.step()
@@ -90,7 +90,7 @@ def kept(detector: nn.Module, hardened: nn.Module, images: Tensor) -> float:
 
 def test_the_loss_in_low_light_falls_and_boxes_in_unchanged_light_stay(detector, photographs):
     weights = deepcopy(detector.state_dict())
-    train = {"epochs": 10, "batch_size": 12, "learning_rate": 0.001, "augmentation": "low_light"}
+    train = {"epochs": 5, "batch_size": 12, "learning_rate": 0.002, "augmentation": "low_light"}
     hardened = harden(detector, photographs, (), train=train, augment=None)
     assert all(value.equal(weights[name]) for name, value in detector.state_dict().items())
     assert type(hardened) is type(detector) and not hardened.training
@@ -104,6 +104,7 @@ def test_the_loss_in_low_light_falls_and_boxes_in_unchanged_light_stay(detector,
     assert kept(detector, hardened, images) >= 0.8
 
 
+@pytest.mark.slow
 def test_without_the_boxes_of_the_teacher_renders_change_those_in_photographs(
     detector, photographs
 ):
@@ -114,6 +115,7 @@ def test_without_the_boxes_of_the_teacher_renders_change_those_in_photographs(
     assert with_teacher > without
 
 
+@pytest.mark.slow
 def test_a_resumed_run_gives_the_weights_of_a_run_without_a_break(
     detector, photographs, tmp_path, monkeypatch
 ):
@@ -134,7 +136,7 @@ def test_a_resumed_run_gives_the_weights_of_a_run_without_a_break(
 
 def test_a_detector_of_torchvision_is_trained_without_meshes(photographs):
     network = small_detector(len(CLASSES), SIZE)
-    hardened = harden(network, photographs, (), augment=None)
+    hardened = harden(network, photographs, (), augment=None, train={"epochs": 1, "batch_size": 12})
     assert hardened.state_dict().keys() == network.state_dict().keys()
     weights = zip(hardened.parameters(), network.parameters(), strict=True)
     assert not all(torch.equal(*pair) for pair in weights)
