@@ -7,7 +7,8 @@ attacks, by smooth factors (gain). Weak ambient light is added, and a camera exp
     radiance = albedo · (slide · gain · shading + ambient)
 
 There are no shadows, no reflections and no depth. No mesh and no label is needed: the class of a
-photograph is what the network predicts for it unchanged.
+photograph is what the network predicts for it unchanged. What a detector or a segmenter finds in
+unchanged photographs is attacked one by one.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -32,12 +33,19 @@ from augment.attack_settings import (
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Objective
 from augment.attacks.optimizers import Gradient, NormBalls, Optimizer, sample
-from augment.classifier import UNIT_RANGE, Classifier, Normalization, as_classifier
-from augment.network import Network, Quantization, device_of, frozen_eval_mode, gradient_flags_kept
+from augment.classifier import MAX_PROBED, UNIT_RANGE, Normalization, TaskNetwork, as_network
+from augment.network import (
+    Network,
+    Quantization,
+    compute_outputs,
+    device_of,
+    frozen_eval_mode,
+    gradient_flags_kept,
+)
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.patterns import draw_slides, interpolate_smoothly, luminance
-from augment.tasks.classification import ClassCriterion
+from augment.tasks.task import Criterion, Task
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode, to_bytes, to_unit
@@ -270,6 +278,10 @@ class UniformDraws(Optimizer):
 class PhotographAttackResult(errors.ShortRepr):
     """Predictions of a network for N photographs in the light of a projector.
 
+    For a detector or a segmenter, a photograph is counted once for each of its
+    detections or segments in unchanged light. One that it finds nothing in is
+    left out.
+
     The projector shows S random pictures (slides) on each photograph, each in
     three lights, which are the keys of the dictionaries:
 
@@ -281,11 +293,12 @@ class PhotographAttackResult(errors.ShortRepr):
     Attributes:
         classifier: The attacked network.
         photographs: Unchanged photographs, uint8, shape (N, 3, height, width).
+        index: Index of each photograph in the list that was given, shape (N,).
+        criterion: What an attack changes in each photograph.
         settings: Settings of the attack.
         seed: Seed of the slides, the searches and the noise.
-        source: Predicted classes of the unchanged photographs, shape (N,).
         predicted: For each light, the predicted classes of the photographs in
-            this light, shape (N, S).
+            this light, shape (N, S). The number of classes stands for nothing.
         changed: For each light, a mask of the photographs whose predicted class
             changes, without noise and in each draw of the noise, shape (N, S),
             bool. If the slide as it is changes the class, no factors are
@@ -294,14 +307,20 @@ class PhotographAttackResult(errors.ShortRepr):
             in each cell of a grid, shape (N, S, 3, cells, cells).
     """
 
-    classifier: Classifier
+    classifier: TaskNetwork
     photographs: Tensor
+    index: Tensor
+    criterion: Criterion
     settings: RelightingSettings
     seed: int
-    source: Tensor
     predicted: dict[str, Tensor]
     changed: dict[str, Tensor]
     log_gain: dict[str, Tensor]
+
+    @property
+    def source(self) -> Tensor:
+        """Predicted classes of the unchanged photographs, shape (N,)."""
+        return self.criterion.source[:, 0]
 
     def kept(self, light: str | None = None) -> Tensor:
         """Return a mask of the photographs that keep their class in the light of every slide.
@@ -341,13 +360,13 @@ class PhotographAttackResult(errors.ShortRepr):
         chosen = self.photographs[photograph]
         if light == UNCHANGED:
             return chosen
-        projected = _draw_lights(self.photographs, [photograph], slide, self.seed)
+        projected = _draw_lights(self, [photograph], slide)
         log_gain = self.log_gain[light][photograph, slide][None]
         return to_bytes(projected.expose(decode(to_unit(chosen[None]), "srgb"), log_gain))[0]
 
 
 def attack_photographs(
-    network: Classifier | Callable[[Tensor], Tensor],
+    network: TaskNetwork | Callable[[Tensor], Any],
     photographs: Tensor,
     settings: RelightingSettings | None = None,
     *,
@@ -356,6 +375,8 @@ def attack_photographs(
     value_range: tuple[float, float] = UNIT_RANGE,
     sensor_noise: float = 1.0,
     batch_size: int = 32,
+    task: Task | None = None,
+    limit: int | None = None,
     seed: int = 0,
 ) -> PhotographAttackResult:
     """Attack a network through the light of a projector on photographs.
@@ -366,16 +387,20 @@ def attack_photographs(
     factors that change the predicted class, with the same number of passes
     through the network. Neither meshes nor labels are needed.
 
+    For a detector or a segmenter, what it finds in an unchanged photograph is
+    the truth. Each detection or segment is attacked by itself.
+
     A change of the predicted class counts if it remains after rounding to 8
     bits and in three draws of sensor noise, as in other attacks.
 
     Args:
-        network: A classifier, or a plain network from images to logits.
+        network: A classifier, a detector or a segmenter, or a plain network from
+            images to their outputs.
         photographs: Photographs of the size of the network, sRGB, uint8, shape
             (N, 3, height, width). Slides show them, too.
         settings: Norm-ball and passes of the attack. None for the defaults.
         classes: Names of the classes of a plain network. None for "0", "1" and
-            so on.
+            so on, or for the names that the network has.
         normalization: Normalization of images for a plain network: "imagenet",
             or mean and standard deviation of the channels, as `attack` takes
             it. None if the network takes images in [0, 1], or normalizes them
@@ -385,6 +410,10 @@ def attack_photographs(
         sensor_noise: Standard deviation of the noise, in units of 1/255. 0 for
             no noise.
         batch_size: Number of photographs that the network sees at a time.
+        task: Task of the network, such as `nb.Detection(threshold=0.3)`. None if
+            its outputs tell.
+        limit: Number of photographs, detections or segments that are attacked,
+            at equal distances in the list of all. None to attack all.
         seed: Seed of the slides, the searches and the noise.
 
     Returns:
@@ -392,7 +421,7 @@ def attack_photographs(
 
     Raises:
         InputError: If the photographs have another dtype or shape, or another
-            size than the images of the network.
+            size than the images of the network, or if it finds nothing in them.
 
     Example:
         >>> import norm_balls as nb
@@ -405,51 +434,62 @@ def attack_photographs(
     expected = "RelightingSettings(...) or None"
     errors.require_kind("settings", settings, RelightingSettings | None, expected)
     errors.require_whole("seed", seed)
+    if limit is not None:
+        errors.require_whole("limit", limit, 1)
     settings = settings or RelightingSettings()
     success_settings = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
     size = as_size("photographs", photographs.shape[-2:])
     with gradient_flags_kept(network):
         device = device_of(network)
         given = size, classes, normalization, value_range, device
-        classifier = as_classifier(network, *given, size_from="the photographs")
+        classifier = as_network(network, *given, task=task, size_from="the photographs")
         if classifier.size != size:
             raise InputError(
                 f"photographs have the size {size} in pixels, "
                 f"but the network takes {classifier.size}: resize them"
             )
-        return _attack(classifier, photographs, settings, success_settings, seed)
+        return _attack(classifier, photographs, settings, success_settings, limit, seed)
 
 
 def _attack(
-    classifier: Classifier,
+    classifier: TaskNetwork,
     photographs: UInt8[Tensor, "N 3 height width"],
     settings: RelightingSettings,
     success: AttackSettings,
+    limit: int | None,
     seed: int,
 ) -> PhotographAttackResult:
     """Attack all photographs with all slides, one batch after the other."""
     device = device_of(classifier)
-    has_gradients = classifier.is_differentiable(torch.empty(0, device=device))
-    lights = LIGHTS if has_gradients else LIGHTS[:-1]
-    shape = (len(photographs), settings.slides)
+    probed = to_unit(photographs[:MAX_PROBED]).to(device)
+    lights = LIGHTS if classifier.is_differentiable(probed) else LIGHTS[:-1]
+    quantizing = Network(classifier, [Quantization()])
+    with frozen_eval_mode(classifier):
+        outputs = compute_outputs(quantizing, photographs, success.batch_size, device)
+    index, criterion = classifier.task.as_found(outputs, classifier.classes)
+    if len(photographs) and not len(index):
+        found, count = classifier.task.finds[0], len(photographs)
+        raise InputError(f"{classifier.title} has no {found} in {count} photographs: give others")
+    if limit is not None and limit < len(index):
+        chosen = torch.linspace(0, len(index) - 1, limit).round().long()
+        index, criterion = index[chosen], criterion.select(chosen.to(device))
+    shape = (len(index), settings.slides)
     shape_of_gains = (*shape, 3, settings.cells, settings.cells)
     result = PhotographAttackResult(
         classifier=classifier,
-        photographs=photographs,
+        photographs=photographs[index],
+        index=index,
+        criterion=criterion.map(Tensor.cpu),
         settings=settings,
         seed=seed,
-        source=torch.empty(len(photographs), dtype=torch.int64),
         predicted={light: torch.empty(shape, dtype=torch.int64) for light in lights},
         changed={light: torch.zeros(shape, dtype=torch.bool) for light in lights},
         log_gain={light: torch.zeros(shape_of_gains) for light in lights},
     )
-    batches = torch.arange(len(photographs)).split(success.batch_size)
-    quantizing = Network(classifier, [Quantization()])
+    batches = torch.arange(len(index)).split(success.batch_size)
     with frozen_eval_mode(classifier):
         for rows in progress(batches, "relighting photographs", len(batches)):
-            images = to_unit(photographs[rows]).to(device)
-            with torch.no_grad():
-                result.source[rows] = quantizing(images).argmax(1).cpu()
+            images = to_unit(result.photographs[rows]).to(device)
             for slide in range(settings.slides):
                 _attack_slide(result, success, images, rows, slide)
     return result
@@ -471,15 +511,13 @@ def _attack_slide(
     indices = rows.tolist()
     problem = RelitPhotographs(
         decode(images, "srgb"),
-        _draw_lights(result.photographs, indices, slide, result.seed).to(images.device),
+        _draw_lights(result, indices, slide).to(images.device),
         settings,
         [generator(result.seed, "factors", index, slide) for index in indices],
     )
-    # Treat each photograph as an example of one view: the second axis has length 1.
-    source = result.source[rows].to(images.device)[:, None]
+    criterion = result.criterion.select(rows).map(lambda values: values.to(images.device))
     examples = torch.arange(len(rows), device=images.device)
     for light in result.changed:
-        criterion = ClassCriterion(source)
         # No search reaches this margin, so each uses all passes. The slide as it is takes no step.
         search = replace(
             success,
@@ -503,18 +541,17 @@ def _attack_slide(
             log_gain = found.values.cpu().view_as(result.log_gain[name][rows, slide])
             result.log_gain[name][rows, slide] = log_gain
         if light == SLIDE:
-            source = source[~is_changed]
+            criterion = criterion.select(~is_changed)
             examples = examples[~is_changed]
             rows = rows[~is_changed.cpu()]
             if not len(rows):
                 return
 
 
-def _draw_lights(
-    photographs: UInt8[Tensor, "N 3 height width"], rows: Sequence[int], slide: int, seed: int
-) -> ProjectedLight:
-    """Draw random projector light that depends on row, slide and seed, not on other photographs."""
-    shape = photographs.shape[-2:]
-    streams = [generator(seed, "light", row, slide) for row in rows]
-    lights = [draw_projected_light(1, shape, draws, photographs) for draws in streams]
+def _draw_lights(result: PhotographAttackResult, rows: Sequence[int], slide: int) -> ProjectedLight:
+    """Draw random projector light that depends on the index of a photograph, slide and seed."""
+    shape = result.photographs.shape[-2:]
+    indices = result.index[list(rows)].tolist()
+    streams = [generator(result.seed, "light", index, slide) for index in indices]
+    lights = [draw_projected_light(1, shape, draws, result.photographs) for draws in streams]
     return ProjectedLight(*map(torch.cat, zip(*lights, strict=True)))

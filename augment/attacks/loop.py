@@ -273,7 +273,8 @@ def evaluate(
         images.append(rendered.detach())
         chosen = objective.select(rows[group])
         if objective.criterion.needs_truth:
-            chosen = chosen.at(problem.truth(part.detach(), examples[rows[group]]))
+            truth = problem.truth(part.detach(), examples[rows[group]])
+            chosen = chosen if truth is None else chosen.at(truth)
         score, image_gradient = chosen.score(images[-1], needs_gradient)
         scores.append(score)
         if needs_gradient:

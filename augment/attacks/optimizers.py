@@ -59,8 +59,8 @@ class Problem(Protocol):
     def render(self, values: Values, examples: Examples) -> Images:
         """Render the V views of examples, differentiable in the values."""
 
-    def truth(self, values: Values, examples: Examples) -> Truth:
-        """Find where the objects are in the images. Only criteria with `needs_truth` ask for it."""
+    def truth(self, values: Values, examples: Examples) -> Truth | None:
+        """Find where the objects are, for criteria with `needs_truth`. None if they never move."""
 
     def project(self, values: Values, examples: Examples) -> Values:
         """Find the nearest values that are feasible and lie in the norm-balls."""
@@ -125,9 +125,9 @@ class NormBalls:
         if used_mask is not None and used_mask.all():
             self.used_mask = None
 
-    def truth(self, values: Values, examples: Examples) -> Truth:
-        """Refuse: nobody knows where objects are in images that were not rendered."""
-        raise NotImplementedError
+    def truth(self, values: Values, examples: Examples) -> Truth | None:
+        """Return None: objects in images that are not rendered stay where they are."""
+        return None
 
     def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
         """Find the nearest feasible values. By default, all values are feasible.

@@ -54,6 +54,7 @@ class Classification(Task):
     missed = "are not classified as their class"
     measure = "logits"
     confidence = "probability"
+    finds = "photographs", "keeps the class of"
 
     def recognizes(self, outputs: Any) -> bool:
         """Return whether outputs are a tensor with two dimensions, such as logits."""
@@ -77,6 +78,12 @@ class Classification(Task):
     ) -> ClassCriterion:
         """Return the criterion of an untargeted attack, for which positions do not matter."""
         return ClassCriterion(source)
+
+    def as_found(
+        self, outputs: Float[Tensor, "N C"], classes: Sequence[str]
+    ) -> tuple[Int[Tensor, " N"], ClassCriterion]:
+        """Return the criterion of an attack on the class of each image."""
+        return torch.arange(len(outputs)), ClassCriterion(outputs.argmax(1, keepdim=True))
 
     def require_target(self, target: Any) -> None:
         """Accept every target."""

@@ -100,6 +100,7 @@ class Detection(Task):
     missed = "have no detection of the object"
     measure = "scores"
     confidence = "score at the object"
+    finds = "detections", "still detects"
 
     threshold: float = 0.4
     iou: float = 0.5
@@ -229,6 +230,24 @@ class Detection(Task):
         """Return the criterion of an untargeted attack on the first object of each example."""
         boxes = visible_boxes(truth())
         return DetectionCriterion(source, task=self, class_count=class_count, boxes=boxes)
+
+    def as_found(
+        self, outputs: list[Detections], classes: Sequence[str]
+    ) -> tuple[Int[Tensor, " E"], DetectionCriterion]:
+        """Return the criterion of an attack on each box whose score reaches the threshold."""
+        is_found = [item["scores"] >= self.threshold for item in outputs]
+        boxes, labels = (
+            torch.cat([item[key][rows] for item, rows in zip(outputs, is_found, strict=True)])
+            for key in ("boxes", "labels")
+        )
+        image = torch.repeat_interleave(torch.tensor([int(rows.sum()) for rows in is_found]))
+        options: dict[str, Any] = {"task": self, "class_count": len(classes)}
+        criterion = DetectionCriterion(labels[:, None], boxes=boxes[:, None], **options)
+        flat = criterion.map(lambda rows: rows[:, 0])
+        evidence = flat.evidence([outputs[index] for index in image.tolist()])
+        # A box at which another class is surer is mislabeled already.
+        kept = flat.predicted(evidence) == flat.source
+        return image[kept.cpu()], criterion.select(kept)
 
     def require_target(self, target: Any) -> None:
         """Check that boxes of another class are the goal of the attack."""

@@ -22,6 +22,8 @@ from augment.tasks.detection import id2label, log_odds_of
 from augment.tasks.task import ObjectCriterion, Task, visible_boxes
 from renderer.errors import InputError, describe, require_number
 
+# Class of the pixels that show no object, and the least fraction of an image that shows one.
+BACKGROUND, LEAST_AREA = "background", 0.01
 # Opacity of the colors that are drawn over an image.
 OPACITY = 0.5
 
@@ -60,6 +62,7 @@ class Segmentation(Task):
     missed = "have no segment of the object"
     measure = "logits"
     confidence = "IoU at the object"
+    finds = "segments", "still finds"
 
     iou: float = 0.5
 
@@ -110,6 +113,20 @@ class Segmentation(Task):
         found = truth()
         visible_boxes(found)
         return SegmentationCriterion(source, task=self, masks=found.masks[..., 0, :, :])
+
+    def as_found(
+        self, outputs: Float[Tensor, "N C H W"], classes: Sequence[str]
+    ) -> tuple[Int[Tensor, " E"], SegmentationCriterion]:
+        """Return the criterion of an attack on each class in an image, except a background.
+
+        The class must have the fraction LEAST_AREA of the pixels.
+        """
+        label = outputs.argmax(1)
+        area = F.one_hot(label, outputs.shape[1]).float().mean((1, 2))
+        area[:, [name.strip("_").lower() == BACKGROUND for name in classes]] = 0
+        image, source = (area >= LEAST_AREA).nonzero(as_tuple=True)
+        masks = label[image] == source[:, None, None]
+        return image.cpu(), SegmentationCriterion(source[:, None], task=self, masks=masks[:, None])
 
     def require_target(self, target: Any) -> None:
         """Refuse a target, because an attack on a segmenter hides an object."""

@@ -167,6 +167,7 @@ class Task(ABC):
         missed: What is said of images in which the true class is not found.
         measure: The numbers that a network of the task returns, in messages.
         confidence: What `confidences` are, on the axis of a chart.
+        finds: What `as_found` gives, and how a network keeps them, in sentences.
     """
 
     name: ClassVar[str]
@@ -174,6 +175,7 @@ class Task(ABC):
     missed: ClassVar[str]
     measure: ClassVar[str]
     confidence: ClassVar[str]
+    finds: ClassVar[tuple[str, str]]
 
     @abstractmethod
     def recognizes(self, outputs: Any) -> bool:
@@ -216,6 +218,13 @@ class Task(ABC):
         self, source: Int[Tensor, " ..."], truth: Callable[[], Truth], class_count: int
     ) -> Criterion:
         """Return the criterion of an untargeted attack. `truth` computes where objects are."""
+
+    @abstractmethod
+    def as_found(self, outputs: Any, classes: Sequence[str]) -> tuple[Int[Tensor, " E"], Criterion]:
+        """Return criteria of attacks on what a network finds in images, and the image of each.
+
+        What it finds in unchanged images is the truth for the same images in other light.
+        """
 
     @abstractmethod
     def require_target(self, target: Any) -> None:

@@ -1,6 +1,8 @@
 """Photographs in the light of a projector, against hand computations, and the attack on them."""
 
 import math
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import nn
 
+import norm_balls as nb
 from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Objective
@@ -236,3 +239,51 @@ def test_relit_photographs_repeat_with_their_seed(photographs):
     assert first.dtype == torch.uint8
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
+
+
+def find_bright(images):
+    """Detect the left and the right half of each image, if their green light is above 0.4."""
+    boxes = torch.tensor([[0.0, 0, 8, 16], [8, 0, 16, 16]])
+    halves = images[:, 1].unflatten(-1, (2, 8)).mean((1, 3))
+    labels = torch.tensor([0, 1])
+    return [
+        {"boxes": boxes, "labels": labels, "scores": (10 * (half - 0.4)).sigmoid()}
+        for half in halves
+    ]
+
+
+def test_what_a_detector_finds_in_unchanged_photographs_is_attacked_one_by_one(photographs):
+    photographs, settings = photographs[:4], replace(SETTINGS, slides=1)
+    options = {"classes": ["a", "b"], "task": nb.Detection(threshold=0.5)}
+    result = attack_photographs(find_bright, photographs, settings, **options)
+    halves = (photographs[:, 1].float() / 255).unflatten(-1, (2, 8)).mean((1, 3))
+    index, source = (halves >= 0.4).nonzero(as_tuple=True)
+    assert torch.equal(result.index, index)
+    assert torch.equal(result.source, source)
+    for row, light in product(range(len(index)), result.changed):
+        image = to_unit(result.image(row, light))
+        is_found = find_bright(image[None])[0]["scores"][source[row]] >= 0.5
+        expected = int(source[row]) if is_found else 2
+        assert int(result.predicted[light][row, 0]) == expected
+    assert result.kept("adversarial").sum() < result.kept("slide").sum()
+    few = attack_photographs(find_bright, photographs, settings, limit=2, **options)
+    assert few.index.tolist() == [int(index[0]), int(index[-1])]
+
+
+def test_what_is_found_nowhere_cannot_be_attacked(photographs):
+    with pytest.raises(InputError, match="no detections in"):
+        attack_photographs(find_bright, 0 * photographs, SETTINGS, classes=["a", "b"])
+
+
+def test_each_segment_of_a_photograph_is_attacked_by_itself(photographs):
+    def find_green(images):
+        green = 20 * (images[:, 1] - 0.3)
+        return torch.stack([0 * green, green], dim=1)
+
+    classes = ["background", "green"]
+    settings = replace(SETTINGS, slides=1)
+    result = attack_photographs(find_green, photographs, settings, classes=classes)
+    area = (find_green(to_unit(photographs)).argmax(1) == 1).float().mean((1, 2))
+    assert result.index.tolist() == (area >= 0.01).nonzero()[:, 0].tolist()
+    assert (result.source == 1).all()
+    assert result.kept("adversarial").sum() <= result.kept("slide").sum()

@@ -2,20 +2,25 @@
 
 The projector shows a slide, which is a random picture. A network loses a photograph
 if the light of the slide changes the predicted class. The photographs need no labels,
-because the prediction for the unchanged photograph counts as right. If an audit has no meshes,
-this is its only test.
+because the prediction for the unchanged photograph counts as right. A detector or a segmenter loses
+each of its detections or segments in unchanged light by itself. If an audit has no meshes, this is
+its only test.
 """
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from augment.attack_settings import RelightingSettings
-from augment.classifier import Classifier
+from augment.classifier import TaskNetwork
+from augment.network import device_of
 from augment.photographs import (
     ADVERSARIAL,
     RANDOM,
@@ -24,11 +29,14 @@ from augment.photographs import (
     PhotographAttackResult,
     attack_photographs,
 )
+from augment.tasks.task import NOTHING
 from renderer.errors import ShortRepr
+from renderer.image import to_unit
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from train.data.photographs import find_unlabeled, load_photographs
 from train.results.first_screen import FirstScreen, ShownMetric
+from train.results.intervals import Units, leave_out
 from train.results.page import write_page
 from train.results.pictures import Picture, evenly_spaced, read_pictures
 from train.results.predictions import RELIT
@@ -61,7 +69,7 @@ MAX_PICTURE_WIDTH = 900
 PASS_THRESHOLD = 0.9
 # Titles of the numbers at the top of the report, by the kind of light.
 NUMBER_TITLES = {
-    SLIDE: "Keep their class under a random slide",
+    SLIDE: "Kept under a random slide",
     RANDOM: "… after random search",
     ADVERSARIAL: "… after as many passes along the gradient",
 }
@@ -76,7 +84,7 @@ IN_LIGHT = {
 
 @dataclass(frozen=True)
 class RelitPhotograph:
-    """Predictions of a network for one photograph in the light of several slides.
+    """Predictions of a network for one photograph, or one of its objects, in several lights.
 
     A slide is a random picture that a projector shows on the photograph. There
     are up to three kinds of light: "slide" is the slide itself, "random" is the
@@ -107,11 +115,13 @@ class RelitScores(ShortRepr):
         gain: Largest factor by which an attack multiplies a color channel of a
             slide.
         passes: Number of passes through the network in each attack.
-        photographs: Predictions for each photograph.
+        photographs: Predictions for each photograph, or for each object that a
+            detector or a segmenter finds in one.
         pictures: For the indices of some photographs, the file name of a
             picture that shows the photograph in each kind of light.
         found: Number of photographs in the folder.
         unreadable: Paths of the photographs that could not be read.
+        finds: What is counted, and how the network keeps it, in sentences.
     """
 
     folder: str
@@ -122,6 +132,7 @@ class RelitScores(ShortRepr):
     pictures: Mapping[int, str]
     found: int
     unreadable: Sequence[str]
+    finds: tuple[str, str]
 
     @property
     def lights(self) -> list[str]:
@@ -131,10 +142,27 @@ class RelitScores(ShortRepr):
         """
         return list(self.photographs[0].kept)
 
+    @property
+    def shown(self) -> int:
+        """Number of photographs."""
+        return len({item.path for item in self.photographs})
+
     def kept(self, light: str) -> Proportion:
-        """Compute the fraction of photographs whose predicted class no slide changes."""
-        is_kept = [photograph.kept[light] == self.slides for photograph in self.photographs]
-        return fraction(sum(is_kept), len(is_kept))
+        """Compute the fraction of photographs whose predicted class no slide changes.
+
+        The interval of what is found in photographs is over the photographs.
+        """
+        is_kept = np.array([item.kept[light] == self.slides for item in self.photographs])
+        kept = fraction(int(is_kept.sum()), len(is_kept))
+        _, unit = np.unique([item.path for item in self.photographs], return_inverse=True)
+        if self.shown == len(unit):
+            return kept
+
+        def mean(counts: np.ndarray) -> np.ndarray:
+            return (counts @ is_kept / counts.sum(-1))[None]
+
+        (over,) = leave_out(mean, Units([unit], "photographs"))
+        return replace(kept, **asdict(over.estimate))
 
     def tables(self) -> list[Table]:
         """Make a table of the photographs that keep their class, and one with a row for each class.
@@ -150,14 +178,15 @@ class RelitScores(ShortRepr):
             rows.append([name, len(group), *map(sum, is_kept)])
         rows.sort(key=lambda row: sum(row[2:]) / row[1])
         titles = [f"kept: {TITLES[light]}" for light in self.lights]
+        subject, _ = self.finds
         return [
-            Table("photographs that keep their class", ["light", "kept"], kept),
-            Table("by predicted class", ["class", "photographs", *titles], rows),
+            Table(f"{subject} that keep their class", ["light", "kept"], kept),
+            Table("by predicted class", ["class", subject, *titles], rows),
         ]
 
 
 def attack_folder(
-    classifier: Classifier,
+    classifier: TaskNetwork,
     folder: Path,
     settings: RelightingSettings,
     out: Path,
@@ -170,7 +199,7 @@ def attack_folder(
     """Attack a network by the light of a projector on photographs, and write the results.
 
     `sensor_noise` is a standard deviation in units of 1/255. `limit` photographs at equal distances
-    in the list are attacked, or all if it is None.
+    in the list are attacked, and as many objects in them, or all if it is None.
     """
     found = find_unlabeled(folder)
     chosen = evenly_spaced(found, limit or len(found))
@@ -178,12 +207,18 @@ def attack_folder(
         folder, chosen, classifier.size, skip_unreadable=True
     )
     result = attack_photographs(
-        classifier, images, settings, sensor_noise=sensor_noise, batch_size=batch_size, seed=seed
+        classifier,
+        images,
+        settings,
+        sensor_noise=sensor_noise,
+        batch_size=batch_size,
+        limit=limit,
+        seed=seed,
     )
     out.mkdir(parents=True, exist_ok=True)
-    classes = result.classifier.classes
+    classes = [*result.classifier.classes, NOTHING]
     photographs = []
-    for index, photograph in enumerate(readable):
+    for index, photograph in enumerate(readable[row] for row in result.index.tolist()):
         becomes = {
             light: [classes[label] for label in result.predicted[light][index].tolist()]
             for light in result.changed
@@ -200,6 +235,7 @@ def attack_folder(
         pictures=_write_pictures(result, out),
         found=len(found),
         unreadable=unreadable,
+        finds=classifier.task.finds,
     )
     atomic_write(out / RELIT, json.dumps(asdict(scores), indent=1) + "\n", durable=True)
     return scores
@@ -234,11 +270,20 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
     for photograph in order[:PICTURE_COUNT].tolist():
         # The first slide that changes the class in the strongest light, or 0.
         slide = int(changed_in_strongest[photograph].int().argmax())
-        images = [result.image(photograph, light, slide) for light in result.changed]
-        side_by_side = torch.cat([result.image(photograph, UNCHANGED), *images], dim=2)
+        shown = [(UNCHANGED, 0), *((light, slide) for light in result.changed)]
+        images = [_drawn(result, result.image(photograph, *item)) for item in shown]
+        side_by_side = torch.cat(images, dim=2)
         names[photograph] = f"relit_{photograph:04d}.png"
         write_image(out / names[photograph], side_by_side)
     return names
+
+
+@torch.no_grad()
+def _drawn(result: PhotographAttackResult, image: UInt8[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """Draw what the attacked network finds in an image on it."""
+    network = result.classifier
+    shown = to_unit(image).to(device_of(network))
+    return network.task.draw(shown, network(shown[None])[0], network.classes).cpu()
 
 
 def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
@@ -264,7 +309,7 @@ def write_photographs_page(
     if kept is not None and kept < PASS_THRESHOLD:
         answer = "Its predictions depend on the light."
     sentences = [_sentence(name, item) for name, item in zip(results, scores, strict=True)]
-    place = f"{len(first.photographs)} photographs of {first.folder}"
+    place = f"{first.shown} photographs of {first.folder}"
     screen = FirstScreen(answer, [*sentences, MODELED], numbers, [*results], place)
     path = write_page(
         out,
@@ -283,7 +328,9 @@ def _sentence(name: str, scores: RelitScores) -> str:
     """Write how many photographs keep their class in each kind of light."""
     counts = [f"{scores.kept(light).hits} {IN_LIGHT[light]}" for light in scores.lights]
     kept = join_words(counts, "and")
-    return f"Of {len(scores.photographs)} photographs, {name} keeps the class of {kept}."
+    subject, keeps = scores.finds
+    place = f" in {scores.shown} photographs" if subject != "photographs" else ""
+    return f"Of {len(scores.photographs)} {subject}{place}, {name} {keeps} {kept}."
 
 
 def _section(name: str, folder: Path) -> dict[str, Any]:
@@ -296,7 +343,7 @@ def _section(name: str, folder: Path) -> dict[str, Any]:
         "A change counts only if it remains in three draws of the noise of a sensor.",
     ]
     unreadable_count = len(scores.unreadable)
-    if len(scores.photographs) + unreadable_count < scores.found:
+    if scores.shown + unreadable_count < scores.found:
         sentences.append(f"The folder holds {scores.found} photographs, of which these are some.")
     if unreadable_count:
         sentences.append(f"{unreadable_count} photographs cannot be read.")

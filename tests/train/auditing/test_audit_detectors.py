@@ -10,8 +10,12 @@ import norm_balls as nb
 from augment.classifier import as_network
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
+from renderer.io.images import write_image
 from train.auditing import found
+from train.auditing.audit import run_audit
 from train.auditing.lights import KINDS, Views, recognize_in_environments
+from train.auditing.relit import RELIT_FOLDER, read_relit
+from train.command_settings import AuditSettings
 
 SIZE = 32
 
@@ -64,6 +68,24 @@ def test_recall_on_renders_is_the_fraction_of_views_in_which_the_object_is_found
     assert content["curve"][-1][0] == pytest.approx(0.5)
     recalls = [recall for _, recall in content["curve"]]
     assert recalls == sorted(recalls)
+
+
+def test_an_audit_without_meshes_relights_what_a_detector_finds_in_photographs(tmp_path):
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    for index in range(3):
+        pixels = np.full((SIZE, SIZE, 3), 128, np.uint8)
+        # The last photograph shows nothing.
+        pixels[8:20, 8 + index : 24] = (150, 110, 90) if index < 2 else 128
+        write_image(photographs / f"{index}.png", pixels)
+    network = as_network(_find_red, SIZE, ["orange", "apple"])
+    out = tmp_path / "out"
+    settings = AuditSettings(network="red", unlabeled=str(photographs), out=str(out))
+    page = run_audit(settings, {"classifier": network}).path.read_text()
+    scores = read_relit(out / "classifier" / RELIT_FOLDER)
+    assert [item.path for item in scores.photographs] == ["0.png", "1.png"]
+    assert {item.predicted for item in scores.photographs} == {"orange"}
+    assert f"Of 2 detections in 2 photographs, {network.name} still detects" in page
 
 
 @pytest.mark.slow
