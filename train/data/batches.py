@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import NamedTuple, cast
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
 from augment import distributed
@@ -23,8 +23,8 @@ from train.data.sets import Split
 # A larger image is shifted by at most a sixteenth of its side.
 SMALL_IMAGE_SHIFT = 4
 
-# Images, uint8, shape (B, 3, H, W); their labels, shape (B,), or tables of the boxes
-# in renders, shape (B, O, 5); and whether each image is a render, bool, shape (B,).
+# Images, uint8, shape (B, 3, H, W); their labels, shape (B,), or maps of the objects
+# in renders, shape (B, 1, H, W); and whether each image is a render, bool, shape (B,).
 Batch = tuple[Tensor, Tensor, Tensor]
 
 
@@ -137,10 +137,10 @@ def training_batches(
             shown[places] = crop_and_flip(pixels, render, shift[:, places], flip[places])
             shown_labels = renders.labels[render]
             if shown_labels.ndim > 1:
-                # The labels of a detector are tables of boxes. A photograph has none.
-                moves = (shift[:, places], flip[places], *pixels.shape[2:])
-                shown_labels = move_boxes(shown_labels, *moves)
-                labels = torch.full_like(shown_labels[:1], NO_OBJECT).repeat(own_size, 1, 1)
+                # Maps of the objects move with the images. A photograph has none.
+                maps = renders.labels
+                shown_labels = crop_and_flip(maps, render, shift[:, places], flip[places])
+                labels = torch.full_like(shown, NO_OBJECT, dtype=maps.dtype)[:, :1]
             labels[places] = shown_labels
         yield shown, labels, mask
 
@@ -180,11 +180,11 @@ def _draw(
 
 
 def crop_and_flip(
-    images: UInt8[Tensor, "N 3 H W"],
+    images: Shaped[Tensor, "N C H W"],
     chosen: Int[Tensor, " B"],
     shifts: Int[Tensor, "2 B"],
     flips: Bool[Tensor, " B"],
-) -> UInt8[Tensor, "B 3 H W"]:
+) -> Shaped[Tensor, "B C H W"]:
     """Select images, shift each by whole pixels, and flip some of them left to right.
 
     A shift uncovers pixels at a border of the image. They are filled by
@@ -200,36 +200,14 @@ def crop_and_flip(
     source_columns = torch.arange(width, device=device).expand(len(chosen), -1)
     source_columns = torch.where(flips[:, None], source_columns.flip(1), source_columns)
     source_columns = _reflect(source_columns + shifts[1, :, None], width)
-    channels = torch.arange(3, device=device)
-    # The four index arrays broadcast to the shape (B, 3, H, W) of the result.
+    channels = torch.arange(images.shape[1], device=device)
+    # The four index arrays broadcast to the shape (B, C, H, W) of the result.
     return images[
         chosen[:, None, None, None],
         channels[:, None, None],
         source_rows[:, None, :, None],
         source_columns[:, None, None, :],
     ]
-
-
-def move_boxes(
-    tables: Float[Tensor, "B O 5"],
-    shifts: Int[Tensor, "2 B"],
-    flips: Bool[Tensor, " B"],
-    height: int,
-    width: int,
-) -> Float[Tensor, "B O 5"]:
-    """Move boxes as `crop_and_flip` moves images. A box outside of the image is no object.
-
-    The columns of a table are class, left, top, right and bottom.
-    """
-    down, right = shifts[:, :, None, None]
-    label, left, top, right_side, bottom = tables.split(1, dim=-1)
-    is_flipped = flips[:, None, None]
-    new_left = torch.where(is_flipped, width - right_side + right, left - right)
-    new_right = torch.where(is_flipped, width - left + right, right_side - right)
-    sides = [new_left.clamp(0, width), (top - down).clamp(0, height)]
-    sides += [new_right.clamp(0, width), (bottom - down).clamp(0, height)]
-    is_shown = (sides[2] > sides[0]) & (sides[3] > sides[1])
-    return torch.cat([torch.where(is_shown, label, NO_OBJECT), *sides], dim=-1)
 
 
 def _reflect(index: Tensor, size: int) -> Tensor:

@@ -66,7 +66,7 @@ class Split:
         images: Images, uint8 RGB, shape (N, 3, H, W). If they stay on disk,
             their files.
         labels: Index of the class of each image, int64, shape (N,). For renders with
-            boxes, their tables, shape (N, O, 5).
+            objects, maps of them, shape (N, 1, H, W).
     """
 
     images: Tensor | ImageFiles

@@ -1,9 +1,8 @@
 """Loss and validation of a detector in training.
 
-The label of an image is a table of boxes with the columns class, left, top, right and bottom. On
+The label of a render is a map of its objects, which is shifted and flipped with the image. On
 photographs, whose objects are unknown, the network before the training is the teacher: its own
-detections in the unchanged photograph are the boxes that the network shall find, also in other
-light.
+detections in the unchanged photograph are what the network shall find, also in other light.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.classifier import TaskNetwork
 from augment.network import device_of, eval_mode
-from augment.scene.truth import NO_OBJECT
+from augment.scene.truth import NO_OBJECT, boxes_of
 from augment.tasks.detection import Detection
 from renderer.errors import InputError, describe, single_line
 from renderer.image import to_unit
@@ -29,20 +28,29 @@ from train.train_settings import TrainSettings
 
 # Number of photographs in a pass of the validation.
 BATCH = 32
-# What a detector takes and returns in training: "boxes" and "labels" of each image.
+# A pixel of a map has the class of its object + MAX_CLASSES · the index of the object.
+MAX_CLASSES = 2**16
+# What a detector takes in training: "boxes", "labels" and "masks" of the objects of an image.
 Target = dict[str, Tensor]
 
 
-def box_tables(targets: Sequence[Target]) -> Float[Tensor, "E O 5"]:
-    """Return the tables of boxes of images. Rows of the class NO_OBJECT fill short tables."""
-    tables = [torch.cat([item["labels"][:, None], item["boxes"]], dim=1) for item in targets]
-    return nn.utils.rnn.pad_sequence(tables, batch_first=True, padding_value=NO_OBJECT)
+def object_maps(targets: Sequence[Target]) -> Int[Tensor, "E 1 H W"]:
+    """Return the maps of the objects of images, which are NO_OBJECT in front of the background."""
+    maps = []
+    for item in targets:
+        places = torch.arange(len(item["labels"]), dtype=torch.int32)
+        numbers = 1 + item["labels"].int() + MAX_CLASSES * places
+        layers = item["masks"] * numbers[:, None, None]
+        maps.append(torch.cat([layers.new_zeros(1, *layers.shape[1:]), layers]).amax(0) - 1)
+    return torch.stack(maps)[:, None]
 
 
-def target_of(table: Float[Tensor, "O 5"]) -> Target:
-    """Return the boxes in the table of an image."""
-    shown = table[table[:, 0] != NO_OBJECT]
-    return {"boxes": shown[:, 1:], "labels": shown[:, 0].long()}
+def target_of(objects: Int[Tensor, "1 H W"]) -> Target:
+    """Return the objects in the map of an image, with the boxes of their visible parts."""
+    numbers = objects[objects != NO_OBJECT].unique()
+    masks = objects == numbers[:, None, None]
+    labels = numbers.long() % MAX_CLASSES
+    return {"boxes": boxes_of(masks), "labels": labels, "masks": masks.byte()}
 
 
 def losses_of(network: nn.Module, images: Tensor, targets: Sequence[Target]) -> Float[Tensor, ""]:
@@ -57,12 +65,13 @@ def losses_of(network: nn.Module, images: Tensor, targets: Sequence[Target]) -> 
 
 
 def require_losses(network: TaskNetwork) -> None:
-    """Check that a detector returns losses in training mode, for one gray image without objects."""
+    """Check that a detector returns losses in training mode, for gray images without objects."""
     copy = deepcopy(network.network).train()
-    image = torch.full((1, 3, *height_and_width(network.size)), 0.5, device=device_of(copy))
-    empty = {"boxes": image.new_zeros(0, 4), "labels": image.new_zeros(0, dtype=torch.int64)}
+    # Batch normalization in training mode needs two images.
+    images = torch.full((2, 3, *height_and_width(network.size)), 0.5, device=device_of(copy))
+    nothing = torch.full_like(images[:, :1], NO_OBJECT, dtype=torch.int32)
     try:
-        losses_of(copy, image, [empty])
+        losses_of(copy, images, [*map(target_of, nothing)])
     except InputError:
         raise
     except Exception as error:  # Networks of users raise errors of many kinds.
@@ -95,7 +104,7 @@ class DetectionLoss:
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Compute the loss of a batch.
 
-        `labels` are tables if there are renders. Return the loss and, in place of the number of
+        `labels` are maps if there are renders. Return the loss and, in place of the number of
         correct predictions, NaN: a detector in training mode predicts nothing.
         """
         is_photograph = ~rendered
@@ -120,15 +129,22 @@ class DetectionLoss:
 
 @torch.no_grad()
 def detected(network: nn.Module, images: UInt8[Tensor, "N 3 H W"], task: Detection) -> list[Target]:
-    """Return the boxes in images that a network finds with a score of at least the threshold."""
+    """Return the objects in images that a network finds with a score of at least the threshold.
+
+    They have masks if the network itself returns masks, as those of torchvision (n, 1, H, W).
+    """
     unit = to_unit(images)
     with eval_mode(network):
-        outputs = task.reader("network")(network(unit), unit)
+        raw = network(unit)
+    outputs = task.reader("network")(raw, unit)
     targets = []
-    for item in outputs:
+    for index, item in enumerate(outputs):
         width, height = (item["boxes"][:, 2:] - item["boxes"][:, :2]).unbind(1)
         is_kept = (item["scores"] >= task.threshold) & (width > 0) & (height > 0)
-        targets.append({key: item[key][is_kept] for key in ("boxes", "labels")})
+        target = {key: item[key][is_kept] for key in ("boxes", "labels")}
+        if task.decode is None and isinstance(raw, list) and "masks" in raw[index]:
+            target["masks"] = (raw[index]["masks"][is_kept, 0] >= 0.5).byte()
+        targets.append(target)
     return targets
 
 
@@ -146,7 +162,7 @@ def validate(
         pair = (detected(one, images.to(device), task) for one in (teacher, network))
         for expected, found in zip(*pair, strict=True):
             truth, boxes = (
-                {key: value.cpu().numpy() for key, value in item.items()}
+                {key: item[key].cpu().numpy() for key in ("boxes", "labels")}
                 for item in (expected, found)
             )
             marked = Marked(**truth, is_crowd=truth["labels"] < 0)

@@ -35,7 +35,7 @@ from train.device import MixedPrecision, SignalHandler, all_reduce_sum
 from train.run_folder import PHASES
 from train.train_settings import TrainSettings
 from train.training.averages import Averages
-from train.training.detection import box_tables, validate
+from train.training.detection import object_maps, validate
 from train.training.recipe import set_training_mode
 from train.training.run_log import RunLog, epoch_metrics, format_epoch
 from train.training.step import TrainingStep, fitting_batch_size, require_equal_shares
@@ -249,7 +249,7 @@ class Trainer:
         with self.phases("attack"):
             renders = self.service.regenerate(self.step.attacked, now.number)
         if renders.targets is not None:
-            renders = replace(renders, labels=box_tables(renders.targets).to(self.device))
+            renders = replace(renders, labels=object_maps(renders.targets).to(self.device))
         if self._log and renders.attack_examples:
             # The images are written now, because a run that is resumed within this round
             # does not attack the renders again.

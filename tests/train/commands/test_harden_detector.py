@@ -4,12 +4,14 @@ The detector of these tests is trained for a second to find a bottle in natural 
 """
 
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 from torch import Tensor, nn
+from torchvision.models import get_model
 from torchvision.ops import box_iou
 
 import norm_balls as nb
@@ -147,3 +149,28 @@ def test_a_detector_without_losses_is_refused(photographs):
     network.register_parameter("weight", nn.Parameter(torch.ones(1)))
     with pytest.raises(InputError, match="training mode"):
         harden(network, photographs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("fasterrcnn_mobilenet_v3_large_320_fpn", 64),
+        ("maskrcnn_resnet50_fpn", 64),
+        ("retinanet_resnet50_fpn", 64),
+        ("fcos_resnet50_fpn", 64),
+        ("ssdlite320_mobilenet_v3_large", 320),
+    ],
+)
+def test_detectors_of_torchvision_learn_from_one_object_several_and_none(photographs, name, size):
+    options = {"weights": None, "weights_backbone": None, "num_classes": 3}
+    options |= {} if name.startswith("ssd") else {"min_size": size, "max_size": size}
+    network = get_model(name, **options).eval()
+    bottle, cup = (nb.ObjectSettings(f"solid:{name}", label=name) for name in ("bottle", "cup"))
+    meshes = [bottle, [cup, replace(bottle, at=(2.0, 0.0))]]
+    train = {"epochs": 1, "batch_size": 4, "images_per_epoch": 4}
+    choices = {"classes": [*CLASSES, "cup"], "size": size, "train": train}
+    hardened = harden(network, photographs, meshes, hard_negatives=["solid:ball"], **choices)
+    pairs = zip(hardened.parameters(), network.parameters(), strict=True)
+    changed = [not torch.equal(*pair) for pair in pairs]
+    assert sum(changed) >= 0.9 * len(changed)

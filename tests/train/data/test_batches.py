@@ -9,11 +9,11 @@ from train.data.batches import (
     Round,
     TrainingImages,
     crop_and_flip,
-    move_boxes,
     rounds_of_epoch,
     training_batches,
 )
 from train.data.sets import Split
+from train.training.detection import object_maps, target_of
 
 
 def noise(*shape: int) -> torch.Tensor:
@@ -148,16 +148,33 @@ class TestRounds:
         assert everything.rows.tolist() == list(range(100))
 
 
-def test_boxes_move_with_the_image_and_are_no_objects_outside_of_it():
-    masks = torch.zeros(4, 3, 12, 16, dtype=torch.uint8)
-    masks[:3, :, 4:9, 5:8] = 1
-    # The box of the last image leaves the image. Its pixels at the border are then mirrored.
-    masks[3, :, 4:9, 14:16] = 1
-    shifts = torch.tensor([[0, 2, -3, 0], [0, -3, 2, -3]])
-    flips = torch.tensor([False, False, True, False])
-    boxes = boxes_of(masks[:, 0].bool())
-    tables = torch.cat([torch.ones(4, 1), boxes], dim=1)[:, None]
-    moved = move_boxes(tables, shifts, flips, 12, 16)[:, 0]
-    shown = boxes_of(crop_and_flip(masks, torch.arange(4), shifts, flips)[:, 0].bool())
-    assert torch.equal(moved[:3, 1:], shown[:3])
-    assert moved[:, 0].tolist() == [1, 1, 1, NO_OBJECT]
+def test_objects_in_renders_move_with_the_pixels_that_show_them():
+    # Each object is a rectangle of its own brightness, so the pixels tell the truth.
+    masks = torch.zeros(3, 2, 12, 16, dtype=torch.uint8)
+    masks[0, 0, 4:9, 5:8] = masks[0, 1, 2:4, 9:15] = 1
+    masks[1, 0, 5:9, 14:16] = 1  # Some shifts move this object out of the image.
+    labels = [[7, 7], [300], []]
+    targets = [
+        {"labels": torch.tensor(label, dtype=torch.int64), "masks": shown[: len(label)]}
+        for label, shown in zip(labels, masks, strict=True)
+    ]
+    light = torch.tensor([60, 90], dtype=torch.uint8)[:, None, None]
+    renders = (masks * light).sum(1, dtype=torch.uint8)[:, None].repeat(1, 3, 1, 1)
+    renders[:, 1] = torch.arange(3, dtype=torch.uint8)[:, None, None]  # Green is the index.
+    photographs = Split(noise(4, 3, 12, 16), torch.zeros(4, dtype=torch.int64))
+    images = TrainingImages(photographs, torch.arange(4), Split(renders, object_maps(targets)))
+    counts = []
+    for number in range(20):
+        now = Round(number, number, torch.arange(7))
+        for batch, maps, is_render in training_batches(images, 7, 3, now):
+            assert (maps[~is_render] == NO_OBJECT).all()
+            for image, objects in zip(batch[is_render], maps[is_render], strict=True):
+                red, index = image[0], int(image[1, 0, 0])
+                shown = [value for value in (60, 90) if (red == value).any()]
+                target = target_of(objects)
+                expected = torch.stack([red == 0, *(red == value for value in shown)])[1:]
+                assert torch.equal(target["masks"].bool(), expected)
+                assert target["labels"].tolist() == labels[index][: len(shown)]
+                assert torch.equal(target["boxes"], boxes_of(expected))
+                counts.append((index, len(shown)))
+    assert {(0, 2), (1, 0), (1, 1), (2, 0)} <= set(counts)
