@@ -13,24 +13,21 @@ from typing import Any
 from warnings import catch_warnings, filterwarnings
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.attacks.adversary import Adversary, reload
 from augment.attacks.attack import attack, find_scene
 from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
 from augment.attacks.files import require_renderers, save
-from augment.attacks.objective import Objective, preprocessed_model
+from augment.attacks.objective import Objective, add_sensor_noise
 from augment.attacks.result import ZERO_GRADIENT, AttackResult, warnings
-from augment.classifier import Classifier
-from augment.network import compute_outputs
+from augment.classifier import Classifier, TaskNetwork
+from augment.network import device_of
 from augment.random_streams import generator
 from augment.scene.build import build_scene
 from augment.scene.objects import add_table, load_object
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
-from augment.tasks.classification import ClassCriterion
 from augment.tasks.task import NO_CLASS
 from renderer.errors import InputError, keyed, keys_of
 from renderer.settings import Size
@@ -75,8 +72,8 @@ def run(settings: AttackExperimentSettings) -> None:
     device = choose_device(settings.device)
     classifier = load_chosen(settings).to(device)
     if adversary is not None:
-        images = adversary.render_views(_start_rasterizer(settings)).to(device)
-        views = format_reloaded(adversary, images, classifier, settings.attack, settings.seed)
+        rasterizer = _start_rasterizer(settings)
+        views = format_reloaded(adversary, rasterizer, classifier, settings.attack, settings.seed)
         print("\n".join(shortened(views)))
         if not settings.attack.parameters:
             return
@@ -287,31 +284,38 @@ def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
 
 def format_reloaded(
     adversary: Adversary,
-    images: Float[Tensor, "V 3 size size"],
-    classifier: Classifier,
+    rasterizer: Rasterizer,
+    classifier: TaskNetwork,
     settings: AttackSettings,
     seed: int,
 ) -> list[str]:
-    """Classify the images of a reloaded adversary, and describe the predictions.
+    """Render a reloaded adversary again, and describe what a network finds in its views.
 
-    The images are rendered again, in [0, 1]. Each line has the prediction, whether noise changes
-    it, and the largest difference from the saved image.
+    Each line has the prediction, whether noise changes it, and the largest difference from the
+    saved image.
     """
-    # `images[None]` is one example with V views. Logits have the shape (1, V, classes).
-    logits = compute_outputs(preprocessed_model(settings, classifier), images[None], len(images))
-    predicted = logits.argmax(2)
-    # The target class of the "attack" is `predicted`. `fooled_in_views` then tests whether
-    # the images are still classified as `predicted` when there is noise.
-    criterion = ClassCriterion(source=torch.full_like(predicted, NO_CLASS), target=predicted)
+    device = device_of(classifier)
+    images = adversary.render_views(rasterizer).to(device)
+    label = adversary.shown.label
+    # A classifier need not know the class.
+    known = NO_CLASS if isinstance(classifier, Classifier) else classifier.label(label)
+    source = torch.full((1, len(images)), known, device=device)
+    truth = partial(adversary.scene(rasterizer, device).truth, classifier.label)
+    criterion = classifier.task.criterion(source, truth, len(classifier.classes))
     objective = Objective(classifier, criterion, settings, seed)
-    example = torch.zeros(1, dtype=torch.int64)
-    is_same_with_noise = objective.fooled_in_views(images[None], predicted, example)[0]
+    # `images[None]` is one example with V views. Evidence has the shape (1, V, K).
+    evidence = objective.evidence(images[None])
+    predicted = criterion.predicted(evidence)
+    is_same_with_noise = torch.ones_like(predicted[0], dtype=torch.bool)
+    noise = (settings.sensor_noise, torch.zeros(1, dtype=torch.int64), seed, "sensor noise")
+    for noisy in add_sensor_noise(images[None], *noise):
+        is_same_with_noise &= (criterion.predicted(objective.evidence(noisy)) == predicted)[0]
     difference = images - adversary.images_in_views.to(images)
     levels = (255 * difference.abs().flatten(1).amax(1)).tolist()
-    named = classifier.task.found(logits[0], predicted[0], classifier.classes)
+    named = classifier.task.found(evidence[0], predicted[0], classifier.classes)
     lines = []
     for view in range(len(images)):
-        line = f"view {view}: {adversary.shown.label} is classified as {named['predicted'][view]}"
+        line = f"view {view}: {label} is recognized as {named['predicted'][view]}"
         line += f" ({named['confidence'][view]:.1%})"
         if settings.sensor_noise:
             same = ", and so with a sensor's noise"

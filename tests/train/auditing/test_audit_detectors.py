@@ -11,6 +11,7 @@ from augment.classifier import as_network
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.io.images import write_image
+from tests.helpers import find_red
 from train.auditing import found
 from train.auditing.audit import run_audit
 from train.auditing.lights import KINDS, Views, recognize_in_environments
@@ -20,34 +21,11 @@ from train.command_settings import AuditSettings
 SIZE = 32
 
 
-def _find_red(images):
-    """Detect what differs from the gray background. Its score is the fraction of red light."""
-    outputs = []
-    for image in images:
-        is_object = ((image - 0.5).abs() > 0.05).any(0)
-        rows, columns = torch.nonzero(is_object, as_tuple=True)
-        if not len(rows):
-            empty = image.new_zeros(0)
-            none = {"boxes": image.new_zeros(0, 4), "labels": empty.long(), "scores": empty}
-            outputs.append(none)
-            continue
-        sides = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
-        red, green, _ = image[:, is_object].mean(1)
-        outputs.append(
-            {
-                "boxes": torch.stack(sides).float()[None],
-                "labels": torch.tensor([0]),
-                "scores": (12 * (red - green) - 1).sigmoid()[None],
-            }
-        )
-    return outputs
-
-
 def test_recall_on_renders_is_the_fraction_of_views_in_which_the_object_is_found(
     monkeypatch, tmp_path
 ):
     monkeypatch.setattr(found, "KINDS", {})
-    network = as_network(_find_red, SIZE, ["orange", "apple"])
+    network = as_network(find_red, SIZE, ["orange", "apple"])
     solids = {
         name: load_object(ObjectSettings(f"solid:{name}:0", label=name))
         for name in ("orange", "lemon")
@@ -78,7 +56,7 @@ def test_an_audit_without_meshes_relights_what_a_detector_finds_in_photographs(t
         # The last photograph shows nothing.
         pixels[8:20, 8 + index : 24] = (150, 110, 90) if index < 2 else 128
         write_image(photographs / f"{index}.png", pixels)
-    network = as_network(_find_red, SIZE, ["orange", "apple"])
+    network = as_network(find_red, SIZE, ["orange", "apple"])
     out = tmp_path / "out"
     settings = AuditSettings(network="red", unlabeled=str(photographs), out=str(out))
     page = run_audit(settings, {"classifier": network}).path.read_text()
@@ -93,7 +71,7 @@ def test_an_audit_of_a_detector_has_a_section_about_detections(tmp_path):
     options = {"classes": ["orange", "apple"], "size": SIZE, "environments": ["eucalyptus"]}
     negatives = ["solid:lemon:0"]
     report = nb.audit(
-        _find_red, ["solid:orange:0"], hard_negatives=negatives, budget=0.1, out=tmp_path, **options
+        find_red, ["solid:orange:0"], hard_negatives=negatives, budget=0.1, out=tmp_path, **options
     )
     assert "<h2>Detections" in report.page
     stored = json.loads((tmp_path / "classifier" / found.DETECTED).read_text())

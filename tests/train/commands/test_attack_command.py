@@ -11,8 +11,12 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
+import norm_balls as nb
 from renderer.io.meshes import load_mesh
 from renderer.light.files import load_light
+from renderer.visibility import choose
+from tests.helpers import find_red
+from train.commands.attack import format_reloaded
 
 PRETRAINED = Path(__file__).parents[3] / "pretrained"
 SMALL = [
@@ -98,7 +102,7 @@ def test_an_adversary_of_two_views_is_rendered_again_and_attacked_further(run, t
     for view, text in enumerate(printed):
         predicted = line["predicted"][view]
         confidence = line["confidence"][view]
-        start = f"view {view}: orange is classified as {predicted} ({confidence:.1%}), "
+        start = f"view {view}: orange is recognized as {predicted} ({confidence:.1%}), "
         assert text.startswith(start)
         levels = float(text.rpartition("by ")[2].partition("/255")[0])
         assert levels <= 1
@@ -107,6 +111,23 @@ def test_an_adversary_of_two_views_is_rendered_again_and_attacked_further(run, t
     (again,) = read_lines(tmp_path / "again" / FOLDER_OF_ORANGE / "attack.jsonl")
     assert again["predicted_before"] == line["predicted"]
     assert again["cost_before"] == pytest.approx(line["cost"], abs=0.05)
+
+
+@pytest.mark.slow
+def test_an_adversary_of_a_detector_is_rendered_and_detected_again(tmp_path):
+    scene = nb.build_scene([("solid:orange:0", "orange")], size=32, views=2, light="uniform")
+    light = nb.StepSettings(step_size=0.2)
+    settings = nb.AttackSettings(lighting=light, max_steps=3)
+    result = nb.attack(find_red, scene, settings=settings, classes=["orange", "apple"], force=True)
+    nb.save(result, tmp_path)
+    lines = read_lines(tmp_path / "attack.jsonl")
+    for line in lines:
+        adversary = nb.reload(tmp_path / f"example_{line['example']:03d}")
+        reloaded = (adversary, choose("auto"), result.classifier, result.settings, 0)
+        (text,) = format_reloaded(*reloaded)
+        expected = f"recognized as {line['predicted'][0]} ({line['confidence'][0]:.1%})"
+        assert expected in text
+    assert {line["predicted"][0] for line in lines} == {"nothing"}
 
 
 def test_success_against_radius_is_a_table_and_a_figure_of_meshes_of_the_classes_they_name(
