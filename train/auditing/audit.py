@@ -24,6 +24,7 @@ import torch
 
 from augment.attack_settings import RelightingSettings
 from augment.classifier import Classifier
+from augment.network import device_of
 from augment.scene.objects import load_object
 from augment.tasks.detection import Detection
 from renderer.errors import InputError, keyed
@@ -94,13 +95,13 @@ def run_audit(
     networks = load_networks(settings) if networks is None else networks
     device = choose_device(settings.device)
     networks = {key: network.to(device) for key, network in networks.items()}
-    caveats = _caveats(settings, networks, device)
-    plan = None
+    plan, given = None, settings
     if settings.meshes:
         settings = complete(settings, networks[CLASSIFIER])
         plan = _Plan(settings, networks, device)
     else:
         find_unlabeled(published_folder(Path(str(settings.unlabeled))))
+    caveats = _caveats(given, networks, plan)
     out = writable_folder(settings.out, "out")
     _require_continuable(out, settings.overwrite, is_named)
     renders = out / "renders"
@@ -147,7 +148,7 @@ def run_audit(
 
 
 def _caveats(
-    settings: AuditSettings, networks: Mapping[str, Classifier], device: torch.device
+    settings: AuditSettings, networks: Mapping[str, Classifier], plan: "_Plan | None"
 ) -> list[str]:
     """Write sentences for the beginning of the report."""
     caveats = []
@@ -158,9 +159,16 @@ def _caveats(
     if settings.meshes and not (settings.hard_negatives or settings.laboratory):
         caveats.append(NO_HARD_NEGATIVES)
     for network in networks.values():
-        if not network.is_differentiable(torch.empty(0, device=device)):
+        images = torch.empty(0, device=device_of(network))
+        if plan is not None:
+            # Only an image with an object tells whether a detector has gradients.
+            scene = plan.attacked_views.scene(network.size)
+            images = lights.render_in(scene, scene.lights[0])[:, 0]
+        elif not isinstance(network, Classifier):
+            continue
+        if not network.is_differentiable(images):
             attack = "only random search attacks it"
-            if settings.meshes:
+            if plan is not None:
                 queries = f"{lights.QUERIES} queries for each radius"
                 attack = f"random search attacks each view with {queries}"
             caveats.append(f"{network.name} has no gradients: {attack}.")

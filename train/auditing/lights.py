@@ -268,7 +268,7 @@ def adversaries(
     else:
         settings |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
     scene = views.scene(classifier.size, kind)
-    if not classifier.is_differentiable(scene.lights):
+    if not classifier.is_differentiable(render_in(scene, scene.lights[0])[:, 0]):
         settings |= {"optimizer": RANDOM_SEARCH, "max_queries": QUERIES}
     return attack(
         classifier,

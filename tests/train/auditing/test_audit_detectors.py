@@ -74,6 +74,7 @@ def test_an_audit_of_a_detector_has_a_section_about_detections(tmp_path):
         find_red, ["solid:orange:0"], hard_negatives=negatives, budget=0.1, out=tmp_path, **options
     )
     assert "<h2>Detections" in report.page
+    assert "has no gradients" not in report.page
     stored = json.loads((tmp_path / "classifier" / found.DETECTED).read_text())
     assert {f"attacked: {light.title}" for light in KINDS.values()} <= stored["metrics"].keys()
     assert report.network.attacks["lighting"].correct == 1
