@@ -360,11 +360,11 @@ class EvaluateSettings(TaskSettings):
     photos: str = setting(
         REQUIRED,
         "Folder of photographs: a folder per class, or images of `label`. Of a detector: a file of "
-        "COCO, or a folder of images with labels of YOLO.",
+        "COCO, or a folder of images with labels of YOLO. Of a segmenter: images/ and masks/.",
     )
     fit: str = setting(
         "letterbox",
-        "How photographs of a detector get its size: letterbox (on gray borders) or stretch.",
+        "How photographs get the size of a detector or segmenter: letterbox or stretch.",
         choices=("letterbox", "stretch"),
     )
     run: str | None = setting(

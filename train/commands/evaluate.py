@@ -13,6 +13,7 @@ from augment.files import as_facts, require_no_facts
 from augment.network import device_of, gradient_flags_kept
 from augment.settings import NormalizeLight
 from augment.tasks.detection import Detection
+from augment.tasks.segmentation import Segmentation
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_folder, as_path, keyed, require_choice
 from renderer.settings import Size
@@ -25,6 +26,7 @@ from train.results import detection_scores, scoring
 from train.results.detection_scores import DetectionScores, evaluate_detector
 from train.results.overwrite import require_replaceable
 from train.results.scoring import Predictor, Scores, format_overall, format_scores
+from train.results.segmentation_scores import SegmentationScores, evaluate_segmenter
 from train.results.store import trained_labels
 from train.run_folder import sole_writer, writable_folder
 from train.settings import GROUPS, label_names, published_folder
@@ -65,8 +67,8 @@ def run(settings: EvaluateSettings) -> None:
         out=settings.out,
         overwrite=settings.overwrite,
     )
-    if isinstance(scores, DetectionScores):
-        print(f"{scores}\nscores, detections and image: {Path(settings.out)}")
+    if not isinstance(scores, Scores):
+        print(f"{scores}\nscores and pictures: {Path(settings.out)}")
         return
     if settings.label is None:
         source = "each class with a sub-folder" if label is None else f"those of {settings.run}"
@@ -95,18 +97,21 @@ def evaluate(
     device: torch.device | str | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
-) -> Scores | DetectionScores:
+) -> Scores | DetectionScores | SegmentationScores:
     """Score a network on the photographs of a folder.
 
     Nothing is written unless `out` is given. A detector is scored on photographs
-    with boxes.
+    with boxes, and a segmenter on photographs with masks.
 
     Args:
-        network: A classifier or a detector, or a plain network from images to
-            logits or boxes, such as a `torch.nn.Module`.
+        network: A classifier, a detector or a segmenter, or a plain network from
+            images to their outputs, such as a `torch.nn.Module`.
         photos: For a detector, a COCO file, a folder with one, or a folder of
             images with label files of YOLO. Photographs are turned as their
-            EXIF orientation says. For a classifier, a folder with a sub-folder
+            EXIF orientation says. For a segmenter, a folder with `images/` and
+            `masks/`: a mask is a gray or palette PNG of the same name, whose
+            values are indices of classes, or 255 where pixels do not count. For
+            a classifier, a folder with a sub-folder
             of photographs for each class. A sub-folder of any other name holds
             negatives: photographs of other objects. "pretrained/laboratory" is
             installed with the library.
@@ -134,8 +139,9 @@ def evaluate(
         skip_unreadable: Whether to leave out photographs that cannot be read.
         precision: "auto" (bfloat16 if the hardware computes in it), "bfloat16"
             or "float32". A detector computes in float32.
-        fit: How photographs get the size of a detector: "letterbox" keeps their
-            aspect ratio and adds gray borders, "stretch" does not.
+        fit: How photographs get the size of a detector or a segmenter:
+            "letterbox" keeps their aspect ratio and adds gray borders, "stretch"
+            does not.
         task: Task of the network, such as `nb.Detection(threshold=0.3)`. None if
             its outputs tell.
         device: Device that computes. None for the device of the network.
@@ -147,7 +153,9 @@ def evaluate(
         Scores of a detector: `overall` and `by_label` have the recall at the
         threshold, AP50 and the false detections per image of the task, and
         `by_source` the same for each folder of photographs. Intervals are over
-        photographs. Scores of a classifier: `overall` has the metrics of all
+        photographs. Scores of a segmenter: `miou`, and the IoU of each class in
+        `by_class`, of the pixels at the size of the network. Scores of a
+        classifier: `overall` has the metrics of all
         photographs, `by_label` the metrics of each positive class, and
         `by_class` the recall of each class of the folder.
 
@@ -180,13 +188,13 @@ def evaluate(
             normalize_light=normalize_light,
             task=task,
         ).to(device)
+        if not isinstance(made, Classifier) and (by != GROUPS[0] or calibrate is not None):
+            raise InputError("by and calibrate are for classifiers: leave them out")
+        if isinstance(made.task, Segmentation) and label is not None:
+            raise InputError("label is for classifiers and detectors: leave it out", "label")
         if isinstance(made.task, Detection):
-            if by != GROUPS[0] or calibrate is not None:
-                raise InputError("by and calibrate are for classifiers: leave them out")
             annotations = read_annotations(folder)
-        elif not isinstance(made, Classifier):
-            raise InputError(f"photos cannot be scored for {made.task.name}: use them in Python")
-        else:
+        elif isinstance(made, Classifier):
             labels = choose_labels(as_folder("photos", folder), made.classes, label)
         target = None
         if out is not None:
@@ -196,8 +204,13 @@ def evaluate(
                 require_outside(target, folder)
         with sole_writer("out", target) if target else nullcontext():
             if not isinstance(made, Classifier):
-                chosen = None if label is None else label_names(label)
-                found = evaluate_detector(made, annotations, chosen, fit, skip_unreadable, device)
+                found: DetectionScores | SegmentationScores
+                how = fit, skip_unreadable, device
+                if isinstance(made.task, Detection):
+                    chosen = None if label is None else label_names(label)
+                    found = evaluate_detector(made, annotations, chosen, *how)
+                else:
+                    found = evaluate_segmenter(made, folder, *how)
                 if target:
                     detection_scores.write(found, target)
                 return found

@@ -1,4 +1,4 @@
-"""Read photographs with boxes of objects: a COCO file, or a folder with the text files of YOLO.
+"""Read photographs with boxes (a COCO file, or a folder with text files of YOLO) or with masks.
 
 A photograph is shown upright, as its EXIF orientation says, and brought to the size of a network.
 """
@@ -32,6 +32,10 @@ BORDER = 114
 MAX_RATIO = 1.02
 # Text files that list the names of classes, one on each line.
 CLASS_FILES = ("classes.txt", "obj.names")
+# Folders of photographs and of their masks, the latter as in VOC.
+MASK_FOLDERS = (("images", "masks"), ("JPEGImages", "SegmentationClass"))
+# Pixels of this class in a mask are not scored.
+UNSCORED = 255
 # Images are read at full size.
 FULL_SIZE = 2**16
 # From the coordinates (x, y) in a stored image, as fractions of its sides, to those in the upright
@@ -112,6 +116,68 @@ class Fitted(NamedTuple):
         """Convert boxes in pixels of the network to those of the photograph, without borders."""
         corners = (boxes.reshape(-1, 2, 2) - self.shift) / self.scale
         return corners.clip(0, self.size).reshape(-1, 4)
+
+
+def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str]]:
+    """Find the photographs of a folder, the mask of each by its name, and those without a mask.
+
+    A mask has the path of its photograph with another folder, as in `MASK_FOLDERS`, and is a PNG
+    file.
+    """
+    for images, masks in MASK_FOLDERS:
+        if (folder / images).is_dir() and (folder / masks).is_dir():
+            break
+    else:
+        raise InputError(
+            f"photos={folder} has no photographs with masks: move them to its folders images and "
+            "masks, under the same names",
+            "photos",
+        )
+    marked, paths, missing = [], {}, []
+    for item in find_unlabeled(folder / images):
+        mask = (folder / masks / item.path).with_suffix(".png")
+        if not mask.is_file():
+            missing.append(str(item.path))
+            continue
+        name = str(item.path)
+        path = folder / images / item.path
+        nothing = np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, bool)
+        marked.append(Annotated(path, name, None, *nothing))
+        paths[name] = mask
+    if not marked:
+        first = Path(missing[0]).with_suffix(".png")
+        raise InputError(f"{folder / masks} has no mask {first}: add it", "photos")
+    return marked, paths, missing
+
+
+def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, "H W"]:
+    """Read the classes of the pixels of a photograph, and bring them to its size for the network.
+
+    Pixels of borders are UNSCORED.
+    """
+    try:
+        with open_image(path) as image:
+            labels = np.array(image)
+    except Exception as error:  # Pillow raises errors of almost any type.
+        raise InputError(f"{path} cannot be read ({single_line(error)}): replace it") from error
+    if labels.shape != (*fitted.size[::-1],):
+        width, height = fitted.size
+        raise InputError(
+            f"{path} has the shape {labels.shape}, and is no mask of its photograph: give a gray "
+            f"or palette image of {width:g} × {height:g} pixels, with indices of classes"
+        )
+    highest = int(labels[labels != UNSCORED].max(initial=0))
+    if highest >= class_count:
+        raise InputError(
+            f"{path} has the value {highest}, but the network has {class_count} classes: use "
+            f"0 to {class_count - 1}, and {UNSCORED} for pixels that do not count"
+        )
+    shown = (fitted.scale * fitted.size).round().astype(int)
+    reduced = Image.fromarray(labels.astype(np.uint8)).resize((*shown,), Image.Resampling.NEAREST)
+    result = np.full(fitted.pixels.shape[1:], UNSCORED, np.uint8)
+    left, top = fitted.shift.astype(int)
+    result[top : top + shown[1], left : left + shown[0]] = np.array(reduced)
+    return result
 
 
 def read_annotations(photos: Path) -> Annotations:

@@ -25,6 +25,7 @@ from train.results import detections, tables
 from train.results.detections import DetectionMetrics, Found, Marked
 from train.results.pictures import evenly_spaced
 from train.results.predictions import CONTACT_SHEET, SUMMARY
+from train.results.segmentation_scores import SegmentationScores
 from train.results.tables import Table
 
 # Number of photographs that a detector sees at a time.
@@ -253,14 +254,15 @@ def _score(
     return overall, by_label, by_source
 
 
-def write(scores: DetectionScores, out: Path) -> None:
-    """Write scores, all detections, and photographs with boxes to the files of a folder."""
+def write(scores: DetectionScores | SegmentationScores, out: Path) -> None:
+    """Write scores, all detections, and photographs with what is found to a folder."""
     out.mkdir(parents=True, exist_ok=True)
     remove_unfinished(out)
     # Without a summary, no folder counts as scored.
     (out / SUMMARY).unlink(missing_ok=True)
-    lines = ",\n".join(json.dumps(entry, ensure_ascii=False) for entry in scores.detections)
-    atomic_write(out / DETECTIONS, f"[\n{lines}\n]\n")
+    if isinstance(scores, DetectionScores):
+        lines = ",\n".join(json.dumps(entry, ensure_ascii=False) for entry in scores.detections)
+        atomic_write(out / DETECTIONS, f"[\n{lines}\n]\n")
     captions = [(name,) for name in scores.pictures]
     tiles = tiles_of(scores.pictures.values(), captions)
     rows = [tiles[start : start + COLUMNS] for start in range(0, len(tiles), COLUMNS)]

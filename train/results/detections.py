@@ -4,13 +4,14 @@ Everything is computed on plain arrays. Boxes have the columns left, top, right 
 unit. Detections are matched as the evaluation of COCO does.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from train.data.annotations import UNSCORED
 from train.results.intervals import Units, leave_out
 from train.results.tables import Estimate
 
@@ -20,8 +21,6 @@ PHOTOGRAPHS = "photographs"
 NO_OBJECT, CROWD = -1, -2
 # Recalls at which the average precision averages the precision, as COCO does.
 RECALLS = np.linspace(0, 1, 101)
-# Pixels of this class in a mask are not scored.
-UNSCORED = 255
 
 
 @dataclass(frozen=True)
@@ -281,22 +280,24 @@ def estimate(
 
 
 def mean_iou(
-    predicted: Sequence[Int[np.ndarray, "H W"]],
-    masks: Sequence[Int[np.ndarray, "H W"]],
+    images: Iterable[tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]],
     class_count: int,
+    units: Int[np.ndarray, " n"] | None = None,
+    over: str = PHOTOGRAPHS,
 ) -> tuple[Estimate, list[float]]:
     """Compute the mean IoU over classes, with its interval over images, and that of each class.
 
-    The IoU of a class is computed from the pixels of all images. It is NaN, and does not count, if
-    no pixel has or is given the class. Pixels of the class UNSCORED are left out.
+    An image has the predicted classes of its pixels and the true ones. The IoU of a class is
+    computed from the pixels of all images. It is NaN, and does not count, if no pixel has or is
+    given the class. Pixels of the class UNSCORED are left out.
     """
-    counted = np.empty((3, len(masks), class_count))
-    for row, (image, mask) in enumerate(zip(predicted, masks, strict=True)):
+    counted = []
+    for image, mask in images:
         is_scored = mask != UNSCORED
         guess, truth = image[is_scored], mask[is_scored]
-        for kind, values in enumerate((truth[guess == truth], guess, truth)):
-            counted[kind, row] = np.bincount(values.ravel(), minlength=class_count)[:class_count]
-    both, guesses, truths = counted
+        kinds = truth[guess == truth], guess, truth
+        counted.append([np.bincount(values, minlength=class_count) for values in kinds])
+    both, guesses, truths = np.array(counted, float).transpose(1, 0, 2)
 
     def by_class(counts: np.ndarray) -> np.ndarray:
         shared = counts @ both
@@ -306,7 +307,6 @@ def mean_iou(
     def mean(counts: np.ndarray) -> np.ndarray:
         return np.nanmean(by_class(counts), axis=-1)
 
-    every_image = np.arange(len(masks))
-    return estimate(mean, [every_image], every_image), by_class(np.ones((1, len(masks))))[
-        0
-    ].tolist()
+    every_image = np.arange(len(counted))
+    interval = estimate(mean, [every_image], every_image if units is None else units, over)
+    return interval, by_class(np.ones((1, len(counted))))[0].tolist()

@@ -143,7 +143,7 @@ def test_mean_iou_is_that_of_the_confusion_matrix():
     rng = np.random.default_rng(0)
     masks, predicted = rng.integers(0, 3, (2, 4, 5, 6))
     masks[0, 0] = detections.UNSCORED
-    mean, by_class = detections.mean_iou(predicted, masks, 4)
+    mean, by_class = detections.mean_iou(zip(predicted, masks, strict=True), 4)
     is_scored = masks != detections.UNSCORED
     confusion = np.zeros((4, 4))
     np.add.at(confusion, (masks[is_scored], predicted[is_scored]), 1)
