@@ -21,6 +21,8 @@ from augment.augmentation_settings import SpecularLayerSettings as SpecularLayer
 from augment.augmentation_settings import TrainingAttackSettings as TrainingAttackSettings
 from augment.augmentation_settings import VariationSettings as VariationSettings
 from augment.classifier import Classifier as Classifier
+from augment.dataset import LabeledRender as LabeledRender
+from augment.dataset import render_dataset as render_dataset
 from augment.photographs import PhotographAttackResult as PhotographAttackResult
 from augment.photographs import attack_photographs as attack_photographs
 from augment.photographs import relight_photographs as relight_photographs

@@ -6,11 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jaxtyping import Float, Int, Shaped
-from torch import Tensor
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from augment.attacks.problem import SceneProblem
+from augment.network import frozen_eval_mode
 from renderer.light.basis import HARMONICS, Basis
+
+# Largest number of successfully attacked renders that are kept for figures each time that the
+# renders of a training run are made.
+SHOWN_EXAMPLES = 4
 
 
 @dataclass(frozen=True)
@@ -72,3 +79,30 @@ class Renders(Dataset[tuple[Tensor, Any]]):
         """Return an image (3, H, W) in [0, 1] on the CPU, and its label or its target."""
         target = int(self.labels[index]) if self.targets is None else self.targets[index]
         return self.images[index].cpu(), target
+
+
+def select_examples_to_log(
+    model: nn.Module,
+    problem: SceneProblem,
+    values: Float[Tensor, "E D"],
+    success: Bool[Tensor, " E"],
+    labels: Int[Tensor, " E"],
+) -> AttackExamples:
+    """Select a few successfully attacked examples for a figure, and render and classify them.
+
+    At most `SHOWN_EXAMPLES` are selected, evenly spaced among the successful examples. The state of
+    the network is restored afterwards.
+    """
+    successful = torch.nonzero(success).squeeze(1)
+    last = max(len(successful) - 1, 0)
+    chosen = torch.linspace(0, last, min(SHOWN_EXAMPLES, len(successful))).round().long()
+    rows = successful[chosen.to(successful.device)]
+    before = problem.conditions(problem.start[rows], rows)
+    after = problem.conditions(values[rows], rows)
+    with frozen_eval_mode(model), torch.no_grad():
+        images = [problem.scene.render(one, rows)[:, 0] for one in (before, after)]
+        logits = [model(one).float() if len(rows) else one.new_zeros(0, 0) for one in images]
+    predictions = torch.stack(logits).softmax(2)
+    lights = torch.stack([before.light, after.light])
+    basis = problem.scene.basis
+    return AttackExamples(torch.stack(images), lights, predictions, labels[rows], basis)

@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
@@ -24,7 +24,7 @@ from augment.classifier import CheckedNetwork, class_index
 from augment.network import compute_outputs, frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
-from augment.renders import AttackExamples, Renders
+from augment.renders import Renders, select_examples_to_log
 from augment.scene.build import MeshItem, build_scene, with_needed_degree
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
@@ -43,12 +43,21 @@ from renderer.image import to_unit
 from renderer.light.files import perturb
 from renderer.settings import Size
 
-# Largest number of successfully attacked renders that are kept for figures each time that the
-# renders of a training run are made.
-SHOWN_EXAMPLES = 4
 # Largest number of random renders that are classified to estimate the error rate. The standard
 # error of this estimate is at most 0.032.
 CLASSIFIED = 250
+
+
+class _Shown(NamedTuple):
+    """Attack values of E examples, their images, and numbers about both.
+
+    `is_success` marks the renders that figures may show.
+    """
+
+    values: Float[Tensor, "E D"]
+    images: Float[Tensor, "E 3 H W"]
+    diagnostics: dict[str, float]
+    is_success: Bool[Tensor, " _"]
 
 
 @dataclass(eq=False, repr=False)
@@ -230,13 +239,35 @@ class AugmentationService:
             return self._from_folder(model, self.images, number)
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
-        is_random = self.settings.mode == "random"
+        problem = self.problem(number)
+        if self.settings.mode == "random":
+            shown = self._random(model, problem, number)
+        else:
+            shown = self._adversarial(model, problem, number)
+        diagnostics = shown.diagnostics | _changes(problem, shown.values)
+        if self._finds_objects:
+            targets = self._truth(problem, shown.values).targets()
+            return Renders(shown.images, self.labels, diagnostics, targets=targets)
+        chosen = (shown.values, shown.is_success, self.labels)
+        examples = select_examples_to_log(model, problem, *chosen)
+        return Renders(shown.images, self.labels, diagnostics, examples)
+
+    def problem(self, number: int) -> SceneProblem:
+        """Vary the scene at random, and return what an attack on it may change."""
+        assert self.scene is not None
         draws = generator(self.seed, number, "rows")
+        is_random = self.settings.mode == "random"
         scene = vary(self.scene, self.settings.vary, draws, once=is_random)
-        problem = build_problem(self.settings.attack, scene)
-        if is_random:
-            return self._random(model, problem, number)
-        return self._adversarial(model, problem, number)
+        return build_problem(self.settings.attack, scene)
+
+    def values(
+        self, model: nn.Module | None, problem: SceneProblem, number: int
+    ) -> Float[Tensor, "E D"]:
+        """Return the values of a problem with this number: random ones, or those of an attack."""
+        if self.settings.mode == "random" or model is None:
+            return self._random_values(problem, number)
+        model = CheckedNetwork(model, "model", self.task, len(self.classes) or None)
+        return self._adversarial(model, problem, number).values
 
     @property
     def _finds_objects(self) -> bool:
@@ -312,19 +343,16 @@ class AugmentationService:
         _, diagnostics = self._classify(model, selected, labels)
         return Renders(selected, labels, diagnostics)
 
-    def _random(self, model: nn.Module, problem: SceneProblem, number: int) -> Renders:
+    def _random(self, model: nn.Module, problem: SceneProblem, number: int) -> _Shown:
         """Render all examples with random values of the parameters, such as random lighting."""
         values = self._random_values(problem, number)
         own = self._own_rows(len(self.labels))
         images = self._gather(problem.images(values, own)[:, 0], own, len(self.labels))
         if self._finds_objects:
-            truth = self._truth(problem, values)
-            diagnostics = self._find(model, images, truth) | _changes(problem, values)
-            return Renders(images, self.labels, diagnostics, targets=truth.targets())
+            diagnostics = self._find(model, images, self._truth(problem, values))
+            return _Shown(values, images, diagnostics, self.labels < NO_OBJECT)
         is_error, diagnostics = self._classify(model, images, self.labels)
-        examples = select_examples_to_log(model, problem, values, is_error, self.labels)
-        diagnostics |= _changes(problem, values)
-        return Renders(images, self.labels, diagnostics, examples)
+        return _Shown(values, images, diagnostics, is_error)
 
     def _truth(self, problem: SceneProblem, values: Float[Tensor, "E D"]) -> Truth:
         """Find the objects with a class that all images show."""
@@ -383,7 +411,7 @@ class AugmentationService:
         is_error = is_error.index_copy(0, rows, is_misclassified)
         return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
 
-    def _adversarial(self, model: nn.Module, problem: SceneProblem, number: int) -> Renders:
+    def _adversarial(self, model: nn.Module, problem: SceneProblem, number: int) -> _Shown:
         """Attack the examples, of which each process has a part.
 
         Examples that show a detector no object with a class get random values instead.
@@ -431,14 +459,11 @@ class AugmentationService:
         }
         if attack.sensor_noise:
             diagnostics["attack_success_without_noise"] = _mean(result.success)
-        diagnostics |= _changes(problem, values)
+        is_new_success = success & ~result.success_before
+        images = result.images[:, 0]
         if self._finds_objects:
             images = problem.images(values, problem.all_examples)[:, 0]
-            targets = self._truth(problem, values).targets()
-            return Renders(images, self.labels, diagnostics, targets=targets)
-        is_new_success = success & ~result.success_before
-        examples = select_examples_to_log(model, problem, values, is_new_success, self.labels)
-        return Renders(result.images[:, 0], self.labels, diagnostics, examples)
+        return _Shown(values, images, diagnostics, is_new_success)
 
     def _own_rows(self, count: int) -> Int[Tensor, " A"]:
         """Return the indices of those of some examples that this process renders or attacks."""
@@ -528,33 +553,6 @@ def _describe_scene(scene: Scene) -> list[object]:
 def _rounded(values: Iterable[float]) -> list[str]:
     """Format numbers with three digits, so that rounding errors do not change the texts."""
     return [f"{float(value):.3g}" for value in values]
-
-
-def select_examples_to_log(
-    model: nn.Module,
-    problem: SceneProblem,
-    values: Float[Tensor, "E D"],
-    success: Bool[Tensor, " E"],
-    labels: Int[Tensor, " E"],
-) -> AttackExamples:
-    """Select a few successfully attacked examples for a figure, and render and classify them.
-
-    At most `SHOWN_EXAMPLES` are selected, evenly spaced among the successful examples. The state of
-    the network is restored afterwards.
-    """
-    successful = torch.nonzero(success).squeeze(1)
-    last = max(len(successful) - 1, 0)
-    chosen = torch.linspace(0, last, min(SHOWN_EXAMPLES, len(successful))).round().long()
-    rows = successful[chosen.to(successful.device)]
-    before = problem.conditions(problem.start[rows], rows)
-    after = problem.conditions(values[rows], rows)
-    with frozen_eval_mode(model), torch.no_grad():
-        images = [problem.scene.render(one, rows)[:, 0] for one in (before, after)]
-        logits = [model(one).float() if len(rows) else one.new_zeros(0, 0) for one in images]
-    predictions = torch.stack(logits).softmax(2)
-    lights = torch.stack([before.light, after.light])
-    basis = problem.scene.basis
-    return AttackExamples(torch.stack(images), lights, predictions, labels[rows], basis)
 
 
 def _changes(problem: SceneProblem, values: Float[Tensor, "E D"]) -> dict[str, float]:

@@ -10,6 +10,7 @@ from augment import Conditions as Conditions
 from augment import Detection as Detection
 from augment import EOTSettings as EOTSettings
 from augment import Example as Example
+from augment import LabeledRender as LabeledRender
 from augment import LampsSettings as LampsSettings
 from augment import MaterialSettings as MaterialSettings
 from augment import MeshSettings as MeshSettings
@@ -38,6 +39,7 @@ from augment import check as check
 from augment import load_classifier as load_classifier
 from augment import relight_photographs as relight_photographs
 from augment import reload as reload
+from augment import render_dataset as render_dataset
 from augment import save as save
 from augment import success_by_radius as success_by_radius
 from augment import transfer as transfer

@@ -6,12 +6,18 @@ This module imports neither torch nor NumPy; see `renderer.settings`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 from augment.attack_settings import AttackSettings, RelightingSettings
+from augment.augmentation_settings import (
+    AugmentationSettings,
+    RandomLightSettings,
+    VariationSettings,
+)
 from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, RendererSettings, SceneSettings
-from renderer.errors import MAX_SCALE, InputError, require_choice
+from renderer.errors import MAX_SCALE, InputError, is_number, require_choice
 from renderer.settings import (
     ENCODINGS,
     MAX_BOUNCES,
@@ -49,6 +55,9 @@ OTHER_PATTERNS = ("rings", "window", "leaves", "text", "colors")
 # Name of the pattern that projects image files of the user.
 SLIDES = "slides"
 PATTERNS = (*TRAINED_PATTERNS, *OTHER_PATTERNS, SLIDES)
+# Layouts of the data sets of pnb-render, and the maps that it writes for each render.
+DATA_SET_FORMATS = ("imagefolder", "coco", "yolo", "webdataset")
+DATA_SET_MAPS = ("mask", "depth", "normals")
 # The objects that pnb-lab renders by default: six oranges, and ten other objects.
 LAB_MESHES = [
     *(f"solid:orange:{seed}" for seed in range(101, 107)),
@@ -471,3 +480,78 @@ class FitSettings(Settings):
             raise InputError(
                 f"mask={self.mask} and box={self.box}: give mask=FILE, or a box instead"
             )
+
+
+@dataclass(kw_only=True)
+class RenderSettings(TaskSettings):
+    """Settings of the command pnb-render, which writes labeled renders as a data set.
+
+    The renders show the meshes in turn, then the next background, then the next view.
+    """
+
+    network: str | None = setting(
+        None, f"Network for whose mistakes each render is attacked: {NETWORKS}. null: none."
+    )
+    size: Any = setting(224, "Pixels per side, or [height, width].", within=(1, MAX_SIZE))
+    meshes: list[Any] = setting(["solid:orange", "solid:apple", "solid:cup"], MESHES)
+    label: Any = setting(
+        None, "Class of the meshes. null: what the name of each file tells.", is_text=True
+    )
+    format: str = setting("imagefolder", "Layout of the data set.", choices=DATA_SET_FORMATS)
+    count: int = setting(100, "Number of renders.", within=(1, MAX_SEED))
+    splits: Any = setting(
+        {"train": 0.8, "val": 0.1, "test": 0.1}, "Parts of the data set, and their fractions."
+    )
+    maps: list[str] = setting(
+        list(DATA_SET_MAPS), f"Further images of each render: {', '.join(DATA_SET_MAPS)}."
+    )
+    seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
+    shards: int = setting(1, "Parts of the work that --multirun shard=0,1,... shares.")
+    shard: int = setting(0, "Index of the part that this process renders.", within=(0, None))
+    out: str = setting(REQUIRED, "Folder of the data set. A stopped command continues in it.")
+    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
+    augment: AugmentationSettings = setting(
+        lambda: AugmentationSettings(
+            mode="random",
+            examples=None,
+            random_light=RandomLightSettings(amplitude=0.1),
+            vary=VariationSettings(
+                shift=0.1,
+                scale=[0.6, 1.0],
+                instances=True,
+                azimuth=25.0,
+                environments=[*ENVIRONMENTS],
+                background_saturation=0.5,
+            ),
+        ),
+        "What is drawn at random, and the attack if there is a network.",
+    )
+    scene: SceneSettings = setting(
+        lambda: SceneSettings(backgrounds=[0.1, 0.3, 0.5, 0.7, 0.9], views=12, fov=30.0),
+        "The scene. light=NAME is short for scene.light=NAME.",
+    )
+    renderer: RendererSettings = setting(
+        lambda: RendererSettings(encoding="srgb"), "How images are rendered."
+    )
+
+    def __post_init__(self) -> None:
+        """Check all values, and compute the number of renders in each part."""
+        super().__post_init__()
+        if self.shard >= self.shards:
+            raise self.wrong("shard", f"must be less than shards={self.shards}")
+        for name in self.maps:
+            require_choice("maps", name, DATA_SET_MAPS)
+        if not self.meshes:
+            raise InputError("meshes must not be empty: name one or more", "meshes")
+        parts = [*self.splits.values()] if isinstance(self.splits, dict) else []
+        if not all(is_number(part) and part >= 0 for part in parts) or not sum(parts):
+            raise self.wrong("splits", "must be parts and their fractions, such as {train: 1}")
+        self.augment.mode = "adversarial" if self.network else "random"
+
+    @property
+    def split_counts(self) -> dict[str, int]:
+        """Number of renders in each part. All parts together have `count` renders."""
+        ends = accumulate(self.splits.values())
+        total = sum(self.splits.values())
+        limits = [0, *(round(self.count * end / total) for end in ends)]
+        return dict(zip(self.splits, map(int.__sub__, limits[1:], limits), strict=True))

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from augment.progress import progress
 from augment.scene.objects import Conditions, SceneObject
@@ -307,7 +308,7 @@ class DirectRenderer:
         rasterizer: The rasterizer.
         basis: Basis of the lights.
         like: A tensor with the dtype and the device of the images.
-        cached: Whether the rasterized views of unmoved objects are kept.
+        cached: Whether the rasterized views of unmoved objects are kept, instead of the last one.
     """
 
     objects: Sequence[SceneObject]
@@ -343,8 +344,9 @@ class DirectRenderer:
         if key in self._views:
             return self._views[key]
         view = self._rasterize(object_index, camera, self.objects[object_index].mesh.vertices)
-        if self.cached:
-            self._views[key] = view
+        if not self.cached:
+            self._views.clear()
+        self._views[key] = view
         return view
 
     def local_view(self, object_index: int, camera: Camera) -> LocalLightView:
@@ -368,6 +370,7 @@ class DirectRenderer:
         Return also the fraction of each object that nothing hides. It is 0 outside of the view.
         `vertices` None are those of the unmoved objects.
         """
+        key = (object_index, camera)
         item = self.objects[object_index]
         positions = item.mesh.vertices
         if vertices is not None:
@@ -377,7 +380,8 @@ class DirectRenderer:
             shown = (positions, faces, [camera], self.settings, self.rasterizer)
             return build_fragments(*shown)[0]
 
-        seen = fragments_of(item.mesh.faces)
+        seen = fragments_of(item.mesh.faces) if vertices is not None else self.view(*key)[0]
+        seen = seen.to("cpu")
         # Index of the object that each sample shows. The table comes after the objects.
         owner_of_face = np.searchsorted(item.ends, seen.faces.numpy(), side="right")
         owner = torch.from_numpy(owner_of_face)[seen.sample_to_seen_face]
@@ -397,6 +401,44 @@ class DirectRenderer:
         else:
             visible = (own_counts > 0).float()
         return counts >= COVERED * self.settings.samples**2, visible
+
+    def surface_maps(
+        self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"] | None = None
+    ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "3 height width"]]:
+        """Find depth and unit normal of the nearest sample in pixels of coverage >= COVERED.
+
+        The depth is the distance from the camera along the viewing direction in world units, and
+        normals are along the axes right, up and back of the camera. Both are 0 in other pixels.
+        """
+        mesh = self.objects[object_index].mesh
+        if vertices is None:
+            fragments, _ = self.view(object_index, camera)
+        else:
+            mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
+            fragments, _ = self._rasterize(object_index, camera, mesh.vertices)
+        fragments = fragments.to("cpu")
+        pose = torch.from_numpy(camera.pose())
+        from_camera = pose[:3, 3] - torch.from_numpy(mesh.vertices)[fragments.corners]
+        depths = fragments.interpolate((from_camera @ pose[:3, 2])[:, :, None])[:, 0]
+        # The nearest sample of each pixel, and the first of equally near ones.
+        pixel, count = fragments.sample_to_pixel, len(fragments.pixels)
+        depth = depths.new_full((count,), math.inf).scatter_reduce_(0, pixel, depths, "amin")
+        numbers = torch.arange(len(pixel)).masked_fill(depths > depth[pixel], len(pixel))
+        nearest = torch.full((count,), len(pixel)).scatter_reduce_(0, pixel, numbers, "amin")
+        seen_face = fragments.sample_to_seen_face[nearest]
+        if self.settings.normals == "smooth":
+            corner_normals = torch.from_numpy(mesh.corner_normals)
+        else:
+            corner_normals = torch.from_numpy(mesh.face_normals())[:, None]
+        corner_normals = corner_normals[fragments.faces[seen_face]] @ pose[:3, :3]
+        normals = (fragments.barycentric[nearest][:, :, None] * corner_normals).sum(1)
+        normals = normalize(normals, dim=1) * fragments.facing[seen_face]
+        at_pixels = torch.cat([depth[None], normals.T])
+        maps = torch.zeros(4, math.prod(fragments.shape))
+        is_covered = fragments.coverage >= COVERED
+        maps[:, fragments.pixels[is_covered]] = at_pixels[:, is_covered].float()
+        maps = maps.unflatten(1, fragments.shape)
+        return maps[0], maps[1:]
 
     def radiance(
         self,

@@ -404,6 +404,22 @@ class Scene:
         truth = (labels, boxes_of(masks), masks, visible)
         return Truth(*(part.to(self.lights.device) for part in truth))
 
+    @torch.no_grad()
+    def surface_maps(
+        self, conditions: Conditions, row: int, example: int
+    ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "3 height width"]]:
+        """Return depth and normals in the first view of an example (`DirectRenderer`).
+
+        Args:
+            conditions: Conditions of some examples.
+            row: Index of the example in the first dimension of the conditions.
+            example: Index of the example in the scene.
+        """
+        index = self.examples[example].object
+        camera = self.cameras_under(conditions, row, example)[0].fixed()
+        vertices = conditions.row(row, self.objects[index].mesh).vertices
+        return self._direct_renderer.surface_maps(index, camera, vertices)
+
     def _as_examples(self, examples: object, count: int | None = None) -> Int[Tensor, " A"]:
         """Convert indices of examples to an integer tensor on the device of the lights.
 

@@ -269,7 +269,9 @@ class Fragments:
         return PixelGroups(pixel, seen_face, sample_count, sample_to_group)
 
     def to(self, device: torch.device | str) -> "Fragments":
-        """Return a copy with all tensors on a device."""
+        """Return the fragments with all tensors on a device."""
+        if self.pixels.device == torch.device(device):
+            return self
         tensors_on_device: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)

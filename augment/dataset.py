@@ -1,0 +1,223 @@
+"""Labeled renders one after another, such as for a data set on disk.
+
+Renders are made in blocks of `BLOCK`, each with random numbers of its own. The render with an index
+is therefore the same whichever others are made, in one process or in several.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from augment.attacks.problem import SceneProblem, source_labels
+from augment.augmentation_settings import AugmentationSettings
+from augment.classifier import TaskNetwork
+from augment.progress import Phases
+from augment.scene.build import MeshItem, build_scene
+from augment.scene.scene import Scene
+from augment.scene.truth import NO_OBJECT
+from augment.service import AugmentationService
+from augment.tasks.classification import Classification
+from renderer import errors
+from renderer.camera import Camera
+from renderer.errors import InputError
+from renderer.image import to_bytes
+from renderer.settings import Size
+
+# Renders with consecutive indices are drawn together. Larger blocks would render more than
+# is asked for, smaller ones would prepare scenes more often.
+BLOCK = 32
+
+
+@dataclass(frozen=True)
+class LabeledRender:
+    """A render with the truth about it.
+
+    Attributes:
+        index: Index of the render in its data set.
+        image: Image of 8 bits, uint8, shape (3, H, W).
+        labels: Class of each of n visible objects, as `meshes` gives it.
+        boxes: Left, top, right and bottom of their visible parts in pixels,
+            float32, shape (n, 4).
+        masks: Pixels of which each covers half or more, bool, shape (n, H, W).
+        visible: Fraction of each object that nothing hides, shape (n,).
+        depth: Distance from the camera along the viewing direction in world
+            units, at the nearest sample of each pixel. 0 where nothing is
+            rendered, as in front of a background. Float32, shape (H, W).
+        normals: Unit normals there, along the axes right, up and back of the
+            camera, float32, shape (3, H, W).
+        camera: Camera as numbers: "pose" (4 × 4, from the camera's axes right, up
+            and back to the world), and "fx", "fy", "cx", "cy" in pixels, or
+            "width" of an orthographic image in world units.
+        light: RGB coefficients of the light, times the exposure, shape (K, 3).
+        mesh: Name of the mesh, or of the first of several.
+    """
+
+    index: int
+    image: UInt8[Tensor, "3 H W"]
+    labels: Sequence[str | int]
+    boxes: Float[Tensor, "n 4"]
+    masks: Bool[Tensor, "n H W"]
+    visible: Float[Tensor, " n"]
+    depth: Float[Tensor, "H W"]
+    normals: Float[Tensor, "3 H W"]
+    camera: Mapping[str, Any]
+    light: Float[Tensor, "K 3"]
+    mesh: str
+
+
+def render_dataset(
+    meshes: Sequence[MeshItem | Sequence[MeshItem]],
+    size: Size,
+    count: int,
+    *,
+    first: int = 0,
+    skip: Collection[int] = (),
+    seed: int = 0,
+    settings: AugmentationSettings | None = None,
+    network: TaskNetwork | None = None,
+    **of_scene: Any,
+) -> Iterator[LabeledRender]:
+    """Render labeled images one after another.
+
+    The renders show the entries of `meshes` in turn, then the next background,
+    then the next view. What else differs is drawn at random, as `settings.vary`
+    and `settings.random_light` say. A render with an index is the same whatever
+    `first` and `count` are, so that several processes can share the work.
+
+    Args:
+        meshes: Entries of `build_scene`: pairs of a mesh and its class, or lists
+            of them for several objects on the same ground.
+        size: Pixels per side of the images, or (height, width).
+        count: Number of renders.
+        first: Index of the first render.
+        skip: Indices of renders that are not needed.
+        seed: Seed of all random draws.
+        settings: What is drawn at random. None for random light only.
+        network: Network for whose mistakes each render is attacked, as
+            `nb.load_classifier` returns it. None for random light.
+        of_scene: Further arguments of `build_scene`, such as light, backgrounds
+            and views.
+
+    Yields:
+        The renders with the indices `first` to `first + count - 1` that are not
+        in `skip`.
+
+    Raises:
+        InputError: If an argument has the wrong type or range, or if
+            `build_scene` refuses one.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> meshes = [("solid:orange", "orange"), ("solid:apple", "apple")]
+        >>> for render in nb.render_dataset(meshes, size=32, count=2, fov=30.0):
+        ...     print(render.labels, render.image.shape, render.boxes.shape)
+        ['orange'] torch.Size([3, 32, 32]) torch.Size([1, 4])
+        ['apple'] torch.Size([3, 32, 32]) torch.Size([1, 4])
+    """
+    for name, value in {"count": count, "first": first, "seed": seed}.items():
+        errors.require_whole(name, value)
+    expected = "nb.AugmentationSettings(...) or None"
+    errors.require_kind("settings", settings, AugmentationSettings | None, expected)
+    errors.require_kind("network", network, TaskNetwork | None, "nb.load_classifier(...) or None")
+    mode = "random" if network is None else "adversarial"
+    settings = settings or AugmentationSettings(mode=mode)
+    if settings.mode != mode:
+        missing = "gets none" if network is None else "gets one"
+        raise InputError(f"mode={settings.mode} does not fit a data set that {missing}: set {mode}")
+    scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **of_scene)
+    skipped = frozenset(skip)
+    indices = [index for index in range(first, first + count) if index not in skipped]
+    return _render_blocks(scene, settings, network, indices, seed)
+
+
+def _render_blocks(
+    scene: Scene,
+    settings: AugmentationSettings,
+    network: TaskNetwork | None,
+    indices: Sequence[int],
+    seed: int,
+) -> Iterator[LabeledRender]:
+    """Yield renders with ascending indices, one block after another."""
+    # The examples of the scene are sorted by object, view and background.
+    shape = (len(scene.objects), -1, len(scene.backgrounds))
+    in_turn = torch.arange(len(scene)).view(shape).permute(1, 2, 0).flatten().tolist()
+    for block, members in groupby(indices, lambda index: index // BLOCK):
+        every = range(block * BLOCK, (block + 1) * BLOCK)
+        chosen = [in_turn[index % len(scene)] for index in every]
+        examples = [scene.examples[example] for example in chosen]
+        shown = scene.changed(examples=examples, lights=scene.lights[chosen])
+        labels = _labels(shown, network)
+        of_service = (replace(settings, examples=BLOCK), shown, labels, seed)
+        service = AugmentationService(
+            *of_service,
+            Phases(labels.device),
+            task=Classification() if network is None else network.task,
+            classes=() if network is None else network.classes,
+        )
+        problem = service.problem(block)
+        values = service.values(network, problem, block)
+        rows = torch.tensor([index - every.start for index in members], device=values.device)
+        yield from _renders(problem, values, rows, every.start)
+
+
+def _labels(scene: Scene, network: TaskNetwork | None) -> Int[Tensor, " E"]:
+    """Return the classes of the examples for an attack, as indices of the network."""
+    device = scene.lights.device
+    if network is None:
+        return torch.zeros(len(scene), dtype=torch.int64, device=device)
+    return source_labels(scene, device, network)[:, 0]
+
+
+def _renders(
+    problem: SceneProblem, values: Float[Tensor, "E D"], rows: Int[Tensor, " A"], start: int
+) -> Iterator[LabeledRender]:
+    """Yield the renders of some examples of a problem, with indices from `start`."""
+    scene = problem.scene
+    names = [*dict.fromkeys(of for item in scene.objects for of in item.labels if of != "")]
+
+    def index_of(label: str | int) -> int:
+        return NO_OBJECT if label == "" else names.index(label)
+
+    # One after another, so that image, truth and maps are of the same rasterized view.
+    for example in rows.tolist():
+        row = torch.tensor([example], device=values.device)
+        conditions = problem.conditions(values[row], row)
+        image = to_bytes(problem.images(values, row)[0, 0]).cpu()
+        truth = [part[0, 0].cpu() for part in vars(scene.truth(index_of, row, conditions)).values()]
+        classes, boxes, masks, visible = (part[truth[0] != NO_OBJECT] for part in truth)
+        [camera] = scene.cameras_under(conditions, 0, example)
+        depth, normals = scene.surface_maps(conditions, 0, example)
+        shown = scene.examples[example]
+        yield LabeledRender(
+            start + example,
+            image,
+            [names[index] for index in classes.tolist()],
+            boxes,
+            masks,
+            visible,
+            depth,
+            normals,
+            describe_camera(camera.fixed(), scene.settings.shape),
+            conditions.light[0].cpu() * shown.exposure,
+            scene.objects[shown.object].name,
+        )
+
+
+def describe_camera(camera: Camera, shape: tuple[int, int]) -> dict[str, Any]:
+    """Describe a camera by its pose and its intrinsics in pixels, see `LabeledRender`."""
+    facts: dict[str, Any] = {"pose": camera.pose().tolist()}
+    if not camera.has_perspective:
+        return facts | {"width": camera.width}
+    height, width = shape
+    focal = width * camera.distance / camera.width
+    facts |= {"fx": focal, "fy": focal * camera.pixel_aspect}
+    facts["cx"] = width / 2 * (1 + camera.principal_right)
+    facts["cy"] = height / 2 - width / 2 * camera.principal_up
+    return facts

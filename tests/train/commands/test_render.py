@@ -1,0 +1,167 @@
+"""Tests of pnb-render: data sets of labeled renders that other programs read."""
+
+import json
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+import yaml
+from PIL import Image
+from torchvision.datasets import ImageFolder
+
+from augment.dataset import BLOCK, describe_camera, render_dataset
+from renderer.camera import PerspectiveCamera
+from renderer.errors import InputError
+from train.command_settings import RenderSettings
+from train.commands.render import run
+
+COUNT = BLOCK + 3
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory) -> list[dict[str, str]]:
+    folder = tmp_path_factory.mktemp("meshes")
+    trimesh.creation.box().export(folder / "box.ply")
+    trimesh.creation.icosphere(2).export(folder / "ball.ply")
+    return [{"mesh": str(folder / f"{name}.ply"), "label": name} for name in ("box", "ball")]
+
+
+def write(meshes, out: Path, **options) -> Path:
+    chosen = {"size": 12, "count": COUNT, "splits": {"train": 2, "val": 1}} | options
+    run(RenderSettings(meshes=meshes, out=str(out), device="cpu", **chosen))
+    return out
+
+
+def pictures(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.rglob("[0-9]*.png"))}
+
+
+def details(folder: Path, index: int) -> dict:
+    return json.loads((folder / "details" / f"{index:06d}.json").read_text())
+
+
+def decoded(counts: list[int], size: list[int]) -> np.ndarray:
+    values = np.repeat(np.arange(len(counts)) % 2, counts)
+    return values.reshape(size[::-1]).T.astype(bool)
+
+
+def test_torchvision_reads_the_classes_of_folders(meshes, tmp_path):
+    folder = write(meshes, tmp_path / "out")
+    for part, count in {"train": 23, "val": 12}.items():
+        found = ImageFolder(str(folder / part))
+        assert len(found) == count and found.classes == ["ball", "box"]
+        for path, label in found.samples:
+            of_render = details(folder, int(Path(path).stem))
+            assert of_render["objects"][0]["class"] == found.classes[label]
+            assert of_render["split"] == part
+
+
+def test_boxes_and_run_lengths_of_coco_are_those_of_the_mask(meshes, tmp_path):
+    folder = write(meshes, tmp_path / "out", format="coco")
+    found = json.loads((folder / "annotations/instances_val.json").read_text())
+    assert len(found["images"]) == len(found["annotations"]) == 12
+    for image, item in zip(found["images"], found["annotations"], strict=True):
+        assert item["image_id"] == image["id"]
+        assert (folder / "val" / image["file_name"]).exists()
+        mask = np.array(Image.open(folder / "details" / f"{image['id'] - 1:06d}_mask.png"))
+        segmentation = item["segmentation"]
+        assert (decoded(segmentation["counts"], segmentation["size"]) == (mask == 1)).all()
+        rows, columns = np.nonzero(mask)
+        left, top, width, height = item["bbox"]
+        assert (left, left + width) == (columns.min(), columns.max() + 1)
+        assert (top, top + height) == (rows.min(), rows.max() + 1)
+        assert item["area"] == (mask == 1).sum()
+
+
+def test_lines_of_yolo_are_centers_and_sizes_as_fractions(meshes, tmp_path):
+    folder = write(meshes, tmp_path / "out", format="yolo", size=[8, 16])
+    names = yaml.safe_load((folder / "data.yaml").read_text())["names"]
+    for path in (folder / "labels").rglob("*.txt"):
+        [line] = path.read_text().splitlines()
+        label, x, y, width, height = map(float, line.split())
+        [item] = details(folder, int(path.stem))["objects"]
+        left, top, right, bottom = item["box"]
+        assert names[int(label)] == item["class"]
+        found = [16 * (x - width / 2), 8 * (y - height / 2), 16 * width, 8 * height]
+        assert found == pytest.approx([left, top, right - left, bottom - top], abs=1e-4)
+
+
+def test_a_tar_file_has_the_same_pictures_as_a_folder(meshes, tmp_path):
+    expected = pictures(write(meshes, tmp_path / "folder", maps=["mask"]))
+    folder = write(meshes, tmp_path / "tar", format="webdataset", maps=["mask"])
+    found = {}
+    for path in folder.glob("*.tar"):
+        with tarfile.open(path) as tar:
+            for member in tar:
+                found[member.name.replace(".mask", "_mask")] = tar.extractfile(member).read()
+    assert {name: found[name] for name in expected} == expected
+    assert {found[name] for name in found if name.endswith(".cls")} == {b"0", b"1"}
+
+
+def test_shards_and_stopped_commands_give_the_same_pictures(meshes, tmp_path):
+    expected = pictures(write(meshes, tmp_path / "one"))
+    folder = tmp_path / "shards"
+    for shard in (1, 0):
+        write(meshes, folder, shards=2, shard=shard)
+    assert pictures(folder) == expected
+    kept = folder / "details/000000.json"
+    before = kept.stat().st_mtime_ns
+    for index in (4, COUNT - 1):
+        (folder / f"details/{index:06d}.json").unlink()
+    write(meshes, folder)
+    assert pictures(folder) == expected and kept.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("changed", [{"seed": 1}, {"size": 8}, {"format": "coco"}])
+def test_a_data_set_of_other_settings_is_not_continued(meshes, tmp_path, changed):
+    folder = write(meshes, tmp_path / "out", count=2)
+    with pytest.raises(InputError, match=next(iter(changed))):
+        write(meshes, folder, **{"count": 2} | changed)
+
+
+def test_a_folder_of_other_files_is_refused(meshes, tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="not empty"):
+        write(meshes, tmp_path)
+
+
+def test_depth_and_normals_of_a_ball_are_those_of_a_sphere(tmp_path):
+    path = tmp_path / "ball.ply"
+    trimesh.creation.icosphere(5).export(path)
+    camera = PerspectiveCamera(polar=70.0, azimuth=30.0, width=2.5, distance=4.0)
+    [render] = render_dataset([(path, "ball")], 32, 1, cameras=[camera])
+    column, row = torch.meshgrid(torch.arange(32), torch.arange(32), indexing="xy")
+    # A ray from the camera, in its axes right, up and back, per unit of depth.
+    facts = render.camera
+    x = (column + 0.5 - facts["cx"]) / facts["fx"]
+    y = (facts["cy"] - row - 0.5) / facts["fy"]
+    # The ray t (x, y, -1) meets the unit sphere around (0, 0, -4).
+    a, b, c = x**2 + y**2 + 1, -2 * 4.0, 4.0**2 - 1
+    inside = (b**2 - 4 * a * c) > 2
+    depth = (-b - (b**2 - 4 * a * c).clamp(min=0).sqrt()) / (2 * a)
+    # The nearest of four samples in a pixel, whose centers are a quarter of a pixel away.
+    assert (render.depth - depth)[inside].abs().max() < 0.05
+    normals = torch.stack([x * depth, y * depth, 4 - depth])
+    assert (render.normals - normals)[:, inside].abs().max() < 0.05
+    assert (render.normals[:, inside].norm(dim=0) - 1).abs().max() < 1e-5
+    assert not render.depth[render.masks[0].logical_not()].any()
+
+
+def test_pixels_of_the_described_camera_are_those_of_its_projection():
+    camera = PerspectiveCamera(60.0, 25.0, width=2.2, right=0.3, up=-0.2, distance=5.0)
+    facts = describe_camera(camera, (40, 60))
+    points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
+    to_camera = np.linalg.inv(np.array(facts["pose"]))
+    x, y, z, _ = to_camera @ np.column_stack([points, np.ones(5)]).T
+    found = [facts["cx"] - facts["fx"] * x / z, facts["cy"] + facts["fy"] * y / z]
+    right, up, _ = camera.project(points).T
+    assert np.allclose(found, [30 + 30 * right, 20 - 30 * up])
+
+
+def test_the_first_meshes_get_the_renders_that_do_not_divide(meshes):
+    pairs = [(item["mesh"], item["label"]) for item in meshes]
+    labels = [render.labels[0] for render in render_dataset(pairs, 8, 5, backgrounds=[0.2, 0.8])]
+    assert labels == ["box", "ball", "box", "ball", "box"]

@@ -1,0 +1,99 @@
+"""pnb-render: labeled renders on disk, as a data set for other programs."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from augment.dataset import BLOCK, render_dataset
+from augment.progress import progress
+from renderer.errors import InputError, keyed, keys_of
+from renderer.io.files import atomic_write
+from renderer.settings import height_and_width
+from train.checkpoints import load_chosen
+from train.class_names import name_of_mesh
+from train.command_settings import RenderSettings
+from train.data.formats import FORMATS
+from train.device import choose_device, choose_rasterizer
+from train.run_folder import read_json, writable_folder
+from train.settings import label_names, read_objects
+
+# File with the settings of a data set. Processes that share one differ in CIRCUMSTANCES only.
+DESCRIPTION = "data_set.json"
+CIRCUMSTANCES = ("out", "shard", "shards", "device", "trust")
+# Bytes of a pixel in the files of a render, before compression, by the name of the map.
+BYTES = {"image": 3, "mask": 1, "depth": 2, "normals": 3}
+
+
+def run(settings: RenderSettings) -> None:
+    """Render a data set, or what a stopped command left to do, and print a summary."""
+    objects = read_objects(settings.meshes, "", "meshes")
+    default = None if settings.label is None else label_names(settings.label)[0]
+    for item in objects.values():
+        item.label = item.label or default or name_of_mesh(item.mesh)
+    labels = [of.label for item in objects.values() for of in (item, *item.others)]
+    classes = [*dict.fromkeys(label for label in labels if label)]
+    folder = writable_folder(settings.out, "out")
+    data = FORMATS[settings.format](
+        folder, classes, settings.split_counts, shard_indices(settings), settings.maps
+    )
+    _describe(settings, folder, classes)
+    missing = [index for index in data.indices if not data.last_file(index).exists()]
+    height, width = height_and_width(settings.size)
+    size = height * width * sum(BYTES[name] for name in ("image", *settings.maps)) * len(missing)
+    print(
+        f"{folder}: {len(missing)} of {settings.count} renders to do, at most {size / 1e9:.2g} GB"
+    )
+    device = choose_device(settings.device)
+    network = load_chosen(settings).to(device) if settings.network else None
+    keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
+    with keyed("scene", **keys):
+        renders = render_dataset(
+            list(objects.values()),
+            settings.size,
+            settings.count,
+            skip=set(range(settings.count)).difference(missing),
+            seed=settings.seed,
+            settings=settings.augment,
+            network=network,
+            scene=settings.scene,
+            renderer=settings.renderer,
+            rasterizer=choose_rasterizer(settings.renderer),
+            views=settings.scene.views,
+            device=device,
+        )
+    data.write(progress(renders, "renders", len(missing)))
+    if data.is_finished():
+        data.finish()
+        parts = ", ".join(f"{count} {name}" for name, count in data.splits.items())
+        print(f"{folder}: {settings.count} renders of {len(classes)} classes ({parts})")
+
+
+def shard_indices(settings: RenderSettings) -> range:
+    """Return the indices of the renders of this process, which are whole blocks."""
+    blocks = -(-settings.count // BLOCK)
+    ends = [blocks * (settings.shard + part) // settings.shards * BLOCK for part in (0, 1)]
+    return range(*(min(end, settings.count) for end in ends))
+
+
+def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> None:
+    """Write the settings to the folder, or check that it holds a data set of the same settings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / DESCRIPTION
+    facts = {key: value for key, value in asdict(settings).items() if key not in CIRCUMSTANCES}
+    facts = json.loads(json.dumps(facts | {"classes": classes}, default=str))
+    if path.exists():
+        found = read_json(path)
+        changed = [key for key in facts if found.get(key) != facts[key]]
+        if changed:
+            reason = f"holds a data set with another {changed[0]}"
+            raise InputError(f"out={folder} {reason}: choose another folder", "out")
+    elif any(name.name != DESCRIPTION for name in folder.iterdir()):
+        raise InputError(f"out={folder} is not empty: choose a new folder", "out")
+    else:
+        atomic_write(path, json.dumps(facts, indent=1))
+
+
+def start(start_shards: Callable[[], None], words: Sequence[str]) -> None:
+    """Start the shards of a --multirun, for which Hydra's launchers need nothing else."""
+    start_shards()
