@@ -271,10 +271,10 @@ class _Plan:
                 if other is not network:
                     arguments = (network, other, attacked_views, results)
                     _write_json(results / lights.TRANSFER, lights.transfer_success, *arguments)
-            if isinstance(network.task, Detection):
+            if not self.has_classes:
                 negatives = replace(views, objects=self.negatives)
                 lit = (network, views, attacked_views, negatives, *environments[1:], results)
-                _write_json(results / found.DETECTED, found.detect_in_lights, *lit)
+                _write_json(results / found.DETECTED, found.find_in_lights, *lit)
         for key, network in {**networks, **normalizing(networks)}.items():
             for name, images in self.image_folders.items():
                 predictor = Predictor(network, network.classes, network.size, self.views.device)

@@ -1,6 +1,7 @@
-"""Score a detector on renders: in plain light, in unusual light, and after attacks.
+"""Score a detector or a segmenter on renders: in plain and unusual light, and after attacks.
 
-Only detections of the class of the meshes count. On renders of hard negatives, each is false.
+Only the class of the meshes counts. On renders of hard negatives, each of its detections or pixels
+is false.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,8 +19,8 @@ from augment.attacks.problem import build_problem
 from augment.classifier import TaskNetwork
 from augment.network import compute_outputs, device_of
 from augment.progress import progress
-from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT, Truth
+from augment.tasks.detection import Detection
 from renderer.light.files import load_light
 from train.auditing import lights
 from train.auditing.lights import BATCH, KINDS, RANDOM, Views
@@ -43,15 +44,31 @@ CURVE_POINTS = 50
 # End of the name of a folder of results with normalized light, and that of the title of a table.
 NORMALIZED, NORMAL = "_normalized_light", ", with normalized light"
 # Header of the table of metrics.
-HEADER = ("recall", "AP50", "false detections per image")
+HEADER = {
+    "recall": "recall",
+    "ap50": "AP50",
+    "false_per_image": "false detections per image",
+    "miou": "mIoU",
+}
+# What is said about the metrics.
+ABOUT = (
+    "Recall at the score threshold, average precision at an IoU of 0.5, and detections of {} "
+    "without an object."
+)
+ABOUT_PIXELS = "Mean of the IoU of the pixels of {} and of that of all other pixels."
 
 
-def _detect(
-    network: TaskNetwork, scene: Scene, images: Float[Tensor, "E 1 3 H W"], truth: Truth | None
-) -> list[tuple[Found, Marked]]:
-    """Detect objects in renders. Without a truth, no object is of the class."""
-    pairs = []
+def _find(
+    network: TaskNetwork, label: int, images: Float[Tensor, "E 1 3 H W"], truth: Truth | None
+) -> list[tuple[Any, Any]]:
+    """Pair what is found in renders with the truth. Without one, nothing is of the class."""
+    pairs: list[tuple[Any, Any]] = []
     for row, output in enumerate(compute_outputs(network, images[:, 0], BATCH)):
+        if not isinstance(network.task, Detection):
+            shown = (output.argmax(0) == label).long()
+            mask = torch.zeros_like(shown) if truth is None else truth.masks[row, 0, 0].long()
+            pairs.append((shown.cpu().numpy(), mask.cpu().numpy()))
+            continue
         arrays = [output[name].cpu().numpy() for name in ("boxes", "labels", "scores")]
         boxes, labels = np.zeros((0, 4)), np.zeros(0, int)
         if truth is not None:
@@ -62,7 +79,7 @@ def _detect(
     return pairs
 
 
-def detect_in_lights(
+def find_in_lights(
     network: TaskNetwork,
     views: Views,
     attacked_views: Views,
@@ -71,11 +88,11 @@ def detect_in_lights(
     random_light_count: int,
     out: Path,
 ) -> dict[str, Any]:
-    """Score a detector in all lights of an audit, after its attacks have been written to `out`."""
+    """Score a network in all lights of an audit, after its attacks have been written to `out`."""
     label = network.label(views.objects[0].label)
-    groups: dict[str, list[tuple[int, tuple[Found, Marked]]]] = {}
+    groups: dict[str, list[tuple[int, tuple[Any, Any]]]] = {}
 
-    def add(title: str, first_view: int, pairs: list[tuple[Found, Marked]]) -> None:
+    def add(title: str, first_view: int, pairs: list[tuple[Any, Any]]) -> None:
         numbered = enumerate(pairs, first_view)
         groups.setdefault(title, []).extend(numbered)
 
@@ -86,8 +103,8 @@ def detect_in_lights(
         truth = None if title else scene.truth(network.label)
         # Views of hard negatives are other units than those of the class.
         first = views.count if title else 0
-        for name, light in progress({"": plain, **unusual}.items(), "detections in other light"):
-            pairs = _detect(network, scene, lights.render_in(scene, light), truth)
+        for name, light in progress({"": plain, **unusual}.items(), "objects in other light"):
+            pairs = _find(network, label, lights.render_in(scene, light), truth)
             group = "random light" if name.startswith(RANDOM) else "environments"
             add(group if name else "plain light", first, pairs)
     for kind, light_kind in KINDS.items():
@@ -99,18 +116,24 @@ def detect_in_lights(
             values = torch.from_numpy(saved["values"]).to(problem.start)
         with torch.no_grad():
             images = problem.images(values)
-        pairs = _detect(network, scene, images, scene.truth(network.label))
+        pairs = _find(network, label, images, scene.truth(network.label))
         add(f"attacked: {light_kind.title}", 0, pairs)
     task: Any = network.task
     metrics = {}
     for title, numbered in groups.items():
         units = np.array([unit for unit, _ in numbered])
+        if not isinstance(task, Detection):
+            miou, _ = detections.mean_iou((pair for _, pair in numbered), 2, units, VIEWS)
+            metrics[title] = {"n": len(numbered), "miou": asdict(miou)}
+            continue
         at_iou, at_half = (
             [_match([pair for _, pair in numbered], label, iou)] for iou in (task.iou, 0.5)
         )
         metrics[title] = asdict(
             detections.score(at_iou, task.threshold, at_half, units, over=VIEWS)
         )
+    if not isinstance(task, Detection):
+        return {"metrics": metrics, "curve": []}
     every = [
         pair
         for title in ("plain light", "environments", "random light")
@@ -147,7 +170,7 @@ def score_photographs(network: TaskNetwork, annotations: Annotations, out: Path)
     detection_scores.write(scores, out)
 
 
-def sections(networks: Mapping[str, Path]) -> list[dict[str, Any]]:
+def sections(networks: Mapping[str, Path], label: str) -> list[dict[str, Any]]:
     """Make a section of a report about each network, whose results are in a folder."""
     made = []
     for name, folder in networks.items():
@@ -161,14 +184,17 @@ def sections(networks: Mapping[str, Path]) -> list[dict[str, Any]]:
                 tables.append(_table(by_label, f"photographs{title}", "class"))
         points = {name: [[(x, y) for x, y in content["curve"]]]}
         chart = plot_curves(points, "recall", "false detections per image")
-        made.append({"name": name, "tables": tables, "charts": [chart] if chart else []})
+        about = (ABOUT if content["curve"] else ABOUT_PIXELS).format(label)
+        charts = [chart] if chart else []
+        made.append({"name": name, "about": about, "tables": tables, "charts": charts})
     return made
 
 
 def _table(metrics_of: Mapping[str, Any], title: str, first: str) -> Table:
     """Make a table of metrics from a file, with a row for each light or class."""
-    rows = []
+    rows, names = [], []
     for name, metrics in metrics_of.items():
-        estimates = [Estimate(**metrics[metric]) for metric in detections.METRICS]
+        names = [metric for metric in HEADER if metric in metrics]
+        estimates = [Estimate(**metrics[metric]) for metric in names]
         rows.append([name, *map(format_interval, estimates)])
-    return Table(title, [first, *HEADER], rows)
+    return Table(title, [first, *(HEADER[metric] for metric in names)], rows)

@@ -432,15 +432,14 @@ def find_plain_views(classifier: TaskNetwork, views: Views) -> PlainViews:
     ENOUGH. If no view is ever recognized, the first combination is returned.
     """
     tried: list[PlainViews] = []
-    candidates = [*product(SIZES, EXPOSURES, PLAIN_LIGHTS)]
-    for size, exposure, name in progress(candidates, "search for plain light"):
-        candidate = replace(views, light=name, exposure=exposure, size=size)
-        scene = candidate.scene(classifier.size)
-        light = load_light(name).to(scene.lights) * exposure
+    for size in progress(SIZES, "search for plain light"):
+        scene = replace(views, size=size).scene(classifier.size)
         criterion = criterion_of(classifier, scene)
-        recognized = int(is_found(classifier, criterion, render_in(scene, light)).sum())
-        as_given = tried[0].recognized if tried else recognized
-        tried.append(PlainViews(name, exposure, size, recognized, views.count, as_given))
-        if recognized >= ENOUGH * views.count:
-            break
+        for exposure, name in product(EXPOSURES, PLAIN_LIGHTS):
+            light = load_light(name).to(scene.lights) * exposure
+            recognized = int(is_found(classifier, criterion, render_in(scene, light)).sum())
+            as_given = tried[0].recognized if tried else recognized
+            tried.append(PlainViews(name, exposure, size, recognized, views.count, as_given))
+            if recognized >= ENOUGH * views.count:
+                return tried[-1]
     return max(tried, key=lambda item: item.recognized)

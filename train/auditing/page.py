@@ -139,7 +139,9 @@ def write_audit_page(
         screen=screen,
         caveats=[*caveats, *unreadable],
         agreement=_agreement(networks) if PHOTOGRAPHS in folders else Proportion(),
-        detections=found.sections({network.name: network.folder for network in networks}),
+        detections=found.sections(
+            {network.name: network.folder for network in networks}, in_words(label)
+        ),
         relit=relit_sections({network.name: network.folder for network in networks}),
         config=read_config(out / CONFIG),
     )

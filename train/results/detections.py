@@ -178,10 +178,6 @@ def _sorted(image_count: int, detections: np.ndarray, objects: np.ndarray) -> Ma
     )
 
 
-# Names of the metrics of detections, in the order of tables.
-METRICS = ("recall", "ap50", "false_per_image")
-
-
 @dataclass(frozen=True)
 class DetectionMetrics:
     """Metrics of the detections of a class, or of all classes, with 95% intervals.

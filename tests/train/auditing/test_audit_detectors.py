@@ -1,6 +1,7 @@
 """An audit of a detector: recall and AP50 in plain light, in other light and after attacks."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from renderer.io.images import write_image
 from tests.helpers import find_red
 from train.auditing import found
 from train.auditing.audit import run_audit
-from train.auditing.lights import KINDS, Views, recognize_in_environments
+from train.auditing.lights import KINDS, Views, recognize_in_environments, render_in
 from train.auditing.relit import RELIT_FOLDER, read_relit
 from train.command_settings import AuditSettings
 
@@ -34,7 +35,7 @@ def test_recall_on_renders_is_the_fraction_of_views_in_which_the_object_is_found
         Views([item], 3, 0, torch.device("cpu"), exposure=0.7) for item in solids.values()
     )
     lights = ["uniform", "eucalyptus"]
-    content = found.detect_in_lights(network, views, views, negatives, lights, 2, tmp_path)
+    content = found.find_in_lights(network, views, views, negatives, lights, 2, tmp_path)
     metrics = content["metrics"]
     recognized = recognize_in_environments(network, views, lights, 2)
     expected = np.mean([recognized[name] for name in lights])
@@ -73,8 +74,34 @@ def test_an_audit_of_a_detector_has_a_section_about_detections(tmp_path):
     report = nb.audit(
         find_red, ["solid:orange:0"], hard_negatives=negatives, budget=0.1, out=tmp_path, **options
     )
-    assert "<h2>Detections" in report.page
+    assert "<h2>Objects in other light" in report.page
     assert "has no gradients" not in report.page
     stored = json.loads((tmp_path / "classifier" / found.DETECTED).read_text())
     assert {f"attacked: {light.title}" for light in KINDS.values()} <= stored["metrics"].keys()
     assert report.network.attacks["lighting"].correct == 1
+
+
+def test_the_miou_on_renders_is_that_of_the_pixels_of_the_class(monkeypatch, tmp_path):
+    def find_gray(images):
+        is_gray = (images - 0.5).abs().amax(1) < 0.05
+        return torch.stack([is_gray.float(), 0.5 + 0 * images[:, 0]], dim=1)
+
+    monkeypatch.setattr(found, "KINDS", {})
+    network = as_network(find_gray, SIZE, ["background", "orange"])
+    items = [load_object(ObjectSettings(f"solid:{name}:0")) for name in ("orange", "lemon")]
+    views, negatives = (
+        Views([replace(item, label="orange")], 3, 0, torch.device("cpu")) for item in items
+    )
+    content = found.find_in_lights(network, views, views, negatives, ["uniform"], 1, tmp_path)
+    scenes = [shown.scene(SIZE) for shown in (views, negatives)]
+    shown = [find_gray(render_in(scene, scene.lights[0])[:, 0]).argmax(1) for scene in scenes]
+    guess = torch.cat(shown).bool()
+    mask = torch.zeros_like(guess)
+    mask[:3] = scenes[0].truth(network.label).masks[:, 0, 0]
+    expected = []
+    for one, other in ((guess, mask), (~guess, ~mask)):
+        expected.append(float((one & other).sum() / (one | other).sum()))
+    miou = content["metrics"]["plain light"]["miou"]
+    assert miou["value"] == pytest.approx(np.mean(expected))
+    assert miou["low"] < miou["value"] < miou["high"]
+    assert content["metrics"]["random light"]["n"] == 6
