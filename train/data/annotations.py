@@ -36,6 +36,8 @@ CLASS_FILES = ("classes.txt", "obj.names")
 MASK_FOLDERS = (("images", "masks"), ("JPEGImages", "SegmentationClass"))
 # Pixels of this class in a mask are not scored.
 UNSCORED = 255
+# Coordinates may leave the image by this fraction of a side.
+ROUNDING = 1e-3
 # Images are read at full size.
 FULL_SIZE = 2**16
 # From the coordinates (x, y) in a stored image, as fractions of its sides, to those in the upright
@@ -204,6 +206,10 @@ def _read_coco(file: Path) -> Annotations:
         names = {item["id"]: str(item["name"]) for item in content["categories"]}
         classes = tuple(dict.fromkeys(names[key] for key in sorted(names)))
         images = {item["id"]: item for item in content["images"]}
+        names_of_images = {item["file_name"] for item in images.values()}
+        for key, found in (("images", images), ("images", names_of_images), ("categories", names)):
+            if len(found) < len(content[key]):
+                raise ValueError(f"two of the {key} have the same id or file_name")
         of_image: dict[Any, list[Mapping[str, Any]]] = defaultdict(list)
         for item in content["annotations"]:
             for key, known in (("image_id", images), ("category_id", names)):
@@ -317,8 +323,11 @@ def _yolo_classes(folder: Path) -> tuple[str, ...]:
                 raise InputError(f"{file} cannot be read: {single_line(error)}") from error
             names = content.get("names") if isinstance(content, dict) else None
             if isinstance(names, dict):
-                # Keys are indices, of which some may be missing.
-                return tuple(str(names.get(key, key)) for key in range(max(names, default=-1) + 1))
+                if not all(str(key).isdecimal() for key in names):
+                    raise InputError(f"{file} has names {names}: give a list, or index: name")
+                # Some indices may be missing.
+                known = {int(key): str(name) for key, name in names.items()}
+                return tuple(known.get(i, str(i)) for i in range(max(known, default=-1) + 1))
             if isinstance(names, list):
                 return tuple(map(str, names))
         for name in (*CLASS_FILES, *(f"labels/{name}" for name in CLASS_FILES)):
@@ -335,7 +344,11 @@ def _yolo_rows(
     file: Path, class_count: int
 ) -> Iterator[tuple[int, tuple[float, float, float, float]]]:
     """Yield the class and the box of each line of a label file."""
-    for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), 1):
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except ValueError as error:
+        raise InputError(f"{file} is no text ({single_line(error)}): write it again") from error
+    for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
         try:
@@ -344,7 +357,7 @@ def _yolo_rows(
                 raise ValueError(f"it has {1 + len(values)} numbers")
             if label not in range(class_count):
                 raise ValueError(f"class {label:g} is none of {class_count} classes")
-            if not all(0 <= value <= 1 for value in values):
+            if not all(-ROUNDING <= value <= 1 + ROUNDING for value in values):
                 raise ValueError("coordinates must be fractions of the sides, from 0 to 1")
         except ValueError as error:
             raise InputError(

@@ -137,6 +137,32 @@ def test_boxes_of_yolo_are_fractions_of_the_sides(tmp_path, image, label, names)
 
 
 @pytest.mark.parametrize(
+    ("names", "expected"),
+    [("[cat, dog]", ("cat", "dog")), ("{'0': cat, 2: dog}", ("cat", "1", "dog"))],
+)
+def test_names_of_yolo_are_a_list_or_a_mapping_of_indices(tmp_path, names, expected):
+    _draw(tmp_path / "a.png")
+    (tmp_path / "a.txt").write_text("1 0.5 0.5 1.0000001 0.4\n")
+    (tmp_path / "data.yaml").write_text(f"names: {names}\n")
+    read = read_annotations(tmp_path)
+    assert read.classes == expected
+    assert read.photographs[0].labels.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [("data.yaml", b"names: {cat: 0}", "has names"), ("a.txt", b"\xff\xfe\x00", "no text")],
+)
+def test_files_of_yolo_in_another_form_are_refused(tmp_path, file, content, message):
+    _draw(tmp_path / "a.png")
+    (tmp_path / "data.yaml").write_text("names: [cat]\n")
+    (tmp_path / "a.txt").write_text("0 0.5 0.5 0.1 0.1\n")
+    (tmp_path / file).write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_annotations(tmp_path)
+
+
+@pytest.mark.parametrize(
     "line", ["2 .5 .5 .1 .1", "0 40 20 10 10", "0 .5 .5 .1", "cat .5 .5 .1 .1", "0 nan 0 0 0"]
 )
 def test_a_wrong_line_of_yolo_is_refused_by_its_number(tmp_path, line):
@@ -155,6 +181,9 @@ def test_a_wrong_line_of_yolo_is_refused_by_its_number(tmp_path, line):
         ({"annotations": [{"image_id": 7, "category_id": 3, "bbox": [0, 0, -1, 1]}]}, "bbox"),
         ({"annotations": [{"image_id": 7, "category_id": 3}]}, "no key 'bbox'"),
         ({"images": []}, "image_id 7"),
+        ({"images": 2 * [{"id": 7, "file_name": "a.png"}]}, "two of the images"),
+        ({"images": [{"id": i, "file_name": "a.png"} for i in (7, 8)]}, "two of the images"),
+        ({"categories": [{"id": 90, "name": name} for name in "ab"]}, "two of the categories"),
     ],
 )
 def test_a_wrong_coco_file_is_refused_in_one_sentence(tmp_path, changes, message):
