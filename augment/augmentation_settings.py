@@ -5,6 +5,7 @@ This module imports neither torch nor NumPy; see `renderer.settings`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from augment.attack_settings import AttackSettings, StepSettings
@@ -182,9 +183,9 @@ class AugmentationSettings(Settings):
         None, "Folder of images for mode=folder: a folder per class, or other_NAME."
     )
     examples: int | None = setting(
-        100,
-        "Renders per regeneration: meshes × views × backgrounds. null: as many as scene.views "
-        "makes, or all images of the folder.",
+        None,
+        "Renders per regeneration, as many of each mesh as possible. null: meshes × views × "
+        "backgrounds (100 without scene.views), or all images of the folder.",
         within=(0, MAX_EXAMPLES),
     )
     init: str = setting(
@@ -226,19 +227,11 @@ class AugmentationSettings(Settings):
         return self.mode != "none" and self.examples != 0
 
 
-def count_views(examples: int | None, objects: int, backgrounds: int, views: int | None) -> int:
-    """Compute the number of views of each mesh from the number of renders.
+def views_of(examples: int, objects: int, backgrounds: int) -> int:
+    """Compute how many views show each mesh at least `examples` times in all, in every background.
 
-    The number of renders is meshes × views × backgrounds. For example, 2 meshes, 10 views and 5
-    backgrounds give 100 renders. None stands for a number that follows from the other.
+    For example, 100 renders of 2 meshes in front of 5 backgrounds need 10 views.
     """
     if not objects or not backgrounds:
         raise InputError("meshes and backgrounds must not be empty: name one of each", "meshes")
-    if examples is None and views is not None:
-        return views
-    derived, rest = divmod(examples or 0, objects * backgrounds)
-    if rest or derived < 1 or views not in (None, derived):
-        product = f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds"
-        advice = "change one of these numbers, or set views or examples to None to compute it"
-        raise InputError(f"examples={examples} is not {product}: {advice}", "examples")
-    return derived
+    return max(1, math.ceil(examples / objects / backgrounds))

@@ -20,6 +20,7 @@ from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import TaskNetwork
 from augment.progress import Phases
 from augment.scene.build import MeshItem, build_scene
+from augment.scene.exposure import warn_of_exposure
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT
 from augment.service import AugmentationService
@@ -163,6 +164,8 @@ def _render_blocks(
         )
         problem = service.problem(block)
         values = service.values(network, problem, block)
+        if block == indices[0] // BLOCK:
+            warn_of_exposure(problem.scene)
         rows = torch.tensor([index - every.start for index in members], device=values.device)
         yield from _renders(problem, values, rows, every.start)
 

@@ -19,13 +19,14 @@ from augment import distributed
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Objective, preprocessed_model
 from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed_light
-from augment.augmentation_settings import AugmentationSettings
+from augment.augmentation_settings import AugmentationSettings, views_of
 from augment.classifier import CheckedNetwork, class_index
 from augment.network import compute_outputs, frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
 from augment.renders import Renders, select_examples_to_log
 from augment.scene.build import MeshItem, build_scene, with_needed_degree
+from augment.scene.exposure import warn_of_exposure
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT, Truth
@@ -154,11 +155,13 @@ class AugmentationService:
     ) -> AugmentationService:
         """Build a source of renders for any training loop.
 
-        There is a render for each mesh, camera and background.
+        There are `settings.examples` renders, as many of each mesh as possible.
+        Without settings, or with `examples=None`, there is a render for each
+        mesh, camera and background.
 
         Args:
-            meshes: Pairs of a mesh and the index of its class. A mesh is a
-                file, solid:NAME or a `Mesh`. With a task that finds objects,
+            meshes: Pairs of a mesh and its class, by index or, with `classes`, by
+                name. A mesh is a file, solid:NAME or a `Mesh`. With a task that finds objects,
                 entries are those of `build_scene`: a class may have its name,
                 "" and −1 stand for no class, and a list has several objects.
             size: Pixels per side of the renders, or (height, width).
@@ -166,10 +169,10 @@ class AugmentationService:
             seed: Seed of all random numbers.
             task: Task of the network, such as `nb.Detection()`, for which the
                 renders get boxes and masks. None for classification.
-            classes: Names of the classes of a detector or a segmenter.
+            classes: Names of the classes of the network.
             of_scene: Further arguments of `build_scene`. By default, there are
-                10 views, 5 gray backgrounds, 8 × 8 samples per pixel and flat
-                shading.
+                as many views as `settings.examples` needs (10 without it), 5
+                gray backgrounds, 8 × 8 samples per pixel and flat shading.
 
         Returns:
             The service.
@@ -193,13 +196,22 @@ class AugmentationService:
         views = 1 if of_scene.get("cameras") else 10
         paper: dict[str, Any] = {"views": views, "samples": 8, "normals": "flat"}
         options = paper | {"backgrounds": [0.0, 0.25, 0.5, 0.75, 1.0]} | of_scene
+        count = None if settings is None else settings.examples
         settings = settings or AugmentationSettings()
+        if count and "views" not in of_scene and "cameras" not in of_scene:
+            options["views"] = views_of(count, len(meshes), len(options["backgrounds"]))
         scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **options)
+        scene = scene.with_count(count) if count else scene
         task = task or Classification()
         names: Sequence[Any] = scene.labels
         if isinstance(task, Classification):
             for item in scene.objects:
-                require_whole(f"meshes: the label of {item.name}", item.label)
+                if not (classes and isinstance(item.label, str)):
+                    require_whole(f"meshes: the label of {item.name}", item.label)
+            names = [
+                class_index(classes, label, "meshes") if isinstance(label, str) else label
+                for label in names
+            ]
         else:
             names = [_index_of(label, classes) for label in names]
         labels = torch.tensor(names, device=scene.lights.device)
@@ -244,6 +256,8 @@ class AugmentationService:
             shown = self._random(model, problem, number)
         else:
             shown = self._adversarial(model, problem, number)
+        if number == 0:
+            warn_of_exposure(problem.scene)
         diagnostics = shown.diagnostics | _changes(problem, shown.values)
         if self._finds_objects:
             targets = self._truth(problem, shown.values).targets()

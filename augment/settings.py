@@ -12,7 +12,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
-from renderer.errors import MAX_SCALE, InputError, is_number, require_choice
+from renderer.errors import MAX_SCALE, InputError, is_number, require_choice, require_range
 from renderer.settings import (
     MAX_DEGREE,
     MAX_SAMPLES,
@@ -151,6 +151,10 @@ LOCAL_LIGHT_SETTINGS: dict[str, type[Settings]] = {
 }
 
 
+# Value of `SceneSettings.exposure` that means: chosen for each mesh.
+AUTO = "auto"
+
+
 @dataclass
 class SceneSettings(Settings):
     """Cameras, backgrounds and lighting of a scene."""
@@ -183,7 +187,10 @@ class SceneSettings(Settings):
         "null: 6, or what the smoothest specular material needs that the run can reach.",
         within=(0, MAX_DEGREE),
     )
-    exposure: float = setting(1.0, "Factor of the lighting.", within=(1 / MAX_SCALE, MAX_SCALE))
+    exposure: Any = setting(
+        1.0,
+        "Factor of the lighting. auto: one for each mesh, at which its pixels have the mean 0.4.",
+    )
     # `projector` and `lamps` are dictionaries that `__post_init__` converts to settings, because
     # OmegaConf cannot set a single field of an optional dataclass.
     projector: Any = setting(
@@ -202,9 +209,16 @@ class SceneSettings(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.exposure != AUTO:
+            require_range("exposure", self.exposure, 1 / MAX_SCALE, MAX_SCALE)
         for name, kind in LOCAL_LIGHT_SETTINGS.items():
             if getattr(self, name) is not None:
                 setattr(self, name, settings_from(kind, getattr(self, name), name))
+
+    @property
+    def given_exposure(self) -> float:
+        """The exposure, or 1 if it is chosen for each mesh."""
+        return 1.0 if self.exposure == AUTO else float(self.exposure)
 
 
 @dataclass

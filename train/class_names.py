@@ -160,14 +160,9 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
     negatives = [
         with_class_name(item, classes, "hard_negatives") for item in settings.hard_negatives
     ]
-    # If `scene.views` is set, the number of examples follows from the number of objects. It
-    # is then computed again, because `ExperimentSettings` removes a generated hard negative
-    # whose name is the positive class.
-    examples = settings.augment.examples if settings.scene.views is None else None
     return replace(
         settings,
         label=names[0] if len(names) == 1 else names,
-        augment=replace(settings.augment, examples=examples),
         meshes=meshes,
         hard_negatives=negatives,
     )

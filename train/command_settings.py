@@ -16,7 +16,13 @@ from augment.augmentation_settings import (
     RandomLightSettings,
     VariationSettings,
 )
-from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, RendererSettings, SceneSettings
+from augment.settings import (
+    AUTO,
+    LOCAL_LIGHT_SETTINGS,
+    LampsSettings,
+    RendererSettings,
+    SceneSettings,
+)
 from renderer.errors import MAX_SCALE, InputError, is_number, require_choice
 from renderer.settings import (
     ENCODINGS,
@@ -527,7 +533,9 @@ class RenderSettings(TaskSettings):
         "What is drawn at random, and the attack if there is a network.",
     )
     scene: SceneSettings = setting(
-        lambda: SceneSettings(backgrounds=[0.1, 0.3, 0.5, 0.7, 0.9], views=12, fov=30.0),
+        lambda: SceneSettings(
+            backgrounds=[0.1, 0.3, 0.5, 0.7, 0.9], views=12, fov=30.0, exposure=AUTO
+        ),
         "The scene. light=NAME is short for scene.light=NAME.",
     )
     renderer: RendererSettings = setting(

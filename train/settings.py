@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from augment.augmentation_settings import MAX_EXAMPLES, AugmentationSettings, count_views
+from augment.augmentation_settings import MAX_EXAMPLES, AugmentationSettings, views_of
 from augment.settings import ObjectSettings, RendererSettings, SceneSettings, read_normalized_light
 from renderer.errors import InputError, composed, is_whole, require_range
 from renderer.settings import MAX_SIZE, MAX_VIEWS, Settings, setting, setting_like, settings_from
@@ -47,6 +47,8 @@ GROUPS = ("source", "mesh", "class")
 # needs this size.
 MIN_SIZE = 5
 MAX_IMAGES = 10**6
+# Number of renders if neither this number nor that of the views is set.
+RENDERS = 100
 MAX_SEED = 2**63 - 1
 # Explanation of a list of meshes in settings.
 MESHES = (
@@ -322,11 +324,8 @@ class ExperimentSettings(NetworkSettings):
             if not isinstance(item, str) or simplified(solid_name(item)) not in positives
         ]
         if renders_meshes:
-            # There is a render for each object, view and background.
-            backgrounds = len(self.scene.backgrounds)
-            self.augment.examples = self.views * self.object_count * backgrounds
             factors = "meshes × views × backgrounds"
-            require_range(factors, self.augment.examples, 1, MAX_EXAMPLES)
+            require_range(factors, self.render_count, 1, MAX_EXAMPLES)
 
     def _check_photographs(self) -> None:
         """Check the folders of photographs: each scored one can have a sub-folder of scores."""
@@ -373,18 +372,18 @@ class ExperimentSettings(NetworkSettings):
 
     @property
     def views(self) -> int:
-        """Number of views of each object.
+        """Number of views of each object: `scene.views`, or as many as the renders need."""
+        backgrounds = len(self.scene.backgrounds)
+        return self.scene.views or views_of(self.render_count, self.object_count, backgrounds)
 
-        It is the setting `scene.views`. If this is None, it is as many as the
-        number of renders needs.
-        """
-        scene = self.scene
-        backgrounds = len(scene.backgrounds)
-        try:
-            return count_views(self.augment.examples, self.object_count, backgrounds, scene.views)
-        except InputError as error:
-            key = "augment" if error.argument == "examples" else "scene"
-            raise error.within(key, [error.argument]) from None
+    @property
+    def render_count(self) -> int:
+        """Number of renders: `augment.examples`, or one for each object, view and background."""
+        if self.augment.examples is not None:
+            return self.augment.examples
+        if self.scene.views is None:
+            return RENDERS
+        return self.scene.views * self.object_count * len(self.scene.backgrounds)
 
     @property
     def negative_objects(self) -> dict[str, ObjectSettings]:

@@ -26,6 +26,7 @@ from augment.network import gradient_flags_kept
 from augment.progress import Phases, progress
 from augment.random_streams import generator
 from augment.scene.build import with_needed_degree
+from augment.scene.exposure import warn_of_exposure
 from augment.scene.scene import Scene
 from augment.settings import NormalizeLight, SceneSettings
 from augment.tasks.classification import Classification
@@ -172,6 +173,7 @@ def _attack(
     problem = build_problem(settings, scene)
     warn_of_changed_light(scene, problem.scene, stacklevel=4)
     images_before = problem.images(problem.start)
+    warn_of_exposure(problem.scene)
 
     has_gradients = classifier.is_differentiable(images_before.flatten(0, 1))
     if settings.optimizer is None and not has_gradients:
@@ -353,7 +355,7 @@ def _best_light(
     for name in dict.fromkeys([settings.light, *PROBES, UNIFORM]):
         light = load_light(name, degree)
         for factor in EXPOSURES:
-            exposure = settings.exposure * factor
+            exposure = settings.given_exposure * factor
             candidates.append(replace(settings, light=name, exposure=exposure))
             coefficients.append(light * exposure)
     # Put all candidates into one scene, so that they are rendered and classified in large batches.

@@ -22,6 +22,7 @@ from torch import Tensor
 from augment.attack_settings import AttackSettings, MaterialSettings
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 from augment.progress import progress
+from augment.scene.exposure import expose
 from augment.scene.objects import (
     ROUGHNESS,
     SceneObject,
@@ -31,7 +32,13 @@ from augment.scene.objects import (
     name_mesh,
 )
 from augment.scene.scene import Scene
-from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
+from augment.settings import (
+    AUTO,
+    LOCAL_LIGHT_SETTINGS,
+    ObjectSettings,
+    RendererSettings,
+    SceneSettings,
+)
 from renderer import errors
 from renderer.camera import Camera, orbit_cameras
 from renderer.errors import InputError
@@ -176,7 +183,7 @@ def build_scene(
         errors.require_bounded(light=environment)
     basis, lights = _build_lights(settings, environment, degree)
     rasterizer = renderer_settings.rasterizer
-    return Scene.grid(
+    built = Scene.grid(
         objects,
         given_cameras
         or orbit_cameras(views, settings.width, settings.polar, settings.azimuth, settings.fov),
@@ -189,6 +196,7 @@ def build_scene(
         basis=basis,
         lights_of_degree=lights_of_degree,
     )
+    return expose(built) if settings.exposure == AUTO else built
 
 
 def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
@@ -269,7 +277,7 @@ def _build_lights(
         environment = load_light(environment, degree, roughness)
     given = [getattr(settings, name) for name in LOCAL_LIGHTS]
     local = [build_local_light(light) for light in given if light is not None]
-    return with_local_lights(environment * settings.exposure, local)
+    return with_local_lights(environment * settings.given_exposure, local)
 
 
 def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:

@@ -238,6 +238,23 @@ class Scene:
         own = {name: getattr(self, name) for name in signature(Scene).parameters}
         return Scene(**own | arguments)
 
+    def with_count(self, count: int) -> Scene:
+        """Return a copy with `count` examples, as many of each object as possible.
+
+        The first objects get one more if the number does not divide. The examples of an object
+        are repeated if there are too few.
+        """
+        of_object: list[list[int]] = [[] for _ in self.objects]
+        for row, example in enumerate(self.examples):
+            of_object[example.object].append(row)
+        rows: list[int] = []
+        for index, own in enumerate(of_object):
+            share = count // len(of_object) + (index < count % len(of_object))
+            rows += [own[number % len(own)] for number in range(share)]
+        if rows == [*range(len(self))]:
+            return self
+        return self.changed(examples=[self.examples[row] for row in rows], lights=self.lights[rows])
+
     def __len__(self) -> int:
         return len(self.examples)
 
@@ -336,7 +353,7 @@ class Scene:
         errors.require_kind("conditions", conditions, Conditions, expected)
         errors.require_shape("conditions.light", conditions.light, "examples", self.basis.size, 3)
         examples = self._as_examples(examples, len(conditions.light))
-        layers = list(self._layers(conditions, examples))
+        layers = list(self.layers(conditions, examples))
         # Start with the background of each image, shape (A · V, 3 or 1, height · width). Then
         # overwrite the pixels that objects cover.
         image_to_background = self._background[examples].repeat_interleave(self.views)
@@ -437,7 +454,7 @@ class Scene:
             )
         return indices.to(self.lights.device)
 
-    def _layers(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Iterator[Layer]:
+    def layers(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Iterator[Layer]:
         """Render the pixels that objects cover, by the fastest method that is exact.
 
         - If shape, albedo or gloss have changed, or if `one_light` is set, each view is rendered

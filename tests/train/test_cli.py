@@ -112,8 +112,8 @@ def test_a_mistake_is_an_error_in_one_line(call, capsys, monkeypatch, tmp_path, 
 def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(
     call, capsys, tmp_path, two_methods
 ):
-    assert call("train", "out=here", *two_methods, *SMALL, "scene.views=3") == USER_ERROR
-    assert "augment.examples=4" in capsys.readouterr().err
+    assert call("train", "out=here", *two_methods, *SMALL, "meshes=[missing.glb]") == USER_ERROR
+    assert "missing.glb" in capsys.readouterr().err
     assert not list(tmp_path.rglob(LAST))
 
 

@@ -110,7 +110,6 @@ TWO_CLASSES += ["scene.views=1", "augment.examples=null"]
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds"),
         (["meshes=[{mesh: 'solid:orange', lable: orange}]"], "meshes[0].lable"),
         (
             ["hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],

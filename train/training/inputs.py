@@ -390,7 +390,7 @@ def _build_scene(
     console.debug("rasterizer: %s", rasterizer.description)
     keys = keys_of("scene", settings.scene)
     with phases("operators"), main_process_first(), keyed("scene", **keys):
-        return build_scene(
+        scene = build_scene(
             list(settings.objects.values()),
             size,
             settings.views,
@@ -401,6 +401,7 @@ def _build_scene(
             vary=settings.augment.vary,
             device=device,
         )
+        return scene.with_count(settings.render_count)
 
 
 def load_renders(settings: ExperimentSettings, data: sets.DataSet) -> tuple[Tensor, Tensor]:

@@ -15,9 +15,11 @@ from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.problem import SceneProblem
-from augment.augmentation_settings import count_views
+from augment.augmentation_settings import views_of
+from augment.network import say_once
 from augment.scene import render
 from augment.scene.build import build_scene
+from augment.scene.exposure import warn_of_exposure
 from augment.scene.objects import Conditions, Example, load_object
 from augment.scene.render import NEAR
 from augment.scene.scene import Scene
@@ -58,13 +60,41 @@ def first_image(scene: Scene) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("examples", "meshes", "backgrounds", "views", "expected"),
-    [(100, 2, 5, None, 10), (100, 2, 5, 10, 10), (None, 7, 5, 36, 36)],
+    ("examples", "meshes", "backgrounds"), [(100, 2, 5), (100, 3, 5), (7, 3, 2), (2, 3, 1)]
 )
-def test_views_follow_from_examples_meshes_and_backgrounds(
-    examples, meshes, backgrounds, views, expected
-):
-    assert count_views(examples, meshes, backgrounds, views) == expected
+def test_renders_are_shared_as_equally_as_possible(examples, meshes, backgrounds):
+    entries = [("solid:orange", str(index)) for index in range(meshes)]
+    views = views_of(examples, meshes, backgrounds)
+    grays = [0.1 * index for index in range(backgrounds)]
+    scene = build_scene(entries, 4, views, backgrounds=grays, samples=1).with_count(examples)
+    shares = [scene.labels.count(str(index)) for index in range(meshes)]
+    assert sum(shares) == examples
+    assert shares == sorted(shares, reverse=True) and shares[0] - shares[-1] <= 1
+    # Views and backgrounds are not repeated before all were shown.
+    shown = {(e.object, e.cameras, e.background) for e in scene.examples}
+    assert len(shown) == examples
+
+
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+@pytest.mark.parametrize("light", ["grace", "st_peters"])
+def test_the_automatic_exposure_makes_the_mean_of_an_object_two_fifths(light, encoding):
+    meshes = [("solid:orange", "orange"), ("solid:cup", "cup")]
+    options = {"light": light, "encoding": encoding, "backgrounds": [0.0], "exposure": "auto"}
+    scene = build_scene(meshes, 24, 3, **options)
+    images = scene.render(scene.conditions(torch.arange(6)), torch.arange(6))[:, 0]
+    masks = scene.truth(lambda label: 0).masks[:, 0, 0]
+    for rows in (slice(0, 3), slice(3, 6)):
+        pixels = images[rows].movedim(1, 0)[:, masks[rows]]
+        assert float(pixels.mean()) == pytest.approx(0.4, abs=1e-5)
+    assert scene.examples[0].exposure != scene.examples[3].exposure
+
+
+@pytest.mark.parametrize(("exposure", "word"), [(1e-3, "dark"), (1e3, "bright"), (1.0, "")])
+def test_an_almost_black_or_white_object_is_warned_about(exposure, word, caplog):
+    say_once.cache_clear()
+    scene = build_scene([("solid:orange", "orange")], 16, exposure=exposure)
+    warn_of_exposure(scene)
+    assert (f"too {word}" in caplog.text) == bool(word)
 
 
 def test_a_scene_takes_paths_as_text_and_as_path_and_cuts_the_center_out_of_a_background(tmp_path):
