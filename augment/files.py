@@ -123,6 +123,14 @@ def is_network_file(name: str) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
+def name_from_anywhere(name: str) -> str:
+    """Return the name of a network with the absolute path of its file or folder."""
+    folder = Path(name.removeprefix("hf:"))
+    if name.startswith("hf:") and folder.is_dir():
+        return f"hf:{folder.absolute()}"
+    return str(Path(name).absolute()) if is_network_file(name) else name
+
+
 def name_error(name: str | Path, reason: str) -> InputError:
     """Return an error about the argument `name`, which names a network."""
     return InputError(f"name={name} {reason}", "name")

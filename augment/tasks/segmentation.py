@@ -187,6 +187,14 @@ class SegmentationCriterion(ObjectCriterion):
 
 
 def _logits(outputs: Any) -> Any:
-    """Return the logits of pixels, which torchvision names "out"."""
+    """Return the logits of pixels, which torchvision names "out".
+
+    Segmenters of transformers with queries, such as Mask2Former, have a mask and the probabilities
+    of the classes for each query. Their sum of both is a score, whose logarithm is returned.
+    """
+    if hasattr(outputs, "masks_queries_logits"):
+        classes = outputs.class_queries_logits.softmax(-1)[..., :-1]
+        scores = torch.einsum("nqc,nqhw->nchw", classes, outputs.masks_queries_logits.sigmoid())
+        return scores.clamp_min(torch.finfo(scores.dtype).tiny).log()
     has_out = isinstance(outputs, Mapping) and "out" in outputs
     return outputs["out"] if has_out else plain_outputs(outputs)

@@ -10,7 +10,6 @@ from PIL import Image
 import norm_balls as nb
 from augment.huggingface import _read_preprocessor
 from augment.network import ChannelNormalization
-from augment.tasks import TASKS
 from renderer import InputError
 
 transformers = pytest.importorskip("transformers")
@@ -86,6 +85,13 @@ WITH_POSITIONS = {
         {"hidden_sizes": [8, 16, 16, 16], "depths": [1, 1, 1, 1], "decoder_hidden_size": 16},
         *("Segformer", SQUARE, SIZE),
     ),
+    "mask2former": (
+        "Mask2FormerForUniversalSegmentation",
+        {"num_queries": 5, "hidden_dim": 32, "feature_size": 32, "mask_feature_size": 32}
+        | {"encoder_layers": 1, "decoder_layers": 2, "num_attention_heads": 2}
+        | {"dim_feedforward": 32, "encoder_feedforward_dim": 32},
+        *("Mask2Former", SQUARE, SIZE),
+    ),
 }
 
 
@@ -103,6 +109,10 @@ def save(tmp_path):
                     **WIDTHS, embedding_size=16, out_features=["stage2"]
                 )
             }
+        if "Mask2" in name:
+            stages = {"depths": [1] * 4, "num_heads": [2] * 4, "image_size": SIZE}
+            stages |= {"out_features": [f"stage{index}" for index in range(1, 5)]}
+            options = options | {"backbone_config": transformers.SwinConfig(**STAGES | stages)}
         network = kind(kind.config_class(**options, **({} if "Model" in name else LABELS))).eval()
         for parameter in network.parameters():  # Outputs of networks as initialized hardly differ.
             torch.nn.init.normal_(parameter, std=0.2) if parameter.ndim > 1 else None
@@ -186,22 +196,46 @@ def test_a_zero_shot_network_finds_classes_by_prompts_as_the_pipeline_does(name,
 
 
 @pytest.mark.parametrize("name", WITH_POSITIONS)
-def test_a_detector_or_segmenter_returns_the_output_of_transformers(name, save):
+def test_a_detector_or_segmenter_finds_what_the_processor_of_transformers_reads(name, save):
     entry = WITH_POSITIONS[name]
-    if not any(entry[0].lower().endswith(task.name) for task in TASKS):
-        pytest.skip("The library has no such task.")
     folder = save(entry)
     network = nb.load_classifier(f"hf:{folder}")
-    assert network.size == SIZE
+    assert (network.size, list(network.classes)) == (SIZE, CLASSES)
     picture = photograph(SIZE)
     processor = transformers.AutoImageProcessor.from_pretrained(folder)
     raw = getattr(transformers, entry[0]).from_pretrained(folder).eval()
     with torch.no_grad():
         expected = raw(**processor(images=picture, return_tensors="pt"))
-        output = network.network(as_images(picture))
-    for key in ("logits", "pred_boxes"):
-        if hasattr(expected, key):
-            torch.testing.assert_close(output[key], expected[key], rtol=1e-4, atol=1e-4)
+        output = network(as_images(picture))[0]
+    if name != "detr":
+        read = processor.post_process_semantic_segmentation
+        assert torch.equal(output.argmax(0), read(expected, target_sizes=[(SIZE, SIZE)])[0])
+        return
+    read = processor.post_process_object_detection
+    (boxes,) = read(expected, threshold=0, target_sizes=[(SIZE, SIZE)])
+    for key, values in boxes.items():
+        torch.testing.assert_close(output[key], values, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ZERO_SHOT)
+def test_hardening_a_zero_shot_network_trains_its_texts_and_its_run_scores_the_same(
+    name, save, tokenizer, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    save(ZERO_SHOT[name])
+    (tmp_path / "photos").mkdir()
+    for index in range(8):
+        photograph(SIZE + index).save(tmp_path / "photos" / f"{index}.png")
+    network = nb.load_classifier("hf:.", classes=CLASSES)
+    options = {"train": {"epochs": 1}, "scene": {"views": 2}, "out": "run"}
+    hardened = nb.harden(network, ["solid:orange"], "photos", **options)
+    before = network.state_dict()
+    changed = {key for key, value in hardened.state_dict().items() if (value != before[key]).any()}
+    assert {key.rpartition(".text.")[1] for key in changed} == {".text."}
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    images = torch.rand(2, 3, SIZE, SIZE)
+    torch.testing.assert_close(nb.load_run("../run")(images), hardened(images))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from augment import distributed
 from augment.classifier import TaskNetwork, class_index
-from augment.files import as_facts, is_network_file, require_no_facts
+from augment.files import as_facts, is_network_file, name_from_anywhere, require_no_facts
 from augment.network import FROM_FILE, YOU, Inputs, without_normalized_light
 from augment.progress import Phases
 from augment.scene.build import build_scene
@@ -161,11 +161,10 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
 def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     """Load a classifier, from another library or from a file, as the initial network."""
     size = settings.size
-    is_file = is_network_file(name)
     with keyed(name="network", size="size"):
         # A file may not record the size of its images, so it gets the size of the settings.
         # Any other classifier has a size of its own.
-        given_size = size if is_file else None
+        given_size = size if is_network_file(name) else None
         facts = as_facts(settings.classes, given_size, settings.normalization, settings.prompt)
         weights = None if settings.weights is None else as_path("weights", settings.weights)
         classifier = load_source(name, weights, facts, settings.trust)
@@ -176,8 +175,7 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
             "give a file of the network in the format of TorchScript or torch.export",
             "network",
         )
-    # The absolute path of a file is recorded, so that it is found from any folder.
-    shape = {"name": str(Path(name).absolute()) if is_file else name, CLASSIFIER: True}
+    shape = {"name": name_from_anywhere(name), CLASSIFIER: True}
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
     inputs = classifier.inputs if size is None else replace(classifier.inputs, size=YOU)
     return Initial(Path(name), architecture, network.state_dict(), inputs=inputs)
@@ -189,7 +187,7 @@ def initial_of(classifier: TaskNetwork, size: int | None) -> Initial:
     `size` is None for the size that the network takes.
     """
     network = without_normalized_light(classifier.network)
-    shape: dict[str, Any] = {"name": classifier.name, CLASSIFIER: True}
+    shape: dict[str, Any] = {"name": name_from_anywhere(classifier.name), CLASSIFIER: True}
     if classifier.normalized_light is not None:
         shape[checkpoints.NORMALIZE_LIGHT] = asdict(classifier.normalized_light)
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
