@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from numbers import Integral
 from typing import Any, Self
 
@@ -97,7 +98,8 @@ class CheckedNetwork(wrappers.Network):
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Any:
         """Compute the outputs of images in the form of the task, and check them."""
         try:
-            outputs = self.network(images)
+            call = self.network if self.task is None else partial(self.task.outputs, self.network)
+            outputs = call(images)
         except Exception as error:
             # The caller handles errors of memory. An `InputError` already tells what is wrong.
             if isinstance(error, InputError) or errors.is_out_of_memory(error):
@@ -453,6 +455,9 @@ def as_network(
         if says:
             wrappers.say_inputs(network.name, network.network, network.size, network.inputs)
         return network.normalizing_light(normalize_light)
+    # `train` and `eval` of YOLO(...) of Ultralytics start a training. The network is inside.
+    if type(network).__module__.startswith("ultralytics.") and hasattr(network, "predictor"):
+        network = network.model.float().eval()  # type: ignore[attr-defined]
     expected = "a torch.nn.Module, a function to logits, or a Classifier"
     errors.require_kind(argument, network, Callable, expected)
     names = None if classes is None else as_class_names("classes", classes)

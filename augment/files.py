@@ -7,6 +7,7 @@ code. They are loaded only if the user trusts them. ONNX is data.
 
 import argparse
 import importlib
+import importlib.util
 import io
 import json
 import math
@@ -24,10 +25,12 @@ import numpy as np
 import safetensors.torch
 import torch
 from torch import Tensor, nn
+from torch.utils._pytree import tree_leaves
 
 from augment import classifier as classifiers
-from augment.classifier import Classifier
-from augment.network import ARRAYS, FILE, YOU, Function, Network, plain_outputs, unwrapped
+from augment.classifier import Classifier, TaskNetwork
+from augment.network import ARRAYS, FILE, YOU, Function, Network, plain_outputs, say_once, unwrapped
+from augment.tasks.task import Task
 from renderer.errors import InputError, require_file, require_kind, single_line
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
@@ -72,12 +75,14 @@ class NetworkFacts:
         normalization: "imagenet", or mean and standard deviation of the
             channels red, green and blue, in units of [0, 1].
         prompt: Text with {} for the name of a class, for zero-shot networks.
+        task: What the outputs mean, for a file that contains a network.
     """
 
     classes: tuple[str, ...] | None = None
     size: Size | None = None
     normalization: classifiers.Normalization = None
     prompt: str | None = None
+    task: Task | None = None
 
 
 def as_facts(
@@ -85,6 +90,7 @@ def as_facts(
     size: Size | None = None,
     normalization: classifiers.Normalization = None,
     prompt: str | None = None,
+    task: Task | None = None,
 ) -> NetworkFacts:
     """Check what the user gives about a network.
 
@@ -100,7 +106,8 @@ def as_facts(
     if normalization is not None:
         classifiers.mean_and_std(normalization)
     require_kind("prompt", prompt, str | None, "a text with {} for the name of a class")
-    return NetworkFacts(names, size, normalization, prompt)
+    require_kind("task", task, Task | None, "a task, such as nb.Detection(decode=function)")
+    return NetworkFacts(names, size, normalization, prompt, task)
 
 
 def require_no_facts(name: str, facts: NetworkFacts) -> None:
@@ -150,7 +157,7 @@ def import_package(package: str, name: str, install: str = "") -> Any:
         raise name_error(name, reason) from error
 
 
-def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
+def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
     """Load a classifier from a file that contains its network.
 
     Without a size, that of the file counts or, if it tells none, 224. Without a normalization, the
@@ -162,7 +169,7 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
         advice = "set trust=true (trust_code=True in Python) if you trust its author"
         reason = f"is a program, which can run any code and overwrite your files: {advice}"
         raise name_error(path, f"{reason}, otherwise ask for a state dict, safetensors or ONNX")
-    readers = {EXPORTED: _read_exported, ONNX: read_onnx}
+    readers = {EXPORTED: _read_exported, ONNX: _read_onnx}
     try:
         content = readers.get(path.suffix.lower(), _read_torchscript)(path)
     except InputError:
@@ -180,10 +187,11 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> Classifier:
             module.training = False
     told = (height, width) if height and width else height or width
     given = facts.size or told, facts.classes, facts.normalization
-    sizer = YOU if facts.size else FILE
-    classifier = classifiers.as_classifier(network, *given, name=name, size_from=sizer, says=False)
-    _require_evaluation_outputs(classifier, name)
-    return classifier
+    named: dict[str, Any] = {"name": name, "size_from": YOU if facts.size else FILE}
+    made = classifiers.as_network(network, *given, task=facts.task, says=False, **named)
+    if isinstance(made, Classifier):
+        _require_evaluation_outputs(made, name)
+    return made
 
 
 def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
@@ -318,20 +326,44 @@ class InBatches(Network):
         super().__init__(network)
         self.batch_size = batch_size
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Compute the logits (N, C) of images (N, 3, H, W)."""
+    def forward(self, images: Tensor) -> Any:
+        """Compute the outputs of images (N, 3, H, W): a tensor, or a tuple of tensors."""
         # Number of copies that fill up the last batch.
         missing_count = -len(images) % self.batch_size
         filled = torch.cat([images, images[:1].expand(missing_count, -1, -1, -1)])
-        logits = [self.network(part) for part in filled.split(self.batch_size)]
-        return torch.cat(logits)[: len(images)]
+        parts = [self.network(part) for part in filled.split(self.batch_size)]
+        if isinstance(parts[0], Tensor):
+            return torch.cat(parts)[: len(images)]
+        return tuple(torch.cat(outputs)[: len(images)] for outputs in zip(*parts, strict=True))
+
+
+def _read_onnx(path: Path) -> Content:
+    """Read a file of ONNX, with gradients if onnx2torch is installed and converts it exactly."""
+    network, sizes = read_onnx(path)
+    if importlib.util.find_spec("onnx2torch") is None:
+        say_once(f"{path} has no gradients, since onnx2torch is not installed: attacks search")
+        return network, sizes
+    import onnx2torch
+
+    shape = [size or default for size, default in zip(sizes, (2, 3, 224, 224), strict=True)]
+    images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    try:
+        with torch.no_grad():
+            converted = onnx2torch.convert(str(path)).eval()
+            both = (tree_leaves(of(images)) for of in (converted, network))
+            for own, expected in zip(*both, strict=True):
+                torch.testing.assert_close(own, expected, rtol=1e-3, atol=1e-3)
+    except Exception as error:  # onnx2torch lacks some operations, and fails in many ways.
+        reason = single_line(error)
+        say_once(f"{path} has no gradients, since onnx2torch fails ({reason}): attacks search")
+        return network, sizes
+    return converted, sizes
 
 
 def read_onnx(path: Path) -> Content:
     """Read a file of ONNX with onnxruntime, on the CPU.
 
-    The network has no gradients. Its one input is images of float32, and its first output is the
-    logits.
+    The network has no gradients. Its one input is images of float32. Several outputs are a tuple.
     """
     onnxruntime = import_package("onnxruntime", str(path), '"parametric-norm-balls[onnx]"')
     options = onnxruntime.SessionOptions()
@@ -340,10 +372,11 @@ def read_onnx(path: Path) -> Content:
     [images] = session.get_inputs()
     sizes = [size if isinstance(size, int) else None for size in images.shape]
 
-    def logits(batch: np.ndarray) -> np.ndarray:
-        return session.run(None, {images.name: batch.astype(np.float32)})[0]
+    def outputs(batch: np.ndarray) -> Any:
+        found = session.run(None, {images.name: batch.astype(np.float32)})
+        return found[0] if len(found) == 1 else tuple(map(torch.from_numpy, found))
 
-    return Function(logits, ARRAYS), sizes
+    return Function(outputs, ARRAYS), sizes
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:

@@ -36,6 +36,7 @@ from augment.progress import progress_message
 from augment.settings import NormalizeLight
 from augment.tasks import recognized_task
 from augment.tasks.classification import Classification
+from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
 from renderer.settings import Size, height_and_width
 
@@ -290,25 +291,30 @@ def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
     return _with_weights(build, facts, files.read_weights(weights), weights, is_published=False)
 
 
+def import_function(name: str) -> Callable[..., Any]:
+    """Import "package.module:function" of the user, also from the current folder."""
+    separator = ":" if ":" in name else "."
+    module_name, _, function_name = name.rpartition(separator)
+    if str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
+    module = importlib.import_module(module_name)
+    if not hasattr(module, function_name):
+        advice = f"did you mean {nearest(function_name, [*vars(module)])}?"
+        reason = f"fails: {module.__file__} has no function {function_name}"
+        raise files.name_error(f"{PYTHON}{name}", f"{reason}: {advice}")
+    return getattr(module, function_name)
+
+
 def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
     """Call a Python function that the user wrote to load a network, and check its result.
 
     Return the network, the pixels per side of its images, and its classes in the order of the
     logits. The name is "package.module:function".
     """
-    full_name = f"python:{name}"
-    separator = ":" if ":" in name else "."
-    module_name, _, function_name = name.rpartition(separator)
-    current_folder = str(Path.cwd())
-    if current_folder not in sys.path:
-        sys.path.insert(0, current_folder)
+    full_name = f"{PYTHON}{name}"
+    module_name = name.rpartition(":" if ":" in name else ".")[0]
     try:
-        module = importlib.import_module(module_name)
-        if not hasattr(module, function_name):
-            advice = f"did you mean {nearest(function_name, [*vars(module)])}?"
-            reason = f"fails: {module.__file__} has no function {function_name}"
-            raise files.name_error(full_name, f"{reason}: {advice}")
-        network, size, classes = getattr(module, function_name)()
+        network, size, classes = import_function(name)()
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # The user's code may raise any exception.
@@ -320,7 +326,7 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         )
         if isinstance(error, ModuleNotFoundError) and error.name == module_name:
             advice = f"start the command in the folder of {module_name}.py"
-            reason = f"fails: there is no module {module_name} in {current_folder}: {advice}"
+            reason = f"fails: there is no module {module_name} in {Path.cwd()}: {advice}"
         raise files.name_error(full_name, reason) from error
     # A single string is not a list of names, although Python counts it as a sequence of strings.
     is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
@@ -377,7 +383,8 @@ def load_classifier(
     normalize_light: NormalizeLight = None,
     trust_code: bool = False,
     prompt: str | None = None,
-) -> Classifier:
+    task: Task | None = None,
+) -> Any:
     """Load a classifier by name, on the CPU.
 
     The size, the normalization and the value range of its images are logged
@@ -410,9 +417,12 @@ def load_classifier(
             `torch.export`. Set it only if you made the file or trust its author.
         prompt: Text with {} for the name of a class, with which a zero-shot
             network of `hf:` finds the classes. None for "a photo of a {}".
+        task: What the outputs of a file's network mean, such as
+            `nb.Detection(decode=function)`. None if their type tells. ONNX has
+            gradients if onnx2torch converts it.
 
     Returns:
-        The classifier.
+        The classifier, or a detector or segmenter, which `nb.attack` takes as well.
 
     Raises:
         InputError: If the name is unknown or is a program that is not trusted,
@@ -428,15 +438,15 @@ def load_classifier(
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     path = None if weights is None else as_path("weights", weights)
-    facts = files.as_facts(classes, size, normalization, prompt)
+    facts = files.as_facts(classes, size, normalization, prompt, task)
     require_flag("trust_code", trust_code)
     classifier = load_source(name, path, facts, trust_code)
     say_inputs(classifier.name, classifier.network, classifier.size, classifier.inputs)
     return classifier.normalizing_light(normalize_light)
 
 
-def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: bool) -> Classifier:
-    """Load a classifier by name, without the normalization of light, and without any message.
+def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: bool) -> Any:
+    """Load a network by name, without the normalization of light, and without any message.
 
     `path` is a file of weights. None stands for the weights of the source.
     """
@@ -453,14 +463,14 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
     elif source + colon not in _TAKE_FACTS:
         files.require_no_facts(name, facts)
     elif source != "hf":
-        files.require_no_facts(name, NetworkFacts(prompt=facts.prompt))
+        files.require_no_facts(name, NetworkFacts(prompt=facts.prompt, task=facts.task))
     with progress_message(f"loading {name}"):
         if known is None:
             return files.load_file(name, facts, trust_code)
         return known(*([model] if colon else []), path, facts, False)
 
 
-def build_classifier(name: str, facts: NetworkFacts, trust_code: bool = False) -> Classifier:
+def build_classifier(name: str, facts: NetworkFacts, trust_code: bool = False) -> Any:
     """Build a classifier with random weights.
 
     A Python function of the user chooses weights and size itself, and a file contains its weights.

@@ -24,7 +24,9 @@ from augment.classifier import Classifier, Normalization, OperatingPoint, TaskNe
 from augment.files import as_facts, is_network_file, require_no_facts
 from augment.network import FROM_FILE, say_inputs, unwrapped, with_normalized_light
 from augment.settings import NormalizeLight
-from augment.sources import SOURCES, load_classifier
+from augment.sources import SOURCES, import_function, load_classifier
+from augment.tasks.detection import Detection
+from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, keyed, require_file, require_kind, single_line
 from renderer.io.files import atomic_write
 from train.data.sets import content_hash
@@ -147,7 +149,8 @@ def load_network(
     normalize_light: NormalizeLight = None,
     trust_code: bool = False,
     prompt: str | None = None,
-) -> Classifier:
+    task: Task | None = None,
+) -> Any:
     """Load a classifier by its name: the network of a training run, or any other classifier.
 
     The arguments other than `name` are those of `nb.load_classifier`. The network of a run has
@@ -159,13 +162,13 @@ def load_network(
     if (folder / BEST).is_file():
         raise InputError(f"name={name} is a training run: give name={RUN}{folder} instead", "name")
     if name.startswith(RUN):
-        require_no_facts(name, as_facts(classes, size, normalization, prompt))
+        require_no_facts(name, as_facts(classes, size, normalization, prompt, task))
         # Error messages about the argument `run` begin with `name` instead, the argument of
         # this function.
         with keyed(run="name"):
             classifier = load_run(name.removeprefix(RUN), weights, trust_code=trust_code)
         return classifier.normalizing_light(normalize_light)
-    given = weights, classes, size, normalization, normalize_light, trust_code, prompt
+    given = weights, classes, size, normalization, normalize_light, trust_code, prompt, task
     return load_classifier(name, *given)
 
 
@@ -182,8 +185,22 @@ def load_chosen(settings: NetworkSettings) -> Any:
             settings.normalize_light,
             settings.trust,
             settings.prompt,
+            _task_that_decodes(settings),
         )
     return _with_task(network, settings) if isinstance(settings, TaskSettings) else network
+
+
+def _task_that_decodes(settings: NetworkSettings) -> Detection | None:
+    """Return the task whose function `decode` the settings name. None if they name none."""
+    name = getattr(settings, "decode", None)
+    if name is None:
+        return None
+    try:
+        return Detection(decode=import_function(name))
+    except (Exception, SystemExit) as error:  # The user's code may raise any exception.
+        advice = "give package.module:function, and start the command in the folder of the module"
+        reason = f"decode={name} cannot be imported ({single_line(error)})"  # type: ignore[arg-type]
+        raise InputError(f"{reason}: {advice}", "decode") from error
 
 
 def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:

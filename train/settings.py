@@ -223,6 +223,11 @@ class TaskSettings(NetworkSettings):
         "Detections and masks with a lower intersection over union do not count. null: 0.5.",
         within=(0.01, 1),
     )
+    decode: str | None = setting(
+        None,
+        "Python function package.module:function from the outputs of the network in a file, such "
+        "as ONNX, to boxes, as in nb.Detection.",
+    )
 
 
 @dataclass

@@ -45,8 +45,12 @@ MAX_OVERLAP = 0.5
 UNUSED = "N/A"
 # Largest number of classes if their number is not known.
 NO_LIMIT = 1e9
-# Keys of the candidates in an output: boxes (K, 4), and scores of all classes (K, C).
+# Keys of the candidates in an output: boxes (K, 4), and scores of all classes (K, C) or, with
+# labels (K,), of one class (K,).
 CANDIDATE_BOXES, CANDIDATE_SCORES = "candidate_boxes", "candidate_scores"
+CANDIDATE_LABELS = "candidate_labels"
+# Limits with which a detector of torchvision returns its candidates instead of its final boxes.
+CANDIDATES = {"score_thresh": 1e-4, "nms_thresh": 1.0, "detections_per_img": 5000}
 # Boxes of one image: "boxes" (n, 4) in pixels, "labels" (n,) and "scores" (n,), and candidates.
 Detections = dict[str, Tensor]
 
@@ -58,9 +62,10 @@ class Detection(Task):
     A network takes images (N, 3, H, W) in [0, 1]. It returns a list of a
     dictionary for each image: "boxes" (left, top, right, bottom, in pixels),
     "labels" and "scores". Detection models of torchvision do so, and the object
-    detectors of transformers are read as well. Labels are indices of the
-    argument `classes` of `nb.attack`. Detectors of torchvision for COCO and
-    those of transformers name their classes themselves.
+    detectors of transformers and models of Ultralytics are read as well.
+    Labels are indices of the argument `classes` of `nb.attack`. Detectors of
+    torchvision for COCO and those of the other two name their classes
+    themselves.
 
     Args:
         threshold: Boxes with a lower score do not count.
@@ -114,8 +119,8 @@ class Detection(Task):
         require_kind("decode", self.decode, Callable | None, "a function of outputs of the network")
 
     def recognizes(self, outputs: Any) -> bool:
-        """Return whether outputs are dictionaries of boxes, or those of a detection transformer."""
-        if _is_transformer(outputs):
+        """Return whether outputs are dictionaries of boxes, or those of a library of detectors."""
+        if _is_transformer(outputs) or _is_ultralytics(outputs):
             return True
         is_list = isinstance(outputs, list | tuple) and len(outputs) > 0
         return is_list and all(isinstance(item, Mapping) and "boxes" in item for item in outputs)
@@ -138,6 +143,45 @@ class Detection(Task):
         """Return the number of classes of the network, which may have a background as class 0."""
         return len(id2label(network)) or _torchvision_count(network)
 
+    def outputs(self, network: Any, images: Tensor) -> Any:
+        """Return the outputs of a network. Those of torchvision get candidates, too.
+
+        The boxes before non-maximum suppression have the smallest scores, too, so that an attack
+        can raise those of another class. The backbone runs once.
+        """
+        raw = unwrapped(network)
+        owner = getattr(raw, "roi_heads", raw)
+        if not _is_of_torchvision(raw) or any(not hasattr(owner, name) for name in CANDIDATES):
+            return network(images)
+        own = owner.postprocess_detections
+        candidates: list[Any] = []
+
+        def postprocess(*args: Any) -> Any:
+            final = own(*args)
+            limits = {name: getattr(owner, name) for name in CANDIDATES}
+            try:
+                vars(owner).update(CANDIDATES)
+                found = own(*args)
+            finally:
+                vars(owner).update(limits)
+            if isinstance(found, tuple):  # Heads with regions of interest return three lists.
+                names = "boxes", "scores", "labels"
+                found = [dict(zip(names, item, strict=True)) for item in zip(*found, strict=True)]
+            candidates.extend(zip(found, args[-1], strict=True))
+            return final
+
+        owner.postprocess_detections = postprocess
+        try:
+            outputs = network(images)
+        finally:
+            del owner.postprocess_detections
+        for item, (found, (height, width)) in zip(outputs, candidates, strict=True):
+            # The network resizes images. The final boxes are in the pixels of the given images.
+            scale = torch.tensor([images.shape[3] / width, images.shape[2] / height] * 2)
+            item[CANDIDATE_BOXES] = found["boxes"] * scale.to(found["boxes"])
+            item[CANDIDATE_SCORES], item[CANDIDATE_LABELS] = found["scores"], found["labels"]
+        return outputs
+
     def reader(
         self, title: str, class_count: int | None = None
     ) -> Callable[[Any, Tensor], list[Detections]]:
@@ -156,21 +200,31 @@ class Detection(Task):
                 raise InputError(f"{title} fails on {describe(given)} ({kind})") from error
         elif _is_transformer(outputs):
             outputs = _of_transformer(outputs, images, title, class_count)
+        is_raw = self.decode is not None or _is_ultralytics(outputs)
+        if _is_ultralytics(outputs):
+            outputs = _of_ultralytics(outputs[0])
         if not len(images):
             return []
         if not self.recognizes(outputs) or len(outputs) != len(images):
             count = len(images)
             reason = f"{title} returned {describe(outputs)} for {count} images"
             raise InputError(f"{reason}: it must return {self.returns}")
-        return [self._detections(title, class_count, item, images) for item in outputs]
+        return [self._detections(title, class_count, item, images, is_raw) for item in outputs]
 
     def _detections(
-        self, title: str, class_count: int | None, item: Mapping[str, Any], images: Tensor
+        self,
+        title: str,
+        class_count: int | None,
+        item: Mapping[str, Any],
+        images: Tensor,
+        is_raw: bool,
     ) -> Detections:
-        """Check the boxes of one image, and add the candidates if there are others."""
-        keys = ("boxes", "labels", "scores", CANDIDATE_BOXES, CANDIDATE_SCORES)
-        found = {key: as_tensor(key, item[key]).to(images.device) for key in keys if key in item}
-        found = {key: found[key] if key == "labels" else found[key].to(images) for key in found}
+        """Check the boxes of one image. Raw boxes become candidates, and lose their duplicates."""
+        keys = "boxes", "scores", CANDIDATE_BOXES, CANDIDATE_SCORES
+        found = {key: as_tensor(key, item[key]).to(images) for key in keys if key in item}
+        for key in ("labels", CANDIDATE_LABELS):
+            if key in item:
+                found[key] = as_tensor(key, item[key]).to(images.device).long()
         if not found["boxes"].numel():
             found["boxes"] = found["boxes"].reshape(0, 4)
         boxes = found["boxes"]
@@ -187,12 +241,13 @@ class Detection(Task):
         if not has_labels:
             found[CANDIDATE_BOXES], found[CANDIDATE_SCORES] = boxes, scores
             found["scores"], found["labels"] = scores.max(1)
-        found["labels"] = found["labels"].long()
         self._require_possible(found, title, class_count, images)
-        if self.decode is not None:
-            if CANDIDATE_BOXES not in found and class_count is not None:
-                found[CANDIDATE_BOXES] = boxes
-                found[CANDIDATE_SCORES] = _of_all_classes(found, class_count)
+        if is_raw:
+            if CANDIDATE_BOXES not in found:
+                given = boxes, found["scores"], found["labels"]
+                found |= zip(
+                    (CANDIDATE_BOXES, CANDIDATE_SCORES, CANDIDATE_LABELS), given, strict=True
+                )
             kept = _without_duplicates(found)
             found |= {key: found[key][kept] for key in ("boxes", "labels", "scores")}
         return found
@@ -322,13 +377,15 @@ class DetectionCriterion(ObjectCriterion):
             outputs, self.boxes, self.source, targets, strict=True
         ):
             boxes = item.get(CANDIDATE_BOXES, item["boxes"])
-            scores = item.get(CANDIDATE_SCORES)
-            if scores is None:
-                scores = _of_all_classes(item, self.class_count)
+            scores = item.get(CANDIDATE_SCORES, item["scores"])
+            is_near = _iou(boxes, box) >= NEAR * self.task.iou
+            near = scores[is_near]
+            if scores.ndim == 1:
+                labels = item.get(CANDIDATE_LABELS, item["labels"])
+                near = _of_all_classes(near, labels[is_near], self.class_count)
             # The first row is the smallest score, so that an image without candidates has a cost.
             smallest = scores.new_full((1, self.class_count), SMALLEST_SCORE)
-            is_near = _iou(boxes, box) >= NEAR * self.task.iou
-            odds = log_odds_of(torch.cat([smallest, scores[is_near]]))
+            odds = log_odds_of(torch.cat([smallest, near]))
             cost = odds[:, source].logsumexp(0)
             if self.task.goal == MISLABEL:
                 has_target = self.target is not None and target != NO_CLASS
@@ -380,10 +437,12 @@ def log_odds_of(scores: Tensor) -> Tensor:
     return torch.logit(scores + (limited - scores).detach())
 
 
-def _of_all_classes(found: Detections, class_count: int) -> Float[Tensor, "K C"]:
+def _of_all_classes(
+    scores: Float[Tensor, " K"], labels: Int[Tensor, " K"], class_count: int
+) -> Float[Tensor, "K C"]:
     """Arrange the scores of labeled boxes as scores of all classes, which are 0 for the others."""
-    zeros = found["scores"].new_zeros(len(found["scores"]), class_count)
-    return zeros.scatter(1, found["labels"][:, None], found["scores"][:, None])
+    zeros = scores.new_zeros(len(scores), class_count)
+    return zeros.scatter(1, labels[:, None], scores[:, None])
 
 
 def _without_duplicates(found: Detections) -> Int[Tensor, " n"]:
@@ -430,15 +489,47 @@ def _of_transformer(
     return found
 
 
+def _is_ultralytics(outputs: Any) -> bool:
+    """Return whether outputs are a tensor of boxes, and what Ultralytics computes it from."""
+    is_pair = isinstance(outputs, tuple) and len(outputs) == 2
+    return is_pair and isinstance(outputs[0], Tensor) and outputs[0].ndim == 3
+
+
+def _of_ultralytics(outputs: Tensor) -> list[dict[str, Tensor]]:
+    """Read rows (N, n, 6) of box, score and label, or columns (N, 4 + C, K) of box and scores.
+
+    Rows begin with left, top, right and bottom, and columns with center and size, in pixels.
+    """
+    if outputs.shape[2] == 6:
+        return [
+            {"boxes": rows[:, :4], "scores": rows[:, 4], "labels": rows[:, 5].detach()}
+            for rows in outputs
+        ]
+    center, size = outputs.mT[..., :2], outputs.mT[..., 2:4]
+    boxes = torch.cat([center - size / 2, center + size / 2], dim=-1)
+    pairs = zip(boxes, outputs.mT[..., 4:], strict=True)
+    return [{"boxes": one, "scores": scores} for one, scores in pairs]
+
+
 def id2label(network: Any) -> Mapping[int, Any]:
-    """Return the names of the classes in the configuration of a network of transformers."""
-    return getattr(getattr(unwrapped(network), "config", None), "id2label", None) or {}
+    """Return the names of the classes that a network of transformers or Ultralytics stores."""
+    raw = unwrapped(network)
+    names = getattr(raw, "names", None)
+    if isinstance(names, Mapping):
+        return names
+    return getattr(getattr(raw, "config", None), "id2label", None) or {}
+
+
+def _is_of_torchvision(raw: Any) -> bool:
+    """Return whether a network is a detector of torchvision, or of a subclass."""
+    names = [kind.__module__ for kind in type(raw).__mro__]
+    return any(name.startswith("torchvision.models.detection") for name in names)
 
 
 def _torchvision_count(network: Any) -> int | None:
     """Return the number of classes of a detector of torchvision, with the background as class 0."""
     raw = unwrapped(network)
-    if not type(raw).__module__.startswith("torchvision.models.detection"):
+    if not _is_of_torchvision(raw):
         return None
     for module in raw.modules():
         for name in ("num_classes", "num_columns"):

@@ -185,6 +185,10 @@ class Task(ABC):
     def class_names(self, network: Any, count: int | None) -> Sequence[str] | None:
         """Return the names of the classes of a network, or None if the user must give them."""
 
+    def outputs(self, network: Any, images: Tensor) -> Any:
+        """Return all outputs of a network that the task can use."""
+        return network(images)
+
     @abstractmethod
     def reader(self, title: str, class_count: int | None = None) -> Reader:
         """Return a function that checks the outputs of a network and brings them into one form.

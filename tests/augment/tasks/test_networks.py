@@ -1,0 +1,236 @@
+"""Attacks on detectors and segmenters of other libraries, with random weights."""
+
+from copy import deepcopy
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torchvision.models import detection, segmentation
+from torchvision.ops import box_iou
+
+import norm_balls as nb
+from augment.classifier import as_network
+from augment.scene.truth import Truth
+from augment.tasks.detection import CANDIDATES
+from tests.detectors import small_detector
+
+SIZE = 64
+CLASSES = ["background", "ball", "cup"]
+UNTRAINED = {"weights": None, "weights_backbone": None, "num_classes": len(CLASSES)}
+SMALL = {"min_size": SIZE, "max_size": SIZE}
+DETECTORS = {
+    "ssdlite320_mobilenet_v3_large": {},
+    "fasterrcnn_mobilenet_v3_large_320_fpn": SMALL,
+    "retinanet_resnet50_fpn": SMALL,
+    "fcos_resnet50_fpn": SMALL,
+    "maskrcnn_resnet50_fpn": SMALL,
+}
+SEGMENTERS = ["lraspp_mobilenet_v3_large", "fcn_resnet50", "deeplabv3_mobilenet_v3_large"]
+SCENE = {"size": SIZE, "width": 2.5}
+
+
+def cost_falls(network: nn.Module, task: nb.Detection | nb.Segmentation, **options) -> bool:
+    """Return whether a step of an attack on light lowers the cost of a network."""
+    scene = nb.build_scene([("solid:ball", "ball")], **SCENE)
+    settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.3), max_steps=1, margin=100.0)
+    given = {"task": task, "settings": settings, "force": True}
+    found = nb.attack(network, scene, **given, **options).minimum
+    return bool((found.cost < found.cost_before).all())
+
+
+def of_torchvision(library, name: str, **options) -> nn.Module:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return getattr(library, name)(**UNTRAINED, **options).eval()
+
+
+@pytest.mark.parametrize("goal", ["hide", "mislabel"])
+def test_an_attack_lowers_the_cost_of_a_small_detector(goal):
+    network = small_detector(len(CLASSES), SIZE)
+    assert cost_falls(network, nb.Detection(goal=goal), classes=CLASSES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("goal", ["hide", "mislabel"])
+@pytest.mark.parametrize("name", DETECTORS)
+def test_an_attack_lowers_the_cost_of_a_detector_of_torchvision(name, goal):
+    network = of_torchvision(detection, name, **DETECTORS[name])
+    assert cost_falls(network, nb.Detection(goal=goal), classes=CLASSES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEGMENTERS)
+def test_an_attack_lowers_the_cost_of_a_segmenter_of_torchvision(name):
+    network = of_torchvision(segmentation, name)
+    assert cost_falls(network, nb.Segmentation(), classes=CLASSES)
+
+
+def test_candidates_of_torchvision_are_its_boxes_without_suppression_in_the_pixels_given():
+    network = small_detector(len(CLASSES), SIZE)
+    images = torch.rand(2, 3, 48, 96, generator=torch.Generator().manual_seed(0))
+    opened = deepcopy(network)
+    vars(opened).update(CANDIDATES)
+    with torch.no_grad():
+        own, expected = network(images), opened(images)
+        found = as_network(network, (48, 96), CLASSES)(images)
+    for item, final, candidates in zip(found, own, expected, strict=True):
+        assert len(candidates["boxes"]) > len(final["boxes"])
+        for key in ("boxes", "scores", "labels"):
+            assert torch.equal(item[key], final[key])
+            torch.testing.assert_close(item[f"candidate_{key}"], candidates[key])
+    assert "postprocess_detections" not in vars(network)
+
+
+@pytest.mark.parametrize("goal", ["hide", "mislabel"])
+def test_the_gradient_in_the_pixels_is_that_of_finite_differences(goal):
+    network = small_detector(len(CLASSES), SIZE).double()
+    adapted = as_network(network, SIZE, CLASSES, dtype=torch.float64)
+    draws = torch.Generator().manual_seed(1)
+    images = torch.rand(1, 3, SIZE, SIZE, generator=draws, dtype=torch.float64)
+    step = 1e-5 * torch.randn(images.shape, generator=draws, dtype=torch.float64)
+    box = torch.tensor([[[[16.0, 16.0, 48.0, 48.0]]]], dtype=torch.float64)
+    masks = torch.zeros(1, 1, 1, SIZE, SIZE, dtype=torch.bool)
+    truth = Truth(torch.ones(1, 1, 1).long(), box, masks, torch.ones(1, 1, 1))
+    task = nb.Detection(goal=goal)
+    rule = task.criterion(torch.tensor([[1]]), lambda: truth, len(CLASSES))
+    rule = rule.map(lambda rows: rows.flatten(0, 1))
+    shown = images.clone().requires_grad_()
+    found = adapted(shown)
+    assert (box_iou(found[0]["candidate_boxes"], box[0, 0]) >= 0.25).sum() > 10
+    (gradient,) = torch.autograd.grad(rule.cost(found).sum(), shown)
+    with torch.no_grad():
+        ahead, behind = (rule.cost(adapted(images + sign * step)) for sign in (1, -1))
+    expected = (gradient * step).sum()
+    torch.testing.assert_close((ahead - behind).sum() / 2, expected, rtol=1e-4, atol=0)
+
+
+class Raw(nn.Module):
+    """Returns the means of 4 × 4 fields in each class, as scores, and one box for each field."""
+
+    def __init__(self, copies: int = 1):
+        super().__init__()
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            self.score = nn.Conv2d(3, len(CLASSES), 16, stride=16)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        scores = self.score(images).sigmoid()
+        return scores.flatten(2).transpose(1, 2), scores[:, :1].flatten(1)
+
+
+def decode(outputs: tuple[Tensor, Tensor]) -> list[dict[str, Tensor]]:
+    """Give every second field a box that covers the ball, and the others small boxes."""
+    boxes = torch.tensor([[8.0, 8.0, 56.0, 56.0], [0.0, 0.0, 8.0, 8.0]]).repeat(8, 1)
+    return [{"boxes": boxes, "scores": scores} for scores in outputs[0]]
+
+
+@pytest.mark.ecosystem
+@pytest.mark.parametrize("batch", ["fixed", "any"])
+@pytest.mark.filterwarnings("ignore")
+def test_a_file_of_onnx_with_decode_has_the_gradients_of_its_network(tmp_path, batch):
+    pytest.importorskip("onnx2torch")
+    path = tmp_path / "network.onnx"
+    network = Raw().eval()
+    names = {"input_names": ["images"], "output_names": ["scores", "first"]}
+    if batch == "any":
+        names["dynamic_axes"] = {key: {0: "N"} for key in ("images", "scores", "first")}
+    torch.onnx.export(
+        network, (torch.rand(1, 3, SIZE, SIZE),), path, dynamo=False, opset_version=13, **names
+    )
+    task = nb.Detection(decode=decode)
+    loaded = nb.load_classifier(str(path), classes=CLASSES, task=task)
+    shown = [torch.rand(3, 3, SIZE, SIZE).requires_grad_()]
+    shown.append(shown[0].detach().clone().requires_grad_())
+    plain = as_network(network, SIZE, CLASSES, task=task)
+    for images, one in zip(shown, (loaded, plain), strict=True):
+        sum(item["candidate_scores"].sum() for item in one(images)).backward()
+    torch.testing.assert_close(shown[0].grad, shown[1].grad)
+    assert cost_falls(loaded, task)
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("ignore")
+def test_a_file_of_onnx_that_cannot_be_converted_is_attacked_by_search(
+    tmp_path, monkeypatch, caplog
+):
+    onnx2torch = pytest.importorskip("onnx2torch")
+
+    def refuse(path: str) -> nn.Module:
+        raise NotImplementedError("no converter")
+
+    monkeypatch.setattr(onnx2torch, "convert", refuse)
+    path = tmp_path / "network.onnx"
+    torch.onnx.export(Raw().eval(), (torch.rand(1, 3, SIZE, SIZE),), path, dynamo=False)
+    task = nb.Detection(decode=decode)
+    loaded = nb.load_classifier(str(path), classes=CLASSES, task=task)
+    assert "has no gradients, since onnx2torch fails (no converter)" in caplog.text
+    scene = nb.build_scene([("solid:ball", "ball")], **SCENE)
+    settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.3), max_queries=8)
+    result = nb.attack(loaded, scene, settings=settings, force=True)
+    assert result.settings.optimizer == "random_search"
+
+
+LABELS = {"id2label": dict(enumerate(CLASSES)), "label2id": {"ball": 1, "cup": 2}}
+QUERIES = {"num_queries": 20, "d_model": 32, "encoder_layers": 1, "decoder_layers": 1}
+HEADS = {"encoder_attention_heads": 2, "decoder_attention_heads": 2}
+FEEDS = {"encoder_ffn_dim": 32, "decoder_ffn_dim": 32}
+BACKBONE = {"embedding_size": 8, "hidden_sizes": [8, 16, 24, 32], "depths": [1, 1, 1, 1]}
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("goal", ["hide", "mislabel"])
+@pytest.mark.parametrize("kind", ["Detr", "ConditionalDetr", "Yolos"])
+def test_an_attack_lowers_the_cost_of_a_detector_of_transformers(kind, goal):
+    transformers = pytest.importorskip("transformers")
+    if kind == "Yolos":
+        vit = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
+        options = vit | {"intermediate_size": 48, "image_size": [SIZE, SIZE]}
+        options |= {"num_detection_tokens": 20}
+    else:
+        backbone = transformers.ResNetConfig(**BACKBONE, out_features=["stage4"])
+        options = QUERIES | HEADS | FEEDS | {"use_timm_backbone": False, "backbone": None}
+        options |= {"use_pretrained_backbone": False, "backbone_config": backbone}
+    config = getattr(transformers, f"{kind}Config")(**options, **LABELS)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = getattr(transformers, f"{kind}ForObjectDetection")(config).eval()
+    # Random boxes are small and near the center.
+    assert cost_falls(network, nb.Detection(goal=goal, iou=0.02))
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("ignore")
+def test_an_attack_lowers_the_cost_of_segformer():
+    transformers = pytest.importorskip("transformers")
+    small = {"hidden_sizes": [8, 16, 24, 32], "depths": [1] * 4, "num_attention_heads": [1] * 4}
+    config = transformers.SegformerConfig(**small, **LABELS, decoder_hidden_size=16)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = transformers.SegformerForSemanticSegmentation(config).eval()
+    assert cost_falls(network, nb.Segmentation())
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["yolov8n", "yolo11n", "yolov10n"])
+@pytest.mark.parametrize("is_wrapped", [True, False])
+def test_a_model_of_ultralytics_is_read_and_attacked(name, is_wrapped):
+    ultralytics = pytest.importorskip("ultralytics")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        yolo = ultralytics.YOLO(f"{name}.yaml")
+    network = yolo if is_wrapped else yolo.model.eval()
+    adapted = as_network(network, SIZE)
+    assert len(adapted.classes) == 80
+    images = torch.rand(2, 3, SIZE, SIZE)
+    raw = yolo.model(images)[0]
+    for item, columns in zip(adapted(images), raw, strict=True):
+        x, y, width, height = columns[:4]
+        sides = torch.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], 1)
+        torch.testing.assert_close(item["candidate_boxes"], sides)
+        torch.testing.assert_close(item["candidate_scores"], columns[4:].mT)
+    # Scores of random weights hardly change with light, but have a gradient.
+    shown = images.requires_grad_()
+    (gradient,) = torch.autograd.grad(adapted(shown)[0]["candidate_scores"].sum(), shown)
+    assert gradient[0].any() and not gradient[1].any()
