@@ -23,6 +23,7 @@ from augment.augmentation_settings import VariationSettings as VariationSettings
 from augment.classifier import Classifier as Classifier
 from augment.dataset import LabeledRender as LabeledRender
 from augment.dataset import render_dataset as render_dataset
+from augment.lightning import lightning_callback as lightning_callback
 from augment.photographs import PhotographAttackResult as PhotographAttackResult
 from augment.photographs import attack_photographs as attack_photographs
 from augment.photographs import relight_photographs as relight_photographs

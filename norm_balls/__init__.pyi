@@ -36,6 +36,7 @@ from augment import attack as attack
 from augment import attack_photographs as attack_photographs
 from augment import build_scene as build_scene
 from augment import check as check
+from augment import lightning_callback as lightning_callback
 from augment import load_classifier as load_classifier
 from augment import relight_photographs as relight_photographs
 from augment import reload as reload

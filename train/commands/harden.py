@@ -38,6 +38,7 @@ from train.train_settings import TrainSettings
 from train.training.detection import require_losses
 from train.training.inputs import initial_of, load_data
 from train.training.run import Run
+from train.training.run_log import Logger
 
 # Values of some settings of a group, such as "train", by name. None for the defaults.
 Section = Mapping[str, Any] | None
@@ -61,6 +62,7 @@ def harden(
     renderer: RendererSettings | Section = None,
     data: DataSettings | Section = None,
     task: Task | None = None,
+    logger: Logger | None = None,
     seed: int = 0,
     device: torch.device | str | None = None,
     out: str | Path | None = None,
@@ -111,6 +113,9 @@ def harden(
         data: Fields of `DataSettings`.
         task: Task of the network, such as `nb.Detection(threshold=0.5)`. None
             recognizes it by the outputs.
+        logger: Object with a method log(values, step=...), which gets the metrics
+            of each epoch instead of TensorBoard, such as a run of Weights &
+            Biases. For MLflow, such a method calls `mlflow.log_metrics`.
         seed: Seed of all random draws.
         device: Device that computes. None for the device of the network.
         out: Folder for the files of the training. None for a temporary folder.
@@ -187,7 +192,7 @@ def harden(
             initial = initial_of(classifier, settings.size)
             run = Run(settings, load_data(settings, initial), folder, initial)
             run.begin()
-            run.train()
+            run.train(logger)
             if out is not None:
                 console.info("%s", report_of([folder], folder))
     copy = _trainable_copy(network)

@@ -43,7 +43,7 @@ from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.inputs import Initial
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate, scale_learning_rate
-from train.training.run_log import RunLog
+from train.training.run_log import Logger, RunLog
 
 # If the training images are on disk, the mean and the standard deviation of their color
 # channels are estimated from this number of images.
@@ -140,10 +140,10 @@ class Run:
         }
         write_config(self.folder, self.settings, **facts)
 
-    def train(self) -> dict[str, float]:
+    def train(self, logger: Logger | None = None) -> dict[str, float]:
         """Train to the last epoch, score the network, and return the final scores by name.
 
-        If the run has an initial network, it is scored, too.
+        If the run has an initial network, it is scored, too. A logger replaces TensorBoard.
         """
         # Another run that was made in between may have set another number of threads.
         torch.set_num_threads(self._threads)
@@ -153,7 +153,7 @@ class Run:
         hardware = (trainer.device, trainer.model.precision, self._threads)
         console.debug(line, *counts, *hardware, distributed.world_size())
         is_first = distributed.rank() == 0
-        log = RunLog(self.folder, trainer.history) if is_first else None
+        log = RunLog(self.folder, trainer.history, logger) if is_first else None
         if is_first:
             self._render_kept_aside()
         has_labels = not trainer.is_detector

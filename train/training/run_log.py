@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
+from typing import Any, Protocol
 
 from jaxtyping import Float
 from torch import Tensor
@@ -27,29 +28,43 @@ EXAMPLE = 128
 GRID_COLUMNS = 20
 
 
+class Logger(Protocol):
+    """Anything with a method `log`, such as a run of Weights & Biases."""
+
+    def log(self, values: Mapping[str, float], step: int) -> Any:
+        """Record the metrics of an epoch, which counts from 1, by their names."""
+
+
 class RunLog:
     """Writer of the metrics and images of a training run.
 
-    Metrics go to metrics.jsonl and to TensorBoard, images to the sub-folder
-    renders/. All methods raise OSError if the disk is full.
+    Metrics go to metrics.jsonl and to a logger or, without one, to TensorBoard, images to the
+    sub-folder renders/. All methods raise OSError if the disk is full.
     """
 
-    def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
+    def __init__(
+        self,
+        folder: Path,
+        history: Sequence[Mapping[str, float]] = (),
+        logger: Logger | None = None,
+    ):
         """Begin the log.
 
         `history` replaces the lines in metrics.jsonl, because a resumed run repeats the epochs
         after its checkpoint.
         """
-        # This import takes half a second. Programs that only read metrics do not
-        # need it.
-        from torch.utils.tensorboard import SummaryWriter
-
         self._metrics = folder / METRICS
         self._renders = folder / RENDERS
         self._epoch_count = len(history)
         atomic_write(self._metrics, "".join(json.dumps(line) + "\n" for line in history))
         remove_unfinished(self._renders)
-        self._board = SummaryWriter(str(folder), purge_step=self._epoch_count + 1)
+        self._logger = logger
+        self._board: Any = None
+        if logger is None:
+            # This import takes half a second. Programs that only read metrics do not need it.
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._board = SummaryWriter(str(folder), purge_step=self._epoch_count + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
         """Write the metrics of an epoch, or the final scores, to the log.
@@ -61,8 +76,12 @@ class RunLog:
             file.write(json.dumps(line) + "\n")
         if epoch is not None:
             self._epoch_count = epoch
+        step = epoch or self._epoch_count + 1
+        if self._logger is not None:
+            self._logger.log(dict(values), step=step)
+            return
         for name, value in values.items():
-            self._board.add_scalar(name, value, epoch or self._epoch_count + 1)
+            self._board.add_scalar(name, value, step)
         if epoch is None:
             self._board.close()
         else:
@@ -71,7 +90,7 @@ class RunLog:
     def renders(self, images: Float[Tensor, "N 3 H W"], epoch: int) -> None:
         """Write the training renders of an epoch as one image with a grid of renders.
 
-        The image goes to TensorBoard and to renders/epoch_EPOCH.png.
+        The image goes to renders/epoch_EPOCH.png and, without a logger, to TensorBoard.
         """
         from torchvision.utils import make_grid
 
@@ -80,7 +99,8 @@ class RunLog:
         self._renders.mkdir(exist_ok=True)
         path = self._renders / f"epoch_{epoch:03d}.png"
         write_image(path, grid, compress_level=1)
-        self._board.add_image("renders", grid, epoch)
+        if self._board is not None:
+            self._board.add_image("renders", grid, epoch)
 
     def attack_examples(
         self, attack_examples: AttackExamples, classes: Sequence[str], epoch: int

@@ -459,3 +459,22 @@ def test_a_resumed_run_is_stopped_without_its_best_network_before_it_writes(tiny
     with pytest.raises(InputError, match=r"best\.pt"):
         loaded_run(settings, run)
     assert modification_times(run) == before
+
+
+def test_a_logger_gets_the_metrics_of_each_epoch_in_place_of_tensorboard(tmp_path):
+    class Recorder:
+        def __init__(self):
+            self.lines = []
+
+        def log(self, values, step):
+            self.lines.append((step, dict(values)))
+
+    recorder = Recorder()
+    log = RunLog(tmp_path, logger=recorder)
+    log.scalars({"loss": 2.0}, 1)
+    log.renders(torch.zeros(1, 3, 8, 8), 1)
+    log.scalars({"loss": 1.0}, 2)
+    log.scalars({"accuracy": 0.5})
+    assert recorder.lines == [(1, {"loss": 2.0}), (2, {"loss": 1.0}), (3, {"accuracy": 0.5})]
+    assert len(read_metrics(tmp_path)) == 3
+    assert not list(tmp_path.glob("events.out*"))

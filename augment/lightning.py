@@ -1,0 +1,81 @@
+"""A callback that makes the renders of a service anew in each epoch of PyTorch Lightning."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import nn
+from torch.utils.data import Dataset
+
+from augment.renders import Renders
+from augment.service import AugmentationService
+from renderer.errors import InputError, require_kind
+
+
+class CurrentRenders(Dataset[Any]):
+    """The renders of the present epoch as a data set, whose items change with the epochs."""
+
+    def __init__(self, length: int):
+        self.current: Renders | None = None
+        self._length = length
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, index: int) -> Any:
+        if self.current is None:
+            raise InputError("the first renders are made by trainer.fit: give the callback to it")
+        return self.current[index]
+
+
+def lightning_callback(service: AugmentationService, network: nn.Module | None = None) -> Any:
+    """Create a callback of PyTorch Lightning that renders anew in each epoch.
+
+    Its attribute `renders` is a data set with the renders of the present epoch.
+    It can be concatenated with the user's data. Without persistent workers, a
+    `DataLoader` reads the new renders in each epoch.
+
+    Args:
+        service: The source of renders, on the device of the network.
+        network: The network from images in [0, 1] to outputs that is attacked.
+            None for the `LightningModule` itself.
+
+    Returns:
+        The callback, for `lightning.Trainer(callbacks=[...])`.
+
+    Raises:
+        InputError: If PyTorch Lightning is not installed, or if an argument
+            has the wrong type.
+
+    Example:
+        >>> import norm_balls as nb
+        >>> service = nb.AugmentationService.from_meshes([("solid:orange", 53)], 32)
+        >>> callback = nb.lightning_callback(service)  # doctest: +SKIP
+        >>> loader = DataLoader(data + callback.renders, 128, shuffle=True)  # doctest: +SKIP
+        >>> Trainer(callbacks=[callback]).fit(module, loader)  # doctest: +SKIP
+    """
+    expected = "nb.AugmentationService.from_meshes(...)"
+    require_kind("service", service, AugmentationService, expected)
+    require_kind("network", network, nn.Module | None, "a torch.nn.Module or None")
+    try:
+        from lightning.pytorch import Callback
+    except ImportError:
+        try:
+            from pytorch_lightning import Callback
+        except ImportError as error:
+            raise InputError("PyTorch Lightning is not installed: pip install lightning") from error
+
+    class RendersOfEpoch(Callback):  # type: ignore[misc]
+        """Makes the renders anew when an epoch begins."""
+
+        def __init__(self) -> None:
+            self.renders = CurrentRenders(len(service))
+
+        def on_train_epoch_start(self, trainer: Any, pl_module: nn.Module) -> None:
+            """Attack the weights as they are now."""
+            attacked = pl_module if network is None else network
+            self.renders.current = service.regenerate(attacked, trainer.current_epoch)
+            for name, value in self.renders.current.diagnostics.items():
+                pl_module.log(f"renders/{name}", value)
+
+    return RendersOfEpoch()

@@ -1,0 +1,56 @@
+"""Tests of the callback for PyTorch Lightning."""
+
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+
+import norm_balls as nb
+
+lightning = pytest.importorskip("lightning")
+pytestmark = [pytest.mark.ecosystem, pytest.mark.filterwarnings("default")]
+
+
+class Module(lightning.LightningModule):
+    def __init__(self):
+        super().__init__()
+        self.network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 8 * 8, 2))
+        self.seen = []
+
+    def forward(self, images):
+        return self.network(images)
+
+    def training_step(self, batch, index):
+        images, labels = batch
+        self.seen.append((self.current_epoch, images.clone(), labels))
+        return nn.functional.cross_entropy(self(images), labels)
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+def test_each_epoch_trains_on_the_renders_of_the_service_for_its_weights(tmp_path):
+    settings = nb.AugmentationSettings(mode="random")
+    meshes = [("solid:orange", 0), ("solid:cup", 1)]
+    options = {"views": 2, "backgrounds": [0.5], "samples": 1}
+    service = nb.AugmentationService.from_meshes(meshes, 8, settings, **options)
+    callback = nb.lightning_callback(service)
+    data = [(torch.zeros(3, 8, 8), 0)] * 2
+    module = Module()
+    trainer = lightning.Trainer(
+        max_epochs=2,
+        callbacks=[callback],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        accelerator="cpu",
+        default_root_dir=tmp_path,
+    )
+    loader = DataLoader(torch.utils.data.ConcatDataset([data, callback.renders]), batch_size=6)
+    trainer.fit(module, loader)
+    for epoch, images, labels in module.seen:
+        expected = service.regenerate(module, epoch)
+        assert torch.equal(images[2:], expected.images)
+        assert torch.equal(labels[2:], expected.labels)
+    assert len(module.seen) == 2
