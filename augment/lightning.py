@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from importlib import import_module
 from typing import Any
 
 from torch import nn
@@ -57,21 +59,20 @@ def lightning_callback(service: AugmentationService, network: nn.Module | None =
     expected = "nb.AugmentationService.from_meshes(...)"
     require_kind("service", service, AugmentationService, expected)
     require_kind("network", network, nn.Module | None, "a torch.nn.Module or None")
-    try:
-        from lightning.pytorch import Callback
-    except ImportError:
-        try:
-            from pytorch_lightning import Callback
-        except ImportError as error:
-            raise InputError("PyTorch Lightning is not installed: pip install lightning") from error
+    for name in ("lightning.pytorch", "pytorch_lightning"):
+        with suppress(ImportError):
+            base: Any = import_module(name).Callback
+            break
+    else:
+        raise InputError("PyTorch Lightning is not installed: pip install lightning")
 
-    class RendersOfEpoch(Callback):  # type: ignore[misc]
+    class RendersOfEpoch(base):  # type: ignore[misc]
         """Makes the renders anew when an epoch begins."""
 
         def __init__(self) -> None:
             self.renders = CurrentRenders(len(service))
 
-        def on_train_epoch_start(self, trainer: Any, pl_module: nn.Module) -> None:
+        def on_train_epoch_start(self, trainer: Any, pl_module: Any) -> None:
             """Attack the weights as they are now."""
             attacked = pl_module if network is None else network
             self.renders.current = service.regenerate(attacked, trainer.current_epoch)

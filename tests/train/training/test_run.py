@@ -33,6 +33,7 @@ from train.run_folder import read_metrics
 from train.system import user_message
 from train.training import loop
 from train.training.inputs import choose_validation, load_data, load_initial
+from train.training.run_log import RunLog
 
 WITHOUT_RENDERS = ("augment=none", "train.epochs=1")
 
