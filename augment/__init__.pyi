@@ -23,10 +23,12 @@ from augment.augmentation_settings import VariationSettings as VariationSettings
 from augment.classifier import Classifier as Classifier
 from augment.dataset import LabeledRender as LabeledRender
 from augment.dataset import render_dataset as render_dataset
+from augment.lighting import RandomLighting as RandomLighting
+from augment.lighting import relight_photographs as relight_photographs
 from augment.lightning import lightning_callback as lightning_callback
 from augment.photographs import PhotographAttackResult as PhotographAttackResult
 from augment.photographs import attack_photographs as attack_photographs
-from augment.photographs import relight_photographs as relight_photographs
+from augment.scene import lights as lights
 from augment.scene.build import build_scene as build_scene
 from augment.scene.objects import Conditions as Conditions
 from augment.scene.objects import Example as Example

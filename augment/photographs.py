@@ -13,13 +13,11 @@ unchanged photographs is attacked one by one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Generator, Tensor
 
@@ -44,12 +42,12 @@ from augment.network import (
 )
 from augment.progress import progress
 from augment.random_streams import generator
-from augment.scene.patterns import draw_slides, interpolate_smoothly, luminance
+from augment.scene.patterns import ProjectedLight, draw_projected_light, require_photographs
 from augment.tasks.task import Criterion, Task
 from renderer import errors
 from renderer.errors import InputError
-from renderer.image import clamp, decode, encode, to_bytes, to_unit
-from renderer.settings import Size, as_size
+from renderer.image import decode, to_bytes, to_unit
+from renderer.settings import as_size
 
 # Names of three lights: the slide as it is, the slide multiplied by the best of several random
 # factors, and the slide multiplied by factors that gradient descent finds.
@@ -62,158 +60,6 @@ UNCHANGED = "unchanged"
 # Total length of all steps of an attack, in units of the radius of the norm-ball. It is more than
 # the diameter, so that the steps can cross the ball from any start (Madry et al. 2018).
 TRAVELED_RADII = 2.5
-# A random smooth surface interpolates random heights at a grid of this number of points per side.
-SURFACE_NODES = 4
-# Largest standard deviation of the random heights of a surface, in units of half the width of the
-# image.
-MAX_STEEPNESS = 0.3
-# Largest angle in degrees between the light of the projector and the normal of a flat print.
-MAX_POLAR = 60.0
-# Smallest and largest ambient light, in units of the light of a white slide.
-AMBIENT = (0.01, 0.1)
-# Smallest and largest random change of the exposure, in stops.
-STOPS = (-1.0, 0.5)
-# The exposure divides by the mean luminance of an image, but at least by this, so that black images
-# stay dark.
-DARKEST = 1e-6
-
-
-class ProjectedLight(NamedTuple):
-    """Light of a projector on B photographs, and the exposure of the camera that sees them.
-
-    Attributes:
-        slide: Picture that the projector shows on each photograph, as linear light in [0, 1].
-        shading: Cosine between the light and the normal of the surface, by which the slide is
-            multiplied, in [0, 1].
-        ambient: Light that is the same everywhere.
-        stops: Exposure in stops. At 0, the mean luminance is that of the unchanged photograph.
-    """
-
-    slide: Float[Tensor, "B 3 H W"]
-    shading: Float[Tensor, "B 1 H W"]
-    ambient: Float[Tensor, "B 1 1 1"]
-    stops: Float[Tensor, "B 1 1 1"]
-
-    def to(self, device: torch.device | str) -> ProjectedLight:
-        """Return a copy whose tensors are on a device."""
-        return ProjectedLight(*(values.to(device) for values in self))
-
-    def light(
-        self, log_gain: Float[Tensor, "B 3 cells cells"] | None = None
-    ) -> Float[Tensor, "B 3 H W"]:
-        """Compute the light that falls on each pixel: slide · gain · shading + ambient.
-
-        Logarithms of gains are interpolated linearly between the centers of the cells. None stands
-        for no gain.
-        """
-        slide = self.slide
-        if log_gain is not None:
-            slide = slide * F.interpolate(log_gain, slide.shape[-2:], mode="bilinear").exp()
-        return slide * self.shading + self.ambient
-
-    def expose(
-        self,
-        albedo: Float[Tensor, "B 3 H W"],
-        log_gain: Float[Tensor, "B 3 cells cells"] | None = None,
-    ) -> Float[Tensor, "B 3 H W"]:
-        """Compute images (sRGB) of linear photographs in the light of the projector.
-
-        The camera exposes an image such that its mean luminance is 2^stops times that of the
-        photograph, before values above 1 are clamped. The result is differentiable in `log_gain`.
-        """
-        radiance = albedo * self.light(log_gain)
-        mean_before = luminance(albedo).mean((2, 3), keepdim=True)
-        mean_after = luminance(radiance).mean((2, 3), keepdim=True)
-        exposure = 2**self.stops * mean_before / mean_after.clamp(min=DARKEST)
-        return encode(clamp(exposure * radiance), "srgb")
-
-
-def draw_shading(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 1 height width"]:
-    """Draw the shading of random smooth surfaces in light from random directions.
-
-    It is the cosine between normal and light, or 0 if the surface faces away.
-    """
-    # Steepness, azimuth and polar angle of the light, as fractions of their ranges.
-    steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
-    node_heights = torch.randn(count, 1, SURFACE_NODES, SURFACE_NODES, generator=draws)
-    # Height of each pixel, shape (count, 1, height, width).
-    height = MAX_STEEPNESS * steepness[:, None] * interpolate_smoothly(node_heights, size)
-    # Slope of the surface. The image is 2 units wide, so a pixel has the width 2 / width.
-    spacing = 2 / height.shape[-1]
-    slope_down, slope_right = torch.gradient(height[:, 0], spacing=spacing, dim=(1, 2))
-    polar = math.radians(MAX_POLAR) * tilt
-    azimuth = 2 * math.pi * turn
-    # Components of the unit vector towards the light. The one along the view is polar.cos().
-    to_right = polar.sin() * azimuth.cos()
-    to_bottom = polar.sin() * azimuth.sin()
-    length = (1 + slope_right**2 + slope_down**2).sqrt()
-    # Product of the light's vector with the normal (-slope_right, -slope_down, 1) / length.
-    cosine = (polar.cos() - to_right * slope_right - to_bottom * slope_down) / length
-    return cosine.clamp(min=0)[:, None]
-
-
-def draw_projected_light(
-    count: int, size: Size, draws: Generator, photographs: UInt8[Tensor, "N 3 H W"] | None = None
-) -> ProjectedLight:
-    """Draw the random light of a projector: slide, shading, ambient light and exposure.
-
-    Slides show photographs only if some are given.
-    """
-    slide = draw_slides(count, size, draws, photographs)
-    shading = draw_shading(count, size, draws)
-    # Fractions in [0, 1] of the ranges of the ambient light and of the exposure.
-    ambient, stops = torch.rand(2, count, 1, 1, 1, generator=draws)
-    ambient = AMBIENT[0] + (AMBIENT[1] - AMBIENT[0]) * ambient
-    return ProjectedLight(slide, shading, ambient, STOPS[0] + (STOPS[1] - STOPS[0]) * stops)
-
-
-def relight_photographs(
-    photographs: Tensor, seed: int = 0, *, slides: Tensor | None = None
-) -> Tensor:
-    """Show photographs in the light of a projector with random slides.
-
-    This models a flat print in the light of a projector, with the shading of a
-    random smooth surface. It needs neither meshes nor labels.
-
-    Args:
-        photographs: Photographs, sRGB of 8 bits, uint8, shape
-            (N, 3, height, width).
-        seed: Seed of all random draws.
-        slides: Photographs that the projector may show as slides, uint8, shape
-            (M, 3, H, W). None for generated slides only.
-
-    Returns:
-        Photographs in the light of the projector, uint8, shape
-        (N, 3, height, width).
-
-    Raises:
-        InputError: If the photographs have another dtype or shape.
-
-    Example:
-        >>> import torch
-        >>> import norm_balls as nb
-        >>> photographs = torch.full((2, 3, 8, 8), 128, dtype=torch.uint8)
-        >>> nb.relight_photographs(photographs, seed=1).shape
-        torch.Size([2, 3, 8, 8])
-    """
-    require_photographs("photographs", photographs)
-    if slides is not None:
-        require_photographs("slides", slides)
-    errors.require_whole("seed", seed)
-    count, _, *shape = photographs.shape
-    light = draw_projected_light(count, shape, generator(seed, "relight"), slides)
-    return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
-
-
-def require_photographs(name: str, photographs: Tensor) -> None:
-    """Check that a value is a tensor of photographs of 8 bits."""
-    errors.require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
-    shape = tuple(photographs.shape)
-    if photographs.dtype != torch.uint8 or len(shape) != 4 or shape[1] != 3 or not all(shape):
-        raise InputError(
-            f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}: "
-            "give uint8 of shape (N, 3, height, width)"
-        )
 
 
 class RelitPhotographs(NormBalls):

@@ -34,8 +34,8 @@ import torch
 from PIL import Image
 
 from augment.classifier import Classifier
+from augment.lighting import relight_photographs
 from augment.network import compute_outputs
-from augment.photographs import relight_photographs
 from benchmarks.splits import Method, adapt_texture_or_material, load, log_evaluations
 from renderer.io.images import read_center
 from train.command_settings import LabSettings

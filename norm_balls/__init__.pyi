@@ -20,6 +20,7 @@ from augment import ParameterSettings as ParameterSettings
 from augment import PhotographAttackResult as PhotographAttackResult
 from augment import PoseSettings as PoseSettings
 from augment import ProjectorSettings as ProjectorSettings
+from augment import RandomLighting as RandomLighting
 from augment import RandomLightSettings as RandomLightSettings
 from augment import RelightingSettings as RelightingSettings
 from augment import RendererSettings as RendererSettings
@@ -37,6 +38,7 @@ from augment import attack_photographs as attack_photographs
 from augment import build_scene as build_scene
 from augment import check as check
 from augment import lightning_callback as lightning_callback
+from augment import lights as lights
 from augment import load_classifier as load_classifier
 from augment import relight_photographs as relight_photographs
 from augment import reload as reload

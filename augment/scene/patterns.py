@@ -7,9 +7,12 @@ The training draws them with `draw_patterns` and `draw_slides`. The laboratory d
 include the same shapes in other sizes, with `draw_lab_pattern`.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +20,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Generator, Tensor
 
-from renderer.image import LUMINANCE, decode, to_unit
+from renderer import errors
+from renderer.errors import InputError
+from renderer.image import LUMINANCE, clamp, decode, encode, to_unit
 from renderer.settings import Size, height_and_width
 
 # Radius of a disc in the pattern `spots`, which has one disc in each square cell of width 1. The
@@ -101,7 +106,7 @@ def random_colors(draws: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3 1 1"]:
     """
     hue, saturation = draws.split(1, dim=1)
     # The sRGB channels of a pure hue are piecewise linear in the hue (HSV, Smith 1978).
-    ramps = (6 * hue + torch.tensor([0.0, 4.0, 2.0])) % 6
+    ramps = (6 * hue + hue.new_tensor([0.0, 4.0, 2.0])) % 6
     pure = ((ramps - 3).abs() - 1).clamp(0, 1)
     return decode(1 - saturation * (1 - pure), "srgb")[:, :, None, None]
 
@@ -281,6 +286,129 @@ def draw_projected(
     chosen = photographs[rows.to(photographs.device)].cpu()
     linear = decode(to_unit(chosen), "srgb")
     return draw_photograph_patterns(linear, pixel_centers(size), draws)
+
+
+# A random smooth surface interpolates random heights at a grid of this number of points per side.
+SURFACE_NODES = 4
+# Largest standard deviation of the random heights of a surface, in units of half the width of the
+# image.
+MAX_STEEPNESS = 0.3
+# Largest angle in degrees between the light of the projector and the normal of a flat print.
+MAX_POLAR = 60.0
+# Smallest and largest ambient light, in units of the light of a white slide.
+AMBIENT = (0.01, 0.1)
+# Smallest and largest random change of the exposure, in stops.
+STOPS = (-1.0, 0.5)
+# The exposure divides by the mean luminance of an image, but at least by this, so that black images
+# stay dark.
+DARKEST = 1e-6
+
+
+def require_photographs(name: str, photographs: Tensor) -> None:
+    """Check that a value is a tensor of photographs of 8 bits."""
+    errors.require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
+    shape = tuple(photographs.shape)
+    if photographs.dtype != torch.uint8 or len(shape) != 4 or shape[1] != 3 or not all(shape):
+        raise InputError(
+            f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}: "
+            "give uint8 of shape (N, 3, height, width)"
+        )
+
+
+class ProjectedLight(NamedTuple):
+    """Light of a projector on B photographs, and the exposure of the camera that sees them.
+
+    Attributes:
+        slide: Picture that the projector shows on each photograph, as linear light in [0, 1].
+        shading: Cosine between the light and the normal of the surface, by which the slide is
+            multiplied, in [0, 1].
+        ambient: Light that is the same everywhere.
+        stops: Exposure in stops. At 0, the mean luminance is that of the unchanged photograph.
+    """
+
+    slide: Float[Tensor, "B 3 H W"]
+    shading: Float[Tensor, "B 1 H W"]
+    ambient: Float[Tensor, "B 1 1 1"]
+    stops: Float[Tensor, "B 1 1 1"]
+
+    def to(self, device: torch.device | str) -> ProjectedLight:
+        """Return a copy whose tensors are on a device."""
+        return ProjectedLight(*(values.to(device) for values in self))
+
+    def light(
+        self, log_gain: Float[Tensor, "B 3 cells cells"] | None = None
+    ) -> Float[Tensor, "B 3 H W"]:
+        """Compute the light that falls on each pixel: slide · gain · shading + ambient.
+
+        Logarithms of gains are interpolated linearly between the centers of the cells. None stands
+        for no gain.
+        """
+        slide = self.slide
+        if log_gain is not None:
+            slide = slide * F.interpolate(log_gain, slide.shape[-2:], mode="bilinear").exp()
+        return slide * self.shading + self.ambient
+
+    def expose(
+        self,
+        albedo: Float[Tensor, "B 3 H W"],
+        log_gain: Float[Tensor, "B 3 cells cells"] | None = None,
+    ) -> Float[Tensor, "B 3 H W"]:
+        """Compute images (sRGB) of linear photographs in the light of the projector.
+
+        The camera exposes an image such that its mean luminance is 2^stops times that of the
+        photograph, before values above 1 are clamped. The result is differentiable in `log_gain`.
+        """
+        radiance = albedo * self.light(log_gain)
+        mean_before = luminance(albedo).mean((2, 3), keepdim=True)
+        mean_after = luminance(radiance).mean((2, 3), keepdim=True)
+        exposure = 2**self.stops * mean_before / mean_after.clamp(min=DARKEST)
+        return encode(clamp(exposure * radiance), "srgb")
+
+
+def draw_shading(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 1 height width"]:
+    """Draw the shading of random smooth surfaces in light from random directions.
+
+    It is the cosine between normal and light, or 0 if the surface faces away.
+    """
+    # Steepness, azimuth and polar angle of the light, as fractions of their ranges.
+    steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
+    node_heights = torch.randn(count, 1, SURFACE_NODES, SURFACE_NODES, generator=draws)
+    # Height of each pixel, shape (count, 1, height, width).
+    height = MAX_STEEPNESS * steepness[:, None] * interpolate_smoothly(node_heights, size)
+    # Slope of the surface. The image is 2 units wide, so a pixel has the width 2 / width.
+    spacing = 2 / height.shape[-1]
+    slope_down, slope_right = torch.gradient(height[:, 0], spacing=spacing, dim=(1, 2))
+    polar = math.radians(MAX_POLAR) * tilt
+    azimuth = 2 * math.pi * turn
+    # Components of the unit vector towards the light. The one along the view is polar.cos().
+    to_right = polar.sin() * azimuth.cos()
+    to_bottom = polar.sin() * azimuth.sin()
+    return lambert(slope_down, slope_right, to_right, to_bottom, polar.cos())[:, None]
+
+
+def lambert(down: Tensor, right: Tensor, to_right: Tensor, to_bottom: Tensor, up: Tensor) -> Tensor:
+    """Return the cosine between a light and the normal of slopes, or 0 if the surface faces away.
+
+    The vector towards the light has the components to the right, to the bottom and up.
+    """
+    length = (1 + right**2 + down**2).sqrt()
+    # Product of the light's vector with the normal (-right, -down, 1) / length.
+    return ((up - to_right * right - to_bottom * down) / length).clamp(min=0)
+
+
+def draw_projected_light(
+    count: int, size: Size, draws: Generator, photographs: UInt8[Tensor, "N 3 H W"] | None = None
+) -> ProjectedLight:
+    """Draw the random light of a projector: slide, shading, ambient light and exposure.
+
+    Slides show photographs only if some are given.
+    """
+    slide = draw_slides(count, size, draws, photographs)
+    shading = draw_shading(count, size, draws)
+    # Fractions in [0, 1] of the ranges of the ambient light and of the exposure.
+    ambient, stops = torch.rand(2, count, 1, 1, 1, generator=draws)
+    ambient = AMBIENT[0] + (AMBIENT[1] - AMBIENT[0]) * ambient
+    return ProjectedLight(slide, shading, ambient, STOPS[0] + (STOPS[1] - STOPS[0]) * stops)
 
 
 # Pictures of the projectors of pnb-lab. The object in the center of a picture spans about

@@ -14,19 +14,10 @@ import norm_balls as nb
 from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Objective
-from augment.photographs import (
-    ADVERSARIAL,
-    LIGHTS,
-    RANDOM,
-    ProjectedLight,
-    RelitPhotographs,
-    attack_photographs,
-    draw_projected_light,
-    draw_shading,
-    relight_photographs,
-)
+from augment.lighting import relight_photographs
+from augment.photographs import ADVERSARIAL, LIGHTS, RANDOM, RelitPhotographs, attack_photographs
 from augment.random_streams import generator
-from augment.scene.patterns import draw_cells
+from augment.scene.patterns import ProjectedLight, draw_cells, draw_projected_light, draw_shading
 from augment.tasks.classification import ClassCriterion
 from renderer.errors import InputError
 from renderer.image import LUMINANCE, decode, encode, to_unit

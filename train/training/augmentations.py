@@ -18,8 +18,9 @@ from augment.attack_settings import AttackSettings, RelightingSettings, StepSett
 from augment.attacks.loop import minimize_from
 from augment.attacks.objective import Objective
 from augment.attacks.optimizers import Gradient, NormBalls
-from augment.photographs import RelitPhotographs, draw_projected_light
+from augment.photographs import RelitPhotographs
 from augment.random_streams import generator, stream_seed
+from augment.scene.patterns import draw_projected_light
 from augment.tasks.classification import ClassCriterion, label_loss
 from renderer.errors import MAX_SCALE
 from renderer.image import clamp, decode, encode, to_bytes, to_unit

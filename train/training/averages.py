@@ -9,7 +9,6 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_avg_fn
 
 from augment.network import compute_outputs
-from augment.photographs import relight_photographs
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from train import console
@@ -208,6 +207,9 @@ def predict(
     batches = torch.arange(len(split)).split(BATCH)
     shown = progress(split.squares(batches), f"{len(split)} images", len(batches))
     if light_key:
+        # This import takes a second, and most runs need no light.
+        from augment.lighting import relight_photographs
+
         shown = (
             relight_photographs(images, stream_seed(*light_key, index, "relit"), slides=images)
             for index, images in enumerate(shown)

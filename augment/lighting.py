@@ -1,0 +1,518 @@
+"""Random light on images, as a transform of torchvision and of Albumentations, and as a function.
+
+Colors are decoded to linear light, multiplied by the light of a model, and encoded (sRGB). Images
+of 8 bits use tables: a decoded value for each byte, and the byte of each linear value, exactly
+rounded. With numba installed, one loop does all of this.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+from torch.utils._pytree import tree_flatten_with_path, tree_unflatten
+from torchvision import tv_tensors
+from torchvision.transforms import v2
+
+from augment.random_streams import generator, stream_seed
+from augment.scene.lights import MODELS, LightModel
+from augment.scene.patterns import draw_projected_light, luminance, require_photographs
+from renderer import errors
+from renderer.errors import InputError
+from renderer.image import decode, encode, to_bytes, to_unit
+
+# Linear values are looked up in so many bins. Each has at most one limit between two bytes.
+BINS = 4096
+# Modes of Pillow's images that are relit as they are, and those that are converted before.
+MODES = ("L", "LA", "RGB", "RGBA", "F", "I;16", "I;16L", "I;16B", "I;16N")
+CONVERTED = {"1": "L", "P": "RGB", "PA": "RGBA", "CMYK": "RGB", "YCbCr": "RGB", "HSV": "RGB"}
+
+
+class Light(NamedTuple):
+    """Light of one image: its model, numbers in [0, 1], seed of the noise, and strength."""
+
+    model: LightModel
+    values: Float[Tensor, " D"]
+    seed: int
+    strength: float
+
+
+class RandomLighting(v2.Transform):
+    """Show images in random light.
+
+    A transform of torchvision (v2). It takes an image or a sample with images,
+    and changes the images only. An image is a PIL image, or a tensor of any
+    dtype and of shape (..., C, H, W), with 1 to 4 channels. A second or fourth
+    channel is alpha and stays. Each image of a batch has its own light, and all
+    frames of a `tv_tensors.Video` have the same. Values above 1 (HDR) are not
+    clipped. The random numbers are from torch's global generator on the CPU.
+
+    The colors of an image (sRGB) stand for the albedo of what it shows. They
+    are decoded to linear light, multiplied by the light of a model, and encoded
+    again. The models are in `nb.lights`:
+
+    - "projected_slide": a projector shows a picture on a print,
+    - "cast_shadow": a polygon, leaves, blinds or a window cast a shadow with a
+      penumbra,
+    - "directional", "point", "lamps": a distant light, a small lamp, or one to
+      three colored lamps light a random smooth surface,
+    - "linear", "fractal": light that rises from side to side, or is cloudy,
+    - "color_temperature": black-body light with a wrong white balance,
+    - "low_light": little light, with the noise of a camera,
+    - "highlights": an exposure that is too long.
+
+    A sample may have the key "depth": distances from the camera in any unit,
+    with the height and width of the images. "projected_slide", "directional",
+    "point" and "lamps" then light the surface of these depths. The depth itself
+    stays.
+
+    Args:
+        lights: Names or objects of the models, of which one is drawn for each
+            image, or a dictionary of their relative weights. None for all.
+        p: Probability that an image is changed.
+        strength: Fraction of the light that is random, in [0, 1]. At 0, images
+            stay as they are.
+
+    Raises:
+        InputError: If a value is out of range, or a model is unknown.
+
+    Example:
+        >>> import torch
+        >>> import norm_balls as nb
+        >>> transform = nb.RandomLighting(["cast_shadow", "low_light"])
+        >>> image = torch.full((3, 8, 12), 128, dtype=torch.uint8)
+        >>> light = transform.make_params()
+        >>> frames = [transform.apply(frame, light) for frame in (image, image)]
+        >>> torch.equal(*frames)
+        True
+    """
+
+    _transformed_types = (tv_tensors.Image, v2._utils.is_pure_tensor, Image.Image, tv_tensors.Video)
+
+    def __init__(
+        self,
+        lights: Sequence[str | LightModel] | Mapping[str | LightModel, float] | str | None = None,
+        p: float = 1.0,
+        strength: float = 1.0,
+    ):
+        super().__init__()
+        errors.require_number("p", p, 0, 1)
+        errors.require_number("strength", strength, 0, 1)
+        given = [*MODELS] if lights is None else lights
+        if not isinstance(given, Mapping):
+            named = [given] if isinstance(given, str | LightModel) else given
+            expected = "names, or models of nb.lights"
+            given = dict.fromkeys(errors.as_list("lights", named, str | LightModel, expected), 1.0)
+        self.p, self.strength = float(p), float(strength)
+        for weight in given.values():
+            errors.require_number("the weight of a light", weight, 0, errors.MAX_MAGNITUDE)
+        self.lights = {_as_model(light): float(weight) for light, weight in given.items()}
+        if not sum(self.lights.values()) > 0:
+            raise InputError("lights has no model with a positive weight: give at least one")
+
+    def extra_repr(self) -> str:
+        """Return the settings as text."""
+        return f"{self.lights}, p={self.p}, strength={self.strength}"
+
+    def make_params(self, flat_inputs: Sequence[Any] = ()) -> dict[str, Any]:
+        """Draw a light for each image of a batch, or one light.
+
+        Args:
+            flat_inputs: Images. Their largest batch gets as many lights.
+
+        Returns:
+            Lights, which `apply` takes.
+        """
+        count = max([math.prod(_batch_shape(image)) for image in flat_inputs], default=1)
+        is_lit = torch.rand(count) < self.p
+        models = [*self.lights]
+        weights = torch.tensor([*self.lights.values()])
+        rows = torch.multinomial(weights, max(count, 1), replacement=True)
+        lights: list[Light | None] = []
+        for is_changed, row in zip(is_lit.tolist(), rows.tolist(), strict=False):
+            model = models[row]
+            values = torch.rand(model.dimensions + model.constants)
+            seed = int(torch.randint(2**62, ()))
+            is_changed = is_changed and self.strength > 0
+            lights.append(Light(model, values, seed, self.strength) if is_changed else None)
+        return {"lights": lights}
+
+    def apply(self, image: Any, params: dict[str, Any], depth: Any = None) -> Any:
+        """Show an image in a light that was drawn before.
+
+        Args:
+            image: PIL image or tensor of any size. If one light was drawn, all
+                images of a batch get it.
+            params: Result of `make_params`.
+            depth: Distances from the camera, of the size of the image. None for a
+                flat image.
+
+        Returns:
+            Image of the same type, dtype, size and device.
+
+        Raises:
+            InputError: If the image has other channels, or the depth another
+                size, or if there are fewer lights than images.
+        """
+        if isinstance(image, Image.Image):
+            return _apply_to_pil(image, params["lights"], depth)
+        if not isinstance(image, Tensor):
+            kind = type(image).__name__
+            raise InputError(f"the image is a {kind}: give a PIL image or a tensor (C, H, W)")
+        relit = _apply_to_tensor(image, params["lights"], depth)
+        return tv_tensors.wrap(relit, like=image) if type(image) is not Tensor else relit
+
+    def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
+        """Show an image of a sample in the drawn light (called by torchvision)."""
+        return self.apply(inpt, params, params.get("depth"))
+
+    @torch.compiler.disable
+    def forward(self, *inputs: Any) -> Any:
+        """Change the images of a sample.
+
+        Args:
+            inputs: Image, or sample of any structure.
+
+        Returns:
+            Sample with the same structure.
+
+        Raises:
+            InputError: If the sample has no image.
+        """
+        paths, spec = tree_flatten_with_path(inputs if len(inputs) > 1 else inputs[0])
+        is_depth = [getattr(path[-1], "key", None) == "depth" for path, _ in paths if path]
+        is_depth = is_depth or [False]
+        leaves = [leaf for _, leaf in paths]
+        # Without the depth, torchvision tells which of the leaves are images.
+        others = [None if is_it else leaf for leaf, is_it in zip(leaves, is_depth, strict=True)]
+        is_image = self._needs_transform_list(others)
+        if not any(is_image):
+            raise InputError("the sample has no image: give a PIL image or a tensor (C, H, W)")
+        images = [leaf for leaf, is_it in zip(leaves, is_image, strict=True) if is_it]
+        params = self.make_params(images)
+        params["depth"] = next(
+            (leaf for leaf, is_it in zip(leaves, is_depth, strict=True) if is_it), None
+        )
+        pairs = zip(leaves, is_image, strict=True)
+        return tree_unflatten(
+            [self.transform(leaf, params) if is_it else leaf for leaf, is_it in pairs], spec
+        )
+
+    def albumentations(self) -> Any:
+        """Return this transform as one of Albumentations, for arrays (H, W, C).
+
+        Returns:
+            `ImageOnlyTransform` with the probability p.
+
+        Raises:
+            InputError: If Albumentations is not installed.
+        """
+        return _albumentations(self)
+
+
+def relight_photographs(
+    photographs: Tensor,
+    seed: int = 0,
+    *,
+    slides: Tensor | None = None,
+    lights: Sequence[str | LightModel] | None = None,
+    strength: float = 1.0,
+) -> Tensor:
+    """Show photographs in random light, by default in that of a projector with random slides.
+
+    The light of the projector models a flat print with the shading of a random
+    smooth surface. It needs neither meshes nor labels.
+
+    Args:
+        photographs: Photographs, sRGB of 8 bits, uint8, shape
+            (N, 3, height, width). With lights, all images that
+            `nb.RandomLighting` takes.
+        seed: Seed of all random draws.
+        slides: Photographs that the projector may show as slides, uint8, shape
+            (M, 3, H, W). None for generated slides only.
+        lights: Models of light, as `nb.RandomLighting` takes them. None for the
+            projector.
+        strength: Fraction of the light that is random, with lights.
+
+    Returns:
+        Photographs in random light, of the same dtype and shape.
+
+    Raises:
+        InputError: If the photographs have another dtype or shape.
+
+    Example:
+        >>> import torch
+        >>> import norm_balls as nb
+        >>> photographs = torch.full((2, 3, 8, 8), 128, dtype=torch.uint8)
+        >>> nb.relight_photographs(photographs, seed=1).shape
+        torch.Size([2, 3, 8, 8])
+        >>> nb.relight_photographs(photographs, lights=["linear"]).dtype
+        torch.uint8
+    """
+    errors.require_whole("seed", seed)
+    if lights is not None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(stream_seed(seed, "lights"))
+            return RandomLighting(lights, strength=strength)(photographs)
+    require_photographs("photographs", photographs)
+    if slides is not None:
+        require_photographs("slides", slides)
+    count, _, *shape = photographs.shape
+    light = draw_projected_light(count, shape, generator(seed, "relight"), slides)
+    return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
+
+
+def _as_model(light: str | LightModel) -> LightModel:
+    """Return a model, or that of a name."""
+    if isinstance(light, LightModel):
+        return light
+    errors.require_kind("lights", light, str, "names, or models of nb.lights")
+    errors.require_choice("lights", light, MODELS)
+    return MODELS[light]()
+
+
+def _batch_shape(image: Any) -> tuple[int, ...]:
+    """Return the shape of the batch of a tensor. All frames of a video are one image."""
+    if not isinstance(image, Tensor):
+        return ()
+    return tuple(image.shape[: -4 if isinstance(image, tv_tensors.Video) else -3])
+
+
+def _apply_to_pil(image: Image.Image, lights: Sequence[Light | None], depth: Any) -> Image.Image:
+    """Relight a PIL image, in its mode. Integers of 32 bits hold 16 bits, as in PNG files."""
+    if lights[0] is None or 0 in image.size:
+        return image
+    if image.mode in MODES or image.mode == "I":
+        array = np.array(image)
+        is_wide = image.mode == "I" and not 0 <= array.min() <= array.max() < 2**16
+        if array.dtype.byteorder == ">" or (image.mode == "I" and not is_wide):
+            array = array.astype(np.uint16)
+        tensor = torch.from_numpy(array)
+        tensor = tensor[None] if tensor.ndim == 2 else tensor.permute(2, 0, 1)
+        relit = _apply_to_tensor(tensor, lights, depth).permute(1, 2, 0).numpy()
+        relit = relit[..., 0] if relit.shape[2] == 1 else relit
+        made = Image.fromarray(np.ascontiguousarray(relit.astype(np.array(image).dtype)))
+    elif image.mode in CONVERTED:
+        mode = "RGBA" if "transparency" in image.info else CONVERTED[image.mode]
+        made = _apply_to_pil(image.convert(mode), lights, depth)
+        if image.mode == "P":
+            made = made.quantize(method=Image.Quantize.FASTOCTREE)
+        else:
+            made = made.convert(image.mode)
+    else:
+        raise InputError(f"the image has the mode {image.mode}: convert it to RGB")
+    made.info.update({key: value for key, value in image.info.items() if key != "transparency"})
+    return made
+
+
+def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) -> Tensor:
+    """Relight the images of a tensor, which are grouped by model."""
+    plain = image.as_subclass(Tensor)
+    if plain.ndim == 2:
+        return _apply_to_tensor(plain[None], lights, depth)[0]
+    if plain.ndim < 2 or not 1 <= plain.shape[-3] <= 4 or plain.dtype == torch.bool:
+        raise InputError(
+            f"the image is {str(image.dtype).removeprefix('torch.')} of shape {tuple(image.shape)}:"
+            " give numbers of shape (..., C, H, W) with 1 to 4 channels"
+        )
+    if plain.is_complex():
+        raise InputError(f"the image is {image.dtype}: give real numbers")
+    count = math.prod(_batch_shape(image))
+    if not plain.numel() or not any(lights):
+        return plain
+    if len(lights) < count and len(lights) != 1:
+        raise InputError(f"{len(lights)} lights were drawn for {count} images: draw one for each")
+    lights = list(lights[:count]) if len(lights) >= count else [lights[0]] * count
+    frames = plain.reshape(-1, *plain.shape[-3:])
+    # All frames of a video have the light of their video.
+    lights = [light for light in lights for _ in range(len(frames) // count)]
+    if frames.is_floating_point() and not frames.isfinite().all():
+        raise InputError("the image has values that are NaN or infinite: replace them")
+    depths = None if depth is None else _as_depth(depth, frames, count)
+    groups: dict[Any, list[int]] = {}
+    for row, light in enumerate(lights):
+        groups.setdefault((id(light and light.model), light and light.strength), []).append(row)
+    relit: list[Tensor] = list(frames)
+    for rows in groups.values():
+        chosen = [light for light in (lights[row] for row in rows) if light is not None]
+        if not chosen:
+            continue
+        part = frames if len(rows) == len(frames) else torch.stack([frames[row] for row in rows])
+        result = _relight(part, chosen, None if depths is None else depths[rows])
+        if len(rows) == len(frames):
+            return result.reshape(plain.shape)
+        for row, values in zip(rows, result, strict=True):
+            relit[row] = values
+    return torch.stack(relit).reshape(plain.shape)
+
+
+def _as_depth(depth: Any, frames: Tensor, count: int) -> Float[Tensor, "N 1 H W"]:
+    """Convert depths to one for each frame."""
+    values = depth if isinstance(depth, Tensor) else torch.from_numpy(np.array(depth))
+    values = values.as_subclass(Tensor).to(frames.device, torch.float32)
+    size = frames.shape[-2:]
+    if values.ndim < 2 or values.shape[-2:] != size:
+        raise InputError(
+            f"depth has shape {tuple(values.shape)}, but the image is {tuple(size)}: resize it"
+        )
+    values = values.reshape(-1, 1, *size)
+    if len(values) not in (1, count, len(frames)):
+        raise InputError(f"depth has {len(values)} maps for {count} images: give one for each")
+    return values.repeat_interleave(len(frames) // len(values), 0)
+
+
+def _relight(
+    images: Tensor, lights: Sequence[Light], depth: Float[Tensor, "N 1 H W"] | None
+) -> Tensor:
+    """Relight images (N, C, H, W) in lights of one model and one strength."""
+    model, strength = lights[0].model, lights[0].strength
+    colored = images.shape[1] // 3 * 2 + 1
+    colors = images[:, :colored]
+    # Integers of more than 24 bits do not fit 32-bit numbers.
+    is_large = images.dtype.itemsize > 2 and images.dtype != torch.float32
+    dtype = torch.float64 if is_large else torch.float32
+    values = torch.stack([light.values for light in lights]).to(images.device, dtype)
+    seeds = [light.seed for light in lights]
+    drawn = model.draw(values, tuple(images.shape[-2:]), depth, seeds)
+    light = model.illumination(drawn, strength)
+    if colored == 1 and light.shape[1] == 3:
+        light = luminance(light)
+    is_integer = not images.is_floating_point()
+    largest = torch.iinfo(images.dtype).max if is_integer else 1
+    if images.dtype == torch.uint8 and not light.requires_grad:
+        if model.has_noise:
+            radiance = _tables(images.device).decoded[colors.int()] * light
+            radiance = model.camera(radiance, drawn, strength, radiance.new_tensor(1.0))
+            relit = relit_bytes(torch.full_like(colors, 255), radiance)
+        else:
+            relit = relit_bytes(colors, light)
+    else:
+        unit = colors.to(dtype) / largest
+        # The largest value of an image above 1 is its white, at which a sensor is full.
+        white = unit.detach().amax((1, 2, 3), keepdim=True).clamp(min=1)
+        white = decode(white, "srgb")
+        linear = model.camera(decode(unit, "srgb") * light, drawn, strength, white)
+        limit = white if model.has_limit else torch.where(white > 1, torch.inf, white)
+        encoded = encode(torch.minimum(linear, limit), "srgb")
+        if is_integer:
+            # The largest number of 64 bits is rounded up, which would overflow.
+            most = math.nextafter(largest, 0) if float(largest) > largest else largest
+            relit = (encoded * largest).round().clamp(max=most).to(images.dtype)
+        else:
+            relit = encoded.clamp(max=torch.finfo(images.dtype).max).to(images.dtype)
+    return relit if colored == images.shape[1] else torch.cat([relit, images[:, colored:]], 1)
+
+
+class Tables(NamedTuple):
+    """Tables of sRGB of 8 bits.
+
+    `decoded` has the linear value of each byte. A linear value in a bin of width 1 / BINS has the
+    byte `lowest`, and one more from the value `limit` on.
+    """
+
+    decoded: Float[Tensor, " 256"]
+    lowest: UInt8[Tensor, " bins"]
+    limit: Float[Tensor, " bins"]
+
+
+@cache
+def _tables(device: torch.device) -> Tables:
+    """Compute the tables in double precision. A value that is half way is rounded up."""
+    decoded = decode(torch.arange(256, dtype=torch.float64) / 255, "srgb")
+    halves = decode((torch.arange(255, dtype=torch.float64) + 0.5) / 255, "srgb").float()
+    starts = torch.arange(BINS + 1) / BINS
+    lowest = torch.searchsorted(halves, starts, right=True)
+    limit = torch.cat([halves, halves.new_tensor([2.0])])[lowest]
+    return Tables(*(table.to(device) for table in (decoded.float(), lowest.byte(), limit)))
+
+
+def relit_bytes(
+    colors: UInt8[Tensor, "N C H W"], light: Float[Tensor, "N _ _ _"]
+) -> UInt8[Tensor, "N C H W"]:
+    """Multiply the linear colors of bytes by light, and return the nearest bytes."""
+    tables = _tables(colors.device)
+    kernel = _kernel() if colors.device.type == "cpu" else None
+    if kernel is None:
+        linear = (tables.decoded[colors.int()] * light).clamp_(max=1)
+        bins = (linear * BINS).int()
+        return tables.lowest[bins] + (linear >= tables.limit[bins])
+    relit = torch.empty(colors.shape, dtype=torch.uint8)
+    full = light.expand(len(colors), -1, *colors.shape[2:]) if light.shape[2:] == (1, 1) else light
+    kernel(
+        colors.flatten(2).contiguous().numpy(),
+        full.detach().float().flatten(2).contiguous().numpy(),
+        *(table.numpy() for table in tables),
+        relit.flatten(2).numpy(),
+    )
+    return relit
+
+
+@cache
+def _kernel() -> Callable[..., None] | None:
+    """Compile `relit_bytes` as one loop, or return None without numba."""
+    try:
+        import numba
+    except ImportError:
+        return None
+    image, table = "uint8[:,:,::1]", "float32[::1]"
+    kinds = f"void({image},float32[:,:,::1],{table},uint8[::1],{table},{image})"
+    compiled: Callable[..., None] = numba.njit(kinds, cache=True, nogil=True)(_relit_bytes)
+    return compiled
+
+
+def _relit_bytes(
+    colors: np.ndarray,
+    light: np.ndarray,
+    decoded: np.ndarray,
+    lowest: np.ndarray,
+    limit: np.ndarray,
+    relit: np.ndarray,
+) -> None:
+    """Relight one byte after the other, with the arithmetic of the tables in `relit_bytes`."""
+    count, channels, pixels = colors.shape
+    for image in range(count):
+        for channel in range(channels):
+            row = min(channel, light.shape[1] - 1)
+            for pixel in range(pixels):
+                value = decoded[colors[image, channel, pixel]] * light[image, row, pixel]
+                value = min(value, np.float32(1))
+                index = np.int32(value * np.float32(BINS))
+                relit[image, channel, pixel] = lowest[index] + (value >= limit[index])
+
+
+def _albumentations(lighting: RandomLighting) -> Any:
+    """Wrap a transform for Albumentations."""
+    try:
+        import albumentations
+    except ImportError as error:
+        raise InputError(
+            f"Albumentations cannot be imported ({error}): pip install albumentations==2.0.8"
+        ) from error
+
+    class Lighting(albumentations.ImageOnlyTransform):  # type: ignore[misc, unused-ignore]
+        """Random light on arrays (H, W, C)."""
+
+        def get_params(self) -> dict[str, Any]:
+            """Draw a light with a seed of Albumentations."""
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(self.py_random.getrandbits(62))
+                return RandomLighting(lighting.lights, strength=lighting.strength).make_params()
+
+        def apply(self, img: np.ndarray, lights: Sequence[Light | None], **_: Any) -> np.ndarray:
+            """Relight an array."""
+            image = torch.from_numpy(np.ascontiguousarray(img))
+            image = image[None] if image.ndim == 2 else image.permute(2, 0, 1)
+            relit = _apply_to_tensor(image, lights, None).permute(1, 2, 0).numpy()
+            return np.ascontiguousarray(relit).reshape(img.shape)
+
+        def __reduce__(self) -> tuple[Any, ...]:
+            return _albumentations, (lighting,)
+
+    return Lighting(p=lighting.p)

@@ -1,0 +1,327 @@
+"""Random light on images of all kinds, and its models against closed forms."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy import integrate, stats
+from torch.utils.data import DataLoader
+from torchvision import tv_tensors
+
+import norm_balls as nb
+from augment import lighting
+from augment.scene import lights, patterns
+from augment.scene.lights import MODELS, visible_fraction
+from renderer.errors import InputError
+from renderer.image import decode, encode
+
+DTYPES = [torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16]
+DTYPES += [torch.float16, torch.bfloat16, torch.float32, torch.float64]
+
+
+def picture(*shape: int, seed: int = 0) -> torch.Tensor:
+    draws = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, shape, generator=draws, dtype=torch.uint8)
+
+
+def draw_values(model: lights.LightModel, count: int = 1, seed: int = 0) -> torch.Tensor:
+    draws = torch.Generator().manual_seed(seed)
+    return torch.rand(count, model.dimensions + model.constants, generator=draws)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (9, 1), (5, 8)])
+def test_each_model_keeps_dtype_shape_and_alpha(name, channels, size):
+    torch.manual_seed(0)
+    image = picture(channels, *size)
+    relit = nb.RandomLighting(name)(image)
+    assert relit.dtype == image.dtype and relit.shape == image.shape
+    if channels in (2, 4):
+        assert torch.equal(relit[-1], image[-1])
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_every_dtype_agrees_with_double_precision(name, dtype):
+    model = MODELS[name]()
+    light = lighting.Light(model, draw_values(model)[0], 3, 1.0)
+    unit = picture(3, 6, 6).double() / 255
+    largest = 1 if dtype.is_floating_point else torch.iinfo(dtype).max
+    exact = lighting.RandomLighting().apply(unit, {"lights": [light]})
+    given = (unit * largest).clamp(max=largest - largest // 1000).to(dtype)
+    relit = lighting.RandomLighting().apply(given, {"lights": [light]})
+    assert relit.dtype == dtype
+    error = (relit.double() / largest - exact).abs().max()
+    # The noise of low light turns rounding errors to steps of whole electrons.
+    assert error < (0.15 if name == "low_light" else 0.02)
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "HSV", "YCbCr"])
+def test_pil_images_keep_mode_and_size(mode):
+    image = Image.fromarray(picture(5, 8, 4).numpy()).convert(mode)
+    relit = nb.RandomLighting("linear")(image)
+    assert relit.mode == mode and relit.size == image.size
+
+
+@pytest.mark.parametrize("mode", ["I;16", "I"])
+def test_pil_images_of_16_bits_are_relit_in_their_range(mode):
+    values = torch.randint(0, 2**16, (4, 6)).to(torch.uint16)
+    light = (transform := nb.RandomLighting("linear")).make_params()
+    expected = transform.apply(values, light)
+    image = Image.fromarray(values.numpy().astype({"I;16": np.uint16, "I": np.int32}[mode]))
+    relit = transform.apply(image, light)
+    assert relit.mode == mode
+    assert np.array_equal(np.array(relit), expected.numpy())
+
+
+def test_labels_of_a_sample_stay_and_its_image_changes():
+    size = (8, 8)
+    sample = {
+        "image": tv_tensors.Image(picture(3, *size)),
+        "boxes": tv_tensors.BoundingBoxes([[1, 2, 5, 6]], format="XYXY", canvas_size=size),
+        "masks": tv_tensors.Mask(picture(2, *size) > 99),
+        "points": torch.rand(4, 2),
+        "depth": torch.rand(*size) + 1,
+        "labels": torch.tensor([3]),
+        "name": "orange",
+    }
+    relit = nb.RandomLighting(["point"])(sample)
+    for key in sample.keys() - {"image"}:
+        assert relit[key] is sample[key]
+    assert type(relit["image"]) is tv_tensors.Image
+    assert not torch.equal(relit["image"], sample["image"])
+
+
+def test_a_plain_tensor_is_the_image_even_behind_its_depth():
+    depth, image = torch.rand(6, 6) + 1, picture(3, 6, 6)
+    relit = nb.RandomLighting("directional")(depth_first := {"depth": depth, "image": image})
+    assert relit["depth"] is depth
+    assert not torch.equal(relit["image"], depth_first["image"])
+
+
+def test_a_batch_has_a_light_for_each_image_and_a_video_has_one():
+    image = picture(3, 6, 6)
+    batch = nb.RandomLighting("linear")(image.expand(4, 3, 6, 6))
+    assert len({tuple(values.flatten().tolist()) for values in batch}) == 4
+    video = nb.RandomLighting("low_light")(tv_tensors.Video(image.expand(4, 3, 6, 6)))
+    assert type(video) is tv_tensors.Video and (video == video[0]).all()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_drawn_light_is_replayed_and_a_batch_equals_its_images(name):
+    transform, images = nb.RandomLighting([name, "linear"]), picture(4, 3, 7, 9)
+    params = transform.make_params([images])
+    batch = transform.apply(images, params)
+    assert torch.equal(batch, transform.apply(images, params))
+    for image, relit, light in zip(images, batch, params["lights"], strict=True):
+        single = transform.apply(image, {"lights": [light]})
+        assert (single.int() - relit.int()).abs().max() <= 1
+
+
+@pytest.mark.parametrize("settings", [{"p": 0.0}, {"strength": 0.0}])
+def test_without_light_an_image_stays(settings):
+    image = torch.rand(3, 4, 4)
+    assert torch.equal(nb.RandomLighting(**settings)(image), image)
+
+
+def test_the_fraction_p_of_the_images_changes():
+    images = picture(3, 2, 2).expand(400, 3, 2, 2)
+    relit = nb.RandomLighting("highlights", p=0.25)(images)
+    changed = (relit != images).flatten(1).any(1).sum()
+    assert stats.binomtest(int(changed), 400, 0.25).pvalue > 1e-4
+
+
+def test_strength_mixes_with_the_unchanged_light():
+    model = lights.CastShadow()
+    values = draw_values(model)
+    drawn = model.draw(values, (5, 5))
+    mixed = 0.7 + 0.3 * model.illumination(drawn)
+    torch.testing.assert_close(model.illumination(drawn, 0.3), mixed)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_values_above_1_are_not_clipped_unless_the_sensor_is_full(name):
+    image = 8 * torch.rand(3, 9, 9)
+    relit = nb.RandomLighting(name)(image)
+    assert relit.isfinite().all()
+    if name in ("color_temperature", "linear", "highlights"):
+        assert relit.max() > 2
+
+
+def test_a_transform_is_pickled_and_works_in_two_workers():
+    transform = pickle.loads(pickle.dumps(nb.RandomLighting(["cast_shadow", "low_light"])))
+    data = [picture(3, 8, 8, seed=seed) for seed in range(4)]
+    loader = DataLoader(_Relit(data, transform), batch_size=2, num_workers=2)
+    assert [tuple(batch.shape) for batch in loader] == [(2, 3, 8, 8)] * 2
+
+
+class _Relit(torch.utils.data.Dataset):
+    def __init__(self, images, transform):
+        self.images, self.transform = images, transform
+
+    def __len__(self):
+        return len(self.images)
+
+    def __getitem__(self, index):
+        return self.transform(self.images[index])
+
+
+def test_torch_draws_the_light():
+    image = picture(3, 8, 8)
+    torch.manual_seed(5)
+    first = nb.RandomLighting()(image)
+    torch.manual_seed(5)
+    assert torch.equal(first, nb.RandomLighting()(image))
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: nb.RandomLighting(strength=1.5),
+        lambda: nb.RandomLighting(strength=math.nan),
+        lambda: nb.RandomLighting(p=-0.1),
+        lambda: nb.RandomLighting("sun"),
+        lambda: nb.RandomLighting([]),
+        lambda: nb.RandomLighting(3),
+        lambda: nb.RandomLighting({"linear": 0.0}),
+        lambda: nb.RandomLighting()(picture(5, 4, 4)),
+        lambda: nb.RandomLighting()(np.zeros((4, 4, 3))),
+        lambda: nb.RandomLighting()(torch.full((3, 2, 2), torch.nan)),
+        lambda: nb.RandomLighting()({"image": picture(3, 4, 4), "depth": torch.ones(5, 4)}),
+        lambda: nb.lights.CastShadow(("sun",)),
+        lambda: nb.lights.LowLight(exposure=0),
+    ],
+)
+def test_bad_input_is_refused_in_one_sentence(call):
+    with pytest.raises(InputError) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_bytes_are_exactly_rounded():
+    # All bytes in 300 lights, against the curve in double precision.
+    light = torch.rand(300, generator=torch.Generator().manual_seed(0)) * 3
+    colors = torch.arange(256, dtype=torch.uint8).view(1, 1, 256, 1).expand(1, 1, 256, 300)
+    relit = lighting.relit_bytes(colors, light.expand(1, 1, 256, 300))
+    linear = decode(colors.double() / 255, "srgb") * light.double()
+    exact = 255 * encode(linear.clamp(max=1), "srgb")
+    # 32-bit numbers can round a value that is half way in either direction.
+    assert (relit - exact).abs().max() < 0.5 + 1e-4
+
+
+def test_the_loop_of_numba_equals_the_operations_of_torch(monkeypatch):
+    pytest.importorskip("numba")
+    colors, light = picture(2, 3, 33, 65), 2 * torch.rand(2, 1, 33, 65)
+    expected = lighting.relit_bytes(colors, light)
+    monkeypatch.setattr(lighting, "_kernel", lambda: None)
+    assert torch.equal(lighting.relit_bytes(colors, light), expected)
+
+
+@pytest.mark.parametrize("distance", [-1.5, -1.0, -0.6, -0.1, 0.0, 0.3, 0.99, 1.0, 2.0])
+def test_the_penumbra_is_the_visible_area_of_a_disc(distance):
+    edge = min(max(distance, -1), 1)
+    area = 2 * integrate.quad(lambda x: math.sqrt(1 - x * x), -1, edge)[0]
+    assert visible_fraction(torch.tensor(distance)) == pytest.approx(area / math.pi, abs=1e-5)
+
+
+def test_a_point_light_over_a_plane_falls_off_as_the_third_power_of_the_cosine():
+    model = lights.PointLight()
+    values = draw_values(model)
+    values[0, 0] = 0  # A plane.
+    values[0, 1:3] = 0.5  # A lamp above the center.
+    light = model.illumination(model.draw(values, (1, 101)))[0, 0, 0]
+    height = 0.4 * 5 ** float(values[0, 3])
+    ambient = patterns.AMBIENT[0] + (patterns.AMBIENT[1] - patterns.AMBIENT[0]) * float(
+        values[0, 4]
+    )
+    x = (np.arange(101) - 50) * 2 / 101
+    expected = (1 + (x / height) ** 2) ** -1.5 + ambient
+    np.testing.assert_allclose(light / light[50], expected / expected[50], rtol=1e-4)
+
+
+def test_the_normals_of_a_tilted_plane_follow_from_its_depth():
+    # The plane z = 2 + x / 2 + y / 4, seen by a camera with a field of view of 60 degrees.
+    tangent, width, height = math.tan(math.radians(30)), 40, 30
+    x, y = ((np.arange(count) + 0.5 - count / 2) * 2 / width * tangent for count in (width, height))
+    depth = 2 / (1 - x / 2 - y[:, None] / 4)
+    surface = lights.surface_of_depth(torch.tensor(depth).float()[None, None])
+    torch.testing.assert_close(
+        surface.slope_right[..., 1:-1, 1:-1].mean(), torch.tensor(-0.5), atol=2e-3, rtol=0
+    )
+    torch.testing.assert_close(
+        surface.slope_down[..., 1:-1, 1:-1].mean(), torch.tensor(-0.25), atol=2e-3, rtol=0
+    )
+
+
+@pytest.mark.parametrize(
+    ("kelvin", "offset", "x", "y"),
+    [
+        # CIE standard illuminants A and D65. D65 is 0.0032 above the Planckian locus.
+        (2855.54, 0.0, 0.44758, 0.40745),
+        (6504, 0.00320, 0.31272, 0.32903),
+        # Black bodies (CIE 15:2004).
+        (4000, 0.0, 0.3805, 0.3768),
+        (10000, 0.0, 0.2807, 0.2884),
+    ],
+)
+def test_chromaticities_of_lamps_are_those_of_the_cie(kelvin, offset, x, y):
+    rgb = lights.planckian_rgb(torch.full((1, 1, 1), float(kelvin)).double(), offset).flatten()
+    to_xyz = np.array(
+        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    )
+    xyz = to_xyz @ rgb.numpy()
+    np.testing.assert_allclose(xyz[:2] / xyz.sum(), [x, y], atol=1e-3)
+
+
+@pytest.mark.parametrize("linear", [0.0, 0.02, 0.2, 1.0])
+def test_low_light_has_the_mean_and_variance_of_photons_and_amplifier(linear):
+    model = lights.LowLight()
+    values = torch.tensor([[0.8, 0.5, 0.6]])
+    radiance = torch.full((1, 1, 300, 300), linear)
+    drawn = model.draw(values, (300, 300), seeds=[1])
+    measured = model.camera(radiance, drawn, 1.0, torch.tensor(1.0)).flatten().double()
+    stops = 0.8 * math.log2(1 / 0.005)
+    mean, gain = linear * 15000 * 2**-stops, 2 ** (0.6 * stops) / 15000
+    draws = np.random.default_rng(0)
+    signal = gain * (draws.poisson(mean, 90000) + 3 * draws.normal(size=90000))
+    expected = np.round(signal.clip(0, 1) * 4095) / 4095
+    assert float(measured.mean()) == pytest.approx(expected.mean(), rel=0.02, abs=1e-5)
+    assert float(measured.std()) == pytest.approx(expected.std(), rel=0.04)
+
+
+def test_approximate_photons_are_within_the_stated_distance_of_a_poisson_distribution():
+    z = stats.norm.ppf((np.arange(200000) + 0.5) / 200000)
+    for mean in (0.02, 0.1, 0.3, 1, 3, 10, 100):
+        skew = (z * z - 1) / 6 * mean / (mean + 0.03)
+        drawn = np.round(mean + math.sqrt(mean) * z + skew).clip(0)
+        counts = np.arange(int(drawn.max()) + 2)
+        share = np.bincount(drawn.astype(int), minlength=len(counts)) / len(z)
+        distance = 0.5 * np.abs(share - stats.poisson.pmf(counts, mean)).sum()
+        assert distance < (0.003 if mean >= 10 else 0.04), mean
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_light_is_differentiable_in_its_numbers(name):
+    model = MODELS[name]()
+    values = draw_values(model, seed=2).requires_grad_()
+    drawn = model.draw(values, (6, 6), seeds=[0])
+    relit = model.camera(0.1 * model.illumination(drawn), drawn, 1.0, torch.tensor(1.0))
+    (gradient,) = torch.autograd.grad(relit.sum(), values)
+    assert gradient.isfinite().all() and gradient[:, : model.dimensions].abs().sum() > 0
+
+
+def test_a_compiled_model_may_hold_the_transform():
+    class Model(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.light = nb.RandomLighting("linear")
+
+        def forward(self, images):
+            return self.light(images * 1.0) + 1
+
+    compiled = torch.compile(Model(), backend="eager")
+    assert compiled(torch.rand(2, 3, 4, 4)).shape == (2, 3, 4, 4)
