@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -345,3 +346,13 @@ def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_
     text = AuditedNetwork("orange", "dark", tmp_path).answer
     for light in KINDS.values():
         assert f"{light.title} of radius {light.radii[2]:g} loses 2 of 4 views" in text
+
+
+def test_each_lighting_of_the_laboratory_has_the_same_number_of_setups(monkeypatch, tmp_path):
+    made = []
+    monkeypatch.setattr(audit, "write_laboratory", made.append)
+    environments = ["a.npy", "b.npy", "c.npy"]
+    settings = AuditSettings(network="any", label="orange", environments=environments)
+    plan = SimpleNamespace(items=[ObjectSettings("solid:orange:1", label="orange")])
+    audit._write_renders(settings, plan, 8, tmp_path)
+    assert made[0].setups == 6 * (len(made[0].patterns) + 3)
