@@ -50,7 +50,9 @@ def test_every_block_of_python_is_run_here():
         "Render",
         "Networks without gradients",
         "Your own training loop",
+        "PyTorch Lightning, and loggers",
         "Your own cameras",
+        "Labeled renders on disk",
         "Many lights and views",
         "Load",
         "Photographs",
@@ -152,6 +154,39 @@ def test_training_loop_block_trains_on_data_and_renders():
     assert names["renders"].labels.eq(53).all()
     assert names["renders"].images.shape == (10, 3, 32, 32)
     assert not torch.equal(network[1].weight, before)
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("default")
+def test_lightning_block_trains_on_data_and_renders():
+    lightning = pytest.importorskip("lightning")
+
+    class Module(lightning.LightningModule):
+        def __init__(self):
+            super().__init__()
+            self.network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
+
+        def forward(self, images):
+            return self.network(images)
+
+        def training_step(self, batch, index):
+            return nn.functional.cross_entropy(self(batch[0]), batch[1])
+
+        def configure_optimizers(self):
+            return torch.optim.SGD(self.parameters(), lr=0.01)
+
+    module = Module()
+    before = module.network[1].weight.detach().clone()
+    names = run("PyTorch Lightning, and loggers", module=module, data=Photographs())
+    assert len(names["callback"].renders.current) == 10
+    assert not torch.equal(module.network[1].weight, before)
+
+
+def test_data_set_block_shows_the_class_of_each_render(capsys):
+    names = run("Labeled renders on disk")
+    assert names["render"].labels == ["orange"]
+    assert names["render"].masks.any()
+    assert len(capsys.readouterr().out.splitlines()) == 10
 
 
 def read_auc(folder: Path) -> float:
