@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from augment.dataset import BLOCK, render_dataset
+from augment import dataset
 from augment.progress import progress
 from renderer.errors import InputError, keyed, keys_of
 from renderer.io.files import atomic_write
@@ -48,7 +48,7 @@ def run(settings: RenderSettings) -> None:
     network = load_chosen(settings).to(device) if settings.network else None
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
-        renders = render_dataset(
+        renders = dataset.render_dataset(
             list(objects.values()),
             settings.size,
             settings.count,
@@ -71,8 +71,8 @@ def run(settings: RenderSettings) -> None:
 
 def shard_indices(settings: RenderSettings) -> range:
     """Return the indices of the renders of this process, which are whole blocks."""
-    blocks = -(-settings.count // BLOCK)
-    ends = [blocks * (settings.shard + part) // settings.shards * BLOCK for part in (0, 1)]
+    blocks = -(-settings.count // dataset.BLOCK)
+    ends = [blocks * (settings.shard + part) // settings.shards * dataset.BLOCK for part in (0, 1)]
     return range(*(min(end, settings.count) for end in ends))
 
 

@@ -12,13 +12,19 @@ import yaml
 from PIL import Image
 from torchvision.datasets import ImageFolder
 
-from augment.dataset import BLOCK, describe_camera, render_dataset
+from augment import dataset
+from augment.dataset import describe_camera, render_dataset
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
 from train.command_settings import RenderSettings
 from train.commands.render import run
 
-COUNT = BLOCK + 3
+COUNT = 11
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch):
+    monkeypatch.setattr(dataset, "BLOCK", 4)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +56,7 @@ def decoded(counts: list[int], size: list[int]) -> np.ndarray:
 
 def test_torchvision_reads_the_classes_of_folders(meshes, tmp_path):
     folder = write(meshes, tmp_path / "out")
-    for part, count in {"train": 23, "val": 12}.items():
+    for part, count in {"train": 7, "val": 4}.items():
         found = ImageFolder(str(folder / part))
         assert len(found) == count and found.classes == ["ball", "box"]
         for path, label in found.samples:
@@ -62,7 +68,7 @@ def test_torchvision_reads_the_classes_of_folders(meshes, tmp_path):
 def test_boxes_and_run_lengths_of_coco_are_those_of_the_mask(meshes, tmp_path):
     folder = write(meshes, tmp_path / "out", format="coco")
     found = json.loads((folder / "annotations/instances_val.json").read_text())
-    assert len(found["images"]) == len(found["annotations"]) == 12
+    assert len(found["images"]) == len(found["annotations"]) == 4
     for image, item in zip(found["images"], found["annotations"], strict=True):
         assert item["image_id"] == image["id"]
         assert (folder / "val" / image["file_name"]).exists()
