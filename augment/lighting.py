@@ -8,8 +8,10 @@ rounded. With numba installed, one loop does all of this.
 from __future__ import annotations
 
 import math
+from bisect import bisect
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +24,7 @@ from torchvision import tv_tensors
 from torchvision.transforms import v2
 
 from augment.random_streams import generator, stream_seed
-from augment.scene.lights import MODELS, LightModel
+from augment.scene.lights import MODELS, Illumination, LightModel
 from augment.scene.patterns import draw_projected_light, luminance, require_photographs
 from renderer import errors
 from renderer.errors import InputError
@@ -131,16 +133,13 @@ class RandomLighting(v2.Transform):
             Lights, which `apply` takes.
         """
         count = max([math.prod(_batch_shape(image)) for image in flat_inputs], default=1)
-        is_lit = torch.rand(count) < self.p
-        models = [*self.lights]
-        weights = torch.tensor([*self.lights.values()])
-        rows = torch.multinomial(weights, max(count, 1), replacement=True)
+        models, weights = [*self.lights], [*self.lights.values()]
         lights: list[Light | None] = []
-        for is_changed, row in zip(is_lit.tolist(), rows.tolist(), strict=False):
-            model = models[row]
+        seeds = torch.randint(2**62, (count,)).tolist()
+        for seed, (chance, choice) in zip(seeds, torch.rand(count, 2).tolist(), strict=True):
+            model = models[bisect(list(accumulate(weights)), choice * sum(weights))]
             values = torch.rand(model.dimensions + model.constants)
-            seed = int(torch.randint(2**62, ()))
-            is_changed = is_changed and self.strength > 0
+            is_changed = chance < self.p and self.strength > 0
             lights.append(Light(model, values, seed, self.strength) if is_changed else None)
         return {"lights": lights}
 
@@ -382,15 +381,21 @@ def _relight(
     seeds = [light.seed for light in lights]
     drawn = model.draw(values, tuple(images.shape[-2:]), depth, seeds)
     light = model.illumination(drawn, strength)
-    if colored == 1 and light.shape[1] == 3:
-        light = luminance(light)
+    if colored == 1:
+        # The light of a gray image is the luminance.
+        light = Illumination(
+            *(
+                luminance(part) if isinstance(part, Tensor) and part.shape[1] == 3 else part
+                for part in light
+            )
+        )
     is_integer = not images.is_floating_point()
     largest = torch.iinfo(images.dtype).max if is_integer else 1
-    if images.dtype == torch.uint8 and not light.requires_grad:
+    if images.dtype == torch.uint8 and not values.requires_grad:
         if model.has_noise:
-            radiance = _tables(images.device).decoded[colors.int()] * light
+            radiance = _decoded(colors) * light.total()
             radiance = model.camera(radiance, drawn, strength, radiance.new_tensor(1.0))
-            relit = relit_bytes(torch.full_like(colors, 255), radiance)
+            relit = relit_bytes(torch.full_like(colors, 255), Illumination(radiance))
         else:
             relit = relit_bytes(colors, light)
     else:
@@ -398,7 +403,7 @@ def _relight(
         # The largest value of an image above 1 is its white, at which a sensor is full.
         white = unit.detach().amax((1, 2, 3), keepdim=True).clamp(min=1)
         white = decode(white, "srgb")
-        linear = model.camera(decode(unit, "srgb") * light, drawn, strength, white)
+        linear = model.camera(decode(unit, "srgb") * light.total(), drawn, strength, white)
         limit = white if model.has_limit else torch.where(white > 1, torch.inf, white)
         encoded = encode(torch.minimum(linear, limit), "srgb")
         if is_integer:
@@ -433,21 +438,31 @@ def _tables(device: torch.device) -> Tables:
     return Tables(*(table.to(device) for table in (decoded.float(), lowest.byte(), limit)))
 
 
-def relit_bytes(
-    colors: UInt8[Tensor, "N C H W"], light: Float[Tensor, "N _ _ _"]
-) -> UInt8[Tensor, "N C H W"]:
+def _decoded(colors: UInt8[Tensor, "N C H W"]) -> Float[Tensor, "N C H W"]:
+    """Look up the linear values of bytes."""
+    flat = colors.flatten().int()
+    return _tables(colors.device).decoded.index_select(0, flat).view(colors.shape)
+
+
+def relit_bytes(colors: UInt8[Tensor, "N C H W"], light: Illumination) -> UInt8[Tensor, "N C H W"]:
     """Multiply the linear colors of bytes by light, and return the nearest bytes."""
     tables = _tables(colors.device)
     kernel = _kernel() if colors.device.type == "cpu" else None
     if kernel is None:
-        linear = (tables.decoded[colors.int()] * light).clamp_(max=1)
+        linear = (_decoded(colors) * light.total()).clamp_(max=1)
         bins = (linear * BINS).int()
         return tables.lowest[bins] + (linear >= tables.limit[bins])
     relit = torch.empty(colors.shape, dtype=torch.uint8)
-    full = light.expand(len(colors), -1, *colors.shape[2:]) if light.shape[2:] == (1, 1) else light
+    count, channels = colors.shape[:2]
+    gain, offset = (
+        torch.as_tensor(part, dtype=torch.float32).expand(count, channels, 1, 1)[..., 0, 0]
+        for part in light[1:]
+    )
     kernel(
         colors.flatten(2).contiguous().numpy(),
-        full.detach().float().flatten(2).contiguous().numpy(),
+        light.field.detach().float().flatten(2).contiguous().numpy(),
+        gain.contiguous().numpy(),
+        offset.contiguous().numpy(),
         *(table.numpy() for table in tables),
         relit.flatten(2).numpy(),
     )
@@ -461,30 +476,38 @@ def _kernel() -> Callable[..., None] | None:
         import numba
     except ImportError:
         return None
-    image, table = "uint8[:,:,::1]", "float32[::1]"
-    kinds = f"void({image},float32[:,:,::1],{table},uint8[::1],{table},{image})"
+    image, rows, table = "uint8[:,:,::1]", "float32[:,::1]", "float32[::1]"
+    kinds = f"void({image},float32[:,:,::1],{rows},{rows},{table},uint8[::1],{table},{image})"
     compiled: Callable[..., None] = numba.njit(kinds, cache=True, nogil=True)(_relit_bytes)
     return compiled
 
 
 def _relit_bytes(
     colors: np.ndarray,
-    light: np.ndarray,
+    field: np.ndarray,
+    gain: np.ndarray,
+    offset: np.ndarray,
     decoded: np.ndarray,
     lowest: np.ndarray,
     limit: np.ndarray,
     relit: np.ndarray,
 ) -> None:
     """Relight one byte after the other, with the arithmetic of the tables in `relit_bytes`."""
-    count, channels, pixels = colors.shape
-    for image in range(count):
-        for channel in range(channels):
-            row = min(channel, light.shape[1] - 1)
+    one, bins = np.float32(1), np.float32(BINS)
+    pixels = colors.shape[2]
+    for image in range(len(colors)):
+        for channel in range(colors.shape[1]):
+            given, shown = colors[image, channel], relit[image, channel]
+            # A field of one value or of one channel stands for all.
+            row = field[image, min(channel, field.shape[1] - 1)]
+            factor, added = gain[image, channel], offset[image, channel]
+            step = 1 if len(row) == pixels else 0
             for pixel in range(pixels):
-                value = decoded[colors[image, channel, pixel]] * light[image, row, pixel]
-                value = min(value, np.float32(1))
-                index = np.int32(value * np.float32(BINS))
-                relit[image, channel, pixel] = lowest[index] + (value >= limit[index])
+                light = factor * row[pixel * step] + added
+                value = min(decoded[given[pixel]] * light, one)
+                # Unsigned indices need no check for negative ones.
+                index = np.uint32(np.int32(value * bins))
+                shown[pixel] = lowest[index] + (value >= limit[index])
 
 
 def _albumentations(lighting: RandomLighting) -> Any:

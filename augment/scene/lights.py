@@ -6,7 +6,7 @@ The linear colors of a photograph stand for the albedo of what it shows:
 
 A model maps numbers to the light of each pixel, which is 1 in the photograph itself. It is
 differentiable in the first `dimensions` numbers, which an attack may change. The other `constants`
-choose the kind of a pattern and its random parts. In a light with a `meter`, the camera sets its
+choose the kind of a pattern and its random parts. In a light with a meter, the camera sets its
 exposure such that the mean luminance of the light is 2^stops.
 
 The image is 2 units wide: x points to the right, y down, and heights towards the camera.
@@ -21,76 +21,37 @@ from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from augment.scene.patterns import (
     AMBIENT,
     DARKEST,
-    MAX_POLAR,
-    MAX_STEEPNESS,
     STOPS,
-    SURFACE_NODES,
     ProjectedLight,
     draw_slides,
-    lambert,
     luminance,
     random_colors,
     require_photographs,
+)
+from augment.scene.surfaces import (
+    MAX_POLAR,
+    MAX_STEEPNESS,
+    SURFACE_NODES,
+    Surface,
+    axes,
+    lambert,
+    smooth,
+    surface_of_depth,
 )
 from renderer import errors
 from renderer.errors import InputError
 from renderer.settings import Size, height_and_width
 
-# Horizontal field of view in degrees of the camera that a depth map is from.
-FIELD_OF_VIEW = 60.0
-
 
 def between(numbers: Tensor, low: float, high: float) -> Tensor:
     """Map numbers in [0, 1] to an interval."""
     return low + (high - low) * numbers
-
-
-def geometric(numbers: Tensor, low: float, high: float) -> Tensor:
-    """Map numbers in [0, 1] to an interval whose logarithm is uniform."""
-    return between(numbers, math.log(low), math.log(high)).exp()
-
-
-def axes(size: Size, like: Tensor) -> tuple[Float[Tensor, "1 1 1 W"], Float[Tensor, "1 1 H 1"]]:
-    """Return x of the columns and y of the rows of an image."""
-    height, width = height_and_width(size)
-    x, y = (
-        (torch.arange(count, device=like.device, dtype=like.dtype) * 2 + (1 - count)) / width
-        for count in (width, height)
-    )
-    return x.view(1, 1, 1, -1), y.view(1, 1, -1, 1)
-
-
-@lru_cache(maxsize=64)
-def spline(nodes: int, pixels: int, spacing: float = 0.0) -> Float[Tensor, "pixels nodes"]:
-    """Return the matrix that interpolates nodes to pixels, or to slopes at a spacing of pixels."""
-    identity = torch.eye(nodes).view(1, nodes, nodes, 1)
-    values = F.interpolate(identity, (pixels, 1), mode="bicubic", align_corners=True)[0, :, :, 0].T
-    if not spacing:
-        return values.contiguous()
-    if pixels == 1:
-        return torch.zeros(1, nodes)
-    return torch.gradient(values, spacing=spacing, dim=0)[0].contiguous()
-
-
-def smooth(
-    nodes: Float[Tensor, "B 1 n n"], size: Size, slope: str = ""
-) -> Float[Tensor, "B 1 H W"]:
-    """Interpolate nodes at the pixels of an image by bicubic splines, or return a slope of them.
-
-    The slope is along "x" or "y". Two products of matrices are faster than `F.interpolate`.
-    """
-    height, width = height_and_width(size)
-    count = nodes.shape[-1]
-    to_rows = spline(count, height, 2 / width if slope == "y" else 0.0).to(nodes)
-    to_columns = spline(count, width, 2 / width if slope == "x" else 0.0).to(nodes)
-    return to_rows @ nodes @ to_columns.T
 
 
 def normal_numbers(uniform: Float[Tensor, "B E"], nodes: int) -> Float[Tensor, "B 1 nodes nodes"]:
@@ -107,47 +68,39 @@ def blend(
     return angle.cos() * first + angle.sin() * second
 
 
-class Surface(NamedTuple):
-    """Slopes of the heights of a surface, and the position (x, y, height) of each pixel."""
+class Range(NamedTuple):
+    """Smallest and largest value of a number, and whether its logarithm is uniform."""
 
-    slope_down: Tensor
-    slope_right: Tensor
-    position: tuple[Tensor, Tensor, Tensor]
+    low: float
+    high: float
+    is_geometric: bool = False
 
 
-def surface_of_depth(depth: Float[Tensor, "B 1 H W"]) -> Surface:
-    """Compute the surface that a pinhole camera sees at given depths, in any unit.
+@lru_cache(maxsize=64)
+def _ranges(
+    ranges: tuple[Range, ...], device: torch.device, dtype: torch.dtype
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the low ends and the widths of ranges, and where they are of logarithms."""
+    ends = [[math.log(end) if log else end for end in (low, high)] for low, high, log in ranges]
+    low, high = torch.tensor(ends, device=device, dtype=dtype).T.contiguous()
+    return low, high - low, torch.tensor([each.is_geometric for each in ranges], device=device)
 
-    It is enlarged such that the mean depth has half the width 1. Pixels without a depth, which is
-    not positive or not finite, get the mean.
-    """
-    is_known = depth.isfinite() & (depth > 0)
-    known = torch.where(is_known, depth, 0)
-    mean = known.mean((2, 3), keepdim=True) / is_known.float().mean((2, 3), keepdim=True)
-    mean = mean.nan_to_num(1.0)
-    relative = torch.where(is_known, known / mean, 1)
-    tangent = math.tan(math.radians(FIELD_OF_VIEW / 2))
-    x, y = axes(depth.shape[-2:], depth)
-    # Slopes of the logarithm of the depth along the pixels, where half the width is the tangent.
-    spacing = 2 * tangent / depth.shape[-1]
-    down, right = (
-        torch.gradient(relative.log(), spacing=spacing, dim=axis)[0]
-        if depth.shape[axis] > 1
-        else torch.zeros_like(depth)
-        for axis in (2, 3)
-    )
-    # Product of both tangents of the surface z · (x, y, 1), up to a factor.
-    towards = 1 + tangent * (x * right + y * down)
-    towards = towards.clamp(min=0.05)
-    height = (1 - relative) / tangent
-    return Surface(-down / towards, -right / towards, (x * relative, y * relative, height))
+
+# Ranges of the numbers that several models have.
+TURN = Range(0, 2 * math.pi)
+WEAK = Range(*AMBIENT)
+METER = Range(*STOPS)
+STEEPNESS = Range(0, MAX_STEEPNESS)
+SURFACE = (STEEPNESS, TURN, Range(0, math.radians(MAX_POLAR)))
+# Position of a small lamp, in half widths.
+LAMP = (Range(-1.5, 1.5), Range(-1.5, 1.5), Range(0.4, 2.0, True))
 
 
 class Drawn(NamedTuple):
     """Numbers of the lights of B images, and what the lights depend on.
 
-    `numbers` are the columns that light depends on smoothly, shape (B, 1, 1, 1) each. `constants`
-    are uniform in [0, 1], shape (B, E). `seeds` are for random numbers of pixels and of slides.
+    `numbers` are what light depends on smoothly, in their ranges, shape (B, 1, 1, 1) each. The
+    `constants` are uniform in [0, 1], shape (B, E). `seeds` are for the noise and for slides.
     """
 
     numbers: Sequence[Tensor]
@@ -161,24 +114,46 @@ class Drawn(NamedTuple):
         if self.depth is not None:
             return surface_of_depth(self.depth)
         heights = normal_numbers(self.constants[:, start:], SURFACE_NODES)
-        nodes = MAX_STEEPNESS * steepness * heights
+        nodes = steepness * heights
         down, right = (smooth(nodes, self.size, slope) for slope in "yx")
         return Surface(down, right, (*axes(self.size, nodes), smooth(nodes, self.size)))
+
+
+class Illumination(NamedTuple):
+    """Light of each pixel: gain · field + offset, of which gain and offset are for whole images."""
+
+    field: Float[Tensor, "B _ H W"]
+    gain: Float[Tensor, "B _ 1 1"] | float = 1.0
+    offset: Float[Tensor, "B _ 1 1"] | float = 0.0
+
+    def total(self) -> Float[Tensor, "B _ H W"]:
+        """Compute the light."""
+        return self.gain * self.field + self.offset
+
+    def scaled(self, gain: Tensor | float, offset: Tensor | float = 0.0) -> Illumination:
+        """Multiply the light, and add to it."""
+        return Illumination(self.field, gain * self.gain, gain * self.offset + offset)
 
 
 class LightModel:
     """Light as a function of numbers in [0, 1]."""
 
-    dimensions: ClassVar[int]
+    # Smallest and largest value of each number, and whether its logarithm is uniform.
+    ranges: ClassVar[tuple[Range, ...]]
     constants: ClassVar[int] = 0
-    # Column of the number of stops of a light whose exposure a meter sets. None without a meter.
-    meter: ClassVar[int | None] = None
+    # Whether a meter sets the exposure, of which the last number has the stops.
+    has_meter: ClassVar[bool] = False
     # Whether the camera adds noise, and whether it clips values above the white of HDR images.
     has_noise: ClassVar[bool] = False
     has_limit: ClassVar[bool] = False
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
-        """Compute the linear light of each pixel, whose axes C, H and W may be 1."""
+    @property
+    def dimensions(self) -> int:
+        """Number of numbers that the light depends on smoothly."""
+        return len(self.ranges)
+
+    def light(self, drawn: Drawn) -> Illumination:
+        """Compute the linear light of each pixel."""
         raise NotImplementedError
 
     def draw(
@@ -188,20 +163,23 @@ class LightModel:
         depth: Tensor | None = None,
         seeds: Sequence[int] = (),
     ) -> Drawn:
-        """Split the numbers of the lights of images."""
-        numbers = values[:, : self.dimensions].T[..., None, None, None].unbind()
-        return Drawn(numbers, values[:, self.dimensions :], size, depth, seeds)
+        """Map the numbers of the lights of images to their ranges."""
+        low, span, is_geometric = _ranges(self.ranges, values.device, values.dtype)
+        numbers = torch.addcmul(low, span, values[:, : self.dimensions])
+        numbers = torch.where(is_geometric, numbers.exp(), numbers)
+        columns = numbers.T[..., None, None, None].unbind()
+        return Drawn(columns, values[:, self.dimensions :], size, depth, seeds)
 
-    def illumination(self, drawn: Drawn, strength: float = 1.0) -> Float[Tensor, "B C H W"]:
+    def illumination(self, drawn: Drawn, strength: float = 1.0) -> Illumination:
         """Mix the light with the unchanged light, and expose it."""
         light = self.light(drawn)
         if strength < 1:
-            light = (1 - strength) + strength * light
-        if self.meter is None:
+            light = light.scaled(strength, 1 - strength)
+        if not self.has_meter:
             return light
-        gray = luminance(light) if light.shape[1] == 3 else light
-        stops = strength * between(drawn.numbers[self.meter], *STOPS)
-        return light * (torch.exp2(stops) / gray.mean((2, 3), keepdim=True).clamp(min=DARKEST))
+        mean = light._replace(field=light.field.mean((2, 3), keepdim=True)).total()
+        gray = luminance(mean) if mean.shape[1] == 3 else mean
+        return light.scaled(torch.exp2(strength * drawn.numbers[-1]) / gray.clamp(min=DARKEST))
 
     def camera(
         self, radiance: Float[Tensor, "B C H W"], drawn: Drawn, strength: float, white: Tensor
@@ -220,29 +198,28 @@ class ProjectedSlide(LightModel):
 
     slides: Tensor | None = None
     cells: ClassVar[int] = 3
-    dimensions = 5 + 3 * 3**2
+    ranges = (*SURFACE, WEAK, *[Range(-math.log(2), math.log(2))] * 3 * cells**2, METER)
     constants = SURFACE_NODES**2
-    meter = 4
+    has_meter = True
 
     def __post_init__(self) -> None:
         if self.slides is not None:
             require_photographs("slides", self.slides)
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
+    def light(self, drawn: Drawn) -> Illumination:
         """Project a picture of its own on each image."""
         draws = [torch.Generator().manual_seed(seed) for seed in drawn.seeds]
         pictures = torch.cat([draw_slides(1, drawn.size, draw, self.slides) for draw in draws])
-        ambient = between(drawn.numbers[3], *AMBIENT)
+        log_gain = torch.cat(list(drawn.numbers[4:-1]), 1).view(-1, 3, self.cells, self.cells)
+        ambient = drawn.numbers[3]
         projected = ProjectedLight(pictures.to(ambient), shading(drawn), ambient, ambient)
-        gains = torch.cat(list(drawn.numbers[5:]), 1).view(-1, 3, self.cells, self.cells)
-        return projected.light(math.log(2) * (2 * gains - 1))
+        return Illumination(projected.light(log_gain))
 
 
 def shading(drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
     """Compute the shading of a surface from its steepness and the direction of the light."""
-    steepness, turn, tilt, *_ = drawn.numbers
+    steepness, azimuth, polar, *_ = drawn.numbers
     surface = drawn.surface(steepness)
-    polar, azimuth = math.radians(MAX_POLAR) * tilt, 2 * math.pi * turn
     to_light = polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()
     return lambert(surface.slope_down, surface.slope_right, *to_light)
 
@@ -254,13 +231,13 @@ class DirectionalLight(LightModel):
     The surface is random and smooth, or that of the depth of the image.
     """
 
-    dimensions = 5
+    ranges = (*SURFACE, WEAK, METER)
     constants = SURFACE_NODES**2
-    meter = 4
+    has_meter = True
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
+    def light(self, drawn: Drawn) -> Illumination:
         """Add weak ambient light to the shading."""
-        return shading(drawn) + between(drawn.numbers[3], *AMBIENT)
+        return Illumination(shading(drawn), offset=drawn.numbers[3])
 
 
 def lamp_light(
@@ -283,37 +260,38 @@ class PointLight(LightModel):
     surface is random and smooth, or that of the depth of the image.
     """
 
-    dimensions = 6
+    ranges = (STEEPNESS, *LAMP, WEAK, METER)
     constants = SURFACE_NODES**2
-    meter = 5
+    has_meter = True
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
+    def light(self, drawn: Drawn) -> Illumination:
         """Add weak ambient light to the light of the lamp."""
-        steepness, right, down, above, ambient, _ = drawn.numbers
-        lamp = between(right, -1.5, 1.5), between(down, -1.5, 1.5), geometric(above, 0.4, 2.0)
-        return lamp_light(drawn.surface(steepness), *lamp) + between(ambient, *AMBIENT)
+        steepness, *lamp, ambient, _ = drawn.numbers
+        return Illumination(lamp_light(drawn.surface(steepness), *lamp), offset=ambient)
 
 
 @dataclass(frozen=True)
 class ColoredLamps(LightModel):
     """One to three small lamps, each of its own color, light a matte surface (see `PointLight`)."""
 
-    dimensions = 3 + 5 * 3
+    ranges = (STEEPNESS, *[*LAMP, Range(0, 1), Range(0, 1)] * 3, WEAK, METER)
     constants = 1 + SURFACE_NODES**2
-    meter = 2
+    has_meter = True
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
+    def light(self, drawn: Drawn) -> Illumination:
         """Add the light of the lamps, of which some are off, to weak ambient light."""
-        steepness, ambient, _, *lamps = drawn.numbers
+        steepness, *lamps, ambient, _ = drawn.numbers
         surface = drawn.surface(steepness, start=1)
-        count = (3 * drawn.constants[:, 0]).floor().view(-1, 1, 1, 1)
-        light = between(ambient, *AMBIENT)
-        for lamp in range(3):
-            right, down, above, hue, saturation = lamps[5 * lamp : 5 * lamp + 5]
-            place = between(right, -1.5, 1.5), between(down, -1.5, 1.5), geometric(above, 0.4, 2.0)
-            color = random_colors(torch.cat([hue, saturation], 1)[:, :, 0, 0])
-            light = light + (count >= lamp).to(color) * color * lamp_light(surface, *place)
-        return light
+        # Index of the last lamp of each image that is on.
+        last = (3 * drawn.constants[:, :1]).floor().clamp(max=2)
+        colors, fields = [], []
+        for lamp in range(int(last.max()) + 1):
+            *place, hue, saturation = lamps[5 * lamp : 5 * lamp + 5]
+            color = random_colors(torch.cat([hue, saturation], 1)[:, :, 0, 0])[..., 0]
+            colors.append(color * (last >= lamp)[..., None])
+            fields.append(lamp_light(surface, *place))
+        mixed = torch.cat(colors, 2) @ torch.cat(fields, 1).flatten(2)
+        return Illumination(mixed.unflatten(2, fields[0].shape[2:]), offset=ambient)
 
 
 @dataclass(frozen=True)
@@ -323,17 +301,17 @@ class LinearLight(LightModel):
     It is the first-order expansion of any smooth light, such as that of a window at one side.
     """
 
-    dimensions = 3
-    meter = 2
+    ranges = (TURN, Range(0, 0.95), METER)
+    has_meter = True
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
+    def light(self, drawn: Drawn) -> Illumination:
         """Compute a ramp with the mean 1 and the minimum 1 − contrast."""
         turn, contrast, _ = drawn.numbers
         height, width = height_and_width(drawn.size)
         x, y = axes(drawn.size, turn)
-        right, down = (2 * math.pi * turn).cos(), (2 * math.pi * turn).sin()
-        scale = 0.95 * contrast / (right.abs() + height / width * down.abs())
-        return (1 + scale * right * x) + scale * down * y
+        right, down = turn.cos(), turn.sin()
+        gain = contrast / (right.abs() + height / width * down.abs())
+        return Illumination(right * x + down * y, gain, 1.0)
 
 
 @dataclass(frozen=True)
@@ -344,31 +322,30 @@ class FractalLight(LightModel):
     """
 
     octaves: ClassVar[tuple[int, ...]] = (2, 4, 8, 16)
-    dimensions = 3
+    ranges = (Range(0.1, 1.0), TURN, METER)
     constants = 2 * sum(count**2 for count in octaves)
-    meter = 2
+    has_meter = True
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
+    def light(self, drawn: Drawn) -> Illumination:
         """Blend two random fields of the same variance, and take the exponential."""
-        contrast, turn, _ = drawn.numbers
-        angle = 2 * math.pi * turn
+        contrast, angle, _ = drawn.numbers
         nodes = torch.zeros_like(contrast)
         start = 0
         for octave, count in enumerate(self.octaves):
             blended = blend(drawn.constants[:, start:], count, angle)
             nodes = nodes + 0.5**octave * smooth(blended, self.octaves[-1])
             start += 2 * count**2
-        return (between(contrast, 0.1, 1.0) * smooth(nodes, drawn.size)).exp()
+        return Illumination(smooth(contrast * nodes, drawn.size).exp())
 
 
-def visible_fraction(distance: Tensor) -> Tensor:
-    """Return the visible fraction of a uniform disc behind a straight edge.
+def circle_segment(distance: Tensor) -> Tensor:
+    """Return t √(1 − t²) + asin t, where t is the distance of an edge from the center of a disc.
 
-    The distance between the center of the disc and the edge is in units of its radius, and positive
-    if the center is visible: 1/2 + (t √(1 − t²) + asin t) / π, the area of a circular segment.
+    A straight edge at a distance, in units of the radius, leaves the fraction 1/2 + segment / π of
+    a uniform disc visible. The distance is positive if the center is visible.
     """
     t = distance.clamp(-1 + 1e-6, 1 - 1e-6)
-    return torch.addcmul(torch.asin(t), t, (1 - t * t).sqrt()) / math.pi + 0.5
+    return torch.addcmul(torch.asin(t), t, torch.addcmul(t.new_ones(()), t, t, value=-1).sqrt())
 
 
 Along = Callable[[Tensor | float, Tensor | float], Tensor]
@@ -378,15 +355,24 @@ Along = Callable[[Tensor | float, Tensor | float], Tensor]
 class CastShadow(LightModel):
     """An object between the sun and the scene casts a shadow, whose penumbra has a uniform width.
 
-    A pixel of the penumbra sees a part of the disc of the sun (`visible_fraction`). Edges count as
+    A pixel of the penumbra sees a part of the disc of the sun (`circle_segment`). Edges count as
     straight. The shadow is lit by the sky, which is bluish. Kinds are "polygon", "leaves", "blinds"
     and "window".
     """
 
     kinds: tuple[str, ...] = ("polygon", "leaves", "blinds", "window")
-    corners: ClassVar[int] = 6
+    corners: ClassVar[int] = 5
     nodes: ClassVar[int] = 9
-    dimensions = 7
+    # Position, turn and scale of the shape, radius of the penumbra, and amount and blueness of the
+    # light of the sky.
+    ranges = (
+        *[Range(-0.8, 0.8)] * 2,
+        TURN,
+        Range(0.3, 1.2, True),
+        Range(0.005, 0.15, True),
+        Range(0.08, 0.5),
+        Range(0, 1),
+    )
     constants = 1 + 2 * nodes**2
 
     def __post_init__(self) -> None:
@@ -395,70 +381,79 @@ class CastShadow(LightModel):
         if not self.kinds:
             raise InputError("kinds is empty: name at least one kind of shadow")
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
+    def light(self, drawn: Drawn) -> Illumination:
         """Compute the light of the sun and of the sky."""
         kinds = (drawn.constants[:, 0] * len(self.kinds)).long().clamp(max=len(self.kinds) - 1)
-        light = drawn.constants.new_empty(len(kinds), 3, *height_and_width(drawn.size))
-        for kind in set(kinds.tolist()):
-            rows = torch.nonzero(kinds == kind)[:, 0]
-            numbers = [column[rows] for column in drawn.numbers]
-            part = drawn._replace(numbers=numbers, constants=drawn.constants[rows, 1:])
-            shadow = self._light(self.kinds[kind], part)
-            if len(rows) == len(kinds):
-                return shadow
-            light = light.index_copy(0, rows, shadow)
-        return light
+        if len(kinds) == 1:
+            part = drawn._replace(constants=drawn.constants[:, 1:])
+            return self._light(self.kinds[int(kinds)], part)
+        fields, gains, offsets = zip(
+            *(
+                self._light(
+                    self.kinds[int(kind)],
+                    drawn._replace(
+                        numbers=[column[row : row + 1] for column in drawn.numbers],
+                        constants=drawn.constants[row : row + 1, 1:],
+                    ),
+                )
+                for row, kind in enumerate(kinds.tolist())
+            ),
+            strict=True,
+        )
+        return Illumination(torch.cat(fields), torch.cat(gains), torch.cat(offsets))
 
-    def _light(self, kind: str, drawn: Drawn) -> Float[Tensor, "B 3 H W"]:
+    def _light(self, kind: str, drawn: Drawn) -> Illumination:
         """Compute the light of shadows of one kind."""
-        right, down, turn, scale, softness, ambient, blue = drawn.numbers
-        angle, scale = 2 * math.pi * turn, geometric(scale, 0.3, 1.2)
+        right, down, angle, scale, softness, ambient, blue = drawn.numbers
         if kind == "leaves":
             nodes = blend(drawn.constants, self.nodes, angle)
             # The heights are 0 at the edges between leaves and gaps.
-            height = smooth(nodes, drawn.size) - between(right, -0.6, 0.6)
+            height = smooth(nodes, drawn.size) - right
             slopes = [smooth(nodes, drawn.size, slope) for slope in "xy"]
             # Distance to the edge, to first order.
             squares = torch.addcmul(slopes[0] * slopes[0], slopes[1], slopes[1])
             distance = height * (squares + 1e-6).rsqrt()
         else:
             x, y = axes(drawn.size, right)
-            x, y = x - between(right, -0.8, 0.8), y - between(down, -0.8, 0.8)
-            cosine, sine = angle.cos() / scale, angle.sin() / scale
+            x, y = x - right, y - down
+            cosine, sine = angle.cos(), angle.sin()
 
             def along(first: Tensor | float, second: Tensor | float) -> Tensor:
                 """Return first · p + second · q of coordinates p and q that turn with the shape."""
                 return (first * cosine - second * sine) * x + (first * sine + second * cosine) * y
 
-            constants = drawn.constants.T[:, :, None, None, None]
-            distance = scale * getattr(self, f"_{kind}")(along, constants)
-        visible = visible_fraction(distance / geometric(softness, 0.005, 0.15))
+            distance = getattr(self, f"_{kind}")(along, scale, drawn.constants[..., None, None])
+        segment = circle_segment(distance * softness.reciprocal())
         # Light of the sky in the shadow, relative to that of sun and sky.
-        tint = torch.tensor([0.5, 0.2, 0.0]).to(blue).view(1, 3, 1, 1)
-        sky = between(ambient, 0.08, 0.5) * (1 - blue * tint)
-        return torch.addcmul(sky, 1 - sky, visible)
+        tint = torch.cat([0.5 * blue, 0.2 * blue, 0 * blue], 1)
+        sky = ambient - ambient * tint
+        return Illumination(segment, (1 - sky) / math.pi, (1 + sky) / 2)
 
-    def _polygon(self, along: Along, constants: Tensor) -> Tensor:
+    def _polygon(self, along: Along, scale: Tensor, constants: Tensor) -> Tensor:
         """Return the distance outside a convex polygon, which is exact except near corners."""
-        distance: Tensor | None = None
-        for corner in range(self.corners):
-            turn, far = constants[2 * corner], constants[2 * corner + 1]
-            angle = 2 * math.pi * (corner + 0.8 * turn) / self.corners
-            edge = along(angle.cos(), angle.sin()) - between(far, 0.4, 1.0)
-            distance = edge if distance is None else torch.maximum(distance, edge)
-        assert distance is not None
+        turns, far = constants[:, : self.corners], constants[:, self.corners : 2 * self.corners]
+        index = torch.arange(self.corners, device=far.device).view(1, -1, 1, 1)
+        angle = 2 * math.pi / self.corners * (index + 0.8 * turns)
+        cosine, sine, far = angle.cos(), angle.sin(), scale * between(far, 0.4, 1.0)
+        distance = along(cosine[:, :1], sine[:, :1]) - far[:, :1]
+        for corner in range(1, self.corners):
+            one = slice(corner, corner + 1)
+            edge = along(cosine[:, one], sine[:, one]) - far[:, one]
+            distance = torch.maximum(distance, edge)
         return distance
 
-    def _blinds(self, along: Along, constants: Tensor) -> Tensor:
+    def _blinds(self, along: Along, scale: Tensor, constants: Tensor) -> Tensor:
         """Return the distance inside the gaps between parallel slats, of which a period is 0.4."""
-        across = along(0.0, 2.5)
-        return (between(constants[0], 0.15, 0.35) - (across - across.floor() - 0.5).abs()) / 2.5
+        across = along(0.0, 2.5 / scale)
+        gap = between(constants[:, :1], 0.15, 0.35)
+        return (gap - (across - across.floor() - 0.5).abs()) * (scale / 2.5)
 
-    def _window(self, along: Along, constants: Tensor) -> Tensor:
+    def _window(self, along: Along, scale: Tensor, constants: Tensor) -> Tensor:
         """Return the distance inside the panes of a window with a cross bar."""
-        high, bar = between(constants[0], 0.6, 1.6), between(constants[1], 0.03, 0.12)
+        high = scale * between(constants[:, :1], 0.6, 1.6)
+        bar = scale * between(constants[:, 1:2], 0.03, 0.12)
         p, q = along(1.0, 0.0).abs(), along(0.0, 1.0).abs()
-        return torch.minimum(torch.minimum(1 - p, high - q), torch.minimum(p - bar, q - bar))
+        return torch.minimum(torch.minimum(scale - p, high - q), torch.minimum(p - bar, q - bar))
 
 
 def planckian_locus(kelvin: Tensor) -> tuple[Tensor, Tensor]:
@@ -497,15 +492,15 @@ class ColorTemperature(LightModel):
     0.02 (Duv) to green or magenta. That of daylight is 0.003.
     """
 
-    dimensions = 3
+    # Temperature in 1/K, how much of it the camera corrects, and the tint.
+    ranges = (Range(1 / 2000, 1 / 15000), Range(0, 1), Range(-0.02, 0.02))
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
+    def light(self, drawn: Drawn) -> Illumination:
         """Compute one color for all pixels. Temperatures are uniform in reciprocal units."""
-        coolness, balance, tint = drawn.numbers
-        lamp = between(coolness, 1 / 2000, 1 / 15000)
+        lamp, balance, tint = drawn.numbers
         assumed = 1 / 6504 + balance * (lamp - 1 / 6504)
-        color = planckian_rgb(1 / lamp, 0.02 * (2 * tint - 1)) / planckian_rgb(1 / assumed)
-        return color / luminance(color)
+        color = planckian_rgb(1 / lamp, tint) / planckian_rgb(1 / assumed)
+        return Illumination(torch.ones_like(lamp), color / luminance(color))
 
 
 @dataclass(frozen=True)
@@ -514,23 +509,26 @@ class LowLight(LightModel):
 
     Electrons are Poisson-distributed, the amplifier adds Gaussian noise of 1 to 5 electrons, and a
     converter of 12 bits rounds them (EMVA 1288; Hasinoff 2014). A white pixel has 15,000 electrons
-    at full light. The light is at least `exposure` of the original. Poisson numbers are
-    round(l + √l z + (z² − 1) / 6 · l / (l + 0.03)) of a normal number z. The total variation
-    between both distributions is below 0.04 for all means l, and 0.003 for l ≥ 10.
+    at full light. The light is at least `exposure` of the original.
+
+    The sum of Poisson and Gaussian numbers has the cumulants l, l + r² and l. It is drawn as
+    l + σ z + l / σ² · (z² − 1) / 6 with σ² = l + r² and a normal number z (Cornish & Fisher 1938).
+    Its distribution function is wrong by less than 0.01.
     """
 
     exposure: float = 0.005
     full_well: ClassVar[float] = 15000.0
     levels: ClassVar[int] = 2**12 - 1
-    dimensions = 3
+    # Fraction of the stops, read noise in electrons, and fraction that the gain recovers.
+    ranges = (Range(0, 1), Range(1, 5), Range(0, 1))
     has_noise = True
 
     def __post_init__(self) -> None:
         errors.require_number("exposure", self.exposure, 1e-6, 1)
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
+    def light(self, drawn: Drawn) -> Illumination:
         """Return 1, because the camera receives less light (see `camera`)."""
-        return torch.ones_like(drawn.numbers[0])
+        return Illumination(torch.ones_like(drawn.numbers[0]))
 
     def camera(
         self, radiance: Float[Tensor, "B C H W"], drawn: Drawn, strength: float, white: Tensor
@@ -539,25 +537,21 @@ class LowLight(LightModel):
         darkness, read, recovered = drawn.numbers
         stops = strength * math.log2(1 / self.exposure) * darkness
         mean = radiance.clamp(min=0) * (self.full_well * torch.exp2(-stops) / white)
-        photons, amplifier = normal_noise(radiance, drawn.seeds)
-        # The limit avoids an infinite gradient at 0.
-        spread = mean.clamp(min=1e-6).sqrt() * photons
-        skew = (photons * photons - 1) * (mean / (6 * mean + 0.18))
-        counted = _rounded(mean + spread + skew).clamp(min=0)
+        variance = mean + read**2
+        z = normal_noise(radiance, drawn.seeds)
+        skew = mean / (6 * variance) * (z * z - 1)
         # The gain of the amplifier, after which a full pixel has the value 1.
         gain = torch.exp2(stops * recovered) / self.full_well
-        signal = gain * (counted + between(read, 1.0, 5.0) * amplifier)
-        return _rounded(signal.clamp(0, 1) * self.levels) * (white / self.levels)
+        signal = (gain * (mean + variance.sqrt() * z + skew)).clamp(0, 1)
+        return _rounded(signal * self.levels) * (white / self.levels)
 
 
-def normal_noise(
-    like: Float[Tensor, "B C H W"], seeds: Sequence[int]
-) -> Float[Tensor, "2 B C H W"]:
-    """Draw two normal numbers for each pixel of each image, from the seed of the image."""
-    noise = like.new_empty(len(like), 2, *like.shape[1:])
+def normal_noise(like: Float[Tensor, "B C H W"], seeds: Sequence[int]) -> Tensor:
+    """Draw a normal number for each value of each image, from the seed of the image."""
+    noise = torch.empty_like(like)
     for image, seed in zip(noise, seeds, strict=True):
         image.normal_(generator=torch.Generator(like.device).manual_seed(seed))
-    return noise.unbind(1)
+    return noise
 
 
 def _rounded(values: Tensor) -> Tensor:
@@ -571,12 +565,12 @@ def _rounded(values: Tensor) -> Tensor:
 class ClippedHighlights(LightModel):
     """The exposure is too long by 0.5 to 3 stops, and full pixels of the sensor are white."""
 
-    dimensions = 1
+    ranges = (Range(0.5, 3.0),)
     has_limit = True
 
-    def light(self, drawn: Drawn) -> Float[Tensor, "B C H W"]:
+    def light(self, drawn: Drawn) -> Illumination:
         """Return the exposure."""
-        return torch.exp2(between(drawn.numbers[0], 0.5, 3.0))
+        return Illumination(torch.exp2(drawn.numbers[0]))
 
 
 # Each model of light, by the name that selects it.

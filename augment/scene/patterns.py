@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Generator, Tensor
 
+from augment.scene.surfaces import draw_shading, interpolate_smoothly
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import LUMINANCE, clamp, decode, encode, to_unit
@@ -264,16 +265,6 @@ def draw_fields(count: int, size: Size, draws: Generator) -> Float[Tensor, "coun
     return torch.cat(fields)
 
 
-def interpolate_smoothly(
-    values: Float[Tensor, "N C n n"], size: Size
-) -> Float[Tensor, "N C height width"]:
-    """Interpolate the values of a coarse grid to the pixels of an image, by bicubic splines.
-
-    Interpolated values may be outside of the range of the given values.
-    """
-    return F.interpolate(values, height_and_width(size), mode="bicubic", align_corners=True)
-
-
 def draw_projected(
     photographs: UInt8[Tensor, "N 3 H W"], count: int, size: Size, draws: Generator
 ) -> Float[Tensor, "count 3 height width"]:
@@ -288,13 +279,6 @@ def draw_projected(
     return draw_photograph_patterns(linear, pixel_centers(size), draws)
 
 
-# A random smooth surface interpolates random heights at a grid of this number of points per side.
-SURFACE_NODES = 4
-# Largest standard deviation of the random heights of a surface, in units of half the width of the
-# image.
-MAX_STEEPNESS = 0.3
-# Largest angle in degrees between the light of the projector and the normal of a flat print.
-MAX_POLAR = 60.0
 # Smallest and largest ambient light, in units of the light of a white slide.
 AMBIENT = (0.01, 0.1)
 # Smallest and largest random change of the exposure, in stops.
@@ -363,37 +347,6 @@ class ProjectedLight(NamedTuple):
         mean_after = luminance(radiance).mean((2, 3), keepdim=True)
         exposure = 2**self.stops * mean_before / mean_after.clamp(min=DARKEST)
         return encode(clamp(exposure * radiance), "srgb")
-
-
-def draw_shading(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 1 height width"]:
-    """Draw the shading of random smooth surfaces in light from random directions.
-
-    It is the cosine between normal and light, or 0 if the surface faces away.
-    """
-    # Steepness, azimuth and polar angle of the light, as fractions of their ranges.
-    steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
-    node_heights = torch.randn(count, 1, SURFACE_NODES, SURFACE_NODES, generator=draws)
-    # Height of each pixel, shape (count, 1, height, width).
-    height = MAX_STEEPNESS * steepness[:, None] * interpolate_smoothly(node_heights, size)
-    # Slope of the surface. The image is 2 units wide, so a pixel has the width 2 / width.
-    spacing = 2 / height.shape[-1]
-    slope_down, slope_right = torch.gradient(height[:, 0], spacing=spacing, dim=(1, 2))
-    polar = math.radians(MAX_POLAR) * tilt
-    azimuth = 2 * math.pi * turn
-    # Components of the unit vector towards the light. The one along the view is polar.cos().
-    to_right = polar.sin() * azimuth.cos()
-    to_bottom = polar.sin() * azimuth.sin()
-    return lambert(slope_down, slope_right, to_right, to_bottom, polar.cos())[:, None]
-
-
-def lambert(down: Tensor, right: Tensor, to_right: Tensor, to_bottom: Tensor, up: Tensor) -> Tensor:
-    """Return the cosine between a light and the normal of slopes, or 0 if the surface faces away.
-
-    The vector towards the light has the components to the right, to the bottom and up.
-    """
-    length = (1 + right**2 + down**2).sqrt()
-    # Product of the light's vector with the normal (-right, -down, 1) / length.
-    return ((up - to_right * right - to_bottom * down) / length).clamp(min=0)
 
 
 def draw_projected_light(

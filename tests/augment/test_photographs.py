@@ -17,7 +17,8 @@ from augment.attacks.objective import Objective
 from augment.lighting import relight_photographs
 from augment.photographs import ADVERSARIAL, LIGHTS, RANDOM, RelitPhotographs, attack_photographs
 from augment.random_streams import generator
-from augment.scene.patterns import ProjectedLight, draw_cells, draw_projected_light, draw_shading
+from augment.scene.patterns import ProjectedLight, draw_cells, draw_projected_light
+from augment.scene.surfaces import draw_shading
 from augment.tasks.classification import ClassCriterion
 from renderer.errors import InputError
 from renderer.image import LUMINANCE, decode, encode, to_unit

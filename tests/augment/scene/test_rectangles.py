@@ -11,7 +11,7 @@ from augment.attacks.files import save
 from augment.augmentation_settings import CameraEffectSettings, VariationSettings
 from augment.random_streams import generator
 from augment.scene import patterns
-from augment.scene.patterns import draw_shading
+from augment.scene.surfaces import draw_shading
 from augment.scene.vary import _blur, vary
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.light.environment import write_map

@@ -1,0 +1,147 @@
+"""Surfaces: smooth random heights or depths, and their shading.
+
+The image is 2 units wide: x points to the right, y down, and heights towards the camera.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from renderer.settings import Size, height_and_width
+
+# A random smooth surface interpolates random heights at a grid of this number of points per side.
+SURFACE_NODES = 4
+# Largest standard deviation of the random heights of a surface, in units of half the width of the
+# image.
+MAX_STEEPNESS = 0.3
+# Largest angle in degrees between the light of the projector and the normal of a flat print.
+MAX_POLAR = 60.0
+# Horizontal field of view in degrees of the camera that a depth map is from.
+FIELD_OF_VIEW = 60.0
+
+
+def interpolate_smoothly(
+    values: Float[Tensor, "N C n n"], size: Size
+) -> Float[Tensor, "N C height width"]:
+    """Interpolate the values of a coarse grid to the pixels of an image, by bicubic splines.
+
+    Interpolated values may be outside of the range of the given values.
+    """
+    return F.interpolate(values, height_and_width(size), mode="bicubic", align_corners=True)
+
+
+@lru_cache(maxsize=64)
+def _axes(
+    height: int, width: int, device: torch.device, dtype: torch.dtype
+) -> tuple[Float[Tensor, "1 1 1 W"], Float[Tensor, "1 1 H 1"]]:
+    """Return x of the columns and y of the rows of an image."""
+    x, y = (
+        (torch.arange(count, device=device, dtype=dtype) * 2 + (1 - count)) / width
+        for count in (width, height)
+    )
+    return x.view(1, 1, 1, -1), y.view(1, 1, -1, 1)
+
+
+def axes(size: Size, like: Tensor) -> tuple[Float[Tensor, "1 1 1 W"], Float[Tensor, "1 1 H 1"]]:
+    """Return x of the columns and y of the rows of an image, on a device."""
+    return _axes(*height_and_width(size), like.device, like.dtype)
+
+
+@lru_cache(maxsize=64)
+def spline(nodes: int, pixels: int, spacing: float = 0.0) -> Float[Tensor, "pixels nodes"]:
+    """Return the matrix that interpolates nodes to pixels, or to slopes at a spacing of pixels."""
+    identity = torch.eye(nodes).view(1, nodes, nodes, 1)
+    values = F.interpolate(identity, (pixels, 1), mode="bicubic", align_corners=True)[0, :, :, 0].T
+    if not spacing:
+        return values.contiguous()
+    if pixels == 1:
+        return torch.zeros(1, nodes)
+    return torch.gradient(values, spacing=spacing, dim=0)[0].contiguous()
+
+
+def smooth(
+    nodes: Float[Tensor, "B 1 n n"], size: Size, slope: str = ""
+) -> Float[Tensor, "B 1 H W"]:
+    """Interpolate nodes at the pixels of an image by bicubic splines, or return a slope of them.
+
+    The slope is along "x" or "y". Two products of matrices are faster than `F.interpolate`.
+    """
+    height, width = height_and_width(size)
+    count = nodes.shape[-1]
+    to_rows = spline(count, height, 2 / width if slope == "y" else 0.0).to(nodes)
+    to_columns = spline(count, width, 2 / width if slope == "x" else 0.0).to(nodes)
+    return to_rows @ nodes @ to_columns.T
+
+
+class Surface(NamedTuple):
+    """Slopes of the heights of a surface, and the position (x, y, height) of each pixel."""
+
+    slope_down: Tensor
+    slope_right: Tensor
+    position: tuple[Tensor, Tensor, Tensor]
+
+
+def surface_of_depth(depth: Float[Tensor, "B 1 H W"]) -> Surface:
+    """Compute the surface that a pinhole camera sees at given depths, in any unit.
+
+    It is enlarged such that the mean depth has half the width 1. Pixels without a depth, which is
+    not positive or not finite, get the mean.
+    """
+    is_known = depth.isfinite() & (depth > 0)
+    known = torch.where(is_known, depth, 0)
+    mean = known.mean((2, 3), keepdim=True) / is_known.float().mean((2, 3), keepdim=True)
+    mean = mean.nan_to_num(1.0)
+    relative = torch.where(is_known, known / mean, 1)
+    tangent = math.tan(math.radians(FIELD_OF_VIEW / 2))
+    x, y = axes(depth.shape[-2:], depth)
+    # Slopes of the logarithm of the depth along the pixels, where half the width is the tangent.
+    spacing = 2 * tangent / depth.shape[-1]
+    down, right = (
+        torch.gradient(relative.log(), spacing=spacing, dim=axis)[0]
+        if depth.shape[axis] > 1
+        else torch.zeros_like(depth)
+        for axis in (2, 3)
+    )
+    # Product of both tangents of the surface z · (x, y, 1), up to a factor.
+    towards = 1 + tangent * (x * right + y * down)
+    towards = towards.clamp(min=0.05)
+    height = (1 - relative) / tangent
+    return Surface(-down / towards, -right / towards, (x * relative, y * relative, height))
+
+
+def draw_shading(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 1 height width"]:
+    """Draw the shading of random smooth surfaces in light from random directions.
+
+    It is the cosine between normal and light, or 0 if the surface faces away.
+    """
+    # Steepness, azimuth and polar angle of the light, as fractions of their ranges.
+    steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
+    node_heights = torch.randn(count, 1, SURFACE_NODES, SURFACE_NODES, generator=draws)
+    # Height of each pixel, shape (count, 1, height, width).
+    height = MAX_STEEPNESS * steepness[:, None] * interpolate_smoothly(node_heights, size)
+    # Slope of the surface. The image is 2 units wide, so a pixel has the width 2 / width.
+    spacing = 2 / height.shape[-1]
+    slope_down, slope_right = torch.gradient(height[:, 0], spacing=spacing, dim=(1, 2))
+    polar = math.radians(MAX_POLAR) * tilt
+    azimuth = 2 * math.pi * turn
+    # Components of the unit vector towards the light. The one along the view is polar.cos().
+    to_right = polar.sin() * azimuth.cos()
+    to_bottom = polar.sin() * azimuth.sin()
+    return lambert(slope_down, slope_right, to_right, to_bottom, polar.cos())[:, None]
+
+
+def lambert(down: Tensor, right: Tensor, to_right: Tensor, to_bottom: Tensor, up: Tensor) -> Tensor:
+    """Return the cosine between a light and the normal of slopes, or 0 if the surface faces away.
+
+    The vector towards the light has the components to the right, to the bottom and up.
+    """
+    length = (1 + right**2 + down**2).sqrt()
+    # Product of the light's vector with the normal (-right, -down, 1) / length.
+    return ((up - to_right * right - to_bottom * down) / length).clamp(min=0)
