@@ -338,18 +338,16 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
     groups: dict[Any, list[int]] = {}
     for row, light in enumerate(lights):
         groups.setdefault((id(light and light.model), light and light.strength), []).append(row)
-    relit: list[Tensor] = list(frames)
+    parts = []
     for rows in groups.values():
         chosen = [light for light in (lights[row] for row in rows) if light is not None]
-        if not chosen:
-            continue
-        part = frames if len(rows) == len(frames) else torch.stack([frames[row] for row in rows])
-        result = _relight(part, chosen, None if depths is None else depths[rows])
-        if len(rows) == len(frames):
-            return result.reshape(plain.shape)
-        for row, values in zip(rows, result, strict=True):
-            relit[row] = values
-    return torch.stack(relit).reshape(plain.shape)
+        part = frames if len(rows) == len(frames) else frames[rows]
+        depth_of_rows = None if depths is None else depths[rows]
+        parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
+    if len(parts) == 1:
+        return parts[0].reshape(plain.shape)
+    order = torch.tensor([row for rows in groups.values() for row in rows]).argsort()
+    return torch.cat(parts)[order.to(plain.device)].reshape(plain.shape)
 
 
 def _as_depth(depth: Any, frames: Tensor, count: int) -> Float[Tensor, "N 1 H W"]:

@@ -211,9 +211,10 @@ class ProjectedSlide(LightModel):
         draws = [torch.Generator().manual_seed(seed) for seed in drawn.seeds]
         pictures = torch.cat([draw_slides(1, drawn.size, draw, self.slides) for draw in draws])
         log_gain = torch.cat(list(drawn.numbers[4:-1]), 1).view(-1, 3, self.cells, self.cells)
+        gain = smooth(log_gain, drawn.size, mode="bilinear").exp()
         ambient = drawn.numbers[3]
-        projected = ProjectedLight(pictures.to(ambient), shading(drawn), ambient, ambient)
-        return Illumination(projected.light(log_gain))
+        shaded = ProjectedLight(pictures.to(gain) * gain, shading(drawn), ambient, ambient)
+        return Illumination(shaded.light())
 
 
 def shading(drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
@@ -348,7 +349,7 @@ def circle_segment(distance: Tensor) -> Tensor:
     return torch.addcmul(torch.asin(t), t, torch.addcmul(t.new_ones(()), t, t, value=-1).sqrt())
 
 
-Along = Callable[[Tensor | float, Tensor | float], Tensor]
+Along = Callable[[Tensor | float, Tensor | float, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -361,7 +362,7 @@ class CastShadow(LightModel):
     """
 
     kinds: tuple[str, ...] = ("polygon", "leaves", "blinds", "window")
-    corners: ClassVar[int] = 5
+    corners: ClassVar[int] = 4
     nodes: ClassVar[int] = 9
     # Position, turn and scale of the shape, radius of the penumbra, and amount and blueness of the
     # light of the sky.
@@ -387,20 +388,14 @@ class CastShadow(LightModel):
         if len(kinds) == 1:
             part = drawn._replace(constants=drawn.constants[:, 1:])
             return self._light(self.kinds[int(kinds)], part)
-        fields, gains, offsets = zip(
-            *(
-                self._light(
-                    self.kinds[int(kind)],
-                    drawn._replace(
-                        numbers=[column[row : row + 1] for column in drawn.numbers],
-                        constants=drawn.constants[row : row + 1, 1:],
-                    ),
-                )
-                for row, kind in enumerate(kinds.tolist())
-            ),
-            strict=True,
-        )
-        return Illumination(torch.cat(fields), torch.cat(gains), torch.cat(offsets))
+        of_kind = [torch.nonzero(kinds == kind)[:, 0] for kind in range(len(self.kinds))]
+        parts = []
+        for kind, rows in zip(self.kinds, of_kind, strict=True):
+            numbers = [column[rows] for column in drawn.numbers]
+            part = drawn._replace(numbers=numbers, constants=drawn.constants[rows, 1:])
+            parts.append(self._light(kind, part))
+        order = torch.cat(of_kind).argsort()
+        return Illumination(*(torch.cat(part)[order] for part in zip(*parts, strict=True)))
 
     def _light(self, kind: str, drawn: Drawn) -> Illumination:
         """Compute the light of shadows of one kind."""
@@ -412,18 +407,21 @@ class CastShadow(LightModel):
             slopes = [smooth(nodes, drawn.size, slope) for slope in "xy"]
             # Distance to the edge, to first order.
             squares = torch.addcmul(slopes[0] * slopes[0], slopes[1], slopes[1])
-            distance = height * (squares + 1e-6).rsqrt()
+            distance = height * (squares + 1e-6).rsqrt() / softness
         else:
             x, y = axes(drawn.size, right)
             x, y = x - right, y - down
-            cosine, sine = angle.cos(), angle.sin()
+            # Distances are in units of the penumbra's radius.
+            cosine, sine, scale = angle.cos() / softness, angle.sin() / softness, scale / softness
 
-            def along(first: Tensor | float, second: Tensor | float) -> Tensor:
-                """Return first · p + second · q of coordinates p and q that turn with the shape."""
-                return (first * cosine - second * sine) * x + (first * sine + second * cosine) * y
+            def along(first: Tensor | float, second: Tensor | float, back: Tensor) -> Tensor:
+                """Return first · p + second · q − back, where p and q turn with the shape."""
+                right, down = first * cosine - second * sine, first * sine + second * cosine
+                return right * x + (down * y - back)
 
-            distance = getattr(self, f"_{kind}")(along, scale, drawn.constants[..., None, None])
-        segment = circle_segment(distance * softness.reciprocal())
+            constants = drawn.constants[..., None, None]
+            distance = getattr(self, f"_{kind}")(along, scale, constants)
+        segment = circle_segment(distance)
         # Light of the sky in the shadow, relative to that of sun and sky.
         tint = torch.cat([0.5 * blue, 0.2 * blue, 0 * blue], 1)
         sky = ambient - ambient * tint
@@ -435,16 +433,16 @@ class CastShadow(LightModel):
         index = torch.arange(self.corners, device=far.device).view(1, -1, 1, 1)
         angle = 2 * math.pi / self.corners * (index + 0.8 * turns)
         cosine, sine, far = angle.cos(), angle.sin(), scale * between(far, 0.4, 1.0)
-        distance = along(cosine[:, :1], sine[:, :1]) - far[:, :1]
+        distance = along(cosine[:, :1], sine[:, :1], far[:, :1])
         for corner in range(1, self.corners):
             one = slice(corner, corner + 1)
-            edge = along(cosine[:, one], sine[:, one]) - far[:, one]
+            edge = along(cosine[:, one], sine[:, one], far[:, one])
             distance = torch.maximum(distance, edge)
         return distance
 
     def _blinds(self, along: Along, scale: Tensor, constants: Tensor) -> Tensor:
         """Return the distance inside the gaps between parallel slats, of which a period is 0.4."""
-        across = along(0.0, 2.5 / scale)
+        across = along(0.0, 2.5 / scale, 0 * scale)
         gap = between(constants[:, :1], 0.15, 0.35)
         return (gap - (across - across.floor() - 0.5).abs()) * (scale / 2.5)
 
@@ -452,7 +450,7 @@ class CastShadow(LightModel):
         """Return the distance inside the panes of a window with a cross bar."""
         high = scale * between(constants[:, :1], 0.6, 1.6)
         bar = scale * between(constants[:, 1:2], 0.03, 0.12)
-        p, q = along(1.0, 0.0).abs(), along(0.0, 1.0).abs()
+        p, q = along(1.0, 0.0, 0 * scale).abs(), along(0.0, 1.0, 0 * scale).abs()
         return torch.minimum(torch.minimum(scale - p, high - q), torch.minimum(p - bar, q - bar))
 
 
@@ -538,12 +536,13 @@ class LowLight(LightModel):
         stops = strength * math.log2(1 / self.exposure) * darkness
         mean = radiance.clamp(min=0) * (self.full_well * torch.exp2(-stops) / white)
         variance = mean + read**2
-        z = normal_noise(radiance, drawn.seeds)
-        skew = mean / (6 * variance) * (z * z - 1)
-        # The gain of the amplifier, after which a full pixel has the value 1.
-        gain = torch.exp2(stops * recovered) / self.full_well
-        signal = (gain * (mean + variance.sqrt() * z + skew)).clamp(0, 1)
-        return _rounded(signal * self.levels) * (white / self.levels)
+        z, ratio = normal_noise(radiance, drawn.seeds), mean / variance
+        slope = torch.addcmul(variance.sqrt(), z, ratio, value=1 / 6)
+        electrons = torch.addcmul(mean, z, slope).sub(ratio, alpha=1 / 6)
+        # The gain of the amplifier, after which a full pixel has the largest number.
+        gain = torch.exp2(stops * recovered) * (self.levels / self.full_well)
+        signal = (electrons * gain).clamp(0, self.levels)
+        return _rounded(signal) * (white / self.levels)
 
 
 def normal_noise(like: Float[Tensor, "B C H W"], seeds: Sequence[int]) -> Tensor:

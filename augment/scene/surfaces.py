@@ -55,28 +55,35 @@ def axes(size: Size, like: Tensor) -> tuple[Float[Tensor, "1 1 1 W"], Float[Tens
 
 
 @lru_cache(maxsize=64)
-def spline(nodes: int, pixels: int, spacing: float = 0.0) -> Float[Tensor, "pixels nodes"]:
+def spline(
+    nodes: int, pixels: int, spacing: float, mode: str, device: torch.device, dtype: torch.dtype
+) -> Float[Tensor, "pixels nodes"]:
     """Return the matrix that interpolates nodes to pixels, or to slopes at a spacing of pixels."""
     identity = torch.eye(nodes).view(1, nodes, nodes, 1)
-    values = F.interpolate(identity, (pixels, 1), mode="bicubic", align_corners=True)[0, :, :, 0].T
-    if not spacing:
-        return values.contiguous()
-    if pixels == 1:
-        return torch.zeros(1, nodes)
-    return torch.gradient(values, spacing=spacing, dim=0)[0].contiguous()
+    # A spline has its outer nodes at the border, and linear interpolation at centers of cells.
+    values = F.interpolate(
+        identity, (pixels, 1), mode=mode, align_corners=True if mode == "bicubic" else None
+    )
+    matrix = values[0, :, :, 0].T
+    if spacing and pixels == 1:
+        matrix = torch.zeros_like(matrix)
+    elif spacing:
+        (matrix,) = torch.gradient(matrix, spacing=spacing, dim=0)
+    return matrix.to(device, dtype).contiguous()
 
 
 def smooth(
-    nodes: Float[Tensor, "B 1 n n"], size: Size, slope: str = ""
-) -> Float[Tensor, "B 1 H W"]:
+    nodes: Float[Tensor, "B C n n"], size: Size, slope: str = "", mode: str = "bicubic"
+) -> Float[Tensor, "B C H W"]:
     """Interpolate nodes at the pixels of an image by bicubic splines, or return a slope of them.
 
     The slope is along "x" or "y". Two products of matrices are faster than `F.interpolate`.
     """
     height, width = height_and_width(size)
     count = nodes.shape[-1]
-    to_rows = spline(count, height, 2 / width if slope == "y" else 0.0).to(nodes)
-    to_columns = spline(count, width, 2 / width if slope == "x" else 0.0).to(nodes)
+    kind = mode, nodes.device, nodes.dtype
+    to_rows = spline(count, height, 2 / width if slope == "y" else 0.0, *kind)
+    to_columns = spline(count, width, 2 / width if slope == "x" else 0.0, *kind)
     return to_rows @ nodes @ to_columns.T
 
 

@@ -122,6 +122,17 @@ def test_a_drawn_light_is_replayed_and_a_batch_equals_its_images(name):
         assert (single.int() - relit.int()).abs().max() <= 1
 
 
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_images_of_a_batch_without_light_stay_for_every_dtype(dtype):
+    images = picture(6, 4, 3, 3).clamp(max=1).to(dtype)
+    transform = nb.RandomLighting(["linear", "highlights"])
+    params = transform.make_params([images])
+    params["lights"][2] = params["lights"][5] = None
+    relit = transform.apply(images, params)
+    assert relit.dtype == dtype
+    assert torch.equal(relit[2], images[2]) and torch.equal(relit[5], images[5])
+
+
 @pytest.mark.parametrize("settings", [{"p": 0.0}, {"strength": 0.0}])
 def test_without_light_an_image_stays(settings):
     image = torch.rand(3, 4, 4)
@@ -317,6 +328,19 @@ def test_the_light_is_differentiable_in_its_numbers(name):
     relit = model.camera(0.1 * model.illumination(drawn).total(), drawn, 1.0, torch.tensor(1.0))
     (gradient,) = torch.autograd.grad(relit.sum(), values)
     assert gradient.isfinite().all() and gradient[:, : model.dimensions].abs().sum() > 0
+
+
+@pytest.mark.ecosystem
+def test_albumentations_relights_arrays_and_pickles():
+    albumentations = pytest.importorskip("albumentations")
+    transform = nb.RandomLighting(["linear"]).albumentations()
+    transform = pickle.loads(pickle.dumps(transform))
+    array = picture(6, 8, 3).numpy()
+    relit = [albumentations.Compose([transform], seed=3)(image=array)["image"] for _ in range(2)]
+    assert relit[0].dtype == np.uint8 and relit[0].shape == array.shape
+    assert np.array_equal(*relit) and not np.array_equal(relit[0], array)
+    unit = albumentations.Compose([transform], seed=3)(image=(array / 255).astype(np.float32))
+    assert np.abs(unit["image"] * 255 - relit[0]).max() < 0.51
 
 
 def test_a_compiled_model_may_hold_the_transform():

@@ -23,7 +23,7 @@ from augment.random_streams import generator, stream_seed
 from augment.scene.patterns import draw_projected_light
 from augment.tasks.classification import ClassCriterion, label_loss
 from renderer.errors import MAX_SCALE
-from renderer.image import clamp, decode, encode, to_bytes, to_unit
+from renderer.image import decode, to_bytes, to_unit
 from renderer.vectors import Ball, nearest_in_box
 from train.train_settings import TrainSettings
 
@@ -31,11 +31,6 @@ from train.train_settings import TrainSettings
 # 8/255 on CIFAR-10.
 PGD = StepSettings(norm="linf", radius=2 / 255, step="sign", step_size=1 / 255)
 PGD_STEPS = 3
-# Low light has up to so many stops less: its sRGB values then fall from 200 to about 15.
-LOW_STOPS = 7.0
-# Largest variance of the noise of photons, in units of the linear light, and largest standard
-# deviation of the noise of the electronics.
-SHOT_NOISE, READ_NOISE = 2e-4, 2e-3
 
 
 @dataclass
@@ -189,9 +184,8 @@ class RelitBatches:
 class LowLight:
     """Augmentation that shows the images of a batch in low light, with the noise of a camera.
 
-    The linear light is divided by up to LOW_STOPS powers of two. Photons and electronics add noise
-    with the variance shot · light + read². With `others`, every second image is instead augmented
-    by them.
+    The light is that of `nb.lights.LowLight`. With `others`, every second image is instead
+    augmented by them.
     """
 
     seed: int
@@ -201,12 +195,11 @@ class LowLight:
         self, images: UInt8[Tensor, "B 3 H W"], labels: Tensor, step: int
     ) -> UInt8[Tensor, "B 3 H W"]:
         """Show each image of a batch in a low light of its own."""
-        draws = generator(self.seed, step, "low light", distributed.rank())
-        stops, shot, read = torch.rand(3, len(images), 1, 1, 1, generator=draws).to(images.device)
-        light = decode(to_unit(images), "srgb") * 0.5 ** (LOW_STOPS * stops)
-        deviation = (SHOT_NOISE * shot * light + (READ_NOISE * read) ** 2).sqrt()
-        noise = torch.randn(images.shape, generator=draws).to(images.device)
-        dark = to_bytes(encode(clamp(light + deviation * noise), "srgb"))
+        # This import takes a second, and most runs need no light.
+        from augment.lighting import relight_photographs
+
+        seed = stream_seed(self.seed, step, "low light", distributed.rank())
+        dark = relight_photographs(images, seed, lights=["low_light"])
         if self.others is not None:
             dark[::2] = self.others.apply(images, labels, step)[::2]
         return dark
