@@ -12,7 +12,7 @@ from bisect import bisect
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -46,7 +46,7 @@ class Light(NamedTuple):
     strength: float
 
 
-class RandomLighting(v2.Transform):
+class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
     """Show images in random light.
 
     A transform of torchvision (v2). It takes an image or a sample with images,
@@ -100,7 +100,7 @@ class RandomLighting(v2.Transform):
 
     def __init__(
         self,
-        lights: Sequence[str | LightModel] | Mapping[str | LightModel, float] | str | None = None,
+        lights: Sequence[str | LightModel] | Mapping[Any, float] | str | None = None,
         p: float = 1.0,
         strength: float = 1.0,
     ):
@@ -172,7 +172,7 @@ class RandomLighting(v2.Transform):
         """Show an image of a sample in the drawn light (called by torchvision)."""
         return self.apply(inpt, params, params.get("depth"))
 
-    @torch.compiler.disable
+    @torch.compiler.disable  # type: ignore[untyped-decorator, unused-ignore]
     def forward(self, *inputs: Any) -> Any:
         """Change the images of a sample.
 
@@ -381,12 +381,11 @@ def _relight(
     light = model.illumination(drawn, strength)
     if colored == 1:
         # The light of a gray image is the luminance.
-        light = Illumination(
-            *(
-                luminance(part) if isinstance(part, Tensor) and part.shape[1] == 3 else part
-                for part in light
-            )
+        field, gain, offset = (
+            luminance(part) if isinstance(part, Tensor) and part.shape[1] == 3 else part
+            for part in light
         )
+        light = Illumination(cast(Tensor, field), gain, offset)
     is_integer = not images.is_floating_point()
     largest = torch.iinfo(images.dtype).max if is_integer else 1
     if images.dtype == torch.uint8 and not values.requires_grad:

@@ -248,7 +248,7 @@ def lamp_light(
     x, y, height = surface.position
     # No surface is nearer to the lamp than a tenth of its distance.
     offsets = right - x, down - y, (above - height).clamp(min=0.1 * above)
-    squares = sum(offset**2 for offset in offsets)
+    squares = offsets[0] ** 2 + offsets[1] ** 2 + offsets[2] ** 2
     cosine = lambert(surface.slope_down, surface.slope_right, *offsets)
     return cosine * (above**2 / (squares * squares.sqrt()))
 
