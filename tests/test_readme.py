@@ -56,7 +56,14 @@ def test_every_block_of_python_is_run_here():
         "Many lights and views",
         "Load",
         "Photographs",
+        "Random light on your own images",
     }
+
+
+def test_random_light_block_relights_a_batch_and_a_clip():
+    names = run("Random light on your own images")
+    assert names["images"].dtype == torch.uint8 and names["images"].shape == (8, 3, 64, 96)
+    assert len(names["frames"]) == 8
 
 
 def test_render_block_has_a_gradient_by_light():

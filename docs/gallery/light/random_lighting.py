@@ -30,6 +30,7 @@ plt.figure(figsize=(8, 4.2))
 plt.imshow(torch.cat([left, right], 2).permute(1, 2, 0))
 plt.xticks([192, 576], ["\n".join(names[:half]), "\n".join(names[half:])])
 plt.yticks([])
+plt.tight_layout()
 plt.show()
 
 # %%
