@@ -352,7 +352,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
 
 def _as_depth(depth: Any, frames: Tensor, count: int) -> Float[Tensor, "N 1 H W"]:
     """Convert depths to one for each frame."""
-    values = depth if isinstance(depth, Tensor) else torch.from_numpy(np.array(depth))
+    values = errors.as_tensor("depth", np.array(depth) if isinstance(depth, Image.Image) else depth)
     values = values.as_subclass(Tensor).to(frames.device, torch.float32)
     size = frames.shape[-2:]
     if values.ndim < 2 or values.shape[-2:] != size:

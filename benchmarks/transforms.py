@@ -45,7 +45,7 @@ def transforms(size: int) -> dict[str, Callable[[], object]]:
     unit = image[None].float() / 255
     calls: dict[str, Callable[[], object]] = {}
     for name in MODELS:
-        calls[name] = partial(RandomLighting(name), image)
+        calls[name] = partial(RandomLighting(name).__call__, image)
     if find_spec("albumentations"):
         os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"
         import albumentations

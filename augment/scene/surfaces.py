@@ -38,6 +38,7 @@ def interpolate_smoothly(
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)
 def _axes(
     height: int, width: int, device: torch.device, dtype: torch.dtype
 ) -> tuple[Float[Tensor, "1 1 1 W"], Float[Tensor, "1 1 H 1"]]:
@@ -55,6 +56,7 @@ def axes(size: Size, like: Tensor) -> tuple[Float[Tensor, "1 1 1 W"], Float[Tens
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)  # Autograd cannot save a tensor that inference mode made.
 def spline(
     nodes: int, pixels: int, spacing: float, mode: str, device: torch.device, dtype: torch.dtype
 ) -> Float[Tensor, "pixels nodes"]:

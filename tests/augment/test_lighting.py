@@ -203,6 +203,7 @@ def test_torch_draws_the_light():
         lambda: nb.RandomLighting()(np.zeros((4, 4, 3))),
         lambda: nb.RandomLighting()(torch.full((3, 2, 2), torch.nan)),
         lambda: nb.RandomLighting()({"image": picture(3, 4, 4), "depth": torch.ones(5, 4)}),
+        lambda: nb.RandomLighting()({"image": picture(3, 4, 4), "depth": "far"}),
         lambda: nb.lights.CastShadow(("sun",)),
         lambda: nb.lights.LowLight(exposure=0),
     ],
@@ -318,6 +319,16 @@ def test_the_noise_of_low_light_is_that_of_poisson_and_gaussian_numbers():
             parts = stats.norm.cdf(drawn[:, None], counts, read) * stats.poisson.pmf(counts, mean)
             error = np.abs(parts.sum(1) - (np.arange(20000) + 0.5) / 20000).max()
             assert error < 0.01, (mean, read)
+
+
+@pytest.mark.parametrize("name", ["directional", "cast_shadow"])
+def test_the_light_is_differentiable_after_inference(name):
+    model = MODELS[name]()
+    with torch.inference_mode():
+        model.illumination(model.draw(draw_values(model), (5, 11)))
+    values = draw_values(model).requires_grad_()
+    model.illumination(model.draw(values, (5, 11))).total().sum().backward()
+    assert values.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("name", MODELS)
