@@ -55,11 +55,15 @@ class FastestDet(nn.Module):
         super().__init__()
         from onnx2torch import convert
 
-        self.network = convert(str(path))
+        self.network = convert(str(path)).requires_grad_(True)
+        # The file is for one image: its channel shuffles reshape 2 · C channels to (C, 2, pixels).
+        for name, shape in self.network.named_buffers():
+            if name.startswith("initializers") and shape.numel() == 3:
+                shape[0] = -1
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return 85 numbers for each of 22 × 22 cells. The file is for one image in BGR."""
-        return torch.cat([self.network(image[None]) for image in images.flip(1)])
+        """Return 85 numbers for each of 22 × 22 cells. The file takes BGR."""
+        return self.network(images.flip(1))
 
 
 def decode(raw: Tensor) -> list[dict[str, Tensor]]:

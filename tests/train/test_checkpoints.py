@@ -85,6 +85,8 @@ def test_different_contents_have_different_hashes_whatever_their_layout_in_memor
     images = torch.rand(2, 3, 4, 4)
     same_images = images.contiguous(memory_format=torch.channels_last)
     assert content_hash(same_images) == content_hash(images)
+    one = torch.ones(1)
+    assert content_hash(one.as_strided((1,), (0,))) == content_hash(one)
 
 
 def test_the_newest_undamaged_checkpoint_is_loaded_and_the_fault_of_a_newer_one_reported(tmp_path):

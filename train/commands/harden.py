@@ -76,7 +76,9 @@ def harden(
 
     A detector in the format of torchvision learns its own losses on the renders
     (experiment=detector). On the photographs, it keeps the boxes that it finds
-    before the training, also in the light of a projector and in low light.
+    before the training, also in the light of a projector and in low light. A raw
+    network with `nb.Detection(decode=...)` keeps the scores and boxes of all its
+    candidates there. It has no losses, and takes no meshes.
 
     Args:
         network: A plain network from images to logits, in evaluation mode, or
@@ -174,7 +176,7 @@ def harden(
             "train": {"device": str(device)},
         }
         if is_detector:
-            require_losses(classifier)
+            require_losses(classifier, bool(meshes))
             if not meshes:
                 changes["augment"] = {"mode": "none"}
         if hard_negatives is not None:

@@ -44,8 +44,10 @@ def _update(digest: Any, value: Any) -> None:
         case Tensor():
             on_cpu = value.detach().cpu().contiguous()
             digest.update(f"{on_cpu.dtype}{tuple(on_cpu.shape)}".encode())
-            # The bytes of the tensor, without a copy.
-            digest.update(on_cpu.flatten().view(torch.uint8).numpy().data)
+            # The bytes of the tensor, without a copy. A contiguous tensor of one value may have a
+            # stride of 0, with which it could not be viewed as bytes.
+            flat = on_cpu.as_strided((on_cpu.numel(),), (1,))
+            digest.update(flat.view(torch.uint8).numpy().data)
         case Mapping():
             for key, item in value.items():
                 digest.update(f"{key!r}:".encode())

@@ -2,22 +2,32 @@
 
 The label of a render is a map of its objects, which is shifted and flipped with the image. On
 photographs, whose objects are unknown, the network before the training is the teacher: its own
-detections in the unchanged photograph are what the network shall find, also in other light.
+detections in the unchanged photograph are what the network shall find, also in other light. A raw
+network, whose outputs the task decodes, has no losses of its own: the scores and boxes of all its
+candidates shall stay.
 """
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy
 
 from augment import distributed
 from augment.classifier import TaskNetwork
 from augment.network import device_of, eval_mode
 from augment.scene.truth import NO_OBJECT, boxes_of
-from augment.tasks.detection import Detection
+from augment.tasks.detection import (
+    CANDIDATE_BOXES,
+    CANDIDATE_LABELS,
+    CANDIDATE_SCORES,
+    SMALLEST_SCORE,
+    Detection,
+)
 from renderer.errors import InputError, describe, single_line
 from renderer.image import to_unit
 from renderer.settings import height_and_width
@@ -64,8 +74,17 @@ def losses_of(network: nn.Module, images: Tensor, targets: Sequence[Target]) -> 
     return torch.stack([*losses.values()]).sum()
 
 
-def require_losses(network: TaskNetwork) -> None:
-    """Check that a detector returns losses in training mode, for gray images without objects."""
+def require_losses(network: TaskNetwork, needs_boxes: bool) -> None:
+    """Check that a detector returns losses in training mode, for gray images without objects.
+
+    A raw network has none: its candidates are compared with those of the teacher, and boxes of
+    renders cannot train it.
+    """
+    if isinstance(network.task, Detection) and network.task.decode is not None:
+        if needs_boxes:
+            reason = "a raw network, whose outputs are decoded, returns no losses for renders"
+            raise InputError(f"meshes: {reason}: give no meshes, or a network that returns losses")
+        return
     copy = deepcopy(network.network).train()
     # Batch normalization in training mode needs two images.
     images = torch.full((2, 3, *height_and_width(network.size)), 0.5, device=device_of(copy))
@@ -85,9 +104,10 @@ def require_losses(network: TaskNetwork) -> None:
 class DetectionLoss:
     """Loss of a detector on a batch of training images, some of which are renders.
 
-    Each image has the losses that the detector itself computes in training mode. They count
-    `distillation_weight` times on photographs with the boxes of the teacher, and
-    `consistency_weight` times on the augmented photographs with the same boxes.
+    Each image has the losses that the detector itself computes in training mode or, if the task
+    decodes its outputs, `candidate_loss`. They count `distillation_weight` times on photographs
+    with the detections of the teacher, and `consistency_weight` times on the augmented photographs
+    with the same detections.
     """
 
     model: nn.Module
@@ -108,23 +128,64 @@ class DetectionLoss:
         correct predictions, NaN: a detector in training mode predicts nothing.
         """
         is_photograph = ~rendered
-        terms: list[tuple[float, Tensor, list[Target]]] = []
+        terms: list[tuple[float, Tensor, Any]] = []
         if rendered.any():
             terms.append((1.0, images[rendered], [*map(target_of, labels[rendered])]))
         if self.teacher is not None and is_photograph.any():
             photographs = images[is_photograph]
-            boxes = detected(self.teacher, photographs, self.task)
-            terms.append((self.settings.distillation_weight, photographs, boxes))
+            find = detected if self.task.decode is None else candidates
+            with torch.no_grad(), eval_mode(self.teacher):
+                found = find(self.teacher, photographs, self.task)
+            terms.append((self.settings.distillation_weight, photographs, found))
             if augmented is not None:
                 weight = self.settings.consistency_weight
-                terms.append((weight, augmented[is_photograph], boxes))
+                terms.append((weight, augmented[is_photograph], found))
         loss = sum(
-            weight * len(shown) / len(images) * losses_of(self.model, to_unit(shown), targets)
-            for weight, shown, targets in terms
+            weight * len(shown) / len(images) * self._loss(shown, found)
+            for weight, shown, found in terms
             if weight
         )
         loss = torch.as_tensor(loss, device=images.device)
         return loss, torch.full_like(loss, torch.nan).detach()
+
+    def _loss(self, images: UInt8[Tensor, "N 3 H W"], targets: Any) -> Float[Tensor, ""]:
+        if self.task.decode is None:
+            return losses_of(self.model, to_unit(images), targets)
+        return candidate_loss(candidates(self.model, images, self.task), targets)
+
+
+# Boxes and scores of the K candidates of each image.
+Candidates = list[tuple[Tensor, Tensor]]
+
+
+def candidates(network: nn.Module, images: UInt8[Tensor, "N 3 H W"], task: Detection) -> Candidates:
+    """Return boxes (K, 4) in pixels and scores (K, C) of all candidates of a raw network."""
+    unit = to_unit(images)
+    outputs = task.reader("network")(network(unit), unit)
+    if any(CANDIDATE_LABELS in item for item in outputs):
+        raise InputError("decode returned labels: training needs the scores (K, C) of all classes")
+    return [(item[CANDIDATE_BOXES], item[CANDIDATE_SCORES]) for item in outputs]
+
+
+def candidate_loss(found: Candidates, expected: Candidates) -> Float[Tensor, ""]:
+    """Return the mean over images of the change of the candidates since the teacher.
+
+    The change of a score is the Kullback-Leibler divergence of its Bernoulli distribution. The
+    change of a box is 1 - GIoU, and counts as often as the best score of the teacher says.
+    """
+    from torchvision.ops import generalized_box_iou_loss  # torchvision takes half a second.
+
+    changes = []
+    for (boxes, scores), (old_boxes, old_scores) in zip(found, expected, strict=True):
+        if boxes.shape != old_boxes.shape:
+            reason = f"decode returned {len(old_boxes)} and {len(boxes)} boxes for two images"
+            raise InputError(f"{reason}: return all candidates, whose number is always the same")
+        old = old_scores.clamp(SMALLEST_SCORE, 1 - SMALLEST_SCORE)
+        entropy = binary_cross_entropy(old, old, reduction="sum")
+        changes.append(binary_cross_entropy(scores, old, reduction="sum") - entropy)
+        moves = generalized_box_iou_loss(boxes, old_boxes)
+        changes.append((old_scores.amax(1) * moves).sum())
+    return torch.stack(changes).sum() / len(found)
 
 
 @torch.no_grad()

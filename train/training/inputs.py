@@ -168,6 +168,9 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         facts = as_facts(settings.classes, given_size, settings.normalization, settings.prompt)
         weights = None if settings.weights is None else as_path("weights", settings.weights)
         classifier = load_source(name, weights, facts, settings.trust)
+    if not isinstance(classifier.task, Classification):
+        reason = f"network={name} is a network of {classifier.task.name}, and pnb-train takes "
+        raise InputError(f"{reason}classifiers: train a detector by nb.harden in Python", "network")
     network = cast(nn.Module, classifier.network)
     if not list(network.parameters()):  # ONNX and quantized networks have none.
         raise InputError(

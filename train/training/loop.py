@@ -225,7 +225,9 @@ class Trainer:
             shown = Split(to_bytes(state.renders.images), state.renders.labels)
             images = TrainingImages(split, rows, shown)
             with self.phases("training"):
-                set_training_mode(self.model, settings, self.is_detector)
+                task = self.service.task
+                has_losses = isinstance(task, Detection) and task.decode is None
+                set_training_mode(self.model, settings, has_losses)
                 batches = training_batches(
                     images, settings.batch_size, self.seed, now, settings.flips, first
                 )

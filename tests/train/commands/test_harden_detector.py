@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 from torch import Tensor, nn
+from torch.distributions import Bernoulli, kl_divergence
 from torchvision.models import get_model
 from torchvision.ops import box_iou
 
@@ -20,9 +21,11 @@ from augment.service import AugmentationService
 from augment.tasks.detection import Detection
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
-from tests.detectors import BrightBox, OneBox, small_detector
+from tests.detectors import BrightBox, OneBox, RawCells, small_detector
+from train.settings import ExperimentSettings
 from train.training.augmentations import LowLight
-from train.training.detection import detected, losses_of
+from train.training.detection import candidate_loss, detected, losses_of
+from train.training.inputs import load_initial
 from train.training.loop import Trainer
 
 SIZE = 32
@@ -144,6 +147,44 @@ def test_a_detector_of_torchvision_is_trained_without_meshes(photographs):
     assert not all(torch.equal(*pair) for pair in weights)
 
 
+RAW = {"task": Detection(decode=RawCells.decode), "augment": None}
+
+
+def test_a_raw_network_keeps_its_candidates_in_low_light(photographs):
+    network = RawCells().eval()
+    train = {"epochs": 4, "batch_size": 12, "learning_rate": 0.1, "augmentation": "low_light"}
+    train["images_per_epoch"] = 24
+    hardened = harden(network, photographs, (), train=train, **RAW)
+    images = as_batch(photographs)
+    dark = to_unit(LowLight(seed=9).apply(images, torch.zeros(len(images)), 0))
+    expected = network(to_unit(images)).sigmoid()
+    changes = [(one(dark).sigmoid() - expected).abs().mean() for one in (network, hardened)]
+    assert changes[1] < 0.8 * changes[0]
+
+
+def test_the_loss_of_candidates_is_the_divergence_of_scores_and_the_overlap_of_boxes():
+    boxes = torch.tensor([[0.0, 0.0, 2.0, 2.0], [4.0, 4.0, 6.0, 8.0]])
+    moved = torch.tensor([[1.0, 0.0, 3.0, 2.0], [4.0, 4.0, 6.0, 8.0]])
+    old, new = torch.tensor([[0.2, 0.8], [0.5, 0.1]]), torch.tensor([[0.4, 0.6], [0.5, 0.3]])
+    divergence = kl_divergence(Bernoulli(old), Bernoulli(new)).sum()
+    # The moved box has 2 of 6 squares in common, and the box around both has 6.
+    expected = divergence + 0.8 * (1 - 2 / 6)
+    assert candidate_loss([(moved, new)], [(boxes, old)]).item() == pytest.approx(float(expected))
+
+
+@pytest.mark.parametrize(
+    ("meshes", "decode", "reason"),
+    [
+        (("solid:bottle",), RawCells.decode, "meshes: a raw network"),
+        ((), lambda raw: BrightBox((0, 0, 9, 9))(raw[:, :3, None, None].sigmoid()), "labels"),
+    ],
+)
+def test_raw_networks_that_cannot_learn_are_refused(photographs, meshes, decode, reason):
+    task = Detection(threshold=0.1, decode=decode)
+    with pytest.raises(InputError, match=reason):
+        harden(RawCells().eval(), photographs, meshes, task=task, augment=None)
+
+
 def test_a_detector_without_losses_is_refused(photographs):
     network = BrightBox((0, 0, SIZE, SIZE)).eval()
     network.register_parameter("weight", nn.Parameter(torch.ones(1)))
@@ -174,3 +215,12 @@ def test_detectors_of_torchvision_learn_from_one_object_several_and_none(photogr
     pairs = zip(hardened.parameters(), network.parameters(), strict=True)
     changed = [not torch.equal(*pair) for pair in pairs]
     assert sum(changed) >= 0.9 * len(changed)
+
+
+def test_a_detector_on_the_command_line_is_refused(tmp_path, monkeypatch):
+    code = "import tests.detectors as d\nmake = lambda: (d.OneBox(32).eval(), 32, ['a', 'b'])\n"
+    (tmp_path / "boxes_of_mine.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    settings = ExperimentSettings(network="python:boxes_of_mine:make", trust=True)
+    with pytest.raises(InputError, match=r"detection.*nb\.harden"):
+        load_initial(settings)

@@ -1,0 +1,127 @@
+"""Harden FastestDet for low light with unlabeled photographs, and score it on real photographs.
+
+Run it as a module in the root of the repository, after `pip install ".[ecosystem]"`:
+
+    python -m benchmarks.low_light --data DATA --out OUT
+
+DATA has weights/ (fastestdet_coco.onnx, coco.names), photographs of anything for the training
+(imagenet_samples/ and photos/), and for the scores alone real_light/low_light_detection/ with boxes
+in a COCO file. Of imagenet_samples, every tenth photograph is held out: the network should find
+there what the original finds.
+"""
+
+import argparse
+import resource
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import nn
+
+import norm_balls as nb
+from augment.network import with_normalized_light
+from augment.settings import NormalizeLight
+from benchmarks.common import machine
+from benchmarks.detectors import SIZE, FastestDet, decode
+from renderer.io.images import crop_center, read_rgb
+from train.data.sets import Split
+from train.results.detection_scores import DetectionScores
+from train.results.tables import format_interval
+from train.training.detection import validate
+
+TASK = nb.Detection(decode=decode)
+# The exposure maps the 98th percentile of the linear light to 0.8.
+NORMALIZED = {"percentile": 98.0, "level": 0.8, "gamma": 1.0}
+# Normalization of light of a network in training, by the name of its weights.
+VARIANTS: dict[str, NormalizeLight] = {"hardened": None, "hardened_normalized": NORMALIZED}
+LIGHTS = ("plain", "low_light", "motion_blur")
+CLASSES = ("apple", "banana", "orange")
+# Single photographs mostly show one large object, so there are also mosaics of 2 × 2.
+MOSAICS = 600
+
+
+def square(path: Path, size: int) -> np.ndarray:
+    """Read the central square of a photograph."""
+    return np.asarray(crop_center(read_rgb(path, size), size))
+
+
+def split(data: Path) -> tuple[list[Path], list[Path]]:
+    """Return the photographs of the training, and those held out."""
+    samples = sorted((data / "imagenet_samples").glob("*.jpg"))
+    is_held_out = [int(path.name.split("_")[0]) % 10 == 0 for path in samples]
+    held_out = [path for path, held in zip(samples, is_held_out, strict=True) if held]
+    # Those of the source "tiny" have 64 pixels per side.
+    photos = (path for path in (data / "photos").glob("*/*.*") if "tiny_" not in path.name)
+    return sorted({*samples, *photos} - {*held_out}), held_out
+
+
+def write_photographs(paths: Sequence[Path], folder: Path) -> None:
+    """Write the training images: all photographs, and mosaics of random ones."""
+    folder.mkdir(parents=True)
+    for index, path in enumerate(paths):
+        Image.fromarray(square(path, SIZE)).save(folder / f"photograph_{index:04}.png")
+    draws = np.random.default_rng(0)
+    for index in range(MOSAICS):
+        tiles = [square(paths[one], SIZE // 2) for one in draws.integers(len(paths), size=4)]
+        mosaic = np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])])
+        Image.fromarray(mosaic).save(folder / f"mosaic_{index:04}.png")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train the variants that have no weights yet, and write the table of all networks."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    add = parser.add_argument
+    add("--data", type=Path, required=True, help="folder of the data")
+    add("--out", type=Path, required=True, help="folder of the weights and of table.md")
+    add("--epochs", type=int, default=40, help="epochs of 400 images")
+    add("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
+    options = parser.parse_args(arguments)
+    weights = options.data / "weights"
+    names = (weights / "coco.names").read_text().splitlines()
+    given = {"classes": names, "size": SIZE, "task": TASK}
+    original = FastestDet(weights / "fastestdet_coco.onnx").eval()
+    training, held_out = split(options.data)
+    photographs = options.out / "photographs"
+    if not photographs.exists():
+        write_photographs(training, photographs)
+    networks: dict[str, tuple[nn.Module, NormalizeLight]] = {"original": (original, None)}
+    networks["normalized light"] = original, NORMALIZED
+    for name in options.variants:
+        light, path = VARIANTS[name], options.out / f"{name}.pt"
+        network: nn.Module = FastestDet(weights / "fastestdet_coco.onnx").eval()
+        if path.exists():
+            network.load_state_dict(torch.load(path))
+        else:
+            train = {"epochs": options.epochs, "augmentation": "low_light", "resume": True}
+            start = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+            run = {"train": train, "data": {"workers": 0}, "out": options.out / name}
+            network = nb.harden(network, [], photographs, normalize_light=light, **given, **run)
+            seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - start
+            print(f"{name}: {seconds / 60:.0f} minutes of one core")
+            torch.save(network.state_dict(), path)
+        networks[name.replace("_", ", ")] = network, light
+    images = np.stack([square(path, SIZE) for path in held_out])
+    kept = Split(torch.tensor(images).permute(0, 3, 1, 2), torch.zeros(len(images)).long())
+    columns = [f"{name}, {light}" for light in LIGHTS for name in (*CLASSES, "false")]
+    lines = [f"|network|{'|'.join(columns)}|kept|", "|-|" + "-|" * (len(columns) + 1)]
+    for name, (network, light) in networks.items():
+        photos = options.data / "real_light" / "low_light_detection"
+        scores = nb.evaluate(network, photos, normalize_light=light, fit="stretch", **given)
+        assert isinstance(scores, DetectionScores)
+        cells = []
+        for kind in LIGHTS:
+            of_light = scores.by_source[kind]
+            cells += [format_interval(of_light[label].recall) for label in CLASSES]
+            cells.append(format_interval(of_light["all"].false_per_image))
+        shown = with_normalized_light(network, light)
+        with torch.no_grad():
+            agreement = validate(shown, original, TASK, kept, torch.arange(len(images)))
+        lines.append(f"|{name}|{'|'.join(cells)}|{agreement['accuracy']:.3f}|")
+        print(lines[-1], flush=True)
+    (options.out / "table.md").write_text("\n".join(lines) + f"\n\n{machine()}\n")
+
+
+if __name__ == "__main__":
+    main()
