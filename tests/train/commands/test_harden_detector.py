@@ -159,7 +159,7 @@ def test_a_raw_network_keeps_its_candidates_in_low_light(photographs):
     dark = to_unit(LowLight(seed=9).apply(images, torch.zeros(len(images)), 0))
     expected = network(to_unit(images)).sigmoid()
     changes = [(one(dark).sigmoid() - expected).abs().mean() for one in (network, hardened)]
-    assert changes[1] < 0.8 * changes[0]
+    assert changes[1] < 0.9 * changes[0]
 
 
 def test_the_loss_of_candidates_is_the_divergence_of_scores_and_the_overlap_of_boxes():
