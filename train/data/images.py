@@ -159,4 +159,6 @@ def _collate(items: Sequence[tuple[Tensor, ReadErrors]]) -> tuple[Tensor, ReadEr
     """Stack the images of a batch, and join their error messages."""
     errors = {path: error for _, of_image in items for path, error in of_image.items()}
     images = [image for image, _ in items]
-    return torch.stack(images) if images else torch.empty(0), errors
+    # An array without images broadcasts to any size.
+    nothing = torch.empty(0, 3, 1, 1, dtype=torch.uint8)
+    return torch.stack(images) if images else nothing, errors

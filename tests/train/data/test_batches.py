@@ -1,6 +1,9 @@
+from pathlib import PurePosixPath
+
 import pytest
 import torch
 import torch.nn.functional as F
+from PIL import Image
 from scipy.stats import binomtest, chisquare
 
 from augment.scene.truth import NO_OBJECT, boxes_of
@@ -12,6 +15,7 @@ from train.data.batches import (
     rounds_of_epoch,
     training_batches,
 )
+from train.data.images import ImageFiles
 from train.data.sets import Split
 from train.training.detection import object_maps, target_of
 
@@ -178,3 +182,17 @@ def test_objects_in_renders_move_with_the_pixels_that_show_them():
                 assert torch.equal(target["boxes"], boxes_of(expected))
                 counts.append((index, len(shown)))
     assert {(0, 2), (1, 0), (1, 1), (2, 0)} <= set(counts)
+
+
+def test_a_batch_of_renders_alone_needs_no_file(tmp_path):
+    Image.new("RGB", (12, 12), "red").save(tmp_path / "photograph.png")
+    files = ImageFiles(tmp_path, (PurePosixPath("photograph.png"),), 12, workers=0, skip=False)
+    photographs = Split(files, torch.zeros(1, dtype=torch.int64))
+    renders = Split(noise(3, 3, 12, 12), torch.ones(3, dtype=torch.int64))
+    images = TrainingImages(photographs, torch.arange(1), renders)
+    batches = [*training_batches(images, 2, 0, epoch_round(4, 0))]
+    assert sorted(int(is_render.sum()) for _, _, is_render in batches) == [1, 2]
+    for shown, labels, is_render in batches:
+        assert labels.tolist() == is_render.int().tolist()
+        is_red = (shown == torch.tensor([255, 0, 0])[:, None, None]).all(dim=(1, 2, 3))
+        assert is_red.tolist() == (~is_render).tolist()
