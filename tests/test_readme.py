@@ -47,6 +47,7 @@ def run(heading: str, **names) -> dict[str, object]:
 def test_every_block_of_python_is_run_here():
     assert BLOCKS.keys() == {
         "Attack a network",
+        "A detector",
         "Render",
         "Networks without gradients",
         "Your own training loop",
@@ -64,6 +65,11 @@ def test_random_light_block_relights_a_batch_and_a_clip():
     names = run("Random light on your own images")
     assert names["images"].dtype == torch.uint8 and names["images"].shape == (8, 3, 64, 96)
     assert len(names["frames"]) == 8
+
+
+def test_detector_block_hides_an_orange_from_the_published_detector(folder):
+    assert run("A detector")["result"].success.all()
+    assert (folder / "detector.png").exists()
 
 
 def test_render_block_has_a_gradient_by_light():

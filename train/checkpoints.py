@@ -30,7 +30,7 @@ from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, keyed, require_file, require_kind, single_line
 from renderer.io.files import atomic_write
 from train.data.sets import content_hash
-from train.networks import PYTHON, VERSION, WIDERESNET, build_network
+from train.networks import DETECTOR, PYTHON, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
 from train.settings import NetworkSettings, TaskSettings, published_folder
 
@@ -278,6 +278,12 @@ def load_run(
         built = build_network(classes, size, trust_code=trust_code, **shape)
         network = with_normalized_light(built, light)
         network.load_state_dict(state["model"])
+        if name == DETECTOR:
+            # The commands ask the task of a network.
+            detector: Any = TaskNetwork(network, size, classes, f"{RUN}{run}", task=Detection())
+            detector.inputs = FROM_FILE
+            say_inputs(detector.name, network, size, FROM_FILE)
+            return detector
         classifier = Classifier(network, size, classes, f"{RUN}{run}")
         classifier.inputs = FROM_FILE
         stored = state.get("operating_point", [])

@@ -22,6 +22,8 @@ from train.train_settings import WIDERESNET
 
 # The name of a network begins with this text if it is an architecture of torchvision.
 TORCHVISION = "torchvision:"
+# Name of the detector that is published with the library.
+DETECTOR = "small_detector"
 # The name of a network begins with this text if a Python function of the user builds it.
 PYTHON = "python:"
 # Version of the description that is stored with the weights of a network. Version 1
@@ -174,13 +176,19 @@ def build_network(
     """Build a network that maps images (N, 3, size, size), RGB in [0, 1], to logits.
 
     The name is "wideresnet", "torchvision:NAME", "python:MODULE:FUNCTION" or, with `classifier`, a
-    pretrained network of `augment.build_classifier`. The mean of the data is 0.5 and the std 0.25
+    pretrained network of `augment.build_classifier`. "small_detector" finds boxes, see
+    `train.detectors`. The mean of the data is 0.5 and the std 0.25
     if they are None; a network of Python normalizes images itself. `shape` is for "wideresnet".
     """
     if classifier:
         normalization = None if mean is None or std is None else (mean, std)
         facts = as_facts(classes, size, normalization)
         return build_classifier(name, facts, trust_code).network.requires_grad_(True)
+    if name == DETECTOR:
+        # torchvision's detectors are imported when they are needed, because that takes a second.
+        from train.detectors import small_detector
+
+        return small_detector(len(classes), size)
     mean, std = mean or MEAN, std or STD
     if name == WIDERESNET:
         return WideResNet(len(classes), **shape, mean=mean, std=std)

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from augment.classifier import Classifier, OperatingPoint
+from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from renderer.errors import InputError, as_path, keyed, require_choice
 from train.checkpoints import load_run, load_selected, write_published
 from train.command_settings import require_calibration
@@ -38,16 +38,28 @@ class PublishedNetwork(Classifier):
     results: Mapping[str, Estimate]
 
 
-def load(name: str) -> PublishedNetwork:
+class PublishedDetector(TaskNetwork):
+    """A detector that is published with the library, with its results.
+
+    Attributes:
+        results: Metrics on generated solids that its training did not show: "held_out/recall",
+            "held_out/ap50" and "held_out/false_per_image".
+    """
+
+    results: Mapping[str, Estimate]
+
+
+def load(name: str) -> PublishedNetwork | PublishedDetector:
     """Load a network that is published with the library, with its results.
 
     Args:
-        name: "best", "adversarial", "random" or "none". The file
+        name: "best", "adversarial", "random", "none" or "detector". The file
             pretrained/README.md describes these networks.
 
     Returns:
-        Classifier of images of 32 pixels per side. Its attribute `results` has
-        its metrics.
+        Classifier of images of 32 pixels per side, or a detector of generated
+        solids in images of 128 pixels per side. Its attribute `results` has its
+        metrics.
 
     Raises:
         InputError: If there is no published network of this name.
@@ -65,9 +77,20 @@ def load(name: str) -> PublishedNetwork:
     folder = published_folder(PRETRAINED / name)
     loaded = load_run(folder)
     _, state = load_selected(folder)
+    scores = state["scores"]
+    if not isinstance(loaded, Classifier):
+        facts = loaded.network, loaded.size, loaded.classes, name
+        detector = PublishedDetector(*facts, task=loaded.task)
+        detector.inputs = loaded.inputs
+        detector.results = {
+            f"{images}/{metric}": Estimate(**metrics["all"][metric])
+            for images, metrics in scores.items()
+            for metric in ("recall", "ap50", "false_per_image")
+        }
+        return detector
     network = PublishedNetwork(loaded.network, loaded.size, loaded.classes, name)
     network.operating_points = loaded.operating_points
-    network.results = _read_results(state["scores"])
+    network.results = _read_results(scores)
     return network
 
 

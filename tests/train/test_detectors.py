@@ -1,0 +1,40 @@
+import pytest
+import torch
+from torchvision.ops import box_iou
+
+import norm_balls as nb
+from train.checkpoints import load_run
+
+LABELED = ("orange", "sweet_pepper", "mushroom", "cup", "bottle")
+LOOKS = {"width": 3.2, "encoding": "srgb"}
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return nb.load("detector")
+
+
+def test_the_published_detector_finds_more_than_half_of_the_solids_that_training_did_not_show(
+    detector,
+):
+    objects = [(f"solid:{kind}:{seed}", kind) for kind in LABELED for seed in (2001, 2002)]
+    scene = nb.build_scene(objects, detector.size, **LOOKS)
+    rows = torch.arange(len(scene))
+    truth = scene.truth(detector.label)
+    found = []
+    for output, box, label in zip(
+        detector(scene.render(scene.conditions(rows), rows)[:, 0]),
+        truth.boxes[:, 0],
+        truth.labels[:, 0, 0],
+        strict=True,
+    ):
+        is_counted = (output["scores"] >= 0.4) & (output["labels"] == label)
+        found.append(bool((box_iou(output["boxes"][is_counted], box) >= 0.5).any()))
+    assert sum(found) >= 6
+
+
+def test_a_run_of_the_published_detector_is_the_same_network(detector):
+    other = load_run("pretrained/detector")
+    assert other.classes == detector.classes == ("background", *LABELED)
+    weights = zip(detector.state_dict().values(), other.state_dict().values(), strict=True)
+    assert all(torch.equal(own, others) for own, others in weights)
