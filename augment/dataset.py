@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
@@ -21,12 +22,13 @@ from augment.classifier import TaskNetwork
 from augment.progress import Phases
 from augment.scene.build import MeshItem, build_scene
 from augment.scene.exposure import warn_of_exposure
+from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT
 from augment.service import AugmentationService
 from augment.tasks.classification import Classification
 from renderer import errors
-from renderer.camera import Camera
+from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import to_bytes
 from renderer.settings import Size
@@ -88,9 +90,11 @@ def render_dataset(
     """Render labeled images one after another.
 
     The renders show the entries of `meshes` in turn, then the next background,
-    then the next view. What else differs is drawn at random, as `settings.vary`
-    and `settings.random_light` say. A render with an index is the same whatever
-    `first` and `count` are, so that several processes can share the work.
+    then the next view. `width` of the scene applies to all objects of an entry,
+    which together span [-1, 1] in the largest direction. What else differs is
+    drawn at random, as `settings.vary` and `settings.random_light` say. A render
+    with an index is the same whatever `first` and `count` are, so that several
+    processes can share the work.
 
     Args:
         meshes: Entries of `build_scene`: pairs of a mesh and its class, or lists
@@ -133,6 +137,12 @@ def render_dataset(
         missing = "gets none" if network is None else "gets one"
         raise InputError(f"mode={settings.mode} does not fit a data set that {missing}: set {mode}")
     scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **of_scene)
+    if "cameras" not in of_scene:
+        examples = [
+            replace(example, cameras=_show_all(example.cameras, scene.objects[example.object]))
+            for example in scene.examples
+        ]
+        scene = scene.changed(examples=examples)
     skipped = frozenset(skip)
     indices = [index for index in range(first, first + count) if index not in skipped]
     return _render_blocks(scene, settings, network, indices, seed)
@@ -168,6 +178,26 @@ def _render_blocks(
             warn_of_exposure(problem.scene)
         rows = torch.tensor([index - every.start for index in members], device=values.device)
         yield from _renders(problem, values, rows, every.start)
+
+
+def _show_all(cameras: Sequence[Camera], item: SceneObject) -> tuple[Camera, ...]:
+    """Return cameras that show all objects of an entry as large as others show a single one."""
+    if not item.others:
+        return tuple(cameras)
+    points = item.mesh.vertices[np.unique(item.mesh.faces[: item.ends[-1]])]
+    factor = float(np.ptp(points, axis=0).max()) / 2
+    shown = []
+    for camera in cameras:
+        scaled = {"width": camera.width * factor}
+        if isinstance(camera, PerspectiveCamera):
+            scaled["distance"] = camera.distance * factor
+        camera = replace(camera, **scaled)
+        seen = camera.project(points)[:, :2]
+        right, up = ((seen.min(0) + seen.max(0)) / 2 * camera.width / 2).tolist()
+        # Near objects are larger in perspective.
+        width = camera.width * max(1.0, float(np.ptp(seen, axis=0).max()) / 2)
+        shown.append(replace(camera, right=camera.right - right, up=camera.up - up, width=width))
+    return tuple(shown)
 
 
 def _labels(scene: Scene, network: TaskNetwork | None) -> Int[Tensor, " E"]:

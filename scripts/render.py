@@ -6,8 +6,11 @@ from train.cli import Command
 
 
 def name_light(words: list[str]) -> list[str]:
-    """Replace light=NAME, a short form of scene.light=NAME, in the command line."""
-    return [re.sub(r"^light=", "scene.light=", word) for word in words]
+    """Replace light=NAME by scene.light=NAME, without the lights that are drawn in its place."""
+    is_given = any(re.match(r"(scene\.)?light=", word) for word in words)
+    is_drawn = any(word.startswith("augment.vary.environments=") for word in words)
+    named = [re.sub(r"^light=", "scene.light=", word) for word in words]
+    return [*named, "augment.vary.environments=[]"] if is_given and not is_drawn else named
 
 
 main = Command(

@@ -410,11 +410,11 @@ class Scene:
                 )
         is_hidden = (labels != NO_OBJECT) & (visible < LEAST_VISIBLE)
         if is_hidden.any():
-            row, view, kept_index = is_hidden.nonzero()[0].tolist()
+            row, _, kept_index = is_hidden.nonzero()[0].tolist()
             say_once(
-                f"objects are left out of the truth of {int(is_hidden.any(2).sum())} views, which "
-                f"show less than {LEAST_VISIBLE:.0%} of them: the first is object "
-                f"{kept[row][kept_index]} of example {int(rows[row])} in view {view}"
+                f"objects are left out of the truth of views that show less than "
+                f"{LEAST_VISIBLE:.0%} of them, such as object {kept[row][kept_index]} of "
+                f"{items[row].name}"
             )
         labels[is_hidden] = NO_OBJECT
         masks[is_hidden] = False

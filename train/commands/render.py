@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 
 from augment import dataset
@@ -21,6 +22,8 @@ from train.settings import label_names, read_objects
 # File with the settings of a data set. Processes that share one differ in CIRCUMSTANCES only.
 DESCRIPTION = "data_set.json"
 CIRCUMSTANCES = ("out", "shard", "shards", "device", "trust")
+# Folder of files of Hydra and submitit for --multirun, as conf/render.yaml says.
+LAUNCHER = ".launcher"
 # Bytes of a pixel in the files of a render, before compression, by the name of the map.
 BYTES = {"image": 3, "mask": 1, "depth": 2, "normals": 3}
 
@@ -34,11 +37,14 @@ def run(settings: RenderSettings) -> None:
     labels = [of.label for item in objects.values() for of in (item, *item.others)]
     classes = [*dict.fromkeys(label for label in labels if label)]
     folder = writable_folder(settings.out, "out")
-    data = FORMATS[settings.format](
-        folder, classes, settings.split_counts, shard_indices(settings), settings.maps
-    )
+    for name in classes if settings.format == "imagefolder" else ():
+        if (folder / name).resolve().parent != folder.resolve():
+            reason = f"a folder cannot have the name of the class {name}"
+            raise InputError(f"{reason}: rename the class or choose another format", "format")
+    shards = shard_indices(settings)
+    data = FORMATS[settings.format](folder, classes, settings.split_counts, shards, settings.maps)
     _describe(settings, folder, classes)
-    missing = [index for index in data.indices if not data.last_file(index).exists()]
+    missing = [index for index in shards[settings.shard] if not data.last_file(index).exists()]
     height, width = height_and_width(settings.size)
     size = height * width * sum(BYTES[name] for name in ("image", *settings.maps)) * len(missing)
     print(
@@ -69,11 +75,11 @@ def run(settings: RenderSettings) -> None:
         print(f"{folder}: {settings.count} renders of {len(classes)} classes ({parts})")
 
 
-def shard_indices(settings: RenderSettings) -> range:
-    """Return the indices of the renders of this process, which are whole blocks."""
+def shard_indices(settings: RenderSettings) -> list[range]:
+    """Return the indices of the renders of each process, which are whole blocks."""
     blocks = -(-settings.count // dataset.BLOCK)
-    ends = [blocks * (settings.shard + part) // settings.shards * dataset.BLOCK for part in (0, 1)]
-    return range(*(min(end, settings.count) for end in ends))
+    ends = [blocks * part // settings.shards * dataset.BLOCK for part in range(settings.shards + 1)]
+    return [range(*ends) for ends in pairwise(min(end, settings.count) for end in ends)]
 
 
 def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> None:
@@ -81,6 +87,8 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / DESCRIPTION
     facts = {key: value for key, value in asdict(settings).items() if key not in CIRCUMSTANCES}
+    if settings.format == "webdataset":
+        facts["shards"] = settings.shards  # A tar file has renders of one shard.
     facts = json.loads(json.dumps(facts | {"classes": classes}, default=str))
     if path.exists():
         found = read_json(path)
@@ -88,7 +96,7 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
         if changed:
             reason = f"holds a data set with another {changed[0]}"
             raise InputError(f"out={folder} {reason}: choose another folder", "out")
-    elif any(name.name != DESCRIPTION for name in folder.iterdir()):
+    elif any(path.name not in (DESCRIPTION, LAUNCHER) for path in folder.iterdir()):
         raise InputError(f"out={folder} is not empty: choose a new folder", "out")
     else:
         atomic_write(path, json.dumps(facts, indent=1))

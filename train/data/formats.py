@@ -40,14 +40,14 @@ class DataSet:
         folder: Its folder.
         classes: Names of the classes.
         splits: Number of renders in each part, such as "train", in the order of their indices.
-        indices: Indices of the renders that this process writes.
+        shards: Indices of the renders that each process writes.
         maps: Which of "mask", "depth" and "normals" are written.
     """
 
     folder: Path
     classes: Sequence[str]
     splits: Mapping[str, int]
-    indices: range
+    shards: Sequence[range]
     maps: Sequence[str]
 
     @property
@@ -185,8 +185,10 @@ class Yolo(DataSet):
         }
 
     def finish(self) -> None:
-        """Write data.yaml."""
-        paths = {part: f"images/{part}" for part in self.splits}
+        """Write data.yaml. Ultralytics demands train and val: the first part stands for both."""
+        first, *_ = self.splits
+        parts = {"train": first, "val": first} | {part: part for part in self.splits}
+        paths = {key: f"images/{part}" for key, part in parts.items()}
         content = {**paths, "names": dict(enumerate(self.classes))}
         atomic_write(self.folder / "data.yaml", yaml.safe_dump(content, sort_keys=False))
 
@@ -199,7 +201,8 @@ class WebDataset(DataSet):
         part = self.split(index)
         ends = accumulate(self.splits.values(), initial=0)
         *_, start = takewhile(lambda end: end <= index, ends)
-        first = max(start, self.indices.start, index // PER_TAR * PER_TAR)
+        [shard] = (shard.start for shard in self.shards if index in shard)
+        first = max(start, shard, index // PER_TAR * PER_TAR)
         return self.folder / f"{part}-{self.stem(first)}.tar"
 
     def image_path(self, render: LabeledRender) -> str:

@@ -1,5 +1,6 @@
 """Tests of pnb-render: data sets of labeled renders that other programs read."""
 
+import gc
 import json
 import tarfile
 from pathlib import Path
@@ -16,6 +17,7 @@ from augment import dataset
 from augment.dataset import describe_camera, render_dataset
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
+from scripts.render import name_light
 from train.command_settings import RenderSettings
 from train.commands.render import run
 
@@ -171,3 +173,123 @@ def test_the_first_meshes_get_the_renders_that_do_not_divide(meshes):
     pairs = [(item["mesh"], item["label"]) for item in meshes]
     labels = [render.labels[0] for render in render_dataset(pairs, 8, 5, backgrounds=[0.2, 0.8])]
     assert labels == ["box", "ball", "box", "ball", "box"]
+
+
+# What other libraries read. Two objects stand on one ground, and a cup alone.
+@pytest.fixture(scope="module")
+def groups(meshes) -> list:
+    box, ball = meshes
+    return [[box, ball | {"label": "a ball: 2"}], ball | {"label": 7}]
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("ignore")
+def test_pycocotools_and_torchvision_read_boxes_and_masks(groups, tmp_path):
+    pytest.importorskip("pycocotools")
+    from torchvision.datasets import CocoDetection, wrap_dataset_for_transforms_v2
+
+    folder = write(groups, tmp_path / "out", format="coco", size=[20, 32])
+    found = CocoDetection(str(folder / "train"), str(folder / "annotations/instances_train.json"))
+    wrapped = wrap_dataset_for_transforms_v2(found, target_keys="all")
+    assert len(found) == 7
+    for (image, annotations), (_, target) in zip(found, wrapped, strict=True):
+        index = annotations[0]["image_id"] - 1
+        assert image.size == (32, 20)
+        number = np.array(Image.open(folder / "details" / f"{index:06d}_mask.png"))
+        objects = details(folder, index)["objects"]
+        names = [found.coco.cats[item["category_id"]]["name"] for item in annotations]
+        assert names == [item["class"] for item in objects]
+        assert target["boxes"].tolist() == [item["box"] for item in objects]
+        for order, item in enumerate(annotations):
+            mask = found.coco.annToMask(item) == 1
+            assert (mask == (number == order + 1)).all()
+            assert (target["masks"][order].bool().numpy() == mask).all()
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("splits", [{"train": 2, "val": 1}, {"train": 1}])
+def test_ultralytics_reads_boxes_and_classes(groups, tmp_path, splits):
+    pytest.importorskip("ultralytics")
+    from ultralytics.data.dataset import YOLODataset
+    from ultralytics.data.utils import check_det_dataset
+
+    folder = write(groups, tmp_path / "out", format="yolo", size=[20, 32], splits=splits)
+    data = check_det_dataset(str(folder / "data.yaml"))
+    assert [*data["names"].values()] == ["box", "a ball: 2", "7"]
+    for found in YOLODataset(img_path=data["train"], data=data).labels:
+        objects = details(folder, int(Path(found["im_file"]).stem))["objects"]
+        assert found["shape"] == (20, 32)
+        assert [data["names"][int(i)] for i in found["cls"][:, 0]] == [i["class"] for i in objects]
+        x, y, width, height = found["bboxes"].T
+        corners = [x - width / 2, y - height / 2, x + width / 2, y + height / 2]
+        expected = [item["box"] for item in objects]
+        assert np.allclose(np.stack(corners, 1) * [32, 20, 32, 20], expected, atol=1e-3)
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("ignore")
+def test_webdataset_reads_images_classes_and_details(groups, tmp_path):
+    webdataset = pytest.importorskip("webdataset")
+    folder = write(groups, tmp_path / "out", format="webdataset", size=[20, 32])
+    expected = write(groups, tmp_path / "folder", size=[20, 32])
+    tars = sorted(map(str, folder.glob("*.tar")))
+    found = list(webdataset.WebDataset(tars, shardshuffle=False).decode("pil"))
+    assert sorted(sample["__key__"] for sample in found) == [f"{i:06d}" for i in range(COUNT)]
+    for sample in found:
+        assert sample["png"].size == (32, 20)
+        objects = sample["json"]["objects"]
+        assert objects == details(expected, sample["json"]["index"])["objects"]
+        assert ["box", "a ball: 2", "7"][sample["cls"]] == objects[0]["class"]
+    # webdataset leaves files open, whose warnings are ignored in this test only.
+    gc.collect()
+
+
+def test_all_objects_of_an_entry_are_in_the_image(meshes):
+    box, ball = ((item["mesh"], item["label"]) for item in meshes)
+    for render in render_dataset(
+        [[box, ball], [ball, box, box]], 40, 8, fov=30.0, views=4, width=2.4
+    ):
+        left, top, right, bottom = render.boxes.T
+        assert min(left.min(), top.min()) > 0 and max(right.max(), bottom.max()) < 40
+        # They fill the image, whose center is theirs.
+        assert abs(left.min() + right.max() - 40) <= 2 and abs(top.min() + bottom.max() - 40) <= 2
+        assert right.max() - left.min() > 13
+
+
+def test_a_light_that_is_named_replaces_those_that_are_drawn():
+    drawn = "augment.vary.environments="
+    for name in ("light", "scene.light"):
+        words = [f"{name}=uniform", "seed=3"]
+        assert name_light(words) == ["scene.light=uniform", "seed=3", f"{drawn}[]"]
+        words.append(f"{drawn}[grace]")
+        assert name_light(words) == ["scene.light=uniform", *words[1:]]
+    assert name_light(["seed=3"]) == ["seed=3"]
+
+
+def test_parts_without_renders_are_left_out(meshes, tmp_path):
+    folder = write(meshes, tmp_path / "out", format="yolo", count=1, splits={"train": 9, "test": 1})
+    paths = yaml.safe_load((folder / "data.yaml").read_text())
+    assert {key: paths[key] for key in paths if key != "names"} == {
+        "train": "images/train",
+        "val": "images/train",
+    }
+
+
+def test_each_index_is_in_one_tar_file_however_often_a_shard_was_stopped(meshes, tmp_path):
+    folder = write(meshes, tmp_path / "out", format="webdataset", shards=2, shard=0)
+    with pytest.raises(InputError, match="shards"):
+        write(meshes, folder, format="webdataset")
+    write(meshes, folder, format="webdataset", shards=2, shard=1)
+    found = []
+    for path in folder.glob("*.tar"):
+        with tarfile.open(path) as tar:
+            found += [int(name[:6]) for name in tar.getnames() if name.endswith(".cls")]
+    assert sorted(found) == [*range(COUNT)]
+
+
+@pytest.mark.parametrize("name", ["a/b", "..", "/tmp"])
+def test_a_class_that_cannot_be_a_folder_is_refused(meshes, tmp_path, name):
+    with pytest.raises(InputError, match="rename the class"):
+        write([meshes[0] | {"label": name}], tmp_path / "out")
+    write([meshes[0] | {"label": name}], tmp_path / "coco", format="coco", count=1)
