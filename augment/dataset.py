@@ -31,7 +31,7 @@ from renderer import errors
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import to_bytes
-from renderer.settings import Size
+from renderer.settings import Size, height_and_width
 
 # Renders with consecutive indices are drawn together. Larger blocks would render more than
 # is asked for, smaller ones would prepare scenes more often.
@@ -90,8 +90,8 @@ def render_dataset(
     """Render labeled images one after another.
 
     The renders show the entries of `meshes` in turn, then the next background,
-    then the next view. `width` of the scene applies to all objects of an entry,
-    which together span [-1, 1] in the largest direction. What else differs is
+    then the next view. `width` of the scene is that of the shorter side, at all
+    objects of an entry, which together span [-1, 1]. What else differs is
     drawn at random, as `settings.vary` and `settings.random_light` say. A render
     with an index is the same whatever `first` and `count` are, so that several
     processes can share the work.
@@ -139,7 +139,9 @@ def render_dataset(
     scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **of_scene)
     if "cameras" not in of_scene:
         examples = [
-            replace(example, cameras=_show_all(example.cameras, scene.objects[example.object]))
+            replace(
+                example, cameras=_show_all(example.cameras, scene.objects[example.object], size)
+            )
             for example in scene.examples
         ]
         scene = scene.changed(examples=examples)
@@ -180,12 +182,15 @@ def _render_blocks(
         yield from _renders(problem, values, rows, every.start)
 
 
-def _show_all(cameras: Sequence[Camera], item: SceneObject) -> tuple[Camera, ...]:
-    """Return cameras that show all objects of an entry as large as others show a single one."""
-    if not item.others:
+def _show_all(cameras: Sequence[Camera], item: SceneObject, size: Size) -> tuple[Camera, ...]:
+    """Return cameras whose shorter side shows all objects of an entry."""
+    height, width = height_and_width(size)
+    aspect = max(1.0, width / height)
+    if not item.others and aspect == 1:
         return tuple(cameras)
     points = item.mesh.vertices[np.unique(item.mesh.faces[: item.ends[-1]])]
-    factor = float(np.ptp(points, axis=0).max()) / 2
+    span = float(np.ptp(points, axis=0).max()) / 2 if item.others else 1.0
+    factor = aspect * span
     shown = []
     for camera in cameras:
         scaled = {"width": camera.width * factor}
@@ -193,10 +198,13 @@ def _show_all(cameras: Sequence[Camera], item: SceneObject) -> tuple[Camera, ...
             scaled["distance"] = camera.distance * factor
         camera = replace(camera, **scaled)
         seen = camera.project(points)[:, :2]
+        if not item.others:
+            shown.append(camera)
+            continue
         right, up = ((seen.min(0) + seen.max(0)) / 2 * camera.width / 2).tolist()
         # Near objects are larger in perspective.
-        width = camera.width * max(1.0, float(np.ptp(seen, axis=0).max()) / 2)
-        shown.append(replace(camera, right=camera.right - right, up=camera.up - up, width=width))
+        wider = camera.width * max(1.0, float((np.ptp(seen, axis=0) * [1, aspect]).max()) / 2)
+        shown.append(replace(camera, right=camera.right - right, up=camera.up - up, width=wider))
     return tuple(shown)
 
 

@@ -498,7 +498,11 @@ class RenderSettings(TaskSettings):
     network: str | None = setting(
         None, f"Network for whose mistakes each render is attacked: {NETWORKS}. null: none."
     )
-    size: Any = setting(224, "Pixels per side, or [height, width].", within=(1, MAX_SIZE))
+    size: Any = setting(
+        None,
+        "Pixels per side, or [height, width]. null: those of the network, or 224.",
+        within=(1, MAX_SIZE),
+    )
     meshes: list[Any] = setting(["solid:orange", "solid:apple", "solid:cup"], MESHES)
     label: Any = setting(
         None, "Class of the meshes. null: what the name of each file tells.", is_text=True

@@ -24,6 +24,7 @@ DESCRIPTION = "data_set.json"
 CIRCUMSTANCES = ("out", "shard", "shards", "device", "trust")
 # Folder of files of Hydra and submitit for --multirun, as conf/render.yaml says.
 LAUNCHER = ".launcher"
+DEFAULT_SIZE = 224
 # Bytes of a pixel in the files of a render, before compression, by the name of the map.
 BYTES = {"image": 3, "mask": 1, "depth": 2, "normals": 3}
 
@@ -41,6 +42,10 @@ def run(settings: RenderSettings) -> None:
         if (folder / name).resolve().parent != folder.resolve():
             reason = f"a folder cannot have the name of the class {name}"
             raise InputError(f"{reason}: rename the class or choose another format", "format")
+    device = choose_device(settings.device)
+    network = load_chosen(settings).to(device) if settings.network else None
+    if settings.size is None:
+        settings.size = DEFAULT_SIZE if network is None else network.size or DEFAULT_SIZE
     shards = shard_indices(settings)
     data = FORMATS[settings.format](folder, classes, settings.split_counts, shards, settings.maps)
     _describe(settings, folder, classes)
@@ -50,8 +55,6 @@ def run(settings: RenderSettings) -> None:
     print(
         f"{folder}: {len(missing)} of {settings.count} renders to do, at most {size / 1e9:.2g} GB"
     )
-    device = choose_device(settings.device)
-    network = load_chosen(settings).to(device) if settings.network else None
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
         renders = dataset.render_dataset(

@@ -13,6 +13,7 @@ import yaml
 from PIL import Image
 from torchvision.datasets import ImageFolder
 
+import norm_balls as nb
 from augment import dataset
 from augment.dataset import describe_camera, render_dataset
 from renderer.camera import PerspectiveCamera
@@ -245,16 +246,19 @@ def test_webdataset_reads_images_classes_and_details(groups, tmp_path):
     gc.collect()
 
 
-def test_all_objects_of_an_entry_are_in_the_image(meshes):
+@pytest.mark.parametrize("size", [[40, 40], [24, 40], [40, 24]])
+def test_all_objects_of_an_entry_are_in_the_image(meshes, size):
     box, ball = ((item["mesh"], item["label"]) for item in meshes)
-    for render in render_dataset(
-        [[box, ball], [ball, box, box]], 40, 8, fov=30.0, views=4, width=2.4
-    ):
+    entries = [[box, ball], [ball, box, box], ball]
+    for render in render_dataset(entries, size, 6, fov=30.0, views=2, width=2.4):
         left, top, right, bottom = render.boxes.T
-        assert min(left.min(), top.min()) > 0 and max(right.max(), bottom.max()) < 40
-        # They fill the image, whose center is theirs.
-        assert abs(left.min() + right.max() - 40) <= 2 and abs(top.min() + bottom.max() - 40) <= 2
-        assert right.max() - left.min() > 13
+        height, width = size
+        assert min(left.min(), top.min()) > 0
+        assert right.max() < width and bottom.max() < height
+        # Their center is that of the image.
+        assert abs(left.min() + right.max() - width) <= 2
+        assert abs(top.min() + bottom.max() - height) <= 2
+        assert max(right.max() - left.min(), bottom.max() - top.min()) > 12
 
 
 def test_a_light_that_is_named_replaces_those_that_are_drawn():
@@ -293,3 +297,20 @@ def test_a_class_that_cannot_be_a_folder_is_refused(meshes, tmp_path, name):
     with pytest.raises(InputError, match="rename the class"):
         write([meshes[0] | {"label": name}], tmp_path / "out")
     write([meshes[0] | {"label": name}], tmp_path / "coco", format="coco", count=1)
+
+
+def test_renders_have_224_pixels_per_side_unless_a_size_is_given(meshes, tmp_path):
+    folder = write(meshes, tmp_path / "out", size=None, count=1, maps=[])
+    assert details(folder, 0)["size"] == [224, 224]
+
+
+@pytest.mark.slow
+def test_a_network_is_wrong_on_the_files_that_are_rendered_against_it(tmp_path):
+    network = nb.load_classifier("efficientnet_lite0")
+    orange = [{"mesh": "solid:orange", "label": "orange"}]
+    folder = write(orange, tmp_path, size=None, count=2, maps=[], network="efficientnet_lite0")
+    for index in range(2):
+        image = np.array(Image.open(folder / details(folder, index)["image"]))
+        pixels = torch.from_numpy(image).permute(2, 0, 1)[None] / 255
+        assert pixels.shape[2:] == (224, 224)
+        assert network.classes[int(network(pixels).argmax())] != "orange"
