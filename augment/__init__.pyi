@@ -1,3 +1,4 @@
+from augment.adversarial_lighting import AdversarialLighting as AdversarialLighting
 from augment.attack_settings import AttackSettings as AttackSettings
 from augment.attack_settings import EOTSettings as EOTSettings
 from augment.attack_settings import MaterialSettings as MaterialSettings

@@ -1,3 +1,4 @@
+from augment import AdversarialLighting as AdversarialLighting
 from augment import Adversary as Adversary
 from augment import AttackResult as AttackResult
 from augment import AttackSettings as AttackSettings

@@ -1,0 +1,182 @@
+"""Light on images that a network handles worst, found by gradient among that of random light."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor, nn
+
+from augment.classifier import CheckedNetwork, TaskNetwork
+from augment.lighting import Light, RandomLighting
+from augment.network import frozen_eval_mode
+from augment.scene.lights import LightModel
+from augment.tasks.classification import Classification
+from augment.tasks.detection import Detection
+from augment.tasks.task import Criterion, Task
+from renderer import errors
+from renderer.errors import InputError
+
+# A step changes each number in [0, 1] by this, divided by the number of steps.
+STEP = 0.5
+
+
+class AdversarialLighting:
+    """Show images in light that a network handles badly.
+
+    The light models are those of `RandomLighting`. Each image begins with a
+    random light. `steps` times, each number in [0, 1] of its light takes a step
+    of 0.5 / `steps` along the sign of the gradient of the task's cost. Each
+    image gets the light with the lowest cost of those that were tried. The
+    network sees each image in `steps` + 1 lights, and once more in unchanged
+    light if there are no targets. There are `steps` backward passes.
+
+    Args:
+        model: Network from images in [0, 1] to outputs. Its mode and its
+            gradient flags are restored after each call.
+        task: What its outputs mean, such as `nb.Detection()`. None for
+            classification, or that of a network of `nb.load_classifier`.
+        steps: Number of steps along the gradient.
+        lights: Light models, as for `RandomLighting`.
+        strength: Fraction of the light that is changed, in [0, 1].
+        classes: Names of the classes of a detector or a segmenter.
+
+    Attributes:
+        forward_passes: Forward passes for each image with targets.
+        backward_passes: Backward passes for each image.
+
+    Raises:
+        InputError: If an argument has the wrong type or range.
+
+    Example:
+        >>> import torch
+        >>> import norm_balls as nb
+        >>> model = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 8 * 8, 2))
+        >>> lighting = nb.AdversarialLighting(model, lights="cast_shadow")
+        >>> images = torch.randint(256, (4, 3, 8, 8), dtype=torch.uint8)
+        >>> lighting(images, torch.tensor([0, 1, 0, 1])).shape
+        torch.Size([4, 3, 8, 8])
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        task: Task | None = None,
+        steps: int = 1,
+        lights: Sequence[str | LightModel] | Mapping[Any, float] | str | None = None,
+        strength: float = 1.0,
+        classes: Sequence[str] = (),
+    ):
+        errors.require_kind("model", model, nn.Module, "a torch.nn.Module")
+        errors.require_kind("task", task, Task | None, "a task, such as nb.Detection(), or None")
+        errors.require_whole("steps", steps, 1)
+        if isinstance(model, TaskNetwork):
+            # Its outputs have the form of its task already.
+            task, classes = model.task, model.classes
+        self.model, self.task, self.steps = model, task or Classification(), steps
+        if not (classes or isinstance(self.task, Classification)):
+            raise InputError(f"classes is empty: name the classes of the {self.task.name} network")
+        self.classes = [*classes]
+        self.forward_passes, self.backward_passes = steps + 1, steps
+        self.lighting = RandomLighting(lights, strength=strength)
+
+    def __call__(
+        self, images: Shaped[Tensor, "N C H W"], targets: Any = None
+    ) -> Shaped[Tensor, "N C H W"]:
+        """Show images in light that the network handles badly.
+
+        Args:
+            images: Images, bytes or in [0, 1].
+            targets: What they show: labels (N,), or a list of dictionaries with
+                "boxes" and "labels", or label maps (N, H, W). None for what the
+                network finds in the images as they are.
+
+        Returns:
+            Images of the same dtype and size.
+        """
+        shape = tuple(images.shape) if isinstance(images, Tensor) else ()
+        if len(shape) != 4 or shape[1] != 3:
+            raise InputError(f"images has shape {shape}: give a tensor (N, 3, H, W)")
+        params = self.lighting.make_params([images])
+        found = self._search(images, targets, params["lights"])
+        return self.lighting.apply(images, {"lights": found})
+
+    def _search(
+        self, images: Tensor, targets: Any, lights: list[Light | None]
+    ) -> list[Light | None]:
+        """Return the light of each image in which the cost of the task is lowest."""
+        if not any(lights):
+            return lights
+        unit = images / 255 if images.dtype == torch.uint8 else images.float()
+        network: CheckedNetwork
+        if isinstance(self.model, TaskNetwork):
+            network = self.model
+        else:
+            network = CheckedNetwork(self.model, "model", self.task, len(self.classes) or None)
+        best, lowest = lights, torch.full((len(unit),), torch.inf, device=unit.device)
+        with frozen_eval_mode(self.model):
+            image_of_row, criterion = self._criterion(network, unit, targets)
+            if not len(image_of_row):
+                return lights
+            for step in range(self.steps + 1):
+                with torch.set_grad_enabled(step < self.steps):
+                    leaves = [light and _leaf(light) for light in lights]
+                    cost = self._cost(network, unit, leaves, image_of_row, criterion)
+                is_lower = (cost < lowest).tolist()
+                lowest = torch.minimum(lowest, cost.detach())
+                pairs = zip(is_lower, lights, best, strict=True)
+                best = [new if lower else old for lower, new, old in pairs]
+                if step < self.steps:
+                    cost.sum().backward()
+                    lights = [light and self._stepped(light) for light in leaves]
+        return best
+
+    def _criterion(
+        self, network: CheckedNetwork, unit: Float[Tensor, "N 3 H W"], targets: Any
+    ) -> tuple[Int[Tensor, " E"], Criterion]:
+        """Return what the cost is about, with one row for each object, and the image of each."""
+        if targets is None:
+            with torch.no_grad():
+                outputs = network(unit)
+        elif isinstance(self.task, Detection):
+            outputs = [item | {"scores": torch.ones(len(item["boxes"]))} for item in targets]
+        else:
+            count = len(self.classes) or int(targets.max()) + 1
+            outputs = F.one_hot(targets.long(), count).movedim(-1, 1).float()
+        if len(outputs) != len(unit):
+            raise InputError(f"{len(outputs)} targets are given for {len(unit)} images: give each")
+        image_of_row, criterion = self.task.as_found(outputs, self.classes)
+        return image_of_row.to(unit.device), criterion.map(lambda rows: rows[:, 0].to(unit.device))
+
+    def _cost(
+        self,
+        network: CheckedNetwork,
+        unit: Float[Tensor, "N 3 H W"],
+        lights: list[Light | None],
+        image_of_row: Int[Tensor, " E"],
+        criterion: Criterion,
+    ) -> Float[Tensor, " N"]:
+        """Sum up the cost of the objects in each image, in some lights."""
+        outputs = network(self.lighting.apply(unit, {"lights": lights}))
+        rows = image_of_row.tolist()
+        chosen = [outputs[row] for row in rows] if isinstance(outputs, list) else outputs[rows]
+        costs = criterion.cost(chosen)
+        return costs.new_zeros(len(unit)).index_add(0, image_of_row, costs)
+
+    def _stepped(self, light: Light) -> Light:
+        """Move the numbers of a light along the sign of their gradient, within [0, 1]."""
+        values = light.values.detach().clone()
+        gradient = light.values.grad
+        if gradient is not None:
+            smooth = slice(light.model.dimensions)
+            moved = values[smooth] - STEP / self.steps * gradient[smooth].sign()
+            values[smooth] = moved.clamp(0, 1)
+        return light._replace(values=values)
+
+
+def _leaf(light: Light) -> Light:
+    """Return a light whose numbers get a gradient."""
+    return light._replace(values=light.values.detach().clone().requires_grad_())

@@ -1,0 +1,87 @@
+"""Light that is found by gradient among the models of random light."""
+
+import pytest
+import torch
+from torch import nn
+
+import norm_balls as nb
+from renderer.errors import InputError
+from tests.detectors import BrightBox
+
+
+class Mean(nn.Module):
+    """Classifier whose first logit is the mean of the image, and whose second is .3."""
+
+    def __init__(self):
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(10.0))
+        self.seen = 0
+
+    def forward(self, images):
+        self.seen += len(images)
+        mean = images.mean((1, 2, 3))
+        return self.scale * torch.stack([mean, 0 * mean + 0.3], dim=1)
+
+
+@pytest.fixture
+def images() -> torch.Tensor:
+    draws = torch.Generator().manual_seed(0)
+    return torch.randint(120, 200, (8, 3, 16, 16), generator=draws, dtype=torch.uint8)
+
+
+SMOOTH = ["projected_slide", "cast_shadow", "directional", "point", "lamps", "linear", "fractal"]
+
+
+@pytest.mark.parametrize("light", [*SMOOTH, "low_light"])
+def test_steps_lower_the_evidence_of_the_class_in_most_images(images, light):
+    model, labels = Mean(), torch.zeros(8, dtype=torch.int64)
+    torch.manual_seed(0)
+    start = nb.RandomLighting(light)(images)
+    torch.manual_seed(0)
+    found = nb.AdversarialLighting(model, steps=2, lights=light)(images, labels)
+    before, after = (model(shown / 255)[:, 0] for shown in (start, found))
+    assert found.dtype == torch.uint8 and found.shape == images.shape
+    assert ((after < before).sum() >= 5) and (after <= before + 0.05).all()
+
+
+def test_each_image_is_seen_as_often_as_stated_and_the_network_stays_as_it_was(images):
+    model = Mean().train()
+    for steps, targets, extra in ((1, torch.zeros(8).long(), 0), (2, None, 1)):
+        model.seen = 0
+        lighting = nb.AdversarialLighting(model, steps=steps, lights="linear")
+        lighting(images, targets)
+        assert model.seen == 8 * (lighting.forward_passes + extra) == 8 * (steps + 1 + extra)
+        assert lighting.backward_passes == steps
+    assert model.training and model.scale.requires_grad and model.scale.grad is None
+
+
+def test_light_hides_boxes_from_a_detector(images):
+    detector = BrightBox((2.0, 2.0, 12.0, 12.0))
+    target = {"boxes": torch.tensor([[2.0, 2.0, 12.0, 12.0]]), "labels": torch.tensor([1])}
+    lighting = nb.AdversarialLighting(
+        detector, nb.Detection(), steps=2, lights="low_light", classes=["background", "lamp"]
+    )
+    torch.manual_seed(0)
+    start = nb.RandomLighting("low_light")(images)
+    torch.manual_seed(0)
+    found = lighting(images, [target] * 8)
+    scores = [[item["scores"] for item in detector(shown / 255)] for shown in (start, found)]
+    assert torch.cat(scores[1]).mean() < torch.cat(scores[0]).mean()
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"steps": 0}, "steps"),
+        ({"task": nb.Detection()}, "classes"),
+        ({"strength": 2.0}, "strength"),
+    ],
+)
+def test_wrong_settings_are_refused_in_a_sentence(options, word):
+    with pytest.raises(InputError, match=word):
+        nb.AdversarialLighting(Mean(), **options)
+
+
+def test_targets_of_another_number_are_refused(images):
+    with pytest.raises(InputError, match="3 targets"):
+        nb.AdversarialLighting(Mean())(images, torch.zeros(3, dtype=torch.int64))
