@@ -440,6 +440,7 @@ def as_network(
     says. A `TaskNetwork` only gets `normalize_light`. `size_from` tells who states the size, and
     `says` whether to log what images the network gets.
     """
+    errors.require_kind("task", task, Task | None, "a task, such as nb.Detection(), or None")
     if size is not None:
         size = as_size("size", size, MAX_SIZE)
     if isinstance(network, TaskNetwork):

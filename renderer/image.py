@@ -83,7 +83,7 @@ def as_background(
     expected = f"a gray value, a color (3,) or images {(3, *shape)}, in [0, 1]"
     if values.ndim < 3 or values.shape[-3:] not in ((1, *shape), (3, *shape)):
         raise InputError(f"background has shape {tuple(values.shape)}: give {expected}")
-    if not (values.min() >= 0 and values.max() <= 1):
+    if values.numel() and not (values.min() >= 0 and values.max() <= 1):
         raise InputError(f"background has values outside [0, 1]: give {expected}")
     return values.expand(*values.shape[:-3], 3, *shape)
 

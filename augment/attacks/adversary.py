@@ -27,6 +27,7 @@ from renderer.light.basis import Basis, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
 from renderer.light.files import load_light, read_light, save_light
 from renderer.light.lamps import LOCAL_LIGHTS
+from renderer.mesh import select_faces
 from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
@@ -229,6 +230,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
         "label": str(shown.label),
         "name": Path(shown.name).name,
         "own_faces": shown.own,
+        "others": [[str(label), len(mesh.faces)] for label, mesh in shown.others],
         "albedo_scale": shown.albedo_scale,
         "gloss": shown.mesh.gloss is not None,
         "local_lights": [basis.name for basis, _ in local_lights],
@@ -323,6 +325,11 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     own_faces = description["own_faces"]
     errors.require_range("own_faces", own_faces, 1, len(mesh.faces))
     label, name = str(description["label"]), str(description["name"])
+    others, start = [], own_faces
+    for other, count in description.get("others", []):
+        errors.require_range("others", count, 1, len(mesh.faces) - start)
+        others.append((str(other), select_faces(mesh, slice(start, start + count))))
+        start += count
     for camera in cameras:
         # This raises InputError if the camera is inside of the mesh.
         camera.depths(mesh.vertices)
@@ -335,7 +342,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
         background = folder / BACKGROUND
     shape = (len(cameras), 3, *settings.shape)
     return Adversary(
-        shown=SceneObject(label, mesh, albedo_scale, name, own_faces),
+        shown=SceneObject(label, mesh, albedo_scale, name, own_faces, others),
         cameras=tuple(cameras),
         light=light,
         basis=basis,

@@ -49,6 +49,9 @@ NO_LIMIT = 1e9
 # labels (K,), of one class (K,).
 CANDIDATE_BOXES, CANDIDATE_SCORES = "candidate_boxes", "candidate_scores"
 CANDIDATE_LABELS = "candidate_labels"
+CANDIDATES_OF = CANDIDATE_BOXES, CANDIDATE_SCORES, CANDIDATE_LABELS
+# Keys of the final boxes in an output.
+FINAL = "boxes", "scores", "labels"
 # Limits with which a detector of torchvision returns its candidates instead of its final boxes.
 CANDIDATES = {"score_thresh": 1e-4, "nms_thresh": 1.0, "detections_per_img": 5000}
 # Boxes of one image: "boxes" (n, 4) in pixels, "labels" (n,) and "scores" (n,), and candidates.
@@ -220,54 +223,25 @@ class Detection(Task):
         is_raw: bool,
     ) -> Detections:
         """Check the boxes of one image. Raw boxes become candidates, and lose their duplicates."""
-        keys = "boxes", "scores", CANDIDATE_BOXES, CANDIDATE_SCORES
-        found = {key: as_tensor(key, item[key]).to(images) for key in keys if key in item}
-        for key in ("labels", CANDIDATE_LABELS):
-            if key in item:
-                found[key] = as_tensor(key, item[key]).to(images.device).long()
-        if not found["boxes"].numel():
-            found["boxes"] = found["boxes"].reshape(0, 4)
-        boxes = found["boxes"]
-        scores = found.setdefault("scores", boxes.new_zeros(()))
-        # Without labels, there is a score for each class.
-        has_labels = "labels" in found
-        columns = () if has_labels else (class_count or scores.shape[-1:].numel(),)
-        is_labeled = not has_labels or found["labels"].shape == boxes.shape[:1]
-        shape = (len(boxes), *columns)
-        if boxes.shape[1:] != (4,) or scores.shape != shape or not is_labeled:
-            shapes = ", ".join(f"{key} {tuple(value.shape)}" for key, value in found.items())
-            advice = f"labels (n,) and scores (n,), or scores (n, {class_count or 'classes'})"
-            raise InputError(f"{title} returned {shapes}: give boxes (n, 4), and {advice}")
-        if not has_labels:
-            found[CANDIDATE_BOXES], found[CANDIDATE_SCORES] = boxes, scores
-            found["scores"], found["labels"] = scores.max(1)
-        self._require_possible(found, title, class_count, images)
+        found: Detections = {}
+        for keys in FINAL, CANDIDATES_OF:
+            if keys[0] in item:
+                found |= _checked_shapes(title, class_count, item, images, keys)
+        if "labels" not in found:
+            found[CANDIDATE_BOXES], found[CANDIDATE_SCORES] = found["boxes"], found["scores"]
+            found["scores"], found["labels"] = found["scores"].max(1)
+        self._require_possible(found, title, images)
         if is_raw:
             if CANDIDATE_BOXES not in found:
-                given = boxes, found["scores"], found["labels"]
-                found |= zip(
-                    (CANDIDATE_BOXES, CANDIDATE_SCORES, CANDIDATE_LABELS), given, strict=True
-                )
+                found |= zip(CANDIDATES_OF, [found[key] for key in FINAL], strict=True)
             kept = _without_duplicates(found)
             found |= {key: found[key][kept] for key in ("boxes", "labels", "scores")}
         return found
 
-    def _require_possible(
-        self, found: Detections, title: str, class_count: int | None, images: Tensor
-    ) -> None:
-        """Check the ranges of scores and labels, and the boxes whose scores reach the threshold."""
+    def _require_possible(self, found: Detections, title: str, images: Tensor) -> None:
+        """Check the boxes whose scores reach the threshold."""
         height, width = images.shape[2:]
-        labels, scores = found["labels"], found["scores"].detach()
-        if not scores.isfinite().all() or not found["boxes"].isfinite().all():
-            raise InputError(f"{title} returned NaN or infinite scores or boxes: check its weights")
-        if len(scores) and not (scores.min() >= 0 and scores.max() <= 1):
-            span = f"from {float(scores.min()):g} to {float(scores.max()):g}"
-            raise InputError(f"{title} returned scores {span}: give probabilities from 0 to 1")
-        last = (class_count or int(NO_LIMIT)) - 1
-        if len(labels) and not (labels.min() >= 0 and labels.max() <= last):
-            span = f"from {int(labels.min())} to {int(labels.max())}"
-            advice = f"give indices of the {class_count} classes, from 0 to {last}"
-            raise InputError(f"{title} returned labels {span}: {advice}")
+        scores = found["scores"]
         left, top, right, bottom = found["boxes"].detach()[scores >= self.threshold].unbind(1)
         if (right < left).any() or (bottom < top).any():
             advice = "give left, top, right, bottom, and not width and height"
@@ -420,6 +394,47 @@ class DetectionCriterion(ObjectCriterion):
         """Return a mask of the views that reach the criterion. Nothing is no other class."""
         reached = super().reached_in_views(predicted)
         return reached & (predicted != self.class_count) if self.task.goal == MISLABEL else reached
+
+
+def _checked_shapes(
+    title: str,
+    class_count: int | None,
+    item: Mapping[str, Any],
+    images: Tensor,
+    keys: tuple[str, str, str],
+) -> Detections:
+    """Return the boxes, scores and labels of an output, after checks of shapes and ranges."""
+    found = {key: as_tensor(key, item[key]).to(images.device) for key in keys if key in item}
+    # Labels keep their digits, which half precision cannot hold.
+    found |= {key: found[key].to(images.dtype) for key in keys[:2] if key in found}
+    if not found[keys[0]].numel():
+        found[keys[0]] = found[keys[0]].reshape(0, 4)
+    boxes = found[keys[0]]
+    scores = found.setdefault(keys[1], boxes.new_zeros(()))
+    labels = found.get(keys[2])
+    # Without labels, there is a score for each class.
+    columns = () if labels is not None else (class_count or scores.shape[-1:].numel(),)
+    is_labeled = labels is None or labels.shape == boxes.shape[:1]
+    if boxes.shape[1:] != (4,) or scores.shape != (len(boxes), *columns) or not is_labeled:
+        shapes = ", ".join(f"{key} {tuple(value.shape)}" for key, value in found.items())
+        advice = f"labels (n,) and scores (n,), or scores (n, {class_count or 'classes'})"
+        raise InputError(f"{title} returned {shapes}: give boxes (n, 4), and {advice}")
+    scores = scores.detach()
+    if not scores.isfinite().all() or not boxes.isfinite().all():
+        raise InputError(f"{title} returned NaN or infinite scores or boxes: check its weights")
+    if scores.numel() and not (scores.min() >= 0 and scores.max() <= 1):
+        span = f"from {float(scores.min()):g} to {float(scores.max()):g}"
+        raise InputError(f"{title} returned scores {span}: give probabilities from 0 to 1")
+    if labels is None:
+        return found
+    if not torch.equal(labels, labels.round()):
+        raise InputError(f"{title} returned labels with fractions: give indices of classes")
+    last = (class_count or int(NO_LIMIT)) - 1
+    if len(labels) and not (labels.min() >= 0 and labels.max() <= last):
+        span = f"from {int(labels.min())} to {int(labels.max())}"
+        advice = f"give indices of the {class_count} classes, from 0 to {last}"
+        raise InputError(f"{title} returned labels {span}: {advice}")
+    return found | {keys[2]: labels.detach().long()}
 
 
 def _iou(boxes: Float[Tensor, "K 4"], box: Float[Tensor, " 4"]) -> Float[Tensor, " K"]:

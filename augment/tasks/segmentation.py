@@ -93,11 +93,12 @@ class Segmentation(Task):
         self, title: str, class_count: int | None, outputs: Any, images: Float[Tensor, "N 3 H W"]
     ) -> Float[Tensor, "N C H W"]:
         logits = _logits(outputs)
-        if isinstance(logits, Tensor) and logits is not outputs and logits.ndim == 4:
+        is_full = isinstance(outputs, Mapping) and "out" in outputs
+        is_tensor = isinstance(logits, Tensor) and logits.ndim == 4
+        if is_tensor and logits is not outputs and not is_full:
             # Segmenters of transformers return smaller logits, which its own reader enlarges.
             logits = F.interpolate(logits, images.shape[2:], mode="bilinear", align_corners=False)
         count = class_count or "C"
-        is_tensor = isinstance(logits, Tensor) and logits.ndim == 4
         expected = (
             (len(images), class_count or logits.shape[1], *images.shape[2:]) if is_tensor else ()
         )

@@ -13,8 +13,9 @@ import torch
 import augment
 from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
-from augment.scene.objects import Example, SceneObject, add_table, with_others
+from augment.scene.objects import Example, SceneObject, add_table, load_object, with_others
 from augment.scene.scene import Scene
+from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.mesh import Mesh, normalize
 from renderer.solids import solid
@@ -117,6 +118,20 @@ def test_an_adversary_with_gloss_beside_a_matte_table_is_read_back(tmp_path, kin
     matte = replace(item, mesh=replace(item.mesh, gloss=None))
     matte_images = attacked({kind}, scene_with(matte)).images
     assert (matte_images - done.images).abs().max() > 0.02
+
+
+def test_the_objects_of_an_adversary_are_read_back_with_their_truth(tmp_path):
+    given = [{"mesh": "solid:cup", "label": "lime", "scale": 0.6}, {"mesh": "solid:ball"}]
+    item = load_object(ObjectSettings("solid:orange", "orange", others=given))
+    done = attacked({"lighting"}, scene_with(add_table(item, BROWN)))
+    write_adversary(adversary_of(done), tmp_path)
+    found = reload(tmp_path)
+    index_of = {"orange": 0, "lime": 1}.get
+    truth, expected = (of.truth(index_of) for of in (found.scene(SOFTWARE), done.problem.scene))
+    assert found.shown.labels == ["orange", "lime", ""]
+    assert expected.labels[0, 0].tolist() == [0, 1]
+    for name, values in vars(expected).items():
+        torch.testing.assert_close(getattr(truth, name), values, msg=name)
 
 
 @pytest.mark.parametrize("fov", [None, 50.0])

@@ -171,6 +171,7 @@ def test_an_object_that_is_not_found_before_is_reported_and_no_success():
 
 
 BOX = {"boxes": [[2.0, 3.0, 10.0, 12.0]], "labels": [0], "scores": [0.9]}
+CANDIDATE = {"candidate_boxes": [[0.0, 0.0, 8.0, 8.0]]}
 
 
 @pytest.mark.parametrize(
@@ -185,6 +186,12 @@ BOX = {"boxes": [[2.0, 3.0, 10.0, 12.0]], "labels": [0], "scores": [0.9]}
         ({"boxes": [[20.0, 3.0, 30.0, 12.0]]}, "outside of the image"),
         ({"boxes": [[0.1, 0.2, 0.6, 0.7]]}, "fractions of the image"),
         ({"boxes": [[1.0, 2.0, 3.0]]}, r"boxes \(n, 4\)"),
+        ({"labels": [0.5]}, "fractions"),
+        ({"candidate_boxes": [[0.0, 0.0, 8.0, 8.0]]}, r"candidate_scores \(\)"),
+        (CANDIDATE | {"candidate_scores": [[0.1] * 5]}, "candidate_scores"),
+        (CANDIDATE | {"candidate_scores": [[0.1, float("nan"), 0.1]]}, "NaN"),
+        (CANDIDATE | {"candidate_scores": [[0.1, 3.0, 0.1]]}, "from 0 to 1"),
+        (CANDIDATE | {"candidate_scores": [0.1], "candidate_labels": [9]}, "from 0 to 2"),
     ],
 )
 def test_impossible_boxes_are_refused(change, message):
@@ -216,6 +223,7 @@ def test_a_decode_function_of_other_shapes_is_refused(decode, message):
         ({"target": "cup", "force": True}, "mislabel"),
         ({"settings": replace(SETTINGS, eot=nb.EOTSettings(draws=1))}, "eot"),
         ({"task": nb.Classification()}, "returned list"),
+        ({"task": "detection"}, "task is 'detection'"),
     ],
 )
 def test_an_attack_that_fits_no_detector_is_refused(options, message):

@@ -39,9 +39,46 @@ def cost_falls(network: nn.Module, task: nb.Detection | nb.Segmentation, **optio
 
 
 def of_torchvision(library, name: str, **options) -> nn.Module:
+    """Return an untrained network whose activations neither vanish nor explode."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return getattr(library, name)(**UNTRAINED, **options).eval()
+        network = getattr(library, name)(**UNTRAINED, **options)
+        for part in network.modules():
+            if isinstance(part, nn.BatchNorm2d):
+                part.momentum = 1.0
+        network.backbone(torch.randn(4, 3, 2 * SIZE, 2 * SIZE))
+    return network.eval()
+
+
+def slopes(
+    network: nn.Module, task: nb.Detection | nb.Segmentation, step: float = 1e-7
+) -> tuple[Tensor, Tensor]:
+    """Return the slope of the cost along its gradient in pixels, and that by finite differences.
+
+    The object is at a candidate of a detector, or in the center for a segmenter. Steps are small,
+    because deep networks have many kinks.
+    """
+    adapted = as_network(network.double(), SIZE, CLASSES, dtype=torch.float64)
+    draws = torch.Generator().manual_seed(1)
+    images = torch.rand(1, 3, SIZE, SIZE, generator=draws, dtype=torch.float64)
+    shown = images.clone().requires_grad_()
+    found = adapted(shown)
+    box = torch.tensor([16.0, 16.0, 48.0, 48.0], dtype=torch.float64)
+    if isinstance(task, nb.Detection):
+        candidates = found[0]["candidate_boxes"].detach()
+        box = candidates[box_iou(candidates, box[None])[:, 0].argmax()]
+    masks = torch.zeros(1, 1, 1, SIZE, SIZE, dtype=torch.bool)
+    masks[..., 16:48, 16:48] = True
+    truth = Truth(torch.ones(1, 1, 1).long(), box.view(1, 1, 1, 4), masks, torch.ones(1, 1, 1))
+    rule = task.criterion(torch.tensor([[1]]), lambda: truth, len(CLASSES))
+    rule = rule.map(lambda rows: rows.flatten(0, 1))
+    (gradient,) = torch.autograd.grad(rule.cost(found).sum(), shown)
+    slope = gradient.norm()
+    with torch.no_grad():
+        ahead, behind = (
+            rule.cost(adapted(images + sign * step * gradient / slope)) for sign in (1, -1)
+        )
+    return slope, (ahead - behind).sum() / (2 * step)
 
 
 @pytest.mark.parametrize("goal", ["hide", "mislabel"])
@@ -53,16 +90,22 @@ def test_an_attack_lowers_the_cost_of_a_small_detector(goal):
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", ["hide", "mislabel"])
 @pytest.mark.parametrize("name", DETECTORS)
-def test_an_attack_lowers_the_cost_of_a_detector_of_torchvision(name, goal):
-    network = of_torchvision(detection, name, **DETECTORS[name])
-    assert cost_falls(network, nb.Detection(goal=goal), classes=CLASSES)
+def test_the_gradient_of_a_detector_of_torchvision_is_that_of_finite_differences(name, goal):
+    found, expected = slopes(
+        of_torchvision(detection, name, **DETECTORS[name]), nb.Detection(goal=goal)
+    )
+    assert found > 1e-8
+    # Detectors with proposals give no gradient to the positions of the proposals.
+    rtol = 0.1 if "rcnn" in name else 1e-3
+    torch.testing.assert_close(found, expected, rtol=rtol, atol=0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SEGMENTERS)
-def test_an_attack_lowers_the_cost_of_a_segmenter_of_torchvision(name):
-    network = of_torchvision(segmentation, name)
-    assert cost_falls(network, nb.Segmentation(), classes=CLASSES)
+def test_the_gradient_of_a_segmenter_of_torchvision_is_that_of_finite_differences(name):
+    found, expected = slopes(of_torchvision(segmentation, name), nb.Segmentation())
+    assert found > 1e-8
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
 
 
 def test_candidates_of_torchvision_are_its_boxes_without_suppression_in_the_pixels_given():
@@ -83,25 +126,9 @@ def test_candidates_of_torchvision_are_its_boxes_without_suppression_in_the_pixe
 
 @pytest.mark.parametrize("goal", ["hide", "mislabel"])
 def test_the_gradient_in_the_pixels_is_that_of_finite_differences(goal):
-    network = small_detector(len(CLASSES), SIZE).double()
-    adapted = as_network(network, SIZE, CLASSES, dtype=torch.float64)
-    draws = torch.Generator().manual_seed(1)
-    images = torch.rand(1, 3, SIZE, SIZE, generator=draws, dtype=torch.float64)
-    step = 1e-5 * torch.randn(images.shape, generator=draws, dtype=torch.float64)
-    box = torch.tensor([[[[16.0, 16.0, 48.0, 48.0]]]], dtype=torch.float64)
-    masks = torch.zeros(1, 1, 1, SIZE, SIZE, dtype=torch.bool)
-    truth = Truth(torch.ones(1, 1, 1).long(), box, masks, torch.ones(1, 1, 1))
-    task = nb.Detection(goal=goal)
-    rule = task.criterion(torch.tensor([[1]]), lambda: truth, len(CLASSES))
-    rule = rule.map(lambda rows: rows.flatten(0, 1))
-    shown = images.clone().requires_grad_()
-    found = adapted(shown)
-    assert (box_iou(found[0]["candidate_boxes"], box[0, 0]) >= 0.25).sum() > 10
-    (gradient,) = torch.autograd.grad(rule.cost(found).sum(), shown)
-    with torch.no_grad():
-        ahead, behind = (rule.cost(adapted(images + sign * step)) for sign in (1, -1))
-    expected = (gradient * step).sum()
-    torch.testing.assert_close((ahead - behind).sum() / 2, expected, rtol=1e-4, atol=0)
+    found, expected = slopes(small_detector(len(CLASSES), SIZE), nb.Detection(goal=goal), step=1e-4)
+    assert found > 1e-8
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
 
 
 class Raw(nn.Module):
