@@ -110,7 +110,8 @@ class AdversarialLighting:
         """Return the light of each image in which the cost of the task is lowest."""
         if not any(lights):
             return lights
-        unit = images / 255 if images.dtype == torch.uint8 else images.float()
+        is_float = images.is_floating_point()
+        unit = images.float() if is_float else images.float() / torch.iinfo(images.dtype).max
         network: CheckedNetwork
         if isinstance(self.model, TaskNetwork):
             network = self.model
@@ -125,12 +126,13 @@ class AdversarialLighting:
                 with torch.set_grad_enabled(step < self.steps):
                     leaves = [light and _leaf(light) for light in lights]
                     cost = self._cost(network, unit, leaves, image_of_row, criterion)
+                    if step < self.steps:
+                        cost.sum().backward()
                 is_lower = (cost < lowest).tolist()
                 lowest = torch.minimum(lowest, cost.detach())
                 pairs = zip(is_lower, lights, best, strict=True)
                 best = [new if lower else old for lower, new, old in pairs]
                 if step < self.steps:
-                    cost.sum().backward()
                     lights = [light and self._stepped(light) for light in leaves]
         return best
 

@@ -85,3 +85,13 @@ def test_wrong_settings_are_refused_in_a_sentence(options, word):
 def test_targets_of_another_number_are_refused(images):
     with pytest.raises(InputError, match="3 targets"):
         nb.AdversarialLighting(Mean())(images, torch.zeros(3, dtype=torch.int64))
+
+
+def test_gradients_need_not_be_enabled_and_bits_of_a_pixel_do_not_matter(images):
+    lighting = nb.AdversarialLighting(Mean(), steps=2, lights="linear")
+    found = []
+    for given in (images / 255, (images.int() * 257).to(torch.uint16)):
+        torch.manual_seed(0)
+        with torch.no_grad():
+            found.append(lighting(given, torch.zeros(8, dtype=torch.int64)))
+    torch.testing.assert_close(found[1].float() / 65535, found[0], rtol=0, atol=1e-4)
