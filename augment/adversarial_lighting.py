@@ -74,7 +74,6 @@ class AdversarialLighting:
         errors.require_kind("task", task, Task | None, "a task, such as nb.Detection(), or None")
         errors.require_whole("steps", steps, 1)
         if isinstance(model, TaskNetwork):
-            # Its outputs have the form of its task already.
             task, classes = model.task, model.classes
         self.model, self.task, self.steps = model, task or Classification(), steps
         if not (classes or isinstance(self.task, Classification)):
@@ -112,11 +111,7 @@ class AdversarialLighting:
             return lights
         is_float = images.is_floating_point()
         unit = images.float() if is_float else images.float() / torch.iinfo(images.dtype).max
-        network: CheckedNetwork
-        if isinstance(self.model, TaskNetwork):
-            network = self.model
-        else:
-            network = CheckedNetwork(self.model, "model", self.task, len(self.classes) or None)
+        network = CheckedNetwork(self.model, "model", self.task, len(self.classes) or None)
         best, lowest = lights, torch.full((len(unit),), torch.inf, device=unit.device)
         with frozen_eval_mode(self.model):
             image_of_row, criterion = self._criterion(network, unit, targets)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from numbers import Integral
 from typing import Any, Self
 
@@ -97,9 +96,10 @@ class CheckedNetwork(wrappers.Network):
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Any:
         """Compute the outputs of images in the form of the task, and check them."""
+        # A network of a task inside has asked its own network already.
+        task = None if isinstance(self.network, TaskNetwork) else self.task
         try:
-            call = self.network if self.task is None else partial(self.task.outputs, self.network)
-            outputs = call(images)
+            outputs = self.network(images) if task is None else task.outputs(self.network, images)
         except Exception as error:
             # The caller handles errors of memory. An `InputError` already tells what is wrong.
             if isinstance(error, InputError) or errors.is_out_of_memory(error):

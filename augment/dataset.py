@@ -183,7 +183,7 @@ def _render_blocks(
 
 
 def _show_all(cameras: Sequence[Camera], item: SceneObject, size: Size) -> tuple[Camera, ...]:
-    """Return cameras whose shorter side shows all objects of an entry."""
+    """Widen cameras such that the shorter side of images shows all objects of an entry."""
     height, width = height_and_width(size)
     aspect = max(1.0, width / height)
     if not item.others and aspect == 1:

@@ -125,8 +125,8 @@ class PhotographAttackResult(errors.ShortRepr):
     """Predictions of a network for N photographs in the light of a projector.
 
     For a detector or a segmenter, a photograph is counted once for each of its
-    detections or segments in unchanged light. One that it finds nothing in is
-    left out.
+    detections or segments in unchanged light. A photograph without any is left
+    out.
 
     The projector shows S random pictures (slides) on each photograph, each in
     three lights, which are the keys of the dictionaries:

@@ -49,16 +49,18 @@ from renderer.settings import Size
 CLASSIFIED = 250
 
 
-class _Shown(NamedTuple):
-    """Attack values of E examples, their images, and numbers about both.
+class _Made(NamedTuple):
+    """Renders of E examples: their attack values, images, and numbers about both.
 
-    `is_success` marks the renders that figures may show.
+    `is_wrong` marks renders that figures may show. None if the network finds objects. `truth` has
+    the objects in the images if it was needed.
     """
 
     values: Float[Tensor, "E D"]
     images: Float[Tensor, "E 3 H W"]
     diagnostics: dict[str, float]
-    is_success: Bool[Tensor, " _"]
+    is_wrong: Bool[Tensor, " E"] | None = None
+    truth: Truth | None = None
 
 
 @dataclass(eq=False, repr=False)
@@ -246,25 +248,23 @@ class AugmentationService:
         """
         require_kind("model", model, nn.Module, "a torch.nn.Module from images to outputs")
         require_whole("number", number)
-        model = CheckedNetwork(model, "model", self.task, len(self.classes) or None)
+        model = self._checked(model)
         if self.images is not None and self.settings.renders:
             return self._from_folder(model, self.images, number)
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
         problem = self.problem(number)
-        if self.settings.mode == "random":
-            shown = self._random(model, problem, number)
-        else:
-            shown = self._adversarial(model, problem, number)
+        make = self._random if self.settings.mode == "random" else self._adversarial
+        made = make(model, problem, number)
         if number == 0:
             warn_of_exposure(problem.scene)
-        diagnostics = shown.diagnostics | _changes(problem, shown.values)
-        if self._finds_objects:
-            targets = self._truth(problem, shown.values).targets()
-            return Renders(shown.images, self.labels, diagnostics, targets=targets)
-        chosen = (shown.values, shown.is_success, self.labels)
+        diagnostics = made.diagnostics | _changes(problem, made.values)
+        if made.is_wrong is None:
+            truth = made.truth or self._truth(problem, made.values)
+            return Renders(made.images, self.labels, diagnostics, targets=truth.targets())
+        chosen = (made.values, made.is_wrong, self.labels)
         examples = select_examples_to_log(model, problem, *chosen)
-        return Renders(shown.images, self.labels, diagnostics, examples)
+        return Renders(made.images, self.labels, diagnostics, examples)
 
     def problem(self, number: int) -> SceneProblem:
         """Vary the scene at random, and return what an attack on it may change."""
@@ -280,8 +280,11 @@ class AugmentationService:
         """Return the values of a problem with this number: random ones, or those of an attack."""
         if self.settings.mode == "random" or model is None:
             return self._random_values(problem, number)
-        model = CheckedNetwork(model, "model", self.task, len(self.classes) or None)
-        return self._adversarial(model, problem, number).values
+        return self._adversarial(self._checked(model), problem, number).values
+
+    def _checked(self, model: nn.Module) -> CheckedNetwork:
+        """Return a network whose outputs the task reads and checks."""
+        return CheckedNetwork(model, "model", self.task, len(self.classes) or None)
 
     @property
     def _finds_objects(self) -> bool:
@@ -357,16 +360,16 @@ class AugmentationService:
         _, diagnostics = self._classify(model, selected, labels)
         return Renders(selected, labels, diagnostics)
 
-    def _random(self, model: nn.Module, problem: SceneProblem, number: int) -> _Shown:
+    def _random(self, model: nn.Module, problem: SceneProblem, number: int) -> _Made:
         """Render all examples with random values of the parameters, such as random lighting."""
         values = self._random_values(problem, number)
         own = self._own_rows(len(self.labels))
         images = self._gather(problem.images(values, own)[:, 0], own, len(self.labels))
         if self._finds_objects:
-            diagnostics = self._find(model, images, self._truth(problem, values))
-            return _Shown(values, images, diagnostics, self.labels < NO_OBJECT)
+            truth = self._truth(problem, values)
+            return _Made(values, images, self._find(model, images, truth), truth=truth)
         is_error, diagnostics = self._classify(model, images, self.labels)
-        return _Shown(values, images, diagnostics, is_error)
+        return _Made(values, images, diagnostics, is_error)
 
     def _truth(self, problem: SceneProblem, values: Float[Tensor, "E D"]) -> Truth:
         """Find the objects with a class that all images show."""
@@ -425,7 +428,7 @@ class AugmentationService:
         is_error = is_error.index_copy(0, rows, is_misclassified)
         return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
 
-    def _adversarial(self, model: nn.Module, problem: SceneProblem, number: int) -> _Shown:
+    def _adversarial(self, model: nn.Module, problem: SceneProblem, number: int) -> _Made:
         """Attack the examples, of which each process has a part.
 
         Examples that show a detector no object with a class get random values instead.
@@ -473,11 +476,11 @@ class AugmentationService:
         }
         if attack.sensor_noise:
             diagnostics["attack_success_without_noise"] = _mean(result.success)
-        is_new_success = success & ~result.success_before
-        images = result.images[:, 0]
         if self._finds_objects:
             images = problem.images(values, problem.all_examples)[:, 0]
-        return _Shown(values, images, diagnostics, is_new_success)
+            return _Made(values, images, diagnostics)
+        is_new_success = success & ~result.success_before
+        return _Made(values, result.images[:, 0], diagnostics, is_new_success)
 
     def _own_rows(self, count: int) -> Int[Tensor, " A"]:
         """Return the indices of those of some examples that this process renders or attacks."""

@@ -28,7 +28,6 @@ from augment.scene.patterns import (
     AMBIENT,
     DARKEST,
     STOPS,
-    ProjectedLight,
     draw_slides,
     luminance,
     random_colors,
@@ -63,7 +62,7 @@ def normal_numbers(uniform: Float[Tensor, "B E"], nodes: int) -> Float[Tensor, "
 def blend(
     uniform: Float[Tensor, "B E"], nodes: int, angle: Float[Tensor, "B 1 1 1"]
 ) -> Float[Tensor, "B 1 nodes nodes"]:
-    """Blend two grids of normal numbers, of which none changes the variance at any angle."""
+    """Blend two grids of normal numbers. The variance is the same at any angle."""
     first, second = (normal_numbers(uniform[:, start:], nodes) for start in (0, nodes**2))
     return angle.cos() * first + angle.sin() * second
 
@@ -121,7 +120,7 @@ class Drawn(NamedTuple):
 
 
 class Illumination(NamedTuple):
-    """Light of each pixel: gain · field + offset, of which gain and offset are for whole images."""
+    """Light of each pixel: gain · field + offset. Gain and offset hold for a whole image."""
 
     field: Float[Tensor, "B _ H W"]
     gain: Float[Tensor, "B _ 1 1"] | float = 1.0
@@ -213,9 +212,7 @@ class ProjectedSlide(LightModel):
         pictures = torch.cat([draw_slides(1, drawn.size, draw, self.slides) for draw in draws])
         log_gain = torch.cat(list(drawn.numbers[4:-1]), 1).view(-1, 3, self.cells, self.cells)
         gain = smooth(log_gain, drawn.size, mode="bilinear").exp()
-        ambient = drawn.numbers[3]
-        shaded = ProjectedLight(pictures.to(gain) * gain, shading(drawn), ambient, ambient)
-        return Illumination(shaded.light())
+        return Illumination(pictures.to(gain) * gain * shading(drawn), offset=drawn.numbers[3])
 
 
 def shading(drawn: Drawn) -> Float[Tensor, "B 1 H W"]:

@@ -206,6 +206,14 @@ def write_image(
     A tensor has channels first, and 8 bits or values in [0, 1]. An array has channels last. A
     reader never sees a part of the new file: see `atomic_write`.
     """
+    image_format = Image.registered_extensions()[path.suffix.lower()]
+    atomic_write(path, encode_image(image, image_format, **options))
+
+
+def encode_image(
+    image: Image.Image | Tensor | np.ndarray, image_format: str, **options: object
+) -> bytes:
+    """Return the content of an image file, see `write_image`. An array may have 16 bits."""
     if not isinstance(image, Image.Image | np.ndarray):
         from renderer.image import to_bytes
 
@@ -214,9 +222,8 @@ def write_image(
     if isinstance(image, np.ndarray):
         image = Image.fromarray(image)
     content = io.BytesIO()
-    image_format = Image.registered_extensions()[path.suffix.lower()]
     image.save(content, image_format, **options)
-    atomic_write(path, content.getbuffer())
+    return content.getvalue()
 
 
 # Distance in pixels between neighboring tiles of a sheet.

@@ -3,6 +3,7 @@ import torch
 from torchvision.ops import box_iou
 
 import norm_balls as nb
+from augment import dataset
 from train.checkpoints import load_run
 
 LABELED = ("orange", "sweet_pepper", "mushroom", "cup", "bottle")
@@ -29,6 +30,17 @@ def test_the_published_detector_finds_more_than_half_of_other_solids(detector):
         is_counted = (output["scores"] >= 0.4) & (output["labels"] == label)
         found.append(bool((box_iou(output["boxes"][is_counted], box) >= 0.5).any()))
     assert sum(found) >= 6
+
+
+def test_renders_are_attacked_for_a_detector_that_reads_its_outputs_itself(detector):
+    attack = nb.TrainingAttackSettings(max_steps=1)
+    settings = nb.AugmentationSettings(mode="adversarial", attack=attack)
+    meshes = [("solid:orange:2001", "orange")]
+    options = {"network": detector, "settings": settings, "samples": 1, **LOOKS}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "BLOCK", 1)
+        [render] = nb.render_dataset(meshes, detector.size, 1, **options)
+    assert render.labels == ["orange"]
 
 
 def test_a_run_of_the_published_detector_is_the_same_network(detector):

@@ -49,19 +49,20 @@ def run(settings: RenderSettings) -> None:
     shards = shard_indices(settings)
     data = FORMATS[settings.format](folder, classes, settings.split_counts, shards, settings.maps)
     _describe(settings, folder, classes)
-    missing = [index for index in shards[settings.shard] if not data.last_file(index).exists()]
+    own = shards[settings.shard]
+    finished = {index for index in own if data.last_file(index).exists()}
+    missing = len(own) - len(finished)
     height, width = height_and_width(settings.size)
-    size = height * width * sum(BYTES[name] for name in ("image", *settings.maps)) * len(missing)
-    print(
-        f"{folder}: {len(missing)} of {settings.count} renders to do, at most {size / 1e9:.2g} GB"
-    )
+    size = height * width * sum(BYTES[name] for name in ("image", *settings.maps)) * missing
+    print(f"{folder}: {missing} of {settings.count} renders to do, at most {size / 1e9:.2g} GB")
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
         renders = dataset.render_dataset(
             list(objects.values()),
             settings.size,
-            settings.count,
-            skip=set(range(settings.count)).difference(missing),
+            len(own),
+            first=own.start,
+            skip=finished,
             seed=settings.seed,
             settings=settings.augment,
             network=network,
@@ -71,7 +72,7 @@ def run(settings: RenderSettings) -> None:
             views=settings.scene.views,
             device=device,
         )
-    data.write(progress(renders, "renders", len(missing)))
+    data.write(progress(renders, "renders", missing))
     if data.is_finished():
         data.finish()
         parts = ", ".join(f"{count} {name}" for name, count in data.splits.items())

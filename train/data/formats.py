@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 import yaml
 from jaxtyping import Bool
-from PIL import Image
+from torch import Tensor
 
 from augment.dataset import LabeledRender
 from renderer.io.files import atomic_write, replacing
+from renderer.io.images import encode_image
 
 # Folder with a JSON file for each render, and with its maps.
 DETAILS = "details"
@@ -93,8 +94,7 @@ class DataSet:
         maps = {f"{stem}_{name}.png": png(_map(render, name)) for name in self.maps}
         image = self.image_path(render)
         details = {"image": image, "split": self.split(render.index), **describe(render)}
-        pixels = png(render.image.permute(1, 2, 0).numpy())
-        return {image: pixels, **maps, f"{stem}.json": json.dumps(details)}
+        return {image: png(render.image), **maps, f"{stem}.json": json.dumps(details)}
 
     def is_finished(self) -> bool:
         """Return whether all renders are there."""
@@ -295,8 +295,6 @@ def _map(render: LabeledRender, name: str) -> np.ndarray:
     return np.rint((normals + 1) / 2 * 255).astype(np.uint8)
 
 
-def png(pixels: np.ndarray) -> bytes:
+def png(pixels: Tensor | np.ndarray) -> bytes:
     """Encode an image as a PNG file. Strong compression would take most of the time."""
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=1)
-    return buffer.getvalue()
+    return encode_image(pixels, "PNG", compress_level=1)
