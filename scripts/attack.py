@@ -1,4 +1,4 @@
-"""pnb-attack: attack a classifier through the lighting, the shape, the colors or the pixels."""
+"""Attack a classifier through the lighting, the shape, the colors or the pixels of a mesh."""
 
 from train.cli import Command
 
@@ -24,9 +24,7 @@ def list_parameters(words: list[str]) -> list[str]:
 main = Command(
     name="attack",
     settings="train.command_settings:AttackExperimentSettings",
-    body="train.commands.attack:run",
-    about="Attack a classifier through the lighting, the shape, the colors or the pixels of a "
-    "mesh.",
+    about=__doc__,
     examples=[
         "pnb-attack attack=lighting network=efficientnet_lite0 meshes=[orange.glb]",
         "pnb-attack attack=lighting+geometry",

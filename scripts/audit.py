@@ -1,18 +1,20 @@
-"""pnb-audit: measure how safe a classifier is in unusual lighting, and what hardening costs."""
+"""Measure how safe a classifier is in unusual lighting, and what hardening costs.
+
+Your own network: network=torchvision:NAME weights=FILE classes=FILE, a file of TorchScript, of
+torch.export (.pt2) or of ONNX (.onnx), or network=python:my_network.load, a function in
+my_network.py. It returns the network, the pixels per side of its images, and the names of its
+classes.
+
+An audit that was stopped continues with the same settings, and with hardened= or photos= in
+addition.
+"""
 
 from train.cli import Command
 
 main = Command(
     name="audit",
     settings="train.command_settings:AuditSettings",
-    body="train.commands.audit:run",
-    about="Measure how safe a classifier is in unusual lighting, and what hardening costs.\n\n"
-    "Your own network: network=torchvision:NAME weights=FILE classes=FILE, a file of "
-    "TorchScript, of torch.export (.pt2) or of ONNX (.onnx), or "
-    "network=python:my_network.load, a function in my_network.py. It returns the network, "
-    "the pixels per side of its images, and the names of its classes.\n\n"
-    "An audit that was stopped continues with the same settings, and with hardened= or photos= "
-    "in addition.",
+    about=__doc__,
     examples=[
         "pnb-audit network=torchvision:resnet50 meshes=orange.glb",
         "pnb-audit network=efficientnet_lite0 unlabeled=FOLDER",

@@ -1,12 +1,11 @@
-"""pnb-compare: print a Markdown table of finished runs."""
+"""Print a Markdown table of finished runs. With -v, print all tables."""
 
 from train.cli import Command
 
 main = Command(
     name="compare",
-    settings="train.commands.compare:CompareSettings",
-    body="train.commands.compare:run",
-    about="Print a Markdown table of finished runs. With -v, print all tables.",
+    settings="train.command_settings:CompareSettings",
+    about=__doc__,
     examples=["pnb-compare 'runs=[runs/a,runs/b]'"],
 )
 

@@ -1,12 +1,11 @@
-"""pnb-evaluate: score a network on a folder of photographs."""
+"""Score a network on a folder of photographs."""
 
 from train.cli import Command
 
 main = Command(
     name="evaluate",
     settings="train.command_settings:EvaluateSettings",
-    body="train.commands.evaluate:run",
-    about="Score a network on a folder of photographs.",
+    about=__doc__,
     examples=[
         "pnb-evaluate run=pretrained/best photos=photos",
         "pnb-evaluate network=torchvision:resnet18 photos=photos",

@@ -1,12 +1,11 @@
-"""pnb-fit: find the camera and the lighting of a photograph."""
+"""Find the camera and the lighting of a photograph."""
 
 from train.cli import Command
 
 main = Command(
     name="fit",
     settings="train.command_settings:FitSettings",
-    body="train.commands.fit:fit",
-    about="Find the camera and the lighting of a photograph.",
+    about=__doc__,
     examples=["pnb-fit photograph=photo.jpg mask=mask.png mesh=orange.glb"],
 )
 

@@ -1,12 +1,11 @@
-"""pnb-lab: path-trace renders of oranges and hard negatives under a projector."""
+"""Path-trace renders of oranges and hard negatives under a projector."""
 
 from train.cli import Command
 
 main = Command(
     name="lab",
     settings="train.command_settings:LabSettings",
-    body="train.commands.lab:render_laboratory",
-    about="Path-trace renders of oranges and hard negatives under a projector.",
+    about=__doc__,
     examples=["pnb-lab out=lab"],
 )
 

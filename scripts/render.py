@@ -1,4 +1,4 @@
-"""pnb-render: write labeled renders as a data set."""
+"""Write labeled renders as a data set: folders of classes, COCO, YOLO or WebDataset."""
 
 import re
 
@@ -16,8 +16,7 @@ def name_light(words: list[str]) -> list[str]:
 main = Command(
     name="render",
     settings="train.command_settings:RenderSettings",
-    body="train.commands.render:run",
-    about="Write labeled renders as a data set: folders of classes, COCO, YOLO or WebDataset.",
+    about=__doc__,
     examples=[
         "pnb-render meshes=[orange.glb,apple.glb] format=coco count=1000 out=renders",
         "pnb-render --multirun shard=0,1 shards=2 launcher=joblib count=1000 out=renders",

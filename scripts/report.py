@@ -1,4 +1,4 @@
-"""pnb-report: write a page of runs, sweeps and attacks."""
+"""Write a page of runs, sweeps and attacks."""
 
 import os
 
@@ -24,9 +24,8 @@ def name_folders(words: list[str]) -> list[str]:
 
 main = Command(
     name="report",
-    settings="train.commands.report:ReportSettings",
-    body="train.commands.report:run",
-    about="Write a page of runs, sweeps and attacks.",
+    settings="train.command_settings:ReportSettings",
+    about=__doc__,
     examples=["pnb-report runs/sweep"],
     rewrite=name_folders,
 )

@@ -1,4 +1,4 @@
-"""pnb-train: train a network with and without renders, and score it."""
+"""Train a network with and without renders, and score it."""
 
 import hashlib
 import re
@@ -36,7 +36,8 @@ class TrainCommand(Command):
                 # Report mistakes in the settings before the import of the module
                 # train.commands.experiment, which takes seconds.
                 read_settings(self.kind, config)
-            import_function(self.body)(config, list(job.overrides.task))
+            train = import_function("train.commands.experiment:train")
+            train(config, list(job.overrides.task))
 
 
 def name_model(words: list[str]) -> list[str]:
@@ -74,8 +75,7 @@ OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 main = TrainCommand(
     name="train",
     settings="train.settings:ExperimentSettings",
-    body="train.commands.experiment:train",
-    about="Train a network with and without renders, and score it.",
+    about=__doc__,
     examples=[
         "pnb-train",
         "pnb-train train.epochs=10 scene.views=5",

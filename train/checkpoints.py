@@ -91,9 +91,8 @@ def _refused_if_damaged(path: Path) -> Iterator[None]:
     # torch, safetensors and json raise errors of many types for a damaged file.
     except Exception as error:
         reason = textwrap.shorten(single_line(error), LONGEST_REASON)
-        raise InputError(
-            f"checkpoint {path} is damaged or not a checkpoint ({reason}): use another one"
-        ) from error
+        fault = f"checkpoint {path} is damaged or not a checkpoint ({reason})"
+        raise InputError(f"{fault}: use another one") from error
 
 
 def _checked(state: dict[str, Any]) -> dict[str, Any]:
@@ -207,10 +206,8 @@ def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
     """Return a network with the settings of its task that are given."""
     own: Any = network.task
     if settings.task not in (None, own.name):
-        raise InputError(
-            f"task={settings.task}, but {network.title} returns {own.returns}: leave the task out",
-            "task",
-        )
+        fault = f"task={settings.task}, but {network.title} returns {own.returns}"
+        raise InputError(f"{fault}: leave the task out", "task")
     given = {
         name: getattr(settings, name)
         for name in ("threshold", "iou", "goal")
@@ -258,9 +255,8 @@ def load_run(
         32
     """
     if weights is not None:
-        raise InputError(
-            f"weights={weights} cannot replace those of a run: leave it out", "weights"
-        )
+        advice = "leave it out"
+        raise InputError(f"weights={weights} cannot replace those of a run: {advice}", "weights")
     require_kind("model", model, str | None, "python:package.module:function, or None")
     path, state = load_selected(as_path("run", run))
     # Arguments of `build_network`, and entries for the wrapper around the network.
@@ -303,10 +299,9 @@ def checks_architecture(path: Path) -> Iterator[None]:
         yield
     except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
         reason = textwrap.shorten(single_line(error), LONGEST_REASON)
-        raise InputError(
-            f"checkpoint {path} is from another architecture ({reason}): "
-            "use the model settings of the training run that wrote the checkpoint"
-        ) from error
+        fault = f"checkpoint {path} is from another architecture ({reason})"
+        advice = "use the model settings of the training run that wrote the checkpoint"
+        raise InputError(f"{fault}: {advice}") from error
 
 
 def is_classifier(name: str) -> bool:
@@ -341,9 +336,8 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     """Read the file of the network that a training run selected, or of a published network."""
     path = selected_file(run)
     if path is None:
-        raise InputError(
-            f"run={run} holds neither {BEST} nor {PUBLISHED}: give another folder", "run"
-        )
+        advice = "give another folder"
+        raise InputError(f"run={run} holds neither {BEST} nor {PUBLISHED}: {advice}", "run")
     if path.suffix == ".safetensors":
         return path, _load_published(path)
     return path, load(path)

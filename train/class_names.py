@@ -11,14 +11,7 @@ from augment.settings import ObjectSettings
 from renderer.errors import InputError, as_list, describe
 from renderer.mesh import Mesh
 from renderer.solids import HARD_NEGATIVES, SOLIDS
-from train.settings import (
-    OTHER,
-    OTHER_PREFIX,
-    ExperimentSettings,
-    label_names,
-    simplified,
-    solid_name,
-)
+from train.settings import ExperimentSettings, is_of_no_class, label_names, simplified, solid_name
 
 # File of a mesh, solid:NAME, or the mesh itself.
 MeshSource = str | Path | Mesh
@@ -42,8 +35,8 @@ def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
     An item without a label, or with one that no network has, such as "other_lemon", stays as it is.
     Only a mapping can have a label.
     """
-    label = item.get("label") if isinstance(item, dict) else None
-    if label in (None, "", OTHER) or str(label).startswith(OTHER_PREFIX):
+    label: Any = item.get("label") if isinstance(item, dict) else None
+    if is_of_no_class(label):
         return item
     return {**item, "label": class_name(classes, label, f"{key}.label")}
 
@@ -77,12 +70,11 @@ def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) ->
     found = []
     for index, item in enumerate(items):
         values = item if isinstance(item, dict) else {"mesh": item}
-        label = values.get("label")
-        if label not in (None, ""):
-            found.append(class_name(classes, label, f"{key}[{index}].label"))
-            continue
-        mesh = str(values.get("mesh"))
-        name = class_of_name(name_of_mesh(mesh), classes)
+        mesh, label = str(values.get("mesh")), values.get("label")
+        if label in (None, ""):
+            name = class_of_name(name_of_mesh(mesh), classes)
+        else:
+            name = class_name(classes, label, f"{key}[{index}].label")
         if name is None:
             raise _unknown_class_error(mesh, classes)
         found.append(name)
@@ -116,10 +108,8 @@ def class_of_meshes(
         return class_name(classes, label, "label")
     found = set(classes_of_meshes(items, classes, key))
     if len(found) != 1:
-        raise InputError(
-            f"label is not set, and {key} are of the classes {', '.join(sorted(found))}: give one",
-            "label",
-        )
+        fault = f"label is not set, and {key} are of the classes {', '.join(sorted(found))}"
+        raise InputError(f"{fault}: give one", "label")
     return found.pop()
 
 
@@ -133,14 +123,13 @@ def require_others(
     "hard_negatives[0]", and labels such as "", "other" and "other_lemon" are of no class.
     """
     for key, item in hard_negatives.items():
-        is_labeled = item.label not in ("", OTHER) and not item.label.startswith(OTHER_PREFIX)
+        is_labeled = not is_of_no_class(item.label)
         name = class_of_name(name_of_mesh(item.mesh), classes)
         if is_labeled:
             name = class_name(classes, item.label, f"label of {key}")
         if name in labels and not (is_labeled and len(labels) > 1):
-            raise InputError(
-                f"{key} is {item.mesh}, which is of the positive class {name}: remove it", key
-            )
+            fault = f"{key} is {item.mesh}, which is of the positive class {name}"
+            raise InputError(f"{fault}: remove it", key)
 
 
 def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> ExperimentSettings:
@@ -157,15 +146,10 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
     else:
         names = [class_name(classes, name, "label") for name in label_names(settings.label)]
         meshes = [with_class_name(item, classes, "meshes") for item in settings.meshes]
-    negatives = [
-        with_class_name(item, classes, "hard_negatives") for item in settings.hard_negatives
-    ]
-    return replace(
-        settings,
-        label=names[0] if len(names) == 1 else names,
-        meshes=meshes,
-        hard_negatives=negatives,
-    )
+    key = "hard_negatives"
+    negatives = [with_class_name(item, classes, key) for item in settings.hard_negatives]
+    label = names[0] if len(names) == 1 else names
+    return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
 
 
 def as_mappings(

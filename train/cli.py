@@ -2,16 +2,15 @@
 
     compare = Command(
         name="compare",
-        settings="train.commands.compare:CompareSettings",
-        body="train.commands.compare:run",
+        settings="train.command_settings:CompareSettings",
         about="Print Markdown tables of finished runs.",
         examples=["pnb-compare runs=[a,b]"],
     )
 
 Hydra reads the command line and the files of conf/. It puts them into the settings class, which
 is typed and checks its values. A mistake of the user is printed in one line that begins with the
-key, and the exit status is 2. The module of the function is imported after that, since it takes
-seconds to import.
+key, and the exit status is 2. After that, `run` of the module train.commands.NAME does the work:
+that module takes seconds to import.
 
 Only this layer knows keys of the command line. The library raises an InputError that names a
 Python argument, and `InputError.within` puts the key in front.
@@ -76,8 +75,7 @@ class Command:
         name: Name of the command without "pnb-". If there is a file conf/NAME.yaml, Hydra
             composes the settings as this file says.
         settings: Class of the settings, as "module:class".
-        body: Function that does the work, as "module:function". Its only argument is the settings.
-        about: Sentence that says what the command does, for --help.
+        about: What the command does, for --help.
         examples: Command lines, for --help.
         common: Keys of the settings that are changed most often, for --help.
         groups: Groups of choices, such as "experiment" for experiment=NAME. A group is a folder
@@ -90,7 +88,6 @@ class Command:
 
     name: str
     settings: str
-    body: str
     about: str
     examples: Sequence[str] = ()
     common: Sequence[str] = ()
@@ -163,7 +160,7 @@ class Command:
         # An error that reached Hydra would get another line in its message.
         with self.handle_errors():
             settings = read_settings(self.kind, config)
-            system.import_function(self.body)(settings)
+            system.import_function(f"train.commands.{self.name}:run")(settings)
 
     def compose(self, overrides: Sequence[str] = ()) -> DictConfig:
         """Compose the configuration of the command without starting it."""
@@ -227,7 +224,7 @@ class Command:
             "Settings:": lines.values(),
         }
         texts = ["\n".join([title, *rows]) for title, rows in sections.items() if rows]
-        return "\n\n".join([self.about, *texts])
+        return "\n\n".join([self.about.strip(), *texts])
 
 
 def types_below(kind: type, prefix: str = "") -> dict[str, Any]:

@@ -10,42 +10,15 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+from augment import augmentation_settings as augmentation
+from augment import settings as scenes
 from augment.attack_settings import AttackSettings, RelightingSettings
-from augment.augmentation_settings import (
-    AugmentationSettings,
-    RandomLightSettings,
-    VariationSettings,
-)
-from augment.settings import (
-    AUTO,
-    LOCAL_LIGHT_SETTINGS,
-    LampsSettings,
-    RendererSettings,
-    SceneSettings,
-)
-from renderer.errors import MAX_SCALE, InputError, is_number, require_choice
-from renderer.settings import (
-    ENCODINGS,
-    MAX_BOUNCES,
-    MAX_SIZE,
-    MAX_VIEWS,
-    REQUIRED,
-    Settings,
-    as_size,
-    pair,
-    setting,
-    setting_like,
-)
-from train.settings import (
-    GROUPS,
-    MAX_IMAGES,
-    MAX_SEED,
-    MESHES,
-    NETWORKS,
-    TIME_FOLDER,
-    TaskSettings,
-    label_names,
-)
+from augment.settings import LampsSettings, RendererSettings, SceneSettings
+from renderer import settings as base
+from renderer.errors import MAX_SCALE, MAX_SEED, InputError, is_number, require_choice
+from renderer.settings import REQUIRED, Settings, pair, setting, setting_like
+from train import settings as common
+from train.settings import LABEL, MESHES, NETWORKS, TIME_FOLDER, TaskSettings
 
 # Default environment maps of an audit.
 ENVIRONMENTS = ("grace", "eucalyptus", "st_peters")
@@ -117,7 +90,9 @@ class AttackSceneSettings(SceneSettings):
 
     views: int = setting_like(SceneSettings, "views", 1)
     search: int = setting(
-        10, "Cameras to try for a misclassified mesh, in several lightings.", within=(0, MAX_VIEWS)
+        10,
+        "Cameras to try for a misclassified mesh, in several lightings.",
+        within=(0, base.MAX_VIEWS),
     )
 
     def __post_init__(self) -> None:
@@ -153,11 +128,7 @@ class AttackExperimentSettings(TaskSettings):
     """
 
     network: str = setting("efficientnet_lite0", f"The attacked network: {NETWORKS}.")
-    label: Any = setting(
-        None,
-        "Class of the meshes, by name or index. null: the class that the name of each file tells.",
-        is_text=True,
-    )
+    label: Any = setting(None, LABEL, is_text=True)
     target: Any = setting(
         None,
         "Class to reach: null (any other), least_likely, a class, or a list, one per view.",
@@ -209,12 +180,11 @@ class AttackExperimentSettings(TaskSettings):
         if (self.attack.relighting is None) != (self.unlabeled is None):
             raise InputError("attack=relighting and unlabeled=FOLDER: set both, or neither")
         if self.unlabeled is not None and (attacked or self.reload):
-            raise InputError(
-                "attack=relighting attacks photographs alone: remove the others", "attack"
-            )
+            advice = "remove the others"
+            raise InputError(f"attack=relighting attacks photographs alone: {advice}", "attack")
         # An attacked light that the scene lacks, such as a projector, is added with default
         # settings. An attack on the positions of lamps needs lamps that shine.
-        for light, settings_class in LOCAL_LIGHT_SETTINGS.items():
+        for light, settings_class in scenes.LOCAL_LIGHT_SETTINGS.items():
             if light in attacked and getattr(self.scene, light, None) is None:
                 setattr(self.scene, light, settings_class())
         if "positions" in attacked and self.scene.lamps is None:
@@ -243,7 +213,7 @@ class LabSettings(Settings):
     setups: int = setting(
         180,
         "Draws of lighting, camera and pose. With one label, each has two renders.",
-        within=(1, MAX_IMAGES),
+        within=(1, common.MAX_IMAGES),
     )
     patterns: list[str] = setting(
         list(TRAINED_PATTERNS),
@@ -276,7 +246,7 @@ class LabSettings(Settings):
     exposure: float = setting(
         1.0, "Factor of the radiance, of which 1 is white.", within=(1 / MAX_SCALE, MAX_SCALE)
     )
-    size: Any = setting(64, "Pixels per side, or [height, width].", within=(1, MAX_SIZE))
+    size: Any = setting(64, "Pixels per side, or [height, width].", within=(1, base.MAX_SIZE))
     spp: int = setting(32, "Paths per pixel and light.", within=(1, 10**5))
     bounces: int = setting(4, "Largest number of bounces of light.", within=(1, 1000))
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
@@ -286,7 +256,7 @@ class LabSettings(Settings):
 
     def __post_init__(self) -> None:
         """Check all values, and that each pattern and each environment gets as many setups."""
-        self.size = as_size("size", self.size, MAX_SIZE)
+        self.size = base.as_size("size", self.size, base.MAX_SIZE)
         super().__post_init__()
         if self.label is None and self.meshes != LAB_MESHES:
             raise InputError("label is not set: give the class of the meshes, label=CLASS", "label")
@@ -317,11 +287,7 @@ class AuditSettings(TaskSettings):
     hardened: str | None = setting(
         None, "Another classifier to show beside it, such as run:runs/harden."
     )
-    label: Any = setting(
-        None,
-        "Class of the meshes, by name or index. null: the class that the name of each file tells.",
-        is_text=True,
-    )
+    label: Any = setting(None, LABEL, is_text=True)
     meshes: list[Any] = setting([], "Meshes of the class. []: only `unlabeled` is audited.")
     unlabeled: str | None = setting(
         None,
@@ -404,7 +370,7 @@ class EvaluateSettings(TaskSettings):
         None, "A folder like photos. null: the threshold that a published network carries, if any."
     )
     by: str = setting(
-        "source", "Groups of the tables: a column of photos.csv, or class.", choices=GROUPS
+        "source", "Groups of the tables: a column of photos.csv, or class.", choices=common.GROUPS
     )
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
@@ -418,13 +384,12 @@ class EvaluateSettings(TaskSettings):
         super().__post_init__()
         require_calibration(self.false_positive_rate, self.calibrate)
         if self.label is not None:
-            label_names(self.label)  # This call only checks the label.
+            common.label_names(self.label)  # This call only checks the label.
         # With `run`, `network` may only name the function that built the network of the run.
         builds_run = bool(self.network and self.network.startswith("python:"))
         if (self.run is None) == (self.network is None) and not (self.run and builds_run):
-            raise InputError(
-                f"run={self.run} and network={self.network} do not name one network: give one"
-            )
+            fault = f"run={self.run} and network={self.network} do not name one network"
+            raise InputError(f"{fault}: give one")
 
 
 def require_calibration(rate: float | None, calibrate: str | None) -> None:
@@ -435,9 +400,8 @@ def require_calibration(rate: float | None, calibrate: str | None) -> None:
     none.
     """
     if (rate is None) != (calibrate is None):
-        raise InputError(
-            f"false_positive_rate={rate} and calibrate={calibrate}: give both, or neither"
-        )
+        advice = "give both, or neither"
+        raise InputError(f"false_positive_rate={rate} and calibrate={calibrate}: {advice}")
 
 
 @dataclass
@@ -463,12 +427,12 @@ class FitSettings(Settings):
         1.0, "Factor of the albedo. Twice as much halves the lighting.", within=(1e-3, 1e3)
     )
     encoding: str = setting(
-        "srgb", "Encoding of the photograph and of the colors of the mesh.", choices=ENCODINGS
+        "srgb", "Encoding of the photograph and of the colors of the mesh.", choices=base.ENCODINGS
     )
     bounces: int = setting(
         3,
         "Bounces of light between the surfaces of the mesh. 0: also no shadows.",
-        within=(0, MAX_BOUNCES),
+        within=(0, base.MAX_BOUNCES),
     )
     label: str | None = setting(
         None, "Class of the printed attack. null: the class that the name of the mesh tells."
@@ -483,9 +447,8 @@ class FitSettings(Settings):
         """Check all values, and that either a mask or a box says where the object is."""
         super().__post_init__()
         if bool(self.mask) == bool(self.box):
-            raise InputError(
-                f"mask={self.mask} and box={self.box}: give mask=FILE, or a box instead"
-            )
+            advice = "give mask=FILE, or a box instead"
+            raise InputError(f"mask={self.mask} and box={self.box}: {advice}")
 
 
 @dataclass(kw_only=True)
@@ -501,7 +464,7 @@ class RenderSettings(TaskSettings):
     size: Any = setting(
         None,
         "Pixels per side, or [height, width]. null: those of the network, or 224.",
-        within=(1, MAX_SIZE),
+        within=(1, base.MAX_SIZE),
     )
     meshes: list[Any] = setting(["solid:orange", "solid:apple", "solid:cup"], MESHES)
     label: Any = setting(
@@ -520,12 +483,12 @@ class RenderSettings(TaskSettings):
     shard: int = setting(0, "Index of the part that this process renders.", within=(0, None))
     out: str = setting(REQUIRED, "Folder of the data set. A stopped command continues in it.")
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
-    augment: AugmentationSettings = setting(
-        lambda: AugmentationSettings(
+    augment: augmentation.AugmentationSettings = setting(
+        lambda: augmentation.AugmentationSettings(
             mode="random",
             examples=None,
-            random_light=RandomLightSettings(amplitude=0.1),
-            vary=VariationSettings(
+            random_light=augmentation.RandomLightSettings(amplitude=0.1),
+            vary=augmentation.VariationSettings(
                 shift=0.1,
                 scale=[0.6, 1.0],
                 instances=True,
@@ -538,7 +501,7 @@ class RenderSettings(TaskSettings):
     )
     scene: SceneSettings = setting(
         lambda: SceneSettings(
-            backgrounds=[0.1, 0.3, 0.5, 0.7, 0.9], views=12, fov=30.0, exposure=AUTO
+            backgrounds=[0.1, 0.3, 0.5, 0.7, 0.9], views=12, fov=30.0, exposure=scenes.AUTO
         ),
         "The scene. light=NAME is short for scene.light=NAME.",
     )
@@ -568,3 +531,43 @@ class RenderSettings(TaskSettings):
         limits = [0, *(round(self.count * end / total) for end in ends)]
         counts = zip(self.splits, map(int.__sub__, limits[1:], limits), strict=True)
         return {part: count for part, count in counts if count}
+
+
+@dataclass
+class CompareSettings(Settings):
+    """Settings of the command pnb-compare, which prints tables of the metrics of training runs."""
+
+    runs: list[str] = setting(
+        REQUIRED, "Folders of finished runs and of sweeps. Folders below them count, too."
+    )
+    exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
+    by: str = setting("source", "Groups of the tables.", choices=common.GROUPS)
+    photos: str = setting(
+        "photographs", "Sub-folder of the scores to compare: its name in `photos`."
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.runs:
+            advice = "give the folders of one run or more, as in runs=[runs/a,runs/b]"
+            raise InputError(f"runs is empty: {advice}", "runs")
+
+
+@dataclass
+class ReportSettings(Settings):
+    """Settings of the command pnb-report, which writes an HTML page about runs and attacks."""
+
+    runs: list[str] = setting(
+        REQUIRED, "Folders of runs, sweeps and attacks. Folders below them count, too."
+    )
+    out: str | None = setting(
+        None,
+        "Folder of the page and its images. null: the common parent of the runs, whose page is "
+        "replaced.",
+    )
+    overwrite: bool = setting(False, "Replace results in the folder `out`.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.runs:
+            raise InputError("runs is empty: give the folders of runs, sweeps or attacks", "runs")

@@ -96,17 +96,14 @@ class WideResNet(nn.Module):
 def _require_shape(depth: int, width: int, dropout: float) -> None:
     """Check the arguments of a WideResNet."""
     if depth < 10 or (depth - 4) % 6 or width < 1:
-        raise InputError(
-            f"depth={depth}, width={width}: set depth to 10, 16, 22 ..., and width to 1 or more",
-            "depth",
-        )
+        advice = "set depth to 10, 16, 22 ..., and width to 1 or more"
+        raise InputError(f"depth={depth}, width={width}: {advice}", "depth")
     # Each group has (depth - 4) / 6 blocks. A block has two 3 × 3 convolutions, whose weights are
     # most of the parameters of the network. The groups have 16, 32 and 64 times `width` channels.
     parameter_count = (depth - 4) // 6 * 2 * 3 * 3 * (16**2 + 32**2 + 64**2) * width**2
     if depth > MAX_DEPTH or parameter_count > MAX_PARAMETER_COUNT:
-        raise InputError(
-            f"depth={depth}, width={width} has {parameter_count:.1g} parameters: set less", "depth"
-        )
+        fault = f"depth={depth}, width={width} has {parameter_count:.1g} parameters"
+        raise InputError(f"{fault}: set less", "depth")
     if not 0 <= dropout < 1:
         raise InputError(f"dropout={dropout} must be at least 0 and below 1", "dropout")
 
@@ -223,9 +220,8 @@ def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
     """Call a Python function of the user that builds a network."""
     network, own_size, own_classes = call_python(name.removeprefix(PYTHON))
     if not isinstance(network, nn.Module):
-        raise InputError(
-            f"name={name} returns a {type(network).__name__}: return a torch.nn.Module", "name"
-        )
+        advice = "return a torch.nn.Module"
+        raise InputError(f"name={name} returns a {type(network).__name__}: {advice}", "name")
     fault = ""
     if own_size != size:
         fault = f"is for images of {own_size} pixels per side, but those of the data have {size}"

@@ -149,9 +149,8 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
     if (folder / CONFIG).is_file():
         recorded = OmegaConf.to_container(read_config(folder / CONFIG))
     if not isinstance(recorded.get("train"), dict) or not isinstance(recorded.get("out"), str):
-        raise InputError(
-            f"out={folder} holds no run to resume: give another, or leave train.resume out"
-        )
+        advice = "give another, or leave train.resume out"
+        raise InputError(f"out={folder} holds no run to resume: {advice}")
     names = [item.name for item in fields(ExperimentSettings)]
     settings = {name: recorded[name] for name in names if name in recorded}
     # If the folder was moved, the paths of its files have changed. A baseline, which was
@@ -206,15 +205,13 @@ def require_same(
         old = before.get(key)
         new = now.get(key)
         if old != new and not is_permitted(key, old, new):
-            raise InputError(
-                f"{folder} was made with {key}={old}, not {new}: set it so, or another {elsewhere}"
-            )
+            advice = f"set it so, or another {elsewhere}"
+            raise InputError(f"{folder} was made with {key}={old}, not {new}: {advice}")
     hashes = config.get("inputs") or {}
     for path, fingerprint in fingerprints(settings).items():
         if hashes.get(path, fingerprint) != fingerprint:
-            raise InputError(
-                f"{path} has changed since {folder} began: put it back, or set another {elsewhere}"
-            )
+            advice = f"put it back, or set another {elsewhere}"
+            raise InputError(f"{path} has changed since {folder} began: {advice}")
     return config
 
 

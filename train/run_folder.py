@@ -49,9 +49,8 @@ def opened_text(path: Path) -> Iterator[str]:
             raise ValueError("there is no such file")
         yield path.read_text(encoding="utf-8")
     except Exception as error:
-        raise InputError(
-            f"{path} is damaged or of another kind ({single_line(error)}): use another run"
-        ) from error
+        fault = f"{path} is damaged or of another kind ({single_line(error)})"
+        raise InputError(f"{fault}: use another run") from error
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -117,9 +116,8 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
     with ExitStack() as stack:
         for folder in folders:
             if not stack.enter_context(locked(folder)):
-                raise InputError(
-                    f"{key}={folder} is being written by another process: choose another"
-                )
+                advice = "choose another"
+                raise InputError(f"{key}={folder} is being written by another process: {advice}")
         try:
             yield
         finally:
@@ -184,7 +182,6 @@ def writable_folder(folder: str | Path, key: str) -> Path:
         with tempfile.TemporaryFile(dir=existing) as file:
             file.write(bytes(TEST_SIZE))
     except OSError as error:
-        raise InputError(
-            f"{key}={path} cannot be written to ({error.strerror}): choose another folder"
-        ) from error
+        fault = f"{key}={path} cannot be written to ({error.strerror})"
+        raise InputError(f"{fault}: choose another folder") from error
     return path

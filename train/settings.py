@@ -10,7 +10,7 @@ from typing import Any
 
 from augment.augmentation_settings import MAX_EXAMPLES, AugmentationSettings, views_of
 from augment.settings import ObjectSettings, RendererSettings, SceneSettings, read_normalized_light
-from renderer.errors import InputError, composed, is_whole, require_range
+from renderer.errors import MAX_SEED, InputError, composed, is_whole, require_range
 from renderer.settings import MAX_SIZE, MAX_VIEWS, Settings, setting, setting_like, settings_from
 from train.train_settings import NEEDS_INITIAL_NETWORK, ModelSettings, TrainSettings
 
@@ -49,7 +49,6 @@ MIN_SIZE = 5
 MAX_IMAGES = 10**6
 # Number of renders if neither this number nor that of the views is set.
 RENDERS = 100
-MAX_SEED = 2**63 - 1
 # Explanation of a list of meshes in settings.
 MESHES = (
     "Objects: mesh files, solid:NAME:SEED, or mappings {mesh, label, up: auto|y|z, "
@@ -57,6 +56,8 @@ MESHES = (
     "azimuth}, or lists of such objects on the same ground, [{mesh, label}, {mesh, label, "
     "at: [x, y], scale, azimuth}, ...], of which the first is attacked."
 )
+# Explanation of the class of meshes in settings.
+LABEL = "Class of the meshes, by name or index. null: the class that the name of each file tells."
 # Values of the setting `network`.
 NETWORKS = (
     "efficientnet_lite0 to 2, torchvision:NAME, timm:NAME, hf:FOLDER_OR_NAME, run:FOLDER, "
@@ -107,9 +108,8 @@ class DataSettings(Settings):
         """Check all values, and that data sets of the user have a path."""
         super().__post_init__()
         if self.name in DATA_SETS_WITH_PATH and not self.path:
-            raise InputError(
-                f"path is not set: give the file or folder of the data set {self.name!r}", "path"
-            )
+            advice = f"give the file or folder of the data set {self.name!r}"
+            raise InputError(f"path is not set: {advice}", "path")
 
 
 @dataclass
@@ -298,25 +298,20 @@ class ExperimentSettings(NetworkSettings):
     def __post_init__(self) -> None:
         """Check all values, and compute the number of renders."""
         if self.network == "":
-            raise InputError(
-                "network is not set: give a run folder, or torchvision:NAME", "network"
-            )
+            advice = "give a run folder, or torchvision:NAME"
+            raise InputError(f"network is not set: {advice}", "network")
         super().__post_init__()
         for name in NEEDS_INITIAL_NETWORK:
             value = getattr(self.train, name)
             if value and not self.network:
-                raise InputError(
-                    f"train.{name}={value} needs a network to begin with: set network",
-                    f"train.{name}",
-                )
+                fault = f"train.{name}={value} needs a network to begin with"
+                raise InputError(f"{fault}: set network", f"train.{name}")
         self._check_photographs()
         renders_meshes = self.augment.renders and self.augment.mode != "folder"
         attacks_pose = renders_meshes and "pose" in self.augment.attack.parameters
         if attacks_pose and not self.renderer.silhouettes:
-            raise InputError(
-                "renderer.silhouettes=false: an attack on the pose needs true",
-                "renderer.silhouettes",
-            )
+            advice = "an attack on the pose needs true"
+            raise InputError(f"renderer.silhouettes=false: {advice}", "renderer.silhouettes")
         if self.label is None:
             # The classes of the meshes will become the label when the classes of the network
             # are known. `with_class_names` then creates these settings again.
@@ -342,11 +337,8 @@ class ExperimentSettings(NetworkSettings):
         for name in self.scored_folders:
             # Each name becomes the name of a sub-folder of the run.
             if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
-                raise InputError(
-                    f"photos has the name {name!r} for a folder: choose letters, digits, _ and -, "
-                    f"and none of {', '.join(RESERVED)}",
-                    "photos",
-                )
+                advice = f"choose letters, digits, _ and -, and none of {', '.join(RESERVED)}"
+                raise InputError(f"photos has the name {name!r} for a folder: {advice}", "photos")
 
     @property
     def label_follows_from_meshes(self) -> bool:
@@ -413,9 +405,8 @@ class ExperimentSettings(NetworkSettings):
         for key, item in objects.items():
             item.label = item.label or solid_name(item.mesh)
             if not item.label:
-                raise InputError(
-                    f"{key} has no class: give {{mesh: {item.mesh}, label: CLASS}}", key
-                )
+                advice = f"give {{mesh: {item.mesh}, label: CLASS}}"
+                raise InputError(f"{key} has no class: {advice}", key)
         missing = set(labels) - {item.label for item in objects.values()}
         if missing and len(labels) > 1:
             raise self.wrong("label", f"has no mesh of {min(missing)}: add one to meshes")
@@ -471,6 +462,11 @@ def in_words(label: str) -> str:
     return label.removeprefix(OTHER_PREFIX).replace("_", " ")
 
 
+def is_of_no_class(label: object) -> bool:
+    """Return whether the label of an object names no class: "", "other", or "other_NAME"."""
+    return label in (None, "", OTHER) or str(label).startswith(OTHER_PREFIX)
+
+
 def label_names(label: str | int | Sequence[str | int]) -> list[str]:
     """List the names of the positive classes in the setting `label`.
 
@@ -481,9 +477,8 @@ def label_names(label: str | int | Sequence[str | int]) -> list[str]:
     is_valid = is_list and all(isinstance(item, str) or is_whole(item) for item in listed)
     names = [composed(str(name)) for name in listed] if is_valid else []
     if not names or len(set(names)) < len(names):
-        raise InputError(
-            f"label={label}: give the name of a class, or a list of several, each once", "label"
-        )
+        advice = "give the name of a class, or a list of several, each once"
+        raise InputError(f"label={label}: {advice}", "label")
     return names
 
 

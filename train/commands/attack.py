@@ -258,9 +258,8 @@ def load_targets(
     for item in settings.transfer.networks:
         values = item if isinstance(item, dict) else {"network": item}
         if values.keys() - {"network", "weights"}:
-            raise InputError(
-                f"transfer.networks has {item}: give a name, or {{network: NAME, weights: FILE}}"
-            )
+            advice = "give a name, or {network: NAME, weights: FILE}"
+            raise InputError(f"transfer.networks has {item}: {advice}")
         name = str(values.get("network"))
         with keyed(name="transfer.networks", weights="transfer.networks: weights"):
             other = load_network(name, values.get("weights"), trust_code=settings.trust)

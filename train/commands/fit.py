@@ -46,7 +46,7 @@ WHITE = 250
 TINT = 8
 
 
-def fit(settings: FitSettings) -> None:
+def run(settings: FitSettings) -> None:
     """Find camera and lighting of a photograph, and print a command that attacks the lighting."""
     image = read_file(settings.photograph)
     out = writable_folder(settings.out, "out")
@@ -159,10 +159,8 @@ def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height w
         levels = _levels(path)
     # Pillow raises errors of almost any type for a damaged file.
     except Exception as error:
-        raise InputError(
-            f"mask={path} cannot be read ({single_line(error)}): save white "
-            "where the object is and black elsewhere"
-        ) from error
+        advice = "save white where the object is and black elsewhere"
+        raise InputError(f"mask={path} cannot be read ({single_line(error)}): {advice}") from error
     if levels.shape != (height, width):
         raise InputError(
             f"mask={path} has {levels.shape[1]} × {levels.shape[0]} pixels, but the photograph has "
@@ -235,9 +233,8 @@ def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndar
     try:
         cv2: Any = import_module("cv2")
     except ImportError as error:
-        raise InputError(
-            "box= needs OpenCV: run pip install opencv-python-headless, or give mask=FILE"
-        ) from error
+        advice = "run pip install opencv-python-headless, or give mask=FILE"
+        raise InputError(f"box= needs OpenCV: {advice}") from error
     height, width = image.shape[:2]
     left, top, right, bottom = box if len(box) == 4 else [0, 0, 0, 0]
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):

@@ -242,9 +242,8 @@ def _read_settings(
     for name, section in sections.items():
         values = asdict(cast(Any, section)) if isinstance(section, Settings) else section or {}
         if not isinstance(values, Mapping):
-            raise InputError(
-                f"{name} is {describe(section)}: give a mapping of fields, or settings"
-            )
+            advice = "give a mapping of fields, or settings"
+            raise InputError(f"{name} is {describe(section)}: {advice}")
         given[name] = values
     merged = OmegaConf.merge(settings, changes, given)
     return read_settings(ExperimentSettings, cast(DictConfig, merged))

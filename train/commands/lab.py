@@ -8,7 +8,7 @@ from train.results.overwrite import require_replaceable
 from train.settings import label_names
 
 
-def render_laboratory(settings: LabSettings) -> None:
+def run(settings: LabSettings) -> None:
     """Render a test set of objects in unusual lighting, and print the number of renders."""
     require_replaceable(Path(settings.out), "out", settings.overwrite)
     count = write_laboratory(settings)

@@ -55,9 +55,8 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     runs = _expand([word for word in words if not word.startswith("-")])
     first_config = main.compose(runs[0])
     if first_config.photographs_first:
-        raise InputError(
-            "photographs_first=true cannot be used in a sweep: start the runs one by one"
-        )
+        advice = "start the runs one by one"
+        raise InputError(f"photographs_first=true cannot be used in a sweep: {advice}")
     overwrite = bool(first_config.overwrite)
     parent = writable_folder(str(first_config.sweep), "sweep")
     # An earlier report about the same sweep may be replaced.
@@ -110,13 +109,11 @@ def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
         if key == "out":
-            raise InputError(
-                "out= names the folder of a single run: name the folder of a sweep with sweep="
-            )
+            advice = "name the folder of a sweep with sweep="
+            raise InputError(f"out= names the folder of a single run: {advice}")
         if key == "launcher" and override.value() == "slurm" and not shutil.which("sbatch"):
-            raise InputError(
-                "launcher=slurm needs the command sbatch of Slurm: start the sweep on the cluster"
-            )
+            advice = "start the sweep on the cluster"
+            raise InputError(f"launcher=slurm needs the command sbatch of Slurm: {advice}")
         if override.is_sweep_override():
             values = list(override.sweep_string_iterator())
         else:

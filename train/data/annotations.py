@@ -130,11 +130,8 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
         if (folder / images).is_dir() and (folder / masks).is_dir():
             break
     else:
-        raise InputError(
-            f"photos={folder} has no photographs with masks: move them to its folders images and "
-            "masks, under the same names",
-            "photos",
-        )
+        advice = "move them to its folders images and masks, under the same names"
+        raise InputError(f"photos={folder} has no photographs with masks: {advice}", "photos")
     marked, paths, missing = [], {}, []
     for item in find_unlabeled(folder / images):
         mask = (folder / masks / item.path).with_suffix(".png")
@@ -170,10 +167,9 @@ def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, 
         )
     highest = int(labels[labels != UNSCORED].max(initial=0))
     if highest >= class_count:
-        raise InputError(
-            f"{path} has the value {highest}, but the network has {class_count} classes: use "
-            f"0 to {class_count - 1}, and {UNSCORED} for pixels that do not count"
-        )
+        fault = f"{path} has the value {highest}, but the network has {class_count} classes"
+        advice = f"use 0 to {class_count - 1}, and {UNSCORED} for pixels that do not count"
+        raise InputError(f"{fault}: {advice}")
     shown = (fitted.scale * fitted.size).round().astype(int)
     reduced = Image.fromarray(labels.astype(np.uint8)).resize((*shown,), Image.Resampling.NEAREST)
     result = np.full(fitted.pixels.shape[1:], UNSCORED, np.uint8)
@@ -294,11 +290,9 @@ def _read_yolo(folder: Path) -> Annotations:
         photographs.append(Annotated(path, name, (1, 1), boxes, labels, is_crowd))
     if not label_count:
         first = _label_files(photographs[0].path.absolute())[0]
-        raise InputError(
-            f"photos={folder} has neither a COCO file nor label files: give one, or text files of "
-            f"YOLO such as {first}",
-            "photos",
-        )
+        fault = f"photos={folder} has neither a COCO file nor label files"
+        advice = f"give one, or text files of YOLO such as {first}"
+        raise InputError(f"{fault}: {advice}", "photos")
     return Annotations(folder, photographs, classes, [])
 
 
@@ -334,10 +328,8 @@ def _yolo_classes(folder: Path) -> tuple[str, ...]:
             if (parent / name).is_file():
                 lines = (parent / name).read_text(encoding="utf-8-sig").splitlines()
                 return tuple(line.strip() for line in lines if line.strip())
-    raise InputError(
-        f"photos={folder} does not name its classes: add data.yaml with names, or classes.txt",
-        "photos",
-    )
+    advice = "add data.yaml with names, or classes.txt"
+    raise InputError(f"photos={folder} does not name its classes: {advice}", "photos")
 
 
 def _yolo_rows(
@@ -360,9 +352,8 @@ def _yolo_rows(
             if not all(-ROUNDING <= value <= 1 + ROUNDING for value in values):
                 raise ValueError("coordinates must be fractions of the sides, from 0 to 1")
         except ValueError as error:
-            raise InputError(
-                f"line {number} of {file} is no box ({error}): write class x y width height"
-            ) from error
+            advice = "write class x y width height"
+            raise InputError(f"line {number} of {file} is no box ({error}): {advice}") from error
         if len(values) == 4:
             x, y, width, height = values
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
@@ -438,10 +429,8 @@ def fit_batches(
                 if isinstance(result, Fitted):
                     continue
                 if not skip_unreadable:
-                    raise InputError(
-                        f"{item.path} cannot be read ({result}): replace it, or set "
-                        "skip_unreadable=True"
-                    )
+                    advice = "replace it, or set skip_unreadable=True"
+                    raise InputError(f"{item.path} cannot be read ({result}): {advice}")
                 console.warning("%s is skipped, because it cannot be read", item.path)
             yield [(item, read) for item, read in results if isinstance(read, Fitted)]
 

@@ -6,13 +6,13 @@ annotations of COCO, is written by each process that finds all of them finished.
 """
 
 import io
+import itertools
 import json
 import tarfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, groupby, takewhile
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 import yaml
@@ -38,6 +38,7 @@ class DataSet:
     """A data set on disk, of `count` renders.
 
     Attributes:
+        image: Path of the image of a render, with its {part}, {number} and first {label}.
         folder: Its folder.
         classes: Names of the classes.
         splits: Number of renders in each part, such as "train", in the order of their indices.
@@ -45,6 +46,7 @@ class DataSet:
         maps: Which of "mask", "depth" and "normals" are written.
     """
 
+    image: ClassVar[str]
     folder: Path
     classes: Sequence[str]
     splits: Mapping[str, int]
@@ -53,48 +55,54 @@ class DataSet:
 
     @property
     def count(self) -> int:
-        """Return the number of renders."""
+        """Number of renders."""
         return sum(self.splits.values())
 
     def split(self, index: int) -> str:
         """Return the part to which the render with an index belongs."""
-        for name, count in self.splits.items():
-            if index < count:
-                return name
-            index -= count
-        raise IndexError(index)
-
-    def stem(self, index: int) -> str:
-        """Return the name of the files of a render, without suffix."""
-        return f"{index:06d}"
+        ends = itertools.accumulate(self.splits.values())
+        return next(part for part, end in zip(self.splits, ends, strict=True) if index < end)
 
     def last_file(self, index: int) -> Path:
         """Return the file that is written last for a render, or for several together."""
-        return self.folder / DETAILS / f"{self.stem(index)}.json"
+        return self.folder / DETAILS / f"{index:06d}.json"
 
     def write(self, renders: Iterable[LabeledRender]) -> None:
         """Write renders with consecutive indices."""
-        for path, group in groupby(renders, lambda render: self.last_file(render.index)):
-            self._write_group(path, group)
-
-    def _write_group(self, path: Path, renders: Iterable[LabeledRender]) -> None:
-        """Write the renders that share their last file."""
         for render in renders:
             for name, content in self.files(render).items():
-                (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
-                atomic_write(self.folder / name, content)
-
-    def image_path(self, render: LabeledRender) -> str:
-        """Return the path of the image of a render in the folder."""
-        raise NotImplementedError
+                path = self.folder / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                atomic_write(path, content)
 
     def files(self, render: LabeledRender) -> dict[str, bytes | str]:
         """Return the content of the files of a render by their paths. The last one is its JSON."""
-        stem = f"{DETAILS}/{self.stem(render.index)}"
-        maps = {f"{stem}_{name}.png": png(_map(render, name)) for name in self.maps}
-        image = self.image_path(render)
-        details = {"image": image, "split": self.split(render.index), **describe(render)}
-        return {image: png(render.image), **maps, f"{stem}.json": json.dumps(details)}
+        part = self.split(render.index)
+        number = f"{render.index:06d}"
+        image = self.image.format(part=part, number=number, label=first_label(render))
+        # Depth, in world units, of one step of the depth image.
+        depth_scale = float(render.depth.max()) / MAX_DEPTH
+        rows = zip(render.labels, render.boxes.tolist(), render.visible.tolist(), strict=True)
+        objects = [
+            {"class": str(label), "box": box, "visible": visible} for label, box, visible in rows
+        ]
+        for item, mask in zip(objects, render.masks.numpy(), strict=True):
+            item |= {"area": int(mask.sum()), "counts": run_lengths(mask)}
+        details = {
+            "image": image,
+            "split": part,
+            "index": render.index,
+            "size": list(render.image.shape[1:]),
+            "mesh": render.mesh,
+            "objects": objects,
+            "camera": render.camera,
+            "light": render.light.tolist(),
+            "depth_scale": depth_scale,
+        }
+        files: dict[str, bytes | str] = {image: png(render.image)}
+        for name in self.maps:
+            files[f"{DETAILS}/{number}_{name}.png"] = png(_map(render, name, depth_scale))
+        return files | {f"{DETAILS}/{number}.json": json.dumps(details)}
 
     def is_finished(self) -> bool:
         """Return whether all renders are there."""
@@ -107,51 +115,39 @@ class DataSet:
 class ImageFolder(DataSet):
     """A folder for each part and class, as `torchvision.datasets.ImageFolder` reads it."""
 
-    def image_path(self, render: LabeledRender) -> str:
-        """Return the path of the image: PART/CLASS/NUMBER.png."""
-        return f"{self.split(render.index)}/{class_folder(render)}/{self.stem(render.index)}.png"
+    image = "{part}/{label}/{number}.png"
 
 
 class Coco(DataSet):
     """Images, and annotations with boxes and masks in the JSON format of COCO."""
 
-    def image_path(self, render: LabeledRender) -> str:
-        """Return the path of the image: PART/NUMBER.png."""
-        return f"{self.split(render.index)}/{self.stem(render.index)}.png"
+    image = "{part}/{number}.png"
 
     def finish(self) -> None:
         """Write annotations/instances_PART.json for each part."""
-        names = {name: index for index, name in enumerate(self.classes, 1)}
-        categories = [{"id": index, "name": name} for name, index in names.items()]
-        parts: dict[str, dict[str, list[Any]]] = {}
+        renders = [json.loads(self.last_file(index).read_text()) for index in range(self.count)]
+        categories = [{"id": number, "name": name} for number, name in enumerate(self.classes, 1)]
+        numbers = itertools.count(1)
         for part in self.splits:
-            parts[part] = {"images": [], "annotations": [], "categories": categories}
-        number = 0
-        for index in range(self.count):
-            text = (self.folder / DETAILS / f"{self.stem(index)}.json").read_text()
-            details = json.loads(text)
-            annotations = parts[details["split"]]
-            height, width = details["size"]
-            name = Path(details["image"]).name
-            annotations["images"].append(
-                {"id": index + 1, "file_name": name, "height": height, "width": width}
-            )
-            for item in details["objects"]:
-                number += 1
-                left, top, right, bottom = item["box"]
-                annotations["annotations"].append(
-                    {
-                        "id": number,
-                        "image_id": index + 1,
-                        "category_id": names[item["class"]],
+            images, annotations = [], []
+            for render in (one for one in renders if one["split"] == part):
+                image_id, name = render["index"] + 1, Path(render["image"]).name
+                height, width = render["size"]
+                images.append({"id": image_id, "file_name": name, "height": height, "width": width})
+                for item in render["objects"]:
+                    left, top, right, bottom = item["box"]
+                    annotation = {
+                        "id": next(numbers),
+                        "image_id": image_id,
+                        "category_id": self.classes.index(item["class"]) + 1,
                         "bbox": [left, top, right - left, bottom - top],
                         "area": item["area"],
                         "segmentation": {"size": [height, width], "counts": item["counts"]},
                         "iscrowd": 0,
                     }
-                )
-        for name, content in parts.items():
-            path = self.folder / "annotations" / f"instances_{name}.json"
+                    annotations.append(annotation)
+            content = {"images": images, "annotations": annotations, "categories": categories}
+            path = self.folder / "annotations" / f"instances_{part}.json"
             path.parent.mkdir(exist_ok=True)
             atomic_write(path, json.dumps(content))
 
@@ -159,30 +155,20 @@ class Coco(DataSet):
 class Yolo(DataSet):
     """Images and text files with boxes, as Ultralytics reads them, and data.yaml."""
 
-    def image_path(self, render: LabeledRender) -> str:
-        """Return the path of the image: images/PART/NUMBER.png."""
-        return f"images/{self.split(render.index)}/{self.stem(render.index)}.png"
+    image = "images/{part}/{number}.png"
 
     def files(self, render: LabeledRender) -> dict[str, bytes | str]:
         """Add the text file: class, center, width and height as fractions of the image."""
         height, width = render.image.shape[1:]
-        lines = []
-        for label, (left, top, right, bottom) in zip(
-            render.labels, render.boxes.tolist(), strict=True
-        ):
-            box = (
-                (left + right) / 2 / width,
-                (top + bottom) / 2 / height,
-                (right - left) / width,
-                (bottom - top) / height,
-            )
-            index = self.classes.index(str(label))
-            lines.append(" ".join([str(index), *(f"{value:.6f}" for value in box)]) + "\n")
-        part = self.split(render.index)
-        return {
-            f"labels/{part}/{self.stem(render.index)}.txt": "".join(lines),
-            **super().files(render),
-        }
+        text = ""
+        for label, box in zip(render.labels, render.boxes.tolist(), strict=True):
+            left, top, right, bottom = box
+            x, y = (left + right) / 2 / width, (top + bottom) / 2 / height
+            numbers = (x, y, (right - left) / width, (bottom - top) / height)
+            words = [f"{number:.6f}" for number in numbers]
+            text += " ".join([str(self.classes.index(str(label))), *words]) + "\n"
+        name = f"labels/{self.split(render.index)}/{render.index:06d}.txt"
+        return {name: text, **super().files(render)}
 
     def finish(self) -> None:
         """Write data.yaml. Ultralytics demands train and val: the first part stands for both."""
@@ -196,34 +182,34 @@ class Yolo(DataSet):
 class WebDataset(DataSet):
     """Tar files of at most PER_TAR renders: image, class, JSON and maps under one key."""
 
+    image = "{number}.png"
+
     def last_file(self, index: int) -> Path:
         """Return the tar file, named by its part and the index of its first render."""
-        part = self.split(index)
-        ends = accumulate(self.splits.values(), initial=0)
-        *_, start = takewhile(lambda end: end <= index, ends)
-        [shard] = (shard.start for shard in self.shards if index in shard)
-        first = max(start, shard, index // PER_TAR * PER_TAR)
-        return self.folder / f"{part}-{self.stem(first)}.tar"
+        # A tar file begins with a part, with the renders of a process, or after a full file.
+        ends = [0, *itertools.accumulate(self.splits.values())]
+        starts = [*ends, *(shard.start for shard in self.shards), index // PER_TAR * PER_TAR]
+        first = max(start for start in starts if start <= index)
+        return self.folder / f"{self.split(index)}-{first:06d}.tar"
 
-    def image_path(self, render: LabeledRender) -> str:
-        """Return the name of the image in its tar file."""
-        return f"{self.stem(render.index)}.png"
+    def write(self, renders: Iterable[LabeledRender]) -> None:
+        """Write renders with consecutive indices. A tar file appears when it is complete."""
+        for path, group in itertools.groupby(renders, lambda one: self.last_file(one.index)):
+            with replacing(path) as temporary, tarfile.open(temporary, "w") as tar:
+                for render in group:
+                    self._add(render, tar)
 
-    def _write_group(self, path: Path, renders: Iterable[LabeledRender]) -> None:
-        """Write the tar file, which appears when it is complete."""
-        with replacing(path) as temporary, tarfile.open(temporary, "w") as tar:
-            for render in renders:
-                stem = self.stem(render.index)
-                label = class_folder(render)
-                number = self.classes.index(label) if label in self.classes else -1
-                entries = self.files(render) | {f"{stem}.cls": str(number)}
-                for name, content in entries.items():
-                    data = content.encode() if isinstance(content, str) else content
-                    # The key of a sample ends at the first point.
-                    name = name.removeprefix(f"{DETAILS}/").replace(f"{stem}_", f"{stem}.")
-                    info = tarfile.TarInfo(name)
-                    info.size = len(data)
-                    tar.addfile(info, io.BytesIO(data))
+    def _add(self, render: LabeledRender, tar: tarfile.TarFile) -> None:
+        """Add the files of a render to a tar file. The key of a sample ends at the first point."""
+        key = f"{render.index:06d}"
+        label = first_label(render)
+        number = self.classes.index(label) if label in self.classes else -1
+        for name, content in (self.files(render) | {f"{key}.cls": str(number)}).items():
+            name = name.removeprefix(f"{DETAILS}/").replace(f"{key}_", f"{key}.")
+            data = content.encode() if isinstance(content, str) else content
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
 
 
 FORMATS: dict[str, type[DataSet]] = {
@@ -234,34 +220,9 @@ FORMATS: dict[str, type[DataSet]] = {
 }
 
 
-def class_folder(render: LabeledRender) -> str:
-    """Return the class of the first visible object of a render as the name of a folder."""
+def first_label(render: LabeledRender) -> str:
+    """Return the class of the first visible object of a render."""
     return str(render.labels[0]) if render.labels else NO_CLASS
-
-
-def describe(render: LabeledRender) -> dict[str, Any]:
-    """Describe a render for its JSON file."""
-    objects = [
-        {
-            "class": str(label),
-            "box": box,
-            "visible": visible,
-            "area": int(mask.sum()),
-            "counts": run_lengths(mask.numpy()),
-        }
-        for label, box, visible, mask in zip(
-            render.labels, render.boxes.tolist(), render.visible.tolist(), render.masks, strict=True
-        )
-    ]
-    return {
-        "index": render.index,
-        "size": list(render.image.shape[1:]),
-        "mesh": render.mesh,
-        "objects": objects,
-        "camera": render.camera,
-        "light": render.light.tolist(),
-        "depth_scale": _depth_scale(render),
-    }
 
 
 def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
@@ -273,12 +234,7 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
     return counts if counts[-1] else counts[:-1]
 
 
-def _depth_scale(render: LabeledRender) -> float:
-    """Return the depth, in world units, of one step of the depth image."""
-    return float(render.depth.max()) / MAX_DEPTH
-
-
-def _map(render: LabeledRender, name: str) -> np.ndarray:
+def _map(render: LabeledRender, name: str, depth_scale: float) -> np.ndarray:
     """Return a map of a render as an array of 8 or 16 bits.
 
     A mask has 1 for the first visible object, 2 for the second, and so on. Normals in [-1, 1]
@@ -289,8 +245,7 @@ def _map(render: LabeledRender, name: str) -> np.ndarray:
         shape = render.depth.shape
         return (render.masks.numpy() * numbers).max(0, initial=0).reshape(shape).astype(np.uint8)
     if name == "depth":
-        scale = _depth_scale(render) or 1.0
-        return np.rint(render.depth.numpy() / scale).astype(np.uint16)
+        return np.rint(render.depth.numpy() / (depth_scale or 1.0)).astype(np.uint16)
     normals = render.normals.permute(1, 2, 0).numpy()
     return np.rint((normals + 1) / 2 * 255).astype(np.uint8)
 

@@ -97,10 +97,8 @@ class ImageFiles:
             errors |= errors_in_batch
             if errors and not self.skip:
                 path, error = next(iter(errors.items()))
-                raise InputError(
-                    f"{self.folder / path} cannot be read ({error}): "
-                    "replace the file, or set skip_unreadable=True"
-                )
+                advice = "replace the file, or set skip_unreadable=True"
+                raise InputError(f"{self.folder / path} cannot be read ({error}): {advice}")
             yield images
         if errors:
             first = next(iter(errors))

@@ -41,10 +41,8 @@ def require_outside(out: Path, folder: Path) -> None:
     photographs.
     """
     if out.resolve().is_relative_to(folder.resolve()):
-        raise InputError(
-            f"out={out} lies inside the folder of the photographs, {folder}: "
-            "choose a folder outside of it"
-        )
+        advice = "choose a folder outside of it"
+        raise InputError(f"out={out} lies inside the folder of the photographs, {folder}: {advice}")
 
 
 def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list[Photograph]:
@@ -75,10 +73,9 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     paths, files = _image_files(folder)
     has_class_folders = _has_class_folders(folder, paths, classes, labels)
     if len(labels) > 1 and not has_class_folders:
-        raise InputError(
-            f"{folder} has no class folders, and label names several classes: "
-            "move the images of the folder into one subfolder per class"
-        )
+        fault = f"{folder} has no class folders, and label names several classes"
+        advice = "move the images of the folder into one subfolder per class"
+        raise InputError(f"{fault}: {advice}")
     table = folder / TABLE
     rows = _read_table(table)
     missing = sorted(rows.keys() - set(map(_composed_path, files)))
@@ -123,10 +120,9 @@ def choose_labels(
     labels = class_folders(folder, classes)
     if not labels:
         known = ", ".join(classes[:3])
-        raise InputError(
-            f"photos={folder} has no sub-folder of a class of the network ({known}, ...): "
-            "name the sub-folders by classes, or give classes or label"
-        )
+        fault = f"photos={folder} has no sub-folder of a class of the network ({known}, ...)"
+        advice = "name the sub-folders by classes, or give classes or label"
+        raise InputError(f"{fault}: {advice}")
     if len(labels) > MAX_LABELS:
         raise InputError(
             f"photos={folder} has sub-folders of {len(labels)} classes, and at most {MAX_LABELS} "
@@ -159,10 +155,8 @@ def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]
     all_paths = list(visible_files(folder))
     image_paths = sorted(path for path in all_paths if _is_image(folder, path))
     if not image_paths:
-        raise InputError(
-            f"{folder} holds no photographs: give a folder with image files whose names end in "
-            f"one of {', '.join(SUFFIXES)}"
-        )
+        advice = f"give a folder with image files whose names end in one of {', '.join(SUFFIXES)}"
+        raise InputError(f"{folder} holds no photographs: {advice}")
     return image_paths, all_paths
 
 
@@ -248,10 +242,9 @@ def _has_class_folders(
         _warn_once(f"{count} {fault}: {', '.join(no_classes)}")
     outside = [path for path in paths if len(path.parts) == 1]
     if names and outside:
-        raise InputError(
-            f"{folder / outside[0]} lies beside class folders, not in one of them: "
-            "move the file into the folder of its class"
-        )
+        fault = f"{folder / outside[0]} lies beside class folders, not in one of them"
+        advice = "move the file into the folder of its class"
+        raise InputError(f"{fault}: {advice}")
     return bool(names)
 
 

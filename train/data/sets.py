@@ -205,11 +205,9 @@ def load_cifar100(path: str) -> DataSet:
         train = CIFAR100(path, train=True, download=True)
         test = CIFAR100(path, train=False, download=True)
     except (OSError, RuntimeError) as error:
-        raise InputError(
-            f"path={path} does not contain CIFAR-100, and the download failed ({error}): "
-            "give the folder of a copy, or connect to the internet",
-            "path",
-        ) from error
+        fault = f"path={path} does not contain CIFAR-100, and the download failed ({error})"
+        advice = "give the folder of a copy, or connect to the internet"
+        raise InputError(f"{fault}: {advice}", "path") from error
     splits = []
     for cifar in (train, test):
         images = torch.from_numpy(cifar.data).permute(0, 3, 1, 2).contiguous()
@@ -280,9 +278,8 @@ def load_folder(
     split_names = [name for name in photographs.folder_names(root) if name.lower() in SPLIT_NAMES]
     if split_names not in ([], ["test", "train"]):
         advice = "give a folder with the two folders train and test, or with class folders only"
-        raise InputError(
-            f"path={path} holds the folders {', '.join(split_names)}: {advice}", "path"
-        )
+        fault = f"path={path} holds the folders {', '.join(split_names)}"
+        raise InputError(f"{fault}: {advice}", "path")
     train_root = root / "train" if split_names else root
     classes = tuple(photographs.folder_names(train_root))
     if len(classes) < 2:
@@ -298,9 +295,8 @@ def load_folder(
     empty_classes = set(range(len(classes))).difference(train.labels.tolist())
     if empty_classes:
         name = classes[min(empty_classes)]
-        raise InputError(
-            f"{train_root / name} holds no image: put images there, or remove the folder"
-        )
+        advice = "put images there, or remove the folder"
+        raise InputError(f"{train_root / name} holds no image: {advice}")
     if split_names:
         return DataSet(classes, train, _read(root / "test", *options))
     is_test = held_out_rows(train, test_fraction, "test_fraction")

@@ -94,10 +94,9 @@ def require_losses(network: TaskNetwork, needs_boxes: bool) -> None:
     except InputError:
         raise
     except Exception as error:  # Networks of users raise errors of many kinds.
-        raise InputError(
-            f"network fails on images and targets in training mode ({single_line(error)}): it must "
-            "return its losses by name, as the detectors of torchvision do"
-        ) from error
+        fault = f"network fails on images and targets in training mode ({single_line(error)})"
+        advice = "it must return its losses by name, as the detectors of torchvision do"
+        raise InputError(f"{fault}: {advice}") from error
 
 
 @dataclass

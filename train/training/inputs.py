@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -93,9 +93,8 @@ class Initial:
         """
         for key in ("classes", "size"):
             if self.architecture[key] != description[key]:
-                raise InputError(
-                    f"network={self.source} differs from this run in {key}: give the same {key}"
-                )
+                advice = f"give the same {key}"
+                raise InputError(f"network={self.source} differs from this run in {key}: {advice}")
         with checkpoints.checks_architecture(self.source):
             network.load_state_dict(self.weights)
 
@@ -128,11 +127,8 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         path, state = checkpoints.load_selected(source)
     built_by = str(state["architecture"].get("name"))
     if built_by.startswith(PYTHON) and settings.model.name != built_by and not settings.trust:
-        raise InputError(
-            f"the network in {path} is built by {built_by}: give model.name={built_by} to run "
-            "that code",
-            "network",
-        )
+        advice = f"give model.name={built_by} to run that code"
+        raise InputError(f"the network in {path} is built by {built_by}: {advice}", "network")
     return Initial(path, state["architecture"], checkpoints.plain_weights(state))
 
 
@@ -144,13 +140,13 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
     settings stay.
     """
     names = [] if settings.label is None else label_names(settings.label)
-    # A number can be the index of a class.
-    may_have_index = any(name.isdecimal() for name in names)
     if len(names) == 1 and settings.augment.renders:
         files = [item for item in settings.meshes if isinstance(item, str)]
         others = [file for file in files if class_of_name(name_of_mesh(file), names) is None]
         if others:
             console.warning("label=%s is the class of %s", names[0], ", ".join(others))
+    # A number can be the index of a class.
+    may_have_index = any(name.isdecimal() for name in names)
     if not (may_have_index or settings.label_follows_from_meshes):
         return settings
     initial = load_initial(settings)
@@ -171,17 +167,12 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     if not isinstance(classifier.task, Classification):
         reason = f"network={name} is a network of {classifier.task.name}, and pnb-train takes "
         raise InputError(f"{reason}classifiers: train a detector by nb.harden in Python", "network")
-    network = cast(nn.Module, classifier.network)
-    if not list(network.parameters()):  # ONNX and quantized networks have none.
-        raise InputError(
-            f"network={name} is a network without weights that can be trained: "
-            "give a file of the network in the format of TorchScript or torch.export",
-            "network",
-        )
-    shape = {"name": name_from_anywhere(name), CLASSIFIER: True}
-    architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
-    inputs = classifier.inputs if size is None else replace(classifier.inputs, size=YOU)
-    return Initial(Path(name), architecture, network.state_dict(), inputs=inputs)
+    if not list(classifier.network.parameters()):  # ONNX and quantized networks have none.
+        fault = f"network={name} is a network without weights that can be trained"
+        advice = "give a file of the network in the format of TorchScript or torch.export"
+        raise InputError(f"{fault}: {advice}", "network")
+    # A run builds the network again, since modules of TorchScript cannot be copied.
+    return replace(initial_of(classifier, size), source=Path(name), network=None)
 
 
 def initial_of(classifier: TaskNetwork, size: int | None) -> Initial:
@@ -195,9 +186,8 @@ def initial_of(classifier: TaskNetwork, size: int | None) -> Initial:
         shape[checkpoints.NORMALIZE_LIGHT] = asdict(classifier.normalized_light)
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
     inputs = classifier.inputs if size is None else replace(classifier.inputs, size=YOU)
-    source = Path(classifier.name)
-    weights = network.state_dict()
-    return Initial(source, architecture, weights, network, inputs, classifier.task)
+    facts = Path(classifier.name), architecture, network.state_dict(), network
+    return Initial(*facts, inputs, classifier.task)
 
 
 def choose_validation(
@@ -217,25 +207,22 @@ def choose_validation(
     asked = settings.data.validation
     # Of data without labels, at most HELD_OUT images validate.
     default = VALIDATION if data.labeled else min(VALIDATION, sets.HELD_OUT / len(data.train))
-    fraction = default if asked is None else asked
-    # What determines which training images the run leaves out for validation.
-    record = {"fraction": fraction, "seed": 0, "images": data.train.content_hash}
-    if data.rendered:
-        record["data"] = "shapes"
+    # What determines which training images the run leaves out for validation. Only a network that
+    # was trained on rendered images records the entry "data".
+    record = {"fraction": asked or default, "seed": 0, "images": data.train.content_hash}
+    record |= {"data": "shapes"} if data.rendered else {}
     stored = initial.architecture.get("validation") if initial else None
     earlier = stored if isinstance(stored, dict) else {}
     left_out = earlier.get("fraction")
-    # Only a network that was trained on rendered images records the entry "data".
     is_of_other_kind = data.rendered and left_out is not None and "data" not in earlier
     if initial is None or is_of_other_kind:
-        return fraction, record
+        return asked or default, record
     # The records of the same images differ only in the fraction.
-    if not isinstance(left_out, float) or {**record, "fraction": left_out} != earlier:
+    if not isinstance(left_out, float) or record | {"fraction": left_out} != earlier:
         name = settings.network
         console.debug("validation: %s does not say whether it learned from these images, too", name)
-        return fraction, None
-    if asked is None:
-        fraction = left_out
+        return asked or default, None
+    fraction = asked or left_out
     if fraction > left_out:
         fault = f"it left out only data.validation={left_out}"
         console.debug("validation: %s learned from part of it: %s", settings.network, fault)
@@ -254,22 +241,21 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> s
     Without a size in the settings, the images get the size that `initial` takes.
     """
     data = settings.data
-    name = data.name
-    console.debug("data: %s", name)
+    console.debug("data: %s", data.name)
     size = settings.size or (initial.size if initial else SIZE)
-    skip = settings.evaluate.skip_unreadable
-    group = UNLABELED if name == UNLABELED else ""
+    group = UNLABELED if data.name == UNLABELED else ""
     with main_process_first(), keyed(group, **keys_of("data", data)):
-        if name == "cifar100":
+        if data.name == "cifar100":
             loaded = sets.load_cifar100(data.path)
-        elif name == "npz":
+        elif data.name == "npz":
             loaded = sets.load_npz(data.path)
-        elif name == "shapes":
+        elif data.name == "shapes":
             counts = (data.train_per_class, data.test_per_class)
             loaded = load_shapes(*counts, size, data.seed, cache_folder(settings.train.cache))
         else:
-            load = sets.load_folder if name == "folder" else sets.load_unlabeled
-            path = data.path if name == "folder" else str(settings.unlabeled)
+            load = sets.load_folder if data.name == "folder" else sets.load_unlabeled
+            path = data.path if data.name == "folder" else str(settings.unlabeled)
+            skip = settings.evaluate.skip_unreadable
             loaded = load(path, size, data.test_fraction, skip, data.workers)
     with keyed("data.path"):
         require_range("image size", loaded.size, MIN_SIZE, MAX_SIZE)
@@ -283,12 +269,10 @@ def require_label(settings: ExperimentSettings, data: sets.DataSet) -> None:
     """
     needs_label = settings.augment.renders or settings.train.ranking_weight > 0
     if settings.label is None and needs_label:
-        choices = ", ".join(data.classes[:5])
-        raise InputError(
-            f"label is not set: set it to the class of the meshes, one of the {len(data.classes)} "
-            f"classes {choices}{', ...' if len(data.classes) > 5 else ''}",
-            "label",
-        )
+        choices = ", ".join(data.classes[:5]) + (", ..." if len(data.classes) > 5 else "")
+        count = len(data.classes)
+        reason = "label is not set: set it to the class of the meshes, one of the"
+        raise InputError(f"{reason} {count} classes {choices}", "label")
     for label in () if settings.label is None else label_names(settings.label):
         name = data.classes[class_index(data.classes, label, "label")]
         if name != label and settings.scored_folders:
@@ -325,10 +309,9 @@ def describe_test_images(settings: ExperimentSettings, data: sets.DataSet) -> st
     kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
     # Classes are counted in the training images, because the test images are not read
     # before the end of the run.
-    class_count = len(data.train.labels.unique())
-    if class_count == len(data.classes):
-        return kind
-    return f"{kind} of {class_count} of the network's {len(data.classes)} classes"
+    class_count, all_count = len(data.train.labels.unique()), len(data.classes)
+    is_part = class_count < all_count
+    return f"{kind} of {class_count} of the network's {all_count} classes" if is_part else kind
 
 
 def build_service(
@@ -341,7 +324,7 @@ def build_service(
     is_classifier = isinstance(task, Classification)
     scene: Scene | None = None
     images: Tensor | None = None
-    labels = torch.zeros(0, dtype=torch.int64, device=device)
+    labels = torch.zeros(0, dtype=torch.int64)
     phases = Phases(device)
     names = [] if settings.label is None else label_names(settings.label)
     # The ranking loss compares images of a positive class with images of other classes. It
@@ -350,11 +333,9 @@ def build_service(
     positive_classes: list[int] = []
     if is_ranked or settings.augment.renders:
         positive_classes = [class_index(data.classes, name, "label") for name in names]
-
     if settings.augment.renders and settings.augment.mode == "folder":
         images, labels = load_renders(settings, data)
         images = images.to(device)
-        labels = labels.to(device)
         is_ranked = len(labels.unique()) > 1
     elif settings.augment.renders:
         positive_names = [data.classes[index] for index in positive_classes]
@@ -367,19 +348,26 @@ def build_service(
                 index = class_index(data.classes, item.label, f"label of {key}")
                 label_of_class[item.label] = index
         scene = _build_scene(settings, data.size, device, phases)
-        labels = torch.tensor([label_of_class[name] for name in scene.labels], device=device)
-
-    has_complementary_labels = (labels < 0).any()
+        labels = torch.tensor([label_of_class[name] for name in scene.labels])
     has_all = is_classifier and len(positive_classes) == len(data.classes)
-    if has_all and has_complementary_labels:
+    if has_all and (labels < 0).any():
         raise InputError(
             f"label={settings.label} has all classes of the network, but some renders show none "
             "of them: remove the objects without a class, or give them a label"
         )
-    rendered = (settings.augment, scene, labels, settings.seed, phases)
-    ranked = positive_classes if is_ranked else ()
-    processes = (distributed.rank(), distributed.world_size())
-    return AugmentationService(*rendered, ranked, *processes, images, task, data.classes)
+    return AugmentationService(
+        settings.augment,
+        scene,
+        labels.to(device),
+        settings.seed,
+        phases,
+        positive_classes if is_ranked else (),
+        distributed.rank(),
+        distributed.world_size(),
+        images,
+        task,
+        data.classes,
+    )
 
 
 def _build_scene(
@@ -389,19 +377,12 @@ def _build_scene(
     with keyed(**keys_of("renderer", settings.renderer)):
         rasterizer = choose_rasterizer(settings.renderer)
     console.debug("rasterizer: %s", rasterizer.description)
+    objects = [*settings.objects.values()]
+    options: dict[str, Any] = {"attack": settings.augment.attack, "vary": settings.augment.vary}
+    options |= {"scene": settings.scene, "renderer": settings.renderer, "rasterizer": rasterizer}
     keys = keys_of("scene", settings.scene)
     with phases("operators"), main_process_first(), keyed("scene", **keys):
-        scene = build_scene(
-            list(settings.objects.values()),
-            size,
-            settings.views,
-            scene=settings.scene,
-            renderer=settings.renderer,
-            rasterizer=rasterizer,
-            attack=settings.augment.attack,
-            vary=settings.augment.vary,
-            device=device,
-        )
+        scene = build_scene(objects, size, settings.views, device=device, **options)
         return scene.with_count(settings.render_count)
 
 
@@ -414,17 +395,12 @@ def load_renders(settings: ExperimentSettings, data: sets.DataSet) -> tuple[Tens
     positive_classes = label_names(settings.label)
     label_of_class = {name: index for index, name in enumerate(data.classes)}
     label_of_negative = complementary_label(label_of_class[positive_classes[0]])
+    skip = settings.evaluate.skip_unreadable
     with keyed("augment.folder"):
         found = find_photographs(folder, data.classes, positive_classes)
-        found, images, _ = load_photographs(
-            folder, found, data.size, settings.evaluate.skip_unreadable
-        )
-        missing = set(positive_classes) - {item.label for item in found}
-        if missing:
-            name = min(missing)
-            raise InputError(
-                f"{folder} has no image of label={name}: "
-                f"add a sub-folder {name} with images of this class"
-            )
+        found, images, _ = load_photographs(folder, found, data.size, skip)
+        for name in sorted(set(positive_classes) - {item.label for item in found}):
+            advice = f"add a sub-folder {name} with images of this class"
+            raise InputError(f"{folder} has no image of label={name}: {advice}")
     labels = [label_of_class.get(item.label, label_of_negative) for item in found]
     return images, torch.tensor(labels)

@@ -112,11 +112,9 @@ class Trainer:
         """
         require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
-            raise InputError(
-                f"ranking_weight={settings.ranking_weight} requires hard negatives: "
-                "add some to the scene, or set a folder of images that has some",
-                "ranking_weight",
-            )
+            fault = f"ranking_weight={settings.ranking_weight} requires hard negatives"
+            advice = "add some to the scene, or set a folder of images that has some"
+            raise InputError(f"{fault}: {advice}", "ranking_weight")
         self.settings = settings
         self.architecture = architecture
         self.service = service
@@ -405,10 +403,9 @@ class Trainer:
             self.load_state_dict(state)
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             reason = single_line(error)
-            raise InputError(
-                f"this run cannot continue from the checkpoint in {self.folder} ({reason}): "
-                f"restore {run_folder.LAST}, or start in another folder"
-            ) from error
+            fault = f"this run cannot continue from the checkpoint in {self.folder} ({reason})"
+            advice = f"restore {run_folder.LAST}, or start in another folder"
+            raise InputError(f"{fault}: {advice}") from error
         if self.epoch:
             # It is read before the training, so that no time is lost if it is damaged.
             self.best = checkpoints.load(self.folder / run_folder.BEST)

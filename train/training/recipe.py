@@ -133,10 +133,8 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
     chosen = [name for name in names if name.startswith(f"{stage}.")]
     if not chosen:
         examples = nearest(stage, sorted({_module_of(name) for name in names}))
-        raise InputError(
-            f"stage={stage} is no module of the network: choose a module, such as {examples}",
-            "stage",
-        )
+        advice = f"choose a module, such as {examples}"
+        raise InputError(f"stage={stage} is no module of the network: {advice}", "stage")
     frozen_count = names.index(chosen[-1]) + 1
     for parameter in list(network.parameters())[:frozen_count]:
         parameter.requires_grad_(False)

@@ -411,9 +411,7 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
     own_name = initial.architecture.get("name", WIDERESNET)
     name = shape.get("name", own_name)
     if name != own_name:
-        raise InputError(
-            f"model.name={name} is not the architecture of network={initial.source}: "
-            "leave model.name out"
-        )
+        fault = f"model.name={name} is not the architecture of network={initial.source}"
+        raise InputError(f"{fault}: leave model.name out")
     statistics = {key: initial.architecture.get(key) for key in ("mean", "std")}
     return {"name": own_name, CLASSIFIER: True, **statistics}
