@@ -97,7 +97,8 @@ class Detection(Task):
         ...     return [{"boxes": box, "labels": label, "scores": score} for score in scores]
         >>> scene = nb.build_scene([("solid:ball", "ball")], size=16, width=2)
         >>> task = nb.Detection(threshold=0.2, iou=0.2)
-        >>> settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.5), max_steps=20)
+        >>> light = nb.StepSettings(step_size=0.5)
+        >>> settings = nb.AttackSettings(lighting=light, max_steps=20, allow_negative=True)
         >>> result = nb.attack(find_bright, scene, task=task, settings=settings, classes=["ball"])
         >>> result.success
         tensor([True])

@@ -76,7 +76,7 @@ _MIN_DEPTH = TOLERANCE / 10
 # norm of its SH coefficients. Negative radiance of a dark channel is only rounding error.
 _DARK_FRACTION = 1e-6
 # Largest number of rounds of the exchange method. A round adds constraints in the
-# directions with negative radiance, and solves again. Seven rounds are usual.
+# directions with negative radiance, and solves again. Ten to twenty rounds are usual.
 _MAX_ROUNDS = 50
 # `project_nonnegative` solves its quadratic program at most this many times. Negative
 # radiance that is left is then removed by adding a smoothed version of the light.
@@ -108,7 +108,7 @@ _NEWTON_STEPS = 2
 # fraction of the largest radiance of the light,
 _ABOVE_ZERO = 0.04
 # and exceeds the radiance of no neighbor by more than this fraction. Few minima are missed
-# with the first value. The search is faster with the second one.
+# with the first value. The search is several times faster with the second one.
 _MANY_STARTS = 1e-3
 _LOWEST_STARTS = 0.0
 
@@ -201,26 +201,32 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
     -`TOLERANCE` times its largest one.
     """
     programs = _create_programs(coefficients, within)
-    unsolved = programs
+    # Few starts find most minima, and many find the rest.
+    for starts in (_LOWEST_STARTS, _MANY_STARTS):
+        _exchange(programs, starts)
+    nearest = np.concatenate([program.nearest for program in programs])
+    return torch.from_numpy(nearest).view(coefficients.mT.shape).to(coefficients).mT
+
+
+def _exchange(programs: "list[_QuadraticProgram]", starts: float) -> None:
+    """Solve programs until no negative minimum is found, see `_find_negative_minima`."""
     for _ in range(_MAX_ROUNDS):
-        nearest = np.concatenate([program.nearest for program in unsolved])
-        original = np.concatenate([program.original for program in unsolved])
+        nearest = np.concatenate([program.nearest for program in programs])
+        original = np.concatenate([program.original for program in programs])
         channel_of_minimum, harmonics = _find_negative_minima(
-            nearest, _rounding_radiance(original), _MANY_STARTS
+            nearest, _rounding_radiance(original), starts
         )
         # Each quadratic program has the same number of channels.
-        channels_per_program = len(nearest) // len(unsolved)
+        channels_per_program = len(nearest) // len(programs)
         still_negative = np.unique(channel_of_minimum // channels_per_program)
         for index in still_negative:
             first_channel = index * channels_per_program
             channels = range(first_channel, first_channel + channels_per_program)
             constraints = [harmonics[channel_of_minimum == channel] for channel in channels]
-            unsolved[index].add_constraints(constraints)
-        unsolved = [unsolved[index] for index in still_negative]
-        if not unsolved:
+            programs[index].add_constraints(constraints)
+        programs = [programs[index] for index in still_negative]
+        if not programs:
             break
-    nearest = np.concatenate([program.nearest for program in programs])
-    return torch.from_numpy(nearest).view(coefficients.mT.shape).to(coefficients).mT
 
 
 def _create_programs(
