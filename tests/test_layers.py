@@ -133,9 +133,3 @@ def test_settings_need_neither_torch_nor_numpy():
     code = f"{hide}; import {', '.join(names)}"
     assert len(names) > 2
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
-
-
-def test_rendering_needs_no_pillow():
-    """Only files of images do."""
-    code = "import sys; sys.modules['PIL'] = None; import renderer.rendering"
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

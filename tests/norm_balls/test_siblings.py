@@ -35,6 +35,7 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_a_script_named_train_uses_the_library(folder):
     (folder / "train.py").write_text(USE)
     done = run(folder, "train.py")

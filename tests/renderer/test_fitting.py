@@ -37,6 +37,7 @@ def coverage_of(mesh: renderer.Mesh, camera: Camera, size: int) -> Tensor:
     return 1 - background[0]
 
 
+@pytest.mark.slow
 def test_the_brightest_channel_is_fitted_alone_and_the_others_are_pulled_toward_its_light():
     """The light is nearly uniform, so that no radiance is negative, and the minimum is closed."""
     gain = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)

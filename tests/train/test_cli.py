@@ -127,6 +127,7 @@ def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, two_met
     assert not list(tmp_path.rglob("metrics.jsonl"))
 
 
+@pytest.mark.slow
 def test_a_stopped_run_is_resumed_by_its_folder_alone(
     call, capsys, no_report, tmp_path, two_methods, photos
 ):

@@ -117,6 +117,7 @@ def test_a_run_does_not_depend_on_the_number_of_its_processes(runs):
     assert len(list((runs / "two").glob("events.out.tfevents.*"))) == 1  # one process writes
 
 
+@pytest.mark.slow
 def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of_one_as_of_a_folder(
     runs,
 ):

@@ -177,6 +177,7 @@ def test_gradients_by_the_camera_are_differences_of_new_images(camera):
     assert relative_error(found, expected) < 0.02
 
 
+@pytest.mark.slow
 def test_gradients_by_the_camera_include_the_movement_of_highlights():
     metal = renderer.Gloss(0.5, 1.0)
     image = moved_camera(named_mesh("pear"), NEAR, ["polar", "azimuth"], metal)

@@ -72,6 +72,7 @@ def test_an_attack_prints_what_it_attacked_writes_its_files_and_records_its_sett
     assert {str(path.relative_to(folder / "example_000")) for path in paths} == ADVERSARY_FILES
 
 
+@pytest.mark.slow
 def test_files_of_an_attack_are_meshes_and_lights_of_another(run, tmp_path):
     assert run("attack=lighting+geometry", *WITHOUT_CHECKS) == 0
     example = tmp_path / "out" / FOLDER_OF_ORANGE / "example_000"
@@ -88,6 +89,7 @@ def test_files_of_an_attack_are_meshes_and_lights_of_another(run, tmp_path):
     assert line["label"] == ["apple"]
 
 
+@pytest.mark.slow
 def test_an_adversary_of_two_views_is_rendered_again_and_attacked_further(run, tmp_path, capsys):
     shared = "scene.views=2", "attack.shared=true"
     assert run("attack=lighting+geometry+albedo", *WITHOUT_CHECKS, *shared) == 0
@@ -130,6 +132,7 @@ def test_an_adversary_of_a_detector_is_rendered_and_detected_again(tmp_path):
     assert {line["predicted"][0] for line in lines} == {"nothing"}
 
 
+@pytest.mark.slow
 def test_success_against_radius_is_a_table_and_a_figure_of_meshes_of_the_classes_they_name(
     run, tmp_path, capsys
 ):
@@ -157,6 +160,7 @@ def test_success_against_radius_is_a_table_and_a_figure_of_meshes_of_the_classes
         assert figure.size == (750, 570)
 
 
+@pytest.mark.slow
 def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_other_meshes(
     run, tmp_path, capsys
 ):

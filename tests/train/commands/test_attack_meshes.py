@@ -64,6 +64,7 @@ def test_a_class_whose_name_is_a_number_is_a_target():
     assert result.criterion.target.tolist() == [[1]]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the first gradient")  # it sees the background alone
 def test_a_scene_in_which_the_mesh_is_recognized_is_searched_for():
     """The classifier knows oranges before light gray alone."""

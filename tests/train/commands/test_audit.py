@@ -70,6 +70,7 @@ def counts_of(report: nb.AuditReport) -> tuple:
     return attack.views, attack.correct, attack.adversarial
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*deprecated")
 @pytest.mark.parametrize("suffix", ["pt", pytest.param("pt2", marks=pytest.mark.slow)])
 def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index_without_a_folder(

@@ -120,6 +120,7 @@ def test_a_hardened_classifier_has_no_threshold_of_the_original(network, photogr
     assert not torch.equal(hardened(images), classifier(images))
 
 
+@pytest.mark.slow
 def test_each_mesh_trains_the_class_that_it_or_its_file_names(network, photographs, tmp_path):
     file = tmp_path / "PEAR.ply"
     trimesh.creation.box().export(file)
@@ -146,6 +147,7 @@ def test_a_copy_trained_in_normalized_light_has_the_weights_without_it(network, 
     assert not torch.equal(plain[4].weight, harden(network, photographs)[4].weight)
 
 
+@pytest.mark.slow
 def test_a_mesh_in_memory_trains_as_its_file_does(network, photographs, tmp_path):
     nb.export_mesh(nb.Gloss(0.6).on(nb.solid("orange", 0)), tmp_path / "a.glb")
     nb.export_mesh(nb.solid("lemon"), tmp_path / "b.glb")

@@ -6,6 +6,7 @@ import pytest
 
 from train.commands.sweep import format_sweep
 
+pytestmark = pytest.mark.slow
 PRETRAINED = Path(__file__).parents[3] / "pretrained"
 MAX_LINES = 15
 SOLIDS = ",".join(f"solid:orange:{seed}" for seed in range(14))
@@ -30,7 +31,7 @@ def sweep(made_up_run, tmp_path) -> list[Path]:
 @pytest.mark.parametrize(
     "words",
     [
-        pytest.param(["attack", f"meshes=[{SOLIDS}]", *ATTACK], marks=pytest.mark.slow),
+        ["attack", f"meshes=[{SOLIDS}]", *ATTACK],
         ["compare", f"runs=[{','.join(f'sweep/{index}' for index in range(12))}]"],
         ["report", "runs=[sweep]", "out=page"],
     ],

@@ -154,6 +154,7 @@ def test_an_attack_and_an_evaluation_find_the_class_by_its_index(call, here):
     assert scores["recall"]["value"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 def test_a_network_in_a_file_begins_with_the_normalization_of_the_user(here, monkeypatch):
     monkeypatch.chdir(here)

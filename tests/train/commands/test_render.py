@@ -299,11 +299,6 @@ def test_a_class_that_cannot_be_a_folder_is_refused(meshes, tmp_path, name):
     write([meshes[0] | {"label": name}], tmp_path / "coco", format="coco", count=1)
 
 
-def test_renders_have_224_pixels_per_side_unless_a_size_is_given(meshes, tmp_path):
-    folder = write(meshes, tmp_path / "out", size=None, count=1, maps=[])
-    assert details(folder, 0)["size"] == [224, 224]
-
-
 @pytest.mark.slow
 def test_a_network_is_wrong_on_the_files_that_are_rendered_against_it(tmp_path):
     network = nb.load_classifier("efficientnet_lite0")

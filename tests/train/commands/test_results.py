@@ -100,6 +100,7 @@ def test_older_scores_are_replaced_by_overwrite_alone(call, here):
     assert json.loads((here / "scores" / "summary.json").read_text())["label"] == "fig"
 
 
+@pytest.mark.slow
 def test_an_attack_over_an_earlier_one_leaves_none_of_its_adversaries(call, here):
     fast = ["attack.max_steps=1", "attack.checks=false", "attack.verify=null"]
     command = ["attack", *COMMANDS["attack"], *fast, "out=out"]

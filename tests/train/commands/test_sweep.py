@@ -137,6 +137,7 @@ def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(
     assert [row[:2] for row in table] == [["network", "runs"], ["none", "2"]]
 
 
+@pytest.mark.slow
 def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_none(
     run_sweep, folder_of, swept, tmp_path, monkeypatch, capsys
 ):
@@ -169,6 +170,7 @@ def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_no
         assert len(read_metrics(folder)) == 3
 
 
+@pytest.mark.slow
 def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_other(
     run_sweep, folder_of, tmp_path, monkeypatch, capsys
 ):

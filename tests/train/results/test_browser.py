@@ -12,6 +12,7 @@ from train.auditing import audit, lights
 from train.auditing.audit import run_audit
 from train.command_settings import AuditSettings
 
+pytestmark = pytest.mark.slow
 CLASSES = ("orange", "other")
 # Least contrast of text by WCAG 2.1, level AA, section 1.4.3; and of large text.
 CONTRAST = 4.5

@@ -90,6 +90,7 @@ def load_torchvision(path: Path) -> nn.Module:
     return network
 
 
+@pytest.mark.slow
 def test_the_result_loads_where_the_original_did_and_in_every_command(tuned, weights):
     folder, _ = tuned("folder", "train.learning_rate=0.01")
     images = torch.rand(4, 3, SIZE, SIZE)
@@ -104,6 +105,7 @@ def test_the_result_loads_where_the_original_did_and_in_every_command(tuned, wei
     torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_normalized_light_is_remembered_by_the_network_and_by_that_of_the_next_run(tuned, weights):
     """The weights do not change noticeably."""
     light = NormalizedLightSettings(white_balance=1.0)

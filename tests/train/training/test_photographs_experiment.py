@@ -79,6 +79,7 @@ def test_the_weights_lie_on_the_line_between_original_and_trained_ones(finished,
             torch.testing.assert_close(value, expected, atol=1e-6, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_ends_as_one_that_was_not(finished, settings_of, tmp_path):
     folder, scores = finished
     stopped = tmp_path / "run"

@@ -191,6 +191,7 @@ class TestARunThatReplacesAnother:
         monkeypatch.setattr("train.training.run.write_laboratory", write)
         return calls
 
+    @pytest.mark.slow
     def test_renders_once_if_it_is_resumed_and_anew_with_other_settings(
         self, tiny, tmp_path, rendered
     ):
@@ -234,6 +235,7 @@ class TestARunThatReplacesAnother:
         assert (left == {"mine.txt"}) == (next(steps) <= kept)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_has_its_recorded_threads_unless_the_settings_give_others(
     tiny, tmp_path, monkeypatch
 ):
