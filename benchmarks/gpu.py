@@ -39,7 +39,7 @@ from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch, precompute
 from renderer.visibility import choose
 from train.checkpoints import load_run
-from train.device import GraphedNetwork, MixedPrecision, choose_precision, set_deterministic
+from train.device import MixedPrecision, choose_precision, set_deterministic
 
 NETWORK = "pretrained/none"
 MESH_COUNT = 2
@@ -196,7 +196,7 @@ def rasterizers(device: str) -> Iterator[Row]:
 
 
 def attack(device: str) -> Iterator[Row]:
-    """Ask what an attack gains by channels last and by CUDA graphs.
+    """Ask what an attack gains by channels last.
 
     Args:
         device: Device of the attack.
@@ -215,8 +215,6 @@ def attack(device: str) -> Iterator[Row]:
         "eager": partial(service.regenerate, network, 0),
         "eager, channels first": channels_first(regenerate_channels_first),
     }
-    if device != "cpu":
-        calls["CUDA graphs"] = partial(service.regenerate, GraphedNetwork(network), 0)
     yield from compare_calls(f"attack of {STEPS} steps", calls, device)
 
 

@@ -92,6 +92,7 @@ class Facts:
         is_pair: True for a list of two numbers [minimum, maximum].
         is_text: True for a name or a path whose annotation is Any.
         may_be_empty: True if an empty text is permitted.
+        is_filled: True for a list with one item or more.
         checks_type: True if the value must have the annotated type.
     """
 
@@ -106,6 +107,7 @@ class Facts:
     is_pair: bool = False
     is_text: bool = False
     may_be_empty: bool = False
+    is_filled: bool = False
     checks_type: bool = True
 
     @property
@@ -235,6 +237,8 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
     """Check a value, or each item of a list, against the range and the choices of its field."""
     if isinstance(value, str) and not value and not facts.may_be_empty:
         raise InputError(f"{name} is empty: give a name", name)
+    if facts.is_filled and not value:
+        raise InputError(f"{name} must not be empty: name one or more", name)
     if facts.is_pair:
         lower = -math.inf if facts.minimum is None else facts.minimum
         upper = math.inf if facts.maximum is None else facts.maximum

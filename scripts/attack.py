@@ -1,5 +1,7 @@
 """Attack a classifier through the lighting, the shape, the colors or the pixels of a mesh."""
 
+import re
+
 from train.cli import Command
 
 
@@ -12,13 +14,10 @@ def list_parameters(words: list[str]) -> list[str]:
     keys = {word.partition("=")[0] for word in words}
     rewritten = []
     for word in words:
-        key, _, value = word.partition("=")
-        if key == "attack" and not value.startswith("["):
-            word = f"attack=[{value.replace('+', ',')}]"
-        rewritten.append(word)
-    if "reload" in keys and "attack" not in keys:
-        rewritten.append("attack=[]")
-    return rewritten
+        found = re.fullmatch(r"attack=(?!\[)(.*)", word)
+        rewritten.append(f"attack=[{found[1].replace('+', ',')}]" if found else word)
+    shows_only = "reload" in keys and "attack" not in keys
+    return [*rewritten, "attack=[]"] if shows_only else rewritten
 
 
 main = Command(

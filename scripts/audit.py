@@ -11,18 +11,14 @@ addition.
 
 from train.cli import Command
 
-main = Command(
-    name="audit",
-    settings="train.command_settings:AuditSettings",
-    about=__doc__,
-    examples=[
-        "pnb-audit network=torchvision:resnet50 meshes=orange.glb",
-        "pnb-audit network=efficientnet_lite0 unlabeled=FOLDER",
-        "pnb-audit network=torchvision:mobilenet_v3_small weights=mine.pth "
-        "classes=mine.txt meshes=orange.glb",
-        "pnb-audit network=NAME meshes=[orange.glb] hard_negatives=[solid:lemon] out=audit",
-    ],
-)
+examples = [
+    "pnb-audit network=torchvision:resnet50 meshes=orange.glb",
+    "pnb-audit network=efficientnet_lite0 unlabeled=FOLDER",
+    "pnb-audit network=torchvision:mobilenet_v3_small weights=mine.pth "
+    "classes=mine.txt meshes=orange.glb",
+    "pnb-audit network=NAME meshes=[orange.glb] hard_negatives=[solid:lemon] out=audit",
+]
+main = Command("audit", "train.command_settings:AuditSettings", __doc__, examples)
 
 if __name__ == "__main__":
     main()

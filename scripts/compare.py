@@ -2,12 +2,8 @@
 
 from train.cli import Command
 
-main = Command(
-    name="compare",
-    settings="train.command_settings:CompareSettings",
-    about=__doc__,
-    examples=["pnb-compare 'runs=[runs/a,runs/b]'"],
-)
+examples = ["pnb-compare 'runs=[runs/a,runs/b]'"]
+main = Command("compare", "train.command_settings:CompareSettings", __doc__, examples)
 
 if __name__ == "__main__":
     main()

@@ -2,15 +2,11 @@
 
 from train.cli import Command
 
-main = Command(
-    name="evaluate",
-    settings="train.command_settings:EvaluateSettings",
-    about=__doc__,
-    examples=[
-        "pnb-evaluate run=pretrained/best photos=photos",
-        "pnb-evaluate network=torchvision:resnet18 photos=photos",
-    ],
-)
+examples = [
+    "pnb-evaluate run=pretrained/best photos=photos",
+    "pnb-evaluate network=torchvision:resnet18 photos=photos",
+]
+main = Command("evaluate", "train.command_settings:EvaluateSettings", __doc__, examples)
 
 if __name__ == "__main__":
     main()

@@ -2,12 +2,8 @@
 
 from train.cli import Command
 
-main = Command(
-    name="fit",
-    settings="train.command_settings:FitSettings",
-    about=__doc__,
-    examples=["pnb-fit photograph=photo.jpg mask=mask.png mesh=orange.glb"],
-)
+examples = ["pnb-fit photograph=photo.jpg mask=mask.png mesh=orange.glb"]
+main = Command("fit", "train.command_settings:FitSettings", __doc__, examples)
 
 if __name__ == "__main__":
     main()

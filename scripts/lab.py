@@ -2,12 +2,7 @@
 
 from train.cli import Command
 
-main = Command(
-    name="lab",
-    settings="train.command_settings:LabSettings",
-    about=__doc__,
-    examples=["pnb-lab out=lab"],
-)
+main = Command("lab", "train.command_settings:LabSettings", __doc__, ["pnb-lab out=lab"])
 
 if __name__ == "__main__":
     main()

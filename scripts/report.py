@@ -22,13 +22,9 @@ def name_folders(words: list[str]) -> list[str]:
     return [*other_words, *runs]
 
 
-main = Command(
-    name="report",
-    settings="train.command_settings:ReportSettings",
-    about=__doc__,
-    examples=["pnb-report runs/sweep"],
-    rewrite=name_folders,
-)
+examples = ["pnb-report runs/sweep"]
+settings = "train.command_settings:ReportSettings"
+main = Command("report", settings, __doc__, examples, rewrite=name_folders)
 
 if __name__ == "__main__":
     main()

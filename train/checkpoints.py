@@ -9,8 +9,8 @@ last.pt has all of `train.training.loop.Trainer.state_dict`.
 import io
 import json
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,12 @@ import torch
 from safetensors import safe_open
 from torch import Tensor, cuda, nn
 
-from augment.classifier import Classifier, Normalization, OperatingPoint, TaskNetwork
+from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.files import as_facts, is_network_file, require_no_facts
-from augment.network import FROM_FILE, say_inputs, unwrapped, with_normalized_light
+from augment.network import FROM_FILE, Inputs, say_inputs, unwrapped, with_normalized_light
 from augment.settings import NormalizeLight
 from augment.sources import SOURCES, import_function, load_classifier
 from augment.tasks.detection import Detection
-from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, keyed, require_file, require_kind, single_line
 from renderer.io.files import atomic_write
 from train.data.sets import content_hash
@@ -41,7 +40,10 @@ RUN = "run:"
 # Entries in the file of a published network, in addition to the weights.
 PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point")
 # Entries in the description of a network that are no arguments of `build_network`.
-FACTS = ("version", "encoding", "validation")
+FACTS = ("version", "encoding", "validation", "assumed")
+# Entry in the description of a network that lists which facts about its images were assumed: fields
+# of `Inputs`.
+ASSUMED = "assumed"
 # Entry in the description of a network that normalizes the light of images, with its settings.
 NORMALIZE_LIGHT = "normalize_light"
 # If a network normalizes the light of images, the names of its weights begin with this text.
@@ -83,16 +85,27 @@ def load(path: Path) -> dict[str, Any]:
         return _checked(state)
 
 
-@contextmanager
-def _refused_if_damaged(path: Path) -> Iterator[None]:
+def _refused_if_damaged(path: Path) -> AbstractContextManager[None]:
     """Turn any error of a block that reads a checkpoint into an InputError."""
+    # torch, safetensors and json raise errors of many types for a damaged file.
+    return _refused(path, "damaged or not a checkpoint", "use another one", Exception)
+
+
+def checks_architecture(path: Path) -> AbstractContextManager[None]:
+    """Raise InputError if the block cannot load weights into a network of another architecture."""
+    errors = (TypeError, ValueError, LookupError, AttributeError, RuntimeError)
+    advice = "use the model settings of the training run that wrote the checkpoint"
+    return _refused(path, "from another architecture", advice, *errors)
+
+
+@contextmanager
+def _refused(path: Path, fault: str, advice: str, *errors: type[Exception]) -> Iterator[None]:
+    """Turn errors of some types into an InputError about a checkpoint."""
     try:
         yield
-    # torch, safetensors and json raise errors of many types for a damaged file.
-    except Exception as error:
+    except errors as error:
         reason = textwrap.shorten(single_line(error), LONGEST_REASON)
-        fault = f"checkpoint {path} is damaged or not a checkpoint ({reason})"
-        raise InputError(f"{fault}: use another one") from error
+        raise InputError(f"checkpoint {path} is {fault} ({reason}): {advice}") from error
 
 
 def _checked(state: dict[str, Any]) -> dict[str, Any]:
@@ -142,50 +155,40 @@ def restore_random_state(state: Mapping[str, Any]) -> None:
 def load_network(
     name: str,
     weights: str | Path | None = None,
-    classes: Sequence[str] | str | None = None,
-    size: int | None = None,
-    normalization: Normalization = None,
+    *,
     normalize_light: NormalizeLight = None,
     trust_code: bool = False,
-    prompt: str | None = None,
-    task: Task | None = None,
+    **facts: Any,
 ) -> Any:
     """Load a classifier by its name: the network of a training run, or any other classifier.
 
     The arguments other than `name` are those of `nb.load_classifier`. The network of a run has
-    its own weights, classes, size and normalization, so these must then be None.
+    its own weights and its own `facts`, such as classes and size, so these must then be None.
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     path = Path(name)
     folder = path.parent if path.name == WEIGHTS else path
     if (folder / BEST).is_file():
         raise InputError(f"name={name} is a training run: give name={RUN}{folder} instead", "name")
-    if name.startswith(RUN):
-        require_no_facts(name, as_facts(classes, size, normalization, prompt, task))
-        # Error messages about the argument `run` begin with `name` instead, the argument of
-        # this function.
-        with keyed(run="name"):
-            classifier = load_run(name.removeprefix(RUN), weights, trust_code=trust_code)
-        return classifier.normalizing_light(normalize_light)
-    given = weights, classes, size, normalization, normalize_light, trust_code, prompt, task
-    return load_classifier(name, *given)
+    options: dict[str, Any] = {"normalize_light": normalize_light, "trust_code": trust_code}
+    if not name.startswith(RUN):
+        return load_classifier(name, weights, **options, **facts)
+    require_no_facts(name, as_facts(**facts))
+    # Error messages about the argument `run` begin with `name` instead, the argument of
+    # this function.
+    with keyed(run="name"):
+        classifier = load_run(name.removeprefix(RUN), weights, trust_code=trust_code)
+    return classifier.normalizing_light(normalize_light)
 
 
 def load_chosen(settings: NetworkSettings) -> Any:
     """Load the network that the settings of a command choose, with its task."""
+    names = ("weights", "classes", "size", "normalization", "normalize_light", "prompt")
+    given = {name: getattr(settings, name) for name in names}
+    task = _task_that_decodes(settings)
     # Error messages about the argument `name` begin with the setting `network` instead.
     with keyed(name="network"):
-        network = load_network(
-            str(settings.network),
-            settings.weights,
-            settings.classes,
-            settings.size,
-            settings.normalization,
-            settings.normalize_light,
-            settings.trust,
-            settings.prompt,
-            _task_that_decodes(settings),
-        )
+        network = load_network(str(settings.network), trust_code=settings.trust, task=task, **given)
     return _with_task(network, settings) if isinstance(settings, TaskSettings) else network
 
 
@@ -208,15 +211,11 @@ def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
     if settings.task not in (None, own.name):
         fault = f"task={settings.task}, but {network.title} returns {own.returns}"
         raise InputError(f"{fault}: leave the task out", "task")
-    given = {
-        name: getattr(settings, name)
-        for name in ("threshold", "iou", "goal")
-        if getattr(settings, name, None) is not None
-    }
-    unknown = [name for name in given if not hasattr(own, name)]
-    if unknown:
-        name = unknown[0]
-        raise InputError(f"{name}={given[name]} is no setting of {own.name}: leave it out", name)
+    values = {name: getattr(settings, name, None) for name in ("threshold", "iou", "goal")}
+    given = {name: value for name, value in values.items() if value is not None}
+    for name, value in given.items():
+        if not hasattr(own, name):
+            raise InputError(f"{name}={value} is no setting of {own.name}: leave it out", name)
     if not given:
         return network
     options = network.network, network.size, network.classes, network.name
@@ -263,10 +262,9 @@ def load_run(
     shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
-        raise InputError(
-            f"the network in {path} is built by {name}: give model={name} to run that code, or "
-            f"load its weights in a {PYTHON}MODULE:FUNCTION of your own"
-        )
+        own = f"load its weights in a {PYTHON}MODULE:FUNCTION of your own"
+        advice = f"give model={name} to run that code, or {own}"
+        raise InputError(f"the network in {path} is built by {name}: {advice}")
     with checks_architecture(path):
         size = int(shape.pop("size"))
         classes = tuple(map(str, shape.pop("classes")))
@@ -274,34 +272,28 @@ def load_run(
         built = build_network(classes, size, trust_code=trust_code, **shape)
         network = with_normalized_light(built, light)
         network.load_state_dict(state["model"])
+        facts = network, size, classes, f"{RUN}{run}"
+        loaded: Any
         if name == DETECTOR:
-            # The commands ask the task of a network.
-            detector: Any = TaskNetwork(network, size, classes, f"{RUN}{run}", task=Detection())
-            detector.inputs = FROM_FILE
-            say_inputs(detector.name, network, size, FROM_FILE)
-            return detector
-        classifier = Classifier(network, size, classes, f"{RUN}{run}")
-        classifier.inputs = FROM_FILE
-        stored = state.get("operating_point", [])
-        points = stored if isinstance(stored, list) else [stored]
-        classifier.operating_points = [OperatingPoint(**values) for values in points]
-        for point in classifier.operating_points:
-            # This call raises InputError if the network lacks the class.
-            classifier.label(point.label)
-        say_inputs(classifier.name, classifier.network, classifier.size, classifier.inputs)
-        return classifier
+            loaded = TaskNetwork(*facts, task=Detection())
+        else:
+            loaded = Classifier(*facts)
+            stored = state.get("operating_point", [])
+            points = stored if isinstance(stored, list) else [stored]
+            loaded.operating_points = [OperatingPoint(**values) for values in points]
+            for point in loaded.operating_points:
+                # This call raises InputError if the network lacks the class.
+                loaded.label(point.label)
+        loaded.inputs = stated_inputs(state["architecture"])
+        say_inputs(loaded.name, network, size, loaded.inputs)
+        return loaded
 
 
-@contextmanager
-def checks_architecture(path: Path) -> Iterator[None]:
-    """Raise InputError if the block cannot load weights into a network of another architecture."""
-    try:
-        yield
-    except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
-        reason = textwrap.shorten(single_line(error), LONGEST_REASON)
-        fault = f"checkpoint {path} is from another architecture ({reason})"
-        advice = "use the model settings of the training run that wrote the checkpoint"
-        raise InputError(f"{fault}: {advice}") from error
+def stated_inputs(architecture: Mapping[str, Any]) -> Inputs:
+    """Return who states the facts about the images of a network, by its description."""
+    given = architecture.get(ASSUMED, ())
+    assumed: dict[str, Any] = {name: None for name in vars(FROM_FILE) if name in given}
+    return replace(FROM_FILE, **assumed)
 
 
 def is_classifier(name: str) -> bool:

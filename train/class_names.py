@@ -85,8 +85,7 @@ def _unknown_class_error(mesh: str, classes: Sequence[str]) -> InputError:
     """Create the error for a mesh whose class is unknown."""
     if mesh in MESHES_IN_MEMORY:
         return InputError(f"an nb.Mesh has no class: give (mesh, {classes[0]!r}) or label")
-    solid = solid_name(mesh)
-    solids = (*SOLIDS, *HARD_NEGATIVES)
+    solid, solids = solid_name(mesh), (*SOLIDS, *HARD_NEGATIVES)
     if not solid and not Path(mesh).exists():
         return InputError(f"{mesh} does not exist: give the path of a mesh, or solid:NAME")
     if solid and solid not in solids:
@@ -106,11 +105,11 @@ def class_of_meshes(
     """
     if label is not None:
         return class_name(classes, label, "label")
-    found = set(classes_of_meshes(items, classes, key))
+    found = sorted(set(classes_of_meshes(items, classes, key)))
     if len(found) != 1:
-        fault = f"label is not set, and {key} are of the classes {', '.join(sorted(found))}"
+        fault = f"label is not set, and {key} are of the classes {', '.join(found)}"
         raise InputError(f"{fault}: give one", "label")
-    return found.pop()
+    return found[0]
 
 
 def require_others(
@@ -162,11 +161,9 @@ def as_mappings(
     kinds = MeshSource | tuple | list | ObjectSettings
     mappings = []
     for index, item in enumerate(as_list(name, meshes, kinds, EXPECTED)):
-        mapping: dict[str, Any]
-        if isinstance(item, list) and any(
-            isinstance(part, tuple | ObjectSettings) for part in item
-        ):
-            mapping, *others = as_mappings(f"{name}[{index}]", item, classifier)
+        key = f"{name}[{index}]"
+        if isinstance(item, list) and any(isinstance(of, tuple | ObjectSettings) for of in item):
+            mapping, *others = as_mappings(key, item, classifier)
             mappings.append(mapping | {"others": [*mapping.get("others", ()), *others]})
             continue
         if isinstance(item, ObjectSettings):
@@ -174,7 +171,7 @@ def as_mappings(
         else:
             source, *label = [item] if isinstance(item, MeshSource) else item or [None]
             if not isinstance(source, MeshSource) or len(label) > 1:
-                raise InputError(f"{name}[{index}] is {describe(item)}: give {EXPECTED}")
+                raise InputError(f"{key} is {describe(item)}: give {EXPECTED}")
             mesh = name_mesh(source) if isinstance(source, Mesh) else str(source)
             mapping = {"mesh": mesh, **({"label": label[0]} if label else {})}
         if mapping.get("label", "") != "":

@@ -1,11 +1,7 @@
 """A command: a settings class, a function of the library, and `main`.
 
-    compare = Command(
-        name="compare",
-        settings="train.command_settings:CompareSettings",
-        about="Print Markdown tables of finished runs.",
-        examples=["pnb-compare runs=[a,b]"],
-    )
+    examples = ["pnb-compare runs=[a,b]"]
+    main = Command("compare", "train.command_settings:CompareSettings", __doc__, examples)
 
 Hydra reads the command line and the files of conf/. It puts them into the settings class, which
 is typed and checks its values. A mistake of the user is printed in one line that begins with the
@@ -136,10 +132,7 @@ class Command:
             # Hydra reads the overrides from sys.argv, composes the configuration, and calls
             # `self.run` with it.
             sys.argv[1:] = self.to_overrides(words)
-            decorate = hydra.main(
-                version_base="1.3", config_path="pkg://conf", config_name=self.name
-            )
-            start = decorate(self.run)
+            start = hydra.main("pkg://conf", self.name, version_base="1.3")(self.run)
             if SWEEP_FLAGS.isdisjoint(words):
                 start()
             else:
@@ -147,13 +140,13 @@ class Command:
 
     def to_overrides(self, arguments: Sequence[str]) -> list[str]:
         """Convert the arguments of the command line to overrides that Hydra reads."""
-        for argument in arguments:
-            if argument in SWEEP_FLAGS and not self.sweep:
-                raise InputError(f"{argument} is not an option of this command: see --help")
+        for flag in SWEEP_FLAGS.intersection(arguments):
+            if not self.sweep:
+                raise InputError(f"{flag} is not an option of this command: see --help")
         # Hydra's parser of options wants --multirun before the settings.
-        ordered = sorted(arguments, key=lambda argument: argument not in SWEEP_FLAGS)
+        words = self.rewrite(sorted(arguments, key=lambda argument: argument not in SWEEP_FLAGS))
         keys = self.keys
-        return [as_override(argument, keys) for argument in self.rewrite(ordered)]
+        return [as_override(word, keys) for word in words]
 
     def run(self, config: DictConfig) -> None:
         """Run the command, and report errors. Hydra calls this method."""
@@ -316,18 +309,16 @@ def _read_node(node: DictConfig, key: str) -> Any:
     """Convert the group of settings with a dotted key ("" for all) to its settings class."""
     kind = cast(type, OmegaConf.get_type(node))
     values: dict[str, Any] = {}
-    for item in fields(cast(Any, kind)):
-        name = item.name
+    for name in [item.name for item in fields(cast(Any, kind))]:
         inner = f"{key}.{name}" if key else name
         if OmegaConf.is_missing(node, name):
             raise InputError(f"{inner} is not set: give {inner}=...", inner)
-        child = node[name]
-        if not OmegaConf.is_config(child):
-            values[name] = child
-        elif is_dataclass(OmegaConf.get_type(child)):
-            values[name] = _read_node(child, inner)
-        else:
-            values[name] = OmegaConf.to_container(child, resolve=True)
+        value = node[name]
+        if is_dataclass(OmegaConf.get_type(value)):
+            value = _read_node(value, inner)
+        elif OmegaConf.is_config(value):
+            value = OmegaConf.to_container(value, resolve=True)
+        values[name] = value
     try:
         return kind(**values)
     except InputError as error:
@@ -348,12 +339,12 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     key, equals, value = argument.partition("=")
     if not key.lstrip("+").startswith("hydra"):
         key = key.lstrip("+")
-    group = key.rpartition(".")[0]
     kind = without_none(keys.get(key))
-    if (CONF / key.partition("@")[0]).is_dir() and re.fullmatch(r"null|true|false|[-+.\d]+", value):
+    choices = key.partition("@")[0]
+    if (CONF / choices).is_dir() and re.fullmatch(r"null|true|false|[-+.\d]+", value):
         # Hydra raises an error of the program for a choice that is no text.
-        raise InputError(_explain_choice(key.partition("@")[0], value))
-    if keys.get(group) is Any:
+        raise InputError(_explain_choice(choices, value))
+    if keys.get(key.rpartition(".")[0]) is Any:
         # A setting of type Any can hold a mapping, such as scene.projector. Hydra sets a
         # key of a mapping, which may be absent, only if the override begins with "++".
         key = f"++{key}"

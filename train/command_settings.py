@@ -142,7 +142,7 @@ class AttackExperimentSettings(TaskSettings):
     )
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
-    meshes: list[Any] = setting(["solid:orange:0"], MESHES)
+    meshes: list[Any] = setting(["solid:orange:0"], MESHES, is_filled=True)
     unlabeled: str | None = setting(
         None, "Folder of any photographs, which attack=relighting attacks instead of meshes."
     )
@@ -174,8 +174,6 @@ class AttackExperimentSettings(TaskSettings):
         # The name of a class can be a number, which YAML reads as one.
         if isinstance(self.target, int | float):
             self.target = str(self.target)
-        if not self.meshes:
-            raise InputError("meshes must not be empty: name one or more", "meshes")
         attacked = self.attack.parameters
         if (self.attack.relighting is None) != (self.unlabeled is None):
             raise InputError("attack=relighting and unlabeled=FOLDER: set both, or neither")
@@ -466,7 +464,9 @@ class RenderSettings(TaskSettings):
         "Pixels per side, or [height, width]. null: those of the network, or 224.",
         within=(1, base.MAX_SIZE),
     )
-    meshes: list[Any] = setting(["solid:orange", "solid:apple", "solid:cup"], MESHES)
+    meshes: list[Any] = setting(
+        ["solid:orange", "solid:apple", "solid:cup"], MESHES, is_filled=True
+    )
     label: Any = setting(
         None, "Class of the meshes. null: what the name of each file tells.", is_text=True
     )
@@ -476,7 +476,7 @@ class RenderSettings(TaskSettings):
         {"train": 0.8, "val": 0.1, "test": 0.1}, "Parts of the data set, and their fractions."
     )
     maps: list[str] = setting(
-        list(DATA_SET_MAPS), f"Further images of each render: {', '.join(DATA_SET_MAPS)}."
+        list(DATA_SET_MAPS), "Further images of each render.", choices=DATA_SET_MAPS
     )
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     shards: int = setting(1, "Parts of the work that --multirun shard=0,1,... shares.")
@@ -514,10 +514,6 @@ class RenderSettings(TaskSettings):
         super().__post_init__()
         if self.shard >= self.shards:
             raise self.wrong("shard", f"must be less than shards={self.shards}")
-        for name in self.maps:
-            require_choice("maps", name, DATA_SET_MAPS)
-        if not self.meshes:
-            raise InputError("meshes must not be empty: name one or more", "meshes")
         parts = [*self.splits.values()] if isinstance(self.splits, dict) else []
         if not all(is_number(part) and part >= 0 for part in parts) or not sum(parts):
             raise self.wrong("splits", "must be parts and their fractions, such as {train: 1}")
@@ -538,7 +534,7 @@ class CompareSettings(Settings):
     """Settings of the command pnb-compare, which prints tables of the metrics of training runs."""
 
     runs: list[str] = setting(
-        REQUIRED, "Folders of finished runs and of sweeps. Folders below them count, too."
+        REQUIRED, "Folders of finished runs and sweeps, or folders above them.", is_filled=True
     )
     exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
     by: str = setting("source", "Groups of the tables.", choices=common.GROUPS)
@@ -546,19 +542,13 @@ class CompareSettings(Settings):
         "photographs", "Sub-folder of the scores to compare: its name in `photos`."
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.runs:
-            advice = "give the folders of one run or more, as in runs=[runs/a,runs/b]"
-            raise InputError(f"runs is empty: {advice}", "runs")
-
 
 @dataclass
 class ReportSettings(Settings):
     """Settings of the command pnb-report, which writes an HTML page about runs and attacks."""
 
     runs: list[str] = setting(
-        REQUIRED, "Folders of runs, sweeps and attacks. Folders below them count, too."
+        REQUIRED, "Folders of runs, sweeps and attacks, or folders above them.", is_filled=True
     )
     out: str | None = setting(
         None,
@@ -566,8 +556,3 @@ class ReportSettings(Settings):
         "replaced.",
     )
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.runs:
-            raise InputError("runs is empty: give the folders of runs, sweeps or attacks", "runs")

@@ -26,6 +26,7 @@ from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, keyed, require_choice
 from renderer.visibility import Rasterizer, choose
 from train import console
+from train.train_settings import TrainSettings
 
 # File in which Linux stores how much time of the cores a container may use: a quota and a
 # period. The quota divided by the period is the number of cores.
@@ -37,12 +38,6 @@ THREADS = torch.get_num_threads()
 SMALL_WORK = 1e10
 # Number type in which a network computes, by the name of the precision.
 PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": torch.float32}
-# Batch sizes for which `GraphedNetwork` records CUDA graphs. Validation has the largest batches.
-# The batches of an attack become smaller when examples leave after their success.
-SIZES = (16, 32, 64, 128, 512)
-# Number of times that torch may compile a function. Its default of 8 is too small, since each
-# batch size is compiled with and without gradients.
-RECOMPILE_LIMIT = 4 * len(SIZES)
 # Signal that submitit (a launcher of Slurm jobs) sends before the time of a job is over. None on
 # Windows, which lacks this signal.
 BATCH_SYSTEM = getattr(signal, "SIGUSR2", None)
@@ -69,9 +64,8 @@ def most_threads() -> int:
     set OMP_NUM_THREADS), the cores to which the process is bound (by taskset or Slurm), and the
     cores that its container may use. More threads than cores would wait for each other.
     """
-    bound = os.cpu_count() or 1
-    if hasattr(os, "sched_getaffinity"):
-        bound = len(os.sched_getaffinity(0))
+    has_affinity = hasattr(os, "sched_getaffinity")
+    bound = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
     try:
         quota, period = QUOTA.read_text().split()
         permitted = max(1, int(quota) // int(period))
@@ -89,8 +83,7 @@ def choose_threads(network: nn.Module, batch_size: int, size: int) -> int:
     follows from the settings, and is not measured: the same command gives the same results.
     """
     weight_count = sum(parameter.numel() for parameter in network.parameters())
-    pixel_count = batch_size * size**2
-    is_small = weight_count * pixel_count < SMALL_WORK
+    is_small = weight_count * batch_size * size**2 < SMALL_WORK
     return 1 if is_small else most_threads()
 
 
@@ -116,10 +109,11 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
     """
     require_choice("precision", precision, ("auto", *PRECISIONS))
     is_gpu = device.type == "cuda"
+    is_x86 = platform.machine() in ("x86_64", "AMD64")
     if is_gpu:
         is_native = torch.cuda.is_bf16_supported(including_emulation=False)
-    elif platform.machine() in ("x86_64", "AMD64"):
-        is_native = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
+    elif device.type == "cpu" and is_x86:
+        is_native = torch.cpu._is_avx512_bf16_supported()
     else:
         is_native = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     if precision == "bfloat16" and not is_native and not is_gpu:
@@ -152,15 +146,29 @@ class MixedPrecision(Network):
         images = images.contiguous(memory_format=torch.channels_last)
         inputs = (images,) if targets is None else (images, targets)
         dtype = PRECISIONS[self.precision]
-        is_mixed = dtype != torch.float32
-        with torch.autocast(images.device.type, dtype, enabled=is_mixed):
+        with torch.autocast(images.device.type, dtype, enabled=dtype != torch.float32):
             outputs = plain_outputs(self.network(*inputs))
         return outputs.float() if isinstance(outputs, Tensor) else outputs
 
 
+def place(
+    network: nn.Module, settings: TrainSettings, size: int, threads: int | None
+) -> MixedPrecision:
+    """Move a network to the device that trains it, and set the precision and the CPU threads.
+
+    Without `threads`, `choose_threads` chooses them for images of `size` pixels per side.
+    """
+    set_deterministic(settings.deterministic)
+    device = choose_device(settings.device)
+    precision = choose_precision(settings.precision, device, network)
+    model = MixedPrecision(network.to(device), precision)
+    torch.set_num_threads(threads or choose_threads(model, settings.batch_size, size))
+    return model
+
+
 @functools.cache
 def compiles(choice: str, device: torch.device) -> bool:
-    """Return whether to record the passes of a network as CUDA graphs with torch.compile.
+    """Return whether to record the training step as CUDA graphs with torch.compile.
 
     "auto" means yes on a GPU if there is a C compiler and one process: several processes
     communicate within a pass.
@@ -177,32 +185,6 @@ def compiles(choice: str, device: torch.device) -> bool:
         console.warning("compile: torch.compile fails here, so training is slower: %s", reason)
         return False
     return True
-
-
-class GraphedNetwork(Network):
-    """Network that replays recorded CUDA graphs in evaluation mode.
-
-    There is a graph for each batch size in SIZES. A batch of another size is padded with images of
-    zeros, which do not change the logits of the other images in evaluation mode. In training mode,
-    and for batches larger than all SIZES, there is no graph. `compiler` is a backend of
-    torch.compile.
-    """
-
-    def __init__(self, network: nn.Module, compiler: Any = "cudagraphs"):
-        super().__init__(network)
-        self._graphs = torch.compile(network.forward, backend=compiler, dynamic=False)
-        torch._dynamo.config.recompile_limit = RECOMPILE_LIMIT
-
-    def forward(self, images: Tensor) -> Tensor:
-        if self.training or len(images) > SIZES[-1]:
-            return self.network(images)
-        # The smallest recorded batch size that is large enough.
-        size = next(size for size in SIZES if len(images) <= size)
-        padding = images.new_zeros(size - len(images), *images.shape[1:])
-        logits = self._graphs(torch.cat([images, padding]))
-        # The next replay of the graph writes its logits to the same memory, so the
-        # logits are copied.
-        return logits[: len(images)].clone()
 
 
 def choose_rasterizer(settings: RendererSettings) -> Rasterizer:

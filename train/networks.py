@@ -29,9 +29,8 @@ PYTHON = "python:"
 # Version of the description that is stored with the weights of a network. Version 1
 # lacked the size and the normalization of images, and the encoding of renders.
 VERSION = 2
-# Largest depth and largest number of parameters of a WideResNet. A file from
-# elsewhere can ask for any depth and width, and 1e9 parameters take 4 GB.
-MAX_DEPTH = 1000
+# Largest number of parameters of a WideResNet. A file from elsewhere can ask for any depth and
+# width, and 1e9 parameters take 4 GB.
 MAX_PARAMETER_COUNT = 1e9
 # Three numbers: red, green and blue.
 Color = Sequence[float]
@@ -71,7 +70,7 @@ class WideResNet(nn.Module):
         The depth is 10, 16, 22 and so on. `mean` and `std` are of RGB images in [0, 1].
         """
         super().__init__()
-        _require_shape(depth, width, dropout)
+        _require_shape(depth, width)
         self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
         self.stem = nn.Conv2d(3, 16, 3, padding=1, bias=False)
@@ -93,19 +92,18 @@ class WideResNet(nn.Module):
         return self.head(F.relu(self.norm(features)).mean((2, 3)))
 
 
-def _require_shape(depth: int, width: int, dropout: float) -> None:
-    """Check the arguments of a WideResNet."""
-    if depth < 10 or (depth - 4) % 6 or width < 1:
-        advice = "set depth to 10, 16, 22 ..., and width to 1 or more"
-        raise InputError(f"depth={depth}, width={width}: {advice}", "depth")
+def _require_shape(depth: int, width: int) -> None:
+    """Check the depth of a WideResNet, and the size that depth and width give it."""
     # Each group has (depth - 4) / 6 blocks. A block has two 3 × 3 convolutions, whose weights are
     # most of the parameters of the network. The groups have 16, 32 and 64 times `width` channels.
     parameter_count = (depth - 4) // 6 * 2 * 3 * 3 * (16**2 + 32**2 + 64**2) * width**2
-    if depth > MAX_DEPTH or parameter_count > MAX_PARAMETER_COUNT:
-        fault = f"depth={depth}, width={width} has {parameter_count:.1g} parameters"
-        raise InputError(f"{fault}: set less", "depth")
-    if not 0 <= dropout < 1:
-        raise InputError(f"dropout={dropout} must be at least 0 and below 1", "dropout")
+    if depth < 10 or (depth - 4) % 6 or width < 1:
+        advice = "set depth to 10, 16, 22 ..., and width to 1 or more"
+    elif parameter_count > MAX_PARAMETER_COUNT:
+        advice = f"set less than {parameter_count:.1g} parameters"
+    else:
+        return
+    raise InputError(f"depth={depth}, width={width}: {advice}", "depth")
 
 
 class _Block(nn.Module):
@@ -193,14 +191,14 @@ def build_network(
         raise InputError(
             f"name={name} is not {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION", "name"
         )
-    own = _call_function(name, classes, size) if name.startswith(PYTHON) else None
     architecture = name.removeprefix(TORCHVISION)
-    if own is None:
+    is_own = name.startswith(PYTHON)
+    if not is_own:
         require_architecture(architecture)
+    network = _call_function(name, classes, size) if is_own else nn.Identity()
     # Architectures raise errors of many types if images are too small for them.
     try:
-        network = own
-        if network is None:
+        if not is_own:
             built = _build_architecture(architecture, len(classes), size)
             network = Network(built, [ChannelNormalization(mean, std)])
         with eval_mode(network), torch.no_grad():
@@ -208,11 +206,8 @@ def build_network(
         if shape_of_two != (2, len(classes)):
             raise ValueError(f"it returned {shape_of_two} for 2 images")
     except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"name={name} does not give {len(classes)} logits for images of {size} pixels per "
-            f"side: {single_line(error)}",
-            "name",
-        ) from error
+        fault = f"name={name} does not give {len(classes)} logits for images of {size} pixels"
+        raise InputError(f"{fault} per side: {single_line(error)}", "name") from error
     return network
 
 
@@ -222,14 +217,13 @@ def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
     if not isinstance(network, nn.Module):
         advice = "return a torch.nn.Module"
         raise InputError(f"name={name} returns a {type(network).__name__}: {advice}", "name")
-    fault = ""
     if own_size != size:
         fault = f"is for images of {own_size} pixels per side, but those of the data have {size}"
     elif list(own_classes) != list(classes):
         fault = f"has other classes than the data, or another order: {classes[0]!r} is the first"
-    if fault:
-        raise InputError(f"name={name} {fault}: return the size and classes of the data", "name")
-    return network
+    else:
+        return network
+    raise InputError(f"name={name} {fault}: return the size and classes of the data", "name")
 
 
 def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Module:
@@ -253,12 +247,9 @@ def describe(
     """
     facts = {"version": VERSION, "classes": list(classes), "size": size, "encoding": encoding}
     # A network normalizes images itself, or by its last transform.
-    owner = (
-        network.transforms[-1] if isinstance(network, Network) and network.transforms else network
-    )
-    normalization = {
-        name: getattr(owner, name).flatten().tolist()
-        for name in ("mean", "std")
-        if hasattr(owner, name)
-    }
+    owner = network
+    if isinstance(network, Network) and network.transforms:
+        owner = network.transforms[-1]
+    names = [name for name in ("mean", "std") if hasattr(owner, name)]
+    normalization = {name: getattr(owner, name).flatten().tolist() for name in names}
     return facts | shape | normalization

@@ -78,29 +78,27 @@ def load(name: str) -> PublishedNetwork | PublishedDetector:
     loaded = load_run(folder)
     _, state = load_selected(folder)
     scores = state["scores"]
-    if not isinstance(loaded, Classifier):
-        facts = loaded.network, loaded.size, loaded.classes, name
-        detector = PublishedDetector(*facts, task=loaded.task)
-        detector.inputs = loaded.inputs
-        detector.results = {
-            f"{images}/{metric}": Estimate(**metrics["all"][metric])
-            for images, metrics in scores.items()
-            for metric in ("recall", "ap50", "false_per_image")
-        }
-        return detector
-    network = PublishedNetwork(loaded.network, loaded.size, loaded.classes, name)
-    network.operating_points = loaded.operating_points
-    network.results = _read_results(scores)
-    return network
+    facts = loaded.network, loaded.size, loaded.classes, name
+    if isinstance(loaded, Classifier):
+        network = PublishedNetwork(*facts)
+        network.operating_points = loaded.operating_points
+        network.results = _read_results(scores)
+        return network
+    detector = PublishedDetector(*facts, task=loaded.task)
+    detector.inputs = loaded.inputs
+    detector.results = {
+        f"{images}/{metric}": Estimate(**metrics["all"][metric])
+        for images, metrics in scores.items()
+        for metric in ("recall", "ap50", "false_per_image")
+    }
+    return detector
 
 
 def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:
     """Read a published network's results; those of folders get names like "photographs/auc"."""
     results = {ACCURACY: Estimate(scores[ACCURACY])}
     for folder, metrics in scores.items():
-        if not isinstance(metrics, Mapping):
-            continue
-        for metric in METRICS:
+        for metric in METRICS if isinstance(metrics, Mapping) else ():
             estimate = Metrics.read(metrics).find(metric)
             if estimate is not None and estimate.value is not None:
                 results[f"{folder}/{metric}"] = estimate
@@ -162,7 +160,11 @@ def publish(
     is_replaced = path.resolve() == (target / PUBLISHED).resolve()
     require_replaceable(target, "out", overwrite, [PUBLISHED] if is_replaced else [])
     if path.suffix != Path(PUBLISHED).suffix:
-        state |= _describe_run(folder)
+        found = summarize(folder)
+        state["settings"] = mapped(dict(found.settings), _without_folder)
+        state["versions"] = dict(found.config.versions)
+        photographs = {key: scores.to_published() for key, scores in found.photographs.items()}
+        state["scores"] = {**found.scores, **photographs}
     points: list[OperatingPoint] = []
     # A Python function of the user may build the network. It is called only if the
     # network must be calibrated.
@@ -185,17 +187,6 @@ def publish(
     target.mkdir(parents=True, exist_ok=True)
     write_published(target / PUBLISHED, state)
     return points
-
-
-def _describe_run(folder: Path) -> dict[str, Any]:
-    """Collect "settings", "versions" of packages and "scores" of a run for the published file."""
-    run = summarize(folder)
-    photographs = {name: scores.to_published() for name, scores in run.photographs.items()}
-    return {
-        "settings": mapped(dict(run.settings), _without_folder),
-        "versions": dict(run.config.versions),
-        "scores": {**run.scores, **photographs},
-    }
 
 
 def _without_folder(text: str) -> str:

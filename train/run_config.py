@@ -179,10 +179,8 @@ def require_same_run(
     """
 
     def is_permitted(key: str, old: Any, new: Any) -> bool:
-        if finished:
-            return False
         is_longer = key == "train.epochs" and isinstance(old, int) and new > old
-        return is_longer or key.startswith(("evaluate.", "photos"))
+        return not finished and (is_longer or key.startswith(("evaluate.", "photos")))
 
     return require_same(folder, settings, "out= (sweep=)", is_permitted)
 
@@ -202,8 +200,7 @@ def require_same(
     before = decisive_settings(defaults) | decisive_settings(config)
     now = decisive_settings(settings)
     for key in sorted(before.keys() | now.keys()):
-        old = before.get(key)
-        new = now.get(key)
+        old, new = before.get(key), now.get(key)
         if old != new and not is_permitted(key, old, new):
             advice = f"set it so, or another {elsewhere}"
             raise InputError(f"{folder} was made with {key}={old}, not {new}: {advice}")

@@ -138,10 +138,9 @@ def state(folder: Path) -> str:
         if not is_ours:
             return "in training"
     failure = folder / FAILURE
-    if failure.exists():
-        reason = failure.read_text(encoding="utf-8", errors="replace").strip()
-        return f"failed: {reason}"
-    return "interrupted"
+    if not failure.exists():
+        return "interrupted"
+    return f"failed: {failure.read_text(encoding='utf-8', errors='replace').strip()}"
 
 
 def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float | None:
@@ -177,8 +176,7 @@ def writable_folder(folder: str | Path, key: str) -> Path:
     """
     path = Path(folder)
     try:
-        candidates = (path, *path.absolute().parents)
-        existing = next(candidate for candidate in candidates if candidate.exists())
+        existing = next(one for one in (path, *path.absolute().parents) if one.exists())
         with tempfile.TemporaryFile(dir=existing) as file:
             file.write(bytes(TEST_SIZE))
     except OSError as error:

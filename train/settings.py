@@ -98,10 +98,8 @@ class DataSettings(Settings):
     workers: int = setting(
         2, "Processes that read images of more than 64 pixels per side.", within=(0, 1024)
     )
-    train_per_class: int = setting(
-        300, "Training images per class of shapes.", within=(1, MAX_IMAGES)
-    )
-    test_per_class: int = setting(60, "Test images per class of shapes.", within=(1, MAX_IMAGES))
+    train_per_class: int = setting(300, "Training images of each shape.", within=(1, MAX_IMAGES))
+    test_per_class: int = setting(60, "Test images of each shape.", within=(1, MAX_IMAGES))
     seed: int = setting(0, "Seed of the shapes.", within=(0, MAX_SEED))
 
     def __post_init__(self) -> None:
@@ -143,10 +141,8 @@ class EvaluationSettings(Settings):
         """Check all values."""
         super().__post_init__()
         if self.laboratory_setups % KEPT_ASIDE_PATTERNS:
-            raise self.wrong(
-                "laboratory_setups",
-                f"must be a multiple of {KEPT_ASIDE_PATTERNS}, the number of projected patterns",
-            )
+            fault = f"is no multiple of {KEPT_ASIDE_PATTERNS}, the number of projected patterns"
+            raise self.wrong("laboratory_setups", fault)
 
 
 @dataclass(kw_only=True)
@@ -321,11 +317,10 @@ class ExperimentSettings(NetworkSettings):
         self.hard_negatives = [
             item
             for item in self.hard_negatives
-            if not isinstance(item, str) or simplified(solid_name(item)) not in positives
+            if not (isinstance(item, str) and simplified(solid_name(item)) in positives)
         ]
         if renders_meshes:
-            factors = "meshes × views × backgrounds"
-            require_range(factors, self.render_count, 1, MAX_EXAMPLES)
+            require_range("meshes × views × backgrounds", self.render_count, 1, MAX_EXAMPLES)
 
     def _check_photographs(self) -> None:
         """Check the folders of photographs: each scored one can have a sub-folder of scores."""
@@ -354,9 +349,7 @@ class ExperimentSettings(NetworkSettings):
     @property
     def scored_folders(self) -> dict[str, Path]:
         """Folders of photographs, each with the name of the sub-folder of its scores as a key."""
-        named = self.photos if isinstance(self.photos, dict) else {}
-        if isinstance(self.photos, str):
-            named = {PHOTOGRAPHS: self.photos}
+        named = {PHOTOGRAPHS: self.photos} if isinstance(self.photos, str) else self.photos or {}
         return {str(name): published_folder(Path(folder)) for name, folder in named.items()}
 
     @property
@@ -418,8 +411,8 @@ def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, Object
 
     Keys are `key` followed by "[0]" and so on. An item without a class gets `label`.
     """
-    keys = [f"{key}[{index}]" for index in range(len(items))]
-    return {key: read_object(item, label, key) for key, item in zip(keys, items, strict=True)}
+    named = {f"{key}[{index}]": item for index, item in enumerate(items)}
+    return {name: read_object(item, label, name) for name, item in named.items()}
 
 
 def read_object(item: Any, label: str, key: str) -> ObjectSettings:
@@ -489,10 +482,9 @@ def published_folder(run: Path) -> Path:
     clone of the repository has this folder, too. The result is `run` itself if it exists, or if
     neither has it.
     """
-    candidates = [run]
-    if run.parts[:1] == ("pretrained",):
-        package = Path(__file__).parent
-        candidates += [package / run, package.parent / run]
+    package = Path(__file__).parent
+    is_published = run.parts[:1] == ("pretrained",)
+    candidates = [run, package / run, package.parent / run] if is_published else [run]
     return next((path for path in candidates if path.exists()), run)
 
 

@@ -179,16 +179,15 @@ def program(name: str, as_called: bool = False) -> list[str]:
     installed_name = f"{PREFIX}{name}"
     is_installed = bool(sys.flags.safe_path) or called.stem.startswith(PREFIX)
     python = sys.executable if as_called else "python"
+    words = ["-m", "train" if name == "train" else f"scripts.{name}"]
     if is_installed:
         has_path = as_called and called.stem == installed_name
         words = [str(called) if has_path else installed_name]
-    else:
-        words = ["-m", "train" if name == "train" else f"scripts.{name}"]
-    if process_count > 1:
-        torchrun = [python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
-        no_python = ["--no-python"] if is_installed else []
-        return [*torchrun, f"--nproc_per_node={process_count}", *no_python, *words]
-    return words if is_installed else [python, *words]
+    if process_count == 1:
+        return words if is_installed else [python, *words]
+    torchrun = [python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
+    no_python = ["--no-python"] if is_installed else []
+    return [*torchrun, f"--nproc_per_node={process_count}", *no_python, *words]
 
 
 def command_line(name: str) -> str:

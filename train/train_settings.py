@@ -38,7 +38,7 @@ class ModelSettings(Settings):
     )
     depth: int = setting(16, "Depth of the WideResNet.")
     width: int = setting(4, "Width of the WideResNet.")
-    dropout: float = setting(0.3, "Dropout of the WideResNet.")
+    dropout: float = setting(0.3, "Dropout of the WideResNet.", minimum=0, below=1)
 
     @property
     def shape(self) -> dict[str, Any]:
@@ -60,9 +60,7 @@ class TrainSettings(Settings):
     accumulation_steps: int = setting(
         1, "Number of parts into which each batch is divided to save memory.", within=(1, 10**6)
     )
-    optimizer: str = setting(
-        "sgd", "Optimizer. adamw decays no biases and norms.", choices=OPTIMIZERS
-    )
+    optimizer: str = setting("sgd", "adamw decays no biases and norms.", choices=OPTIMIZERS)
     learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
     feature_norm: float | None = setting(
         None,
@@ -160,9 +158,7 @@ class TrainSettings(Settings):
         False, "Compute the same bits every time on a GPU, too, which is slower."
     )
     checkpoint_every: int = setting(
-        1,
-        "Epochs between checkpoints. A single process also writes one every minute.",
-        within=(1, 10**6),
+        1, "Epochs between checkpoints. One process alone adds one a minute.", within=(1, 10**6)
     )
     resume: bool = setting(
         False, "Resume from the last checkpoint in `out`. out=FOLDER train.resume=true is enough."
@@ -175,6 +171,5 @@ class TrainSettings(Settings):
         """Check all values, and that attacked images have a loss."""
         super().__post_init__()
         if self.relight_steps and not self.consistency_weight:
-            raise self.wrong(
-                "relight_steps", "attacks the images of the consistency loss: set its weight"
-            )
+            advice = "attacks the images of the consistency loss: set its weight"
+            raise self.wrong("relight_steps", advice)

@@ -174,7 +174,7 @@ def name_mesh(mesh: Mesh) -> str:
         for array in arrays:
             digest.update(f"{field.name}{array.dtype}{array.shape}".encode())
             digest.update(np.ascontiguousarray(array).data)
-    name = f"mesh_{digest.hexdigest()[:8]}"
+    name = f"mesh_in_memory_{digest.hexdigest()[:8]}"
     MESHES_IN_MEMORY[name] = mesh
     return name
 

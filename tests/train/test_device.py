@@ -6,8 +6,6 @@ import torch
 from renderer.errors import InputError
 from train import device
 from train.device import (
-    SIZES,
-    GraphedNetwork,
     MixedPrecision,
     choose_device,
     choose_precision,
@@ -113,31 +111,3 @@ def test_one_gpu_compiles_where_it_can_unless_disabled(monkeypatch, caplog, work
     monkeypatch.setattr(device.distributed, "world_size", lambda: 2)
     assert not compiles("auto", GPU)
     compiles.cache_clear()
-
-
-@pytest.mark.filterwarnings(
-    "ignore:The .grad attribute of a Tensor that is not a leaf"
-)  # the compiler looks at it
-def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_and_gradient():
-    sizes = []
-
-    def compiler(module, inputs):
-        sizes.append(next(len(x) for x in inputs if x.shape[1:] == (3, 8, 8)))
-        return module.forward
-
-    linear = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 3))
-    linear = linear.double().requires_grad_(False)
-    graphed = GraphedNetwork(linear, compiler).eval()
-    for count in (1, 7, 16, 17, 30, 32, 33):
-        images = torch.rand(count, 3, 8, 8, dtype=torch.float64, requires_grad=True)
-        logits = graphed(images)
-        expected = linear(images)
-        torch.testing.assert_close(logits, expected)
-        weights = torch.rand_like(logits)
-        (gradient,) = torch.autograd.grad((logits * weights).sum(), images)
-        (exact,) = torch.autograd.grad((expected * weights).sum(), images)
-        torch.testing.assert_close(gradient, exact)
-    graphed.train()(images)
-    graphed.eval()(images[:1].expand(SIZES[-1] + 1, -1, -1, -1))
-    # The model itself is used in training mode and for larger batches.
-    assert sizes == [16, 32, 64]

@@ -220,7 +220,7 @@ def test_a_network_that_does_not_take_the_data_is_refused_by_name(name, size, me
 
 
 @pytest.mark.parametrize(
-    ("argument", "value"), [("depth", 15), ("width", 0), ("dropout", 1.0), ("depth", 6 * 10**9 + 4)]
+    ("argument", "value"), [("depth", 15), ("width", 0), ("depth", 6 * 10**9 + 4)]
 )
 def test_an_impossible_architecture_is_refused_by_its_argument(argument, value):
     with pytest.raises(InputError, match=f"{argument}={value}"):

@@ -82,14 +82,13 @@ def run(settings: AttackExperimentSettings) -> None:
         if settings.attack.checks is not False:
             # The checks say this for each mesh.
             filterwarnings("ignore", ZERO_GRADIENT)
-        headings = []
+        headings: list[str] = []
         # Name, examples, examples that were correct before, and successes for each mesh.
         rows: list[tuple[str, int, int, int]] = []
         details = []
         sweeps: dict[str, attack_tables.Sweep] = {}
-        for index, (name, scene, result) in enumerate(
-            attacks(settings, classifier, device, adversary)
-        ):
+        found = attacks(settings, classifier, device, adversary)
+        for index, (name, scene, result) in enumerate(found):
             # The name of a solid has colons, which Windows does not allow in file names.
             folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
             heading, lines = _write_attack(name, scene, result, folder, settings, targets)
@@ -104,8 +103,13 @@ def run(settings: AttackExperimentSettings) -> None:
             rows.append((name, len(correct), int(correct.sum()), hits))
             headings.append(heading)
             details += lines
+        if len(rows) > 1:
+            correct_count, hits = sum(row[2] for row in rows), sum(row[3] for row in rows)
+            total = f"success on {hits} of {correct_count} examples that were correct before"
+            table = Table("", ["mesh", "examples", "correct before", "success"], rows)
+            headings = [f"{len(rows)} meshes: {total}", *str(table).splitlines()]
         if not is_verbose():
-            print("\n".join(shortened([*_format_summary(headings, rows), *details])))
+            print("\n".join(shortened([*headings, *details])))
         if sweeps:
             norms = {name: steps.norm for name, steps in settings.attack.parameters.items()}
             attack_tables.write_sweeps(sweeps, norms, out)
@@ -122,8 +126,8 @@ def _results_of(settings: AttackExperimentSettings, classifier: Classifier) -> I
     with sole_writer("out", out):
         remove_attack(out)
         yield out
-        facts = {"command": command_line("attack"), "images": classifier.describe_inputs()}
-        write_config(out, settings, **facts)
+        images = classifier.describe_inputs()
+        write_config(out, settings, command=command_line("attack"), images=images)
 
 
 def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
@@ -143,7 +147,9 @@ def _write_attack(
     """Check and write the attack on one mesh, and return its success and further lines."""
     details = []
     if scene != settings.scene:
-        changes = overrides(scene, settings.scene)
+        before = vars(settings.scene)
+        changed = [item for item in vars(scene).items() if item[1] != before[item[0]]]
+        changes = shlex.join(f"scene.{key}={value}" for key, value in changed)
         details.append(f"{name} is misclassified in the given scene, but not with {changes}")
     has_checks = settings.attack.checks
     if has_checks is None:
@@ -159,19 +165,6 @@ def _write_attack(
         table = attack_tables.write_transfers(transfer(result, **targets), folder / TRANSFERS)
         details += table.splitlines()
     return heading, details
-
-
-def _format_summary(
-    headings: Sequence[str], rows: Sequence[tuple[str, int, int, int]]
-) -> Sequence[str]:
-    """Return the sentence about one mesh, or the sum and a table of several."""
-    if len(rows) == 1:
-        return headings
-    correct = sum(row[2] for row in rows)
-    hits = sum(row[3] for row in rows)
-    total = f"success on {hits} of {correct} examples that were correct before"
-    table = Table("", ["mesh", "examples", "correct before", "success"], rows)
-    return [f"{len(rows)} meshes: {total}", *str(table).splitlines()]
 
 
 def attacks(
@@ -190,15 +183,13 @@ def attacks(
 
     def start(scene: Scene, force: bool) -> AttackResult:
         with keyed("attack", **keys_of("attack", settings.attack)):
-            return attack(
-                classifier, scene, settings.target, settings.attack, seed=settings.seed, force=force
-            )
+            given = settings.target, settings.attack
+            return attack(classifier, scene, *given, seed=settings.seed, force=force)
 
     if adversary is not None:
         if adversary.pixels is not None:
-            raise InputError(
-                f"reload={settings.reload} has changed pixels, which cannot be attacked on"
-            )
+            fault = "has changed pixels, which cannot be attacked on"
+            raise InputError(f"reload={settings.reload} {fault}")
         scene = adversary.scene(_start_rasterizer(settings), device)
         yield adversary.shown.name, settings.scene, start(scene, force=True)
         return
@@ -228,19 +219,11 @@ def build_attacked(
     one example for each background. Otherwise it has one example for each pair
     of a view and a background.
     """
-    rasterizer = _start_rasterizer(settings)
+    options: dict[str, Any] = {"attack": settings.attack, "shared": settings.attack.shared}
+    options |= {"scene": scene, "renderer": settings.renderer, "device": device}
+    options["rasterizer"] = _start_rasterizer(settings)
     with keyed("scene", **keys_of("scene", scene)):
-        return build_scene(
-            [item],
-            size,
-            scene.views,
-            shared=settings.attack.shared,
-            scene=scene,
-            renderer=settings.renderer,
-            attack=settings.attack,
-            rasterizer=rasterizer,
-            device=device,
-        )
+        return build_scene([item], size, scene.views, **options)
 
 
 def load_targets(
@@ -251,11 +234,12 @@ def load_targets(
     Return the arguments of `nb.transfer`.
     """
     label = ""
-    if settings.transfer.networks or settings.transfer.meshes:
+    chosen = settings.transfer
+    if chosen.networks or chosen.meshes:
         # The class is compared by name, because its index may differ in other classifiers.
         label = class_of_meshes(settings.meshes, attacked.classes, "meshes", settings.label)
     classifiers = []
-    for item in settings.transfer.networks:
+    for item in chosen.networks:
         values = item if isinstance(item, dict) else {"network": item}
         if values.keys() - {"network", "weights"}:
             advice = "give a name, or {network: NAME, weights: FILE}"
@@ -267,18 +251,11 @@ def load_targets(
         other.label(label)
         classifiers.append(other.to(device))
     objects = []
-    for mesh in read_objects(settings.transfer.meshes, label, "transfer.meshes").values():
+    for mesh in read_objects(chosen.meshes, label, "transfer.meshes").values():
         attacked.label(mesh.label)
         loaded = load_object(mesh, settings.scene.vertices)
         objects.append(add_table(loaded, settings.scene.ground))
-    azimuths = settings.transfer.azimuths
-    return {"classifiers": classifiers, "azimuths": azimuths, "objects": objects}
-
-
-def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
-    """Write the settings that the search for a scene changed, such as "scene.polar=80.0"."""
-    changed = [item for item in vars(scene).items() if item[1] != getattr(before, item[0])]
-    return shlex.join(f"scene.{name}={value}" for name, value in changed)
+    return {"classifiers": classifiers, "azimuths": chosen.azimuths, "objects": objects}
 
 
 def format_reloaded(
@@ -313,15 +290,13 @@ def format_reloaded(
     levels = (255 * difference.abs().flatten(1).amax(1)).tolist()
     named = classifier.task.found(evidence[0], predicted[0], classifier.classes)
     lines = []
-    for view in range(len(images)):
+    for view, level in enumerate(levels):
         line = f"view {view}: {label} is recognized as {named['predicted'][view]}"
         line += f" ({named['confidence'][view]:.1%})"
         if settings.sensor_noise:
-            same = ", and so with a sensor's noise"
-            different = ", but not always with a sensor's noise"
-            line += same if is_same_with_noise[view] else different
-        line += f"; values differ from the saved image's by {levels[view]:.3g}/255 at most"
-        lines.append(line)
+            change = "and so" if is_same_with_noise[view] else "but not always"
+            line += f", {change} with a sensor's noise"
+        lines.append(f"{line}; values differ from the saved image's by {level:.3g}/255 at most")
     return lines
 
 
@@ -331,19 +306,13 @@ def _attack_photographs(
     """Attack a network by the light of a projector on photographs, and print the results."""
     device = choose_device(settings.device)
     classifier = load_chosen(settings).to(device)
+    photographs = published_folder(Path(folder))
+    options: dict[str, Any] = {"seed": settings.seed, "batch_size": settings.attack.batch_size}
+    options["sensor_noise"] = settings.attack.sensor_noise
     with _results_of(settings, classifier) as out, keyed("unlabeled"):
-        scores = attack_folder(
-            classifier,
-            published_folder(Path(folder)),
-            relighting,
-            out,
-            sensor_noise=settings.attack.sensor_noise,
-            batch_size=settings.attack.batch_size,
-            seed=settings.seed,
-        )
-    print(f"{scores.tables()[0]}\n")
-    print(f"{MODELED}\n")
-    unreadable = [f"warning: {path} cannot be read" for path in scores.unreadable]
+        found = attack_folder(classifier, photographs, relighting, out, **options)
+    print(f"{found.tables()[0]}\n\n{MODELED}\n")
+    unreadable = [f"warning: {path} cannot be read" for path in found.unreadable]
     for line in shortened(unreadable, MAX_UNREADABLE):
         print(line)
     print(f"predictions and pictures: {out / RELIT}")

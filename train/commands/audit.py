@@ -125,18 +125,12 @@ def audit(
             require_replaceable(folder, "out", overwrite)
             items = as_mappings("meshes", meshes, classifier)
             negatives = as_mappings("hard_negatives", hard_negatives, classifier)
-            settings = AuditSettings(
-                network=classifier.name,
-                label=label,
-                meshes=items,
-                hard_negatives=negatives,
-                photos=None if photos is None else str(photos),
-                laboratory=None if laboratory is None else str(laboratory),
-                environments=as_list("environments", environments, str, "a list of names"),
-                budget=budget,
-                seed=seed,
-                device=str(device),
-                out=str(folder),
-                overwrite=overwrite,
-            )
+            folders = {"photos": photos, "laboratory": laboratory, "out": folder}
+            given: dict[str, Any] = {
+                key: None if path is None else str(path) for key, path in folders.items()
+            }
+            given |= {"label": label, "meshes": items, "hard_negatives": negatives, "seed": seed}
+            given |= {"budget": budget, "device": str(device), "overwrite": overwrite}
+            maps = as_list("environments", environments, str, "a list of names")
+            settings = AuditSettings(network=classifier.name, environments=maps, **given)
             return run_audit(settings, networks).report()

@@ -42,8 +42,7 @@ def run(settings: EvaluateSettings) -> None:
         # The file of a training run has its classes, size and normalization. These settings
         # are therefore an error here.
         facts = settings.classes, settings.size, settings.normalization, settings.prompt
-        given_values = as_facts(*facts)
-        require_no_facts(f"run={settings.run}", given_values)
+        require_no_facts(f"run={settings.run}", as_facts(*facts))
         loaded = load_run(settings.run, settings.weights, settings.network, settings.trust)
         # The returned copy normalizes the light of each image, unless the setting is None.
         network = loaded.normalizing_light(settings.normalize_light)
@@ -53,20 +52,10 @@ def run(settings: EvaluateSettings) -> None:
     with keyed("label"):
         for name in [] if label is None else label_names(label):
             network.label(name)
-    scores = evaluate(
-        network,
-        settings.photos,
-        label,
-        by=settings.by,
-        calibrate=settings.calibrate,
-        false_positive_rate=settings.false_positive_rate,
-        skip_unreadable=settings.skip_unreadable,
-        precision=settings.precision,
-        fit=settings.fit,
-        device=choose_device(settings.device),
-        out=settings.out,
-        overwrite=settings.overwrite,
-    )
+    names = ("by", "calibrate", "false_positive_rate", "skip_unreadable", "precision", "fit")
+    options = {name: getattr(settings, name) for name in (*names, "out", "overwrite")}
+    device = choose_device(settings.device)
+    scores = evaluate(network, settings.photos, label, device=device, **options)
     if not isinstance(scores, Scores):
         print(f"{scores}\nscores and pictures: {Path(settings.out)}")
         return
@@ -178,16 +167,8 @@ def evaluate(
     folder = published_folder(as_path("photos", photos))
     device = device_of(network) if device is None else torch.device(device)
     with gradient_flags_kept(network):
-        made = as_network(
-            network,
-            size,
-            classes,
-            normalization,
-            value_range,
-            device,
-            normalize_light=normalize_light,
-            task=task,
-        ).to(device)
+        given = size, classes, normalization, value_range, device
+        made = as_network(network, *given, normalize_light=normalize_light, task=task).to(device)
         if not isinstance(made, Classifier) and (by != GROUPS[0] or calibrate is not None):
             raise InputError("by and calibrate are for classifiers: leave them out")
         if isinstance(made.task, Segmentation) and label is not None:
@@ -222,9 +203,8 @@ def evaluate(
                 negatives = published_folder(Path(calibrate))
                 # The caller knows this folder as the argument `calibrate`.
                 with keyed(folder="calibrate"):
-                    points = scoring.choose_operating_points(
-                        predictor, negatives, labels, false_positive_rate, skip_unreadable
-                    )
+                    options = labels, false_positive_rate, skip_unreadable
+                    points = scoring.choose_operating_points(predictor, negatives, *options)
             predictions = predictor.predict(folder, labels, skip_unreadable)
             scores = scoring.score(predictions, by, points)
             if target:

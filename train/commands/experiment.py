@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -33,8 +33,8 @@ from train.run_config import CONFIG, format_command, require_same_run, resume_co
 from train.run_folder import sole_writer, writable_folder
 from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings, NetworkSettings
 from train.system import is_verbose, program
-from train.training.inputs import with_label
-from train.training.run import make_runs
+from train.training.inputs import load_inputs, with_label
+from train.training.run import Run
 
 # An override such as experiment=photographs chooses a file of settings. These keys
 # are the folders of such files in conf/.
@@ -65,7 +65,8 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         settings = with_label(read_settings(ExperimentSettings, config))
         if settings.photographs_first:
             settings = _train_on_photographs(settings, folder, command)
-        _train_in(folder, settings, command, program("train", as_called=True))
+        again = (f"out={folder}", "train.resume=true")
+        _train_in(folder, settings, command, [*program("train", as_called=True), *again])
 
 
 def _report_thread_error(error: threading.ExceptHookArgs) -> None:
@@ -99,32 +100,20 @@ def _train_on_photographs(
             remove_run(folder)
         # The folder of the main training has no recorded settings yet. To resume, the
         # user therefore has to give the whole command again.
-        _train_in(first, on_photographs, command, shlex.split(command), folder)
-    return replace(
-        settings,
-        photographs_first=False,
-        # The file of the first network names the code that the user has named for it.
-        trust=True,
-        network=str(first),
-        # The file of the first network has its weights, classes and normalization.
-        weights=None,
-        classes=None,
-        normalization=None,
-    )
+        again = (f"out={folder}", "train.resume=true")
+        _train_in(first, on_photographs, command, [*shlex.split(command), *again])
+    # The file of the first network has its weights, classes and normalization, and names the code
+    # that the user has named for it.
+    cleared: dict[str, Any] = dict.fromkeys(("weights", "classes", "normalization"))
+    return replace(settings, photographs_first=False, trust=True, network=str(first), **cleared)
 
 
 def _train_in(
-    folder: Path,
-    settings: ExperimentSettings,
-    command: str,
-    resuming: Sequence[str],
-    resumed_folder: Path | None = None,
+    folder: Path, settings: ExperimentSettings, command: str, resuming: Sequence[str]
 ) -> None:
     """Check that the folders can be written to, and train a network and its baselines.
 
-    If the training is interrupted, the command that resumes it is printed. `resuming` has the words
-    of that command without out= and train.resume=, and `resumed_folder` its folder, or None for
-    `folder`.
+    If the training is interrupted, the command that resumes it is printed: `resuming`.
     """
     # The baselines come first. Each has a sub-folder with the name of its kind of renders.
     settings_of_runs = {}
@@ -143,7 +132,14 @@ def _train_in(
             first_process.enter_context(logged_to(log))
             first_process.enter_context(sole_writer("out", *settings_of_runs))
         try:
-            for run in make_runs(settings_of_runs, command):
+            data, initial = load_inputs(next(iter(settings_of_runs.values())))
+            # All mistakes are reported before the first run is trained.
+            runs = [Run(of, data, path, initial, command) for path, of in settings_of_runs.items()]
+            # The main run is the last one. It begins first, because it also removes the earlier
+            # runs in the subfolders of its folder, to which the baselines write.
+            for run in reversed(runs):
+                run.begin()
+            for run in runs:
                 mode = run.settings.augment.mode
                 purpose = "" if run.folder == folder else ", for comparison"
                 console.debug("\n== augment=%s: %s%s", mode, MODES[mode], purpose)
@@ -157,8 +153,7 @@ def _train_in(
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
             advice = "no checkpoint yet: start again"
             if any(map(checkpoints.exists, settings_of_runs)):
-                words = [*resuming, f"out={resumed_folder or folder}", "train.resume=true"]
-                advice = f"to go on: {shlex.join(words)}"
+                advice = f"to go on: {shlex.join(resuming)}"
             console.info("%s%s", cause, advice)
             raise
 
@@ -174,25 +169,23 @@ def logged_to(path: Path, prefix: str = "", level: int = logging.INFO) -> Iterat
     # If the disk is full, the log file lacks lines. The training then raises an error of its own,
     # which is enough for the user.
     logging.raiseExceptions = False
-    file = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
-    terminal = logging.StreamHandler(sys.stdout)
-    file.setFormatter(logging.Formatter("%(message)s"))
-    terminal.setFormatter(logging.Formatter(f"{prefix}%(message)s"))
     # Messages of matplotlib about its font cache do not concern the user.
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     root = logging.getLogger()
     level_before = root.level
     root.setLevel(logging.INFO)
     console.setLevel(logging.DEBUG)
+    file = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+    terminal = logging.StreamHandler(sys.stdout)
+    terminal.setFormatter(logging.Formatter(f"{prefix}%(message)s"))
     terminal.setLevel(logging.DEBUG if is_verbose() else level)
-    handlers = (terminal, file)
-    for handler in handlers:
+    for handler in (terminal, file):
         root.addHandler(handler)
     try:
         yield
     finally:
         root.setLevel(level_before)
         console.setLevel(logging.NOTSET)
-        for handler in handlers:
+        for handler in (terminal, file):
             root.removeHandler(handler)
             handler.close()

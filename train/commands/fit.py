@@ -56,16 +56,10 @@ def run(settings: FitSettings) -> None:
     else:
         mask = grab_cut(image, settings.box)
     mesh_settings = ObjectSettings(settings.mesh, label="", albedo_scale=settings.albedo_scale)
-    found = fit_photograph(
-        image,
-        mask,
-        load_object(mesh_settings).mesh,
-        settings.size,
-        fov=settings.fov,
-        albedo_scale=settings.albedo_scale,
-        encoding=settings.encoding,
-        bounces=settings.bounces,
-    )
+    mesh = load_object(mesh_settings).mesh
+    names = ("fov", "albedo_scale", "encoding", "bounces")
+    options = {name: getattr(settings, name) for name in names}
+    found = fit_photograph(image, mask, mesh, settings.size, **options)
     out.mkdir(parents=True, exist_ok=True)
     # The window is the square of the photograph that the found camera shows.
     background = found.window.cut(image, BACKGROUND_SIZE, settings.encoding)
@@ -128,8 +122,7 @@ def render_attacked(
     )
     label = settings.label or ""
     mesh = ObjectSettings(settings.mesh, label=label, albedo_scale=settings.albedo_scale)
-    device = torch.device("cpu")
-    shown = build_attacked(attacked, mesh, attacked.scene, ATTACKED_SIZE, device)
+    shown = build_attacked(attacked, mesh, attacked.scene, ATTACKED_SIZE, torch.device("cpu"))
     first_example = torch.arange(1)
     images = shown.render(shown.conditions(first_example), first_example)
     # `images` has one example and one view, shape (1, 1, 3, size, size).
@@ -162,10 +155,9 @@ def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height w
         advice = "save white where the object is and black elsewhere"
         raise InputError(f"mask={path} cannot be read ({single_line(error)}): {advice}") from error
     if levels.shape != (height, width):
-        raise InputError(
-            f"mask={path} has {levels.shape[1]} × {levels.shape[0]} pixels, but the photograph has "
-            f"{width} × {height}: give a mask of the same size"
-        )
+        fault = f"mask={path} has {levels.shape[1]} × {levels.shape[0]} pixels"
+        reason = f"but the photograph has {width} × {height}"
+        raise InputError(f"{fault}, {reason}: give a mask of the same size")
     return levels
 
 
@@ -238,9 +230,8 @@ def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndar
     height, width = image.shape[:2]
     left, top, right, bottom = box if len(box) == 4 else [0, 0, 0, 0]
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):
-        raise InputError(
-            f"box={box} is not [left, top, right, bottom] within {width} × {height} pixels"
-        )
+        wanted = f"[left, top, right, bottom] within {width} × {height} pixels"
+        raise InputError(f"box={box} is not {wanted}")
     rectangle = (left, top, right - left, bottom - top)
     labels = np.zeros((height, width), np.uint8)
     # OpenCV takes the color channels in the order blue, green, red.

@@ -11,15 +11,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
+from augment import classifier as classifiers
 from augment.augmentation_settings import AugmentationSettings
-from augment.classifier import (
-    UNIT_RANGE,
-    Classifier,
-    Normalization,
-    TaskNetwork,
-    as_network,
-    require_evaluation_mode,
-)
+from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
 from augment.network import device_of, keep_text_vectors, unwrapped
 from augment.settings import NormalizeLight, RendererSettings
 from augment.tasks.classification import Classification
@@ -164,17 +158,12 @@ def harden(
             raise InputError("network has no parameters: give a network that can be trained")
         keep_text_vectors(classifier.network, len(classifier.classes))
         items = class_names.as_mappings("meshes", meshes, classifier)
-        changes: dict[str, Any] = {
-            "out": str(folder.absolute()),
-            "seed": seed,
-            "overwrite": overwrite,
-            "label": None if label is None else classifier.classes[classifier.label(label)],
-            "network": classifier.name,
-            "meshes": items,
-            "unlabeled": str(as_path("unlabeled", unlabeled)),
-            "data": {"name": "unlabeled"},
-            "train": {"device": str(device)},
-        }
+        changes: dict[str, Any] = {"seed": seed, "overwrite": overwrite, "meshes": items}
+        changes |= {"network": classifier.name, "unlabeled": str(as_path("unlabeled", unlabeled))}
+        changes |= {"data": {"name": "unlabeled"}, "train": {"device": str(device)}}
+        changes["out"] = str(folder.absolute())
+        if label is not None:
+            changes["label"] = classifier.classes[classifier.label(label)]
         if is_detector:
             require_losses(classifier, bool(meshes))
             if not meshes:
@@ -211,17 +200,16 @@ def harden(
 def _trainable_copy(network: nn.Module) -> nn.Module:
     """Copy a network, and check that the weights of the copy can be trained."""
     if not isinstance(network, TaskNetwork):
-        require_evaluation_mode(network, "network")
+        classifiers.require_evaluation_mode(network, "network")
     # Vectors of texts may be results of a text encoder, which have a graph and cannot be copied.
     values = [value for module in network.modules() for value in vars(module).values()]
     results = [value for value in values if isinstance(value, Tensor) and not value.is_leaf]
     copy = deepcopy(network, {id(value): value.detach().clone() for value in results})
     # An optimizer can change a parameter only if it is a leaf of the autograd graph.
     if not all(weight.is_leaf for weight in copy.parameters()):
-        raise InputError(
-            "network contains a module of torch.jit, which cannot be trained: write it with "
-            "torch.jit.save, and give norm_balls.load_classifier(FILE, trust_code=True)"
-        )
+        fault = "network contains a module of torch.jit, which cannot be trained"
+        advice = "norm_balls.load_classifier(FILE, trust_code=True)"
+        raise InputError(f"{fault}: write it with torch.jit.save, and give {advice}")
     return copy
 
 
@@ -233,9 +221,7 @@ def _read_settings(
     `sections`, which the caller gave, win over `changes`, and these win over the experiment.
     """
     config = main.compose([f"experiment={experiment}"])
-    composed = cast(dict[str, Any], OmegaConf.to_container(config))
-    names = [item.name for item in fields(ExperimentSettings)]
-    settings = OmegaConf.create({name: composed[name] for name in names})
+    settings = OmegaConf.masked_copy(config, [item.name for item in fields(ExperimentSettings)])
     # `harden` returns only the network, so scores on test renders are not needed.
     settings.evaluate.laboratory_setups = 0
     given = {}

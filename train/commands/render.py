@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 from augment import dataset
 from augment.progress import progress
@@ -55,23 +56,14 @@ def run(settings: RenderSettings) -> None:
     height, width = height_and_width(settings.size)
     size = height * width * sum(BYTES[name] for name in ("image", *settings.maps)) * missing
     print(f"{folder}: {missing} of {settings.count} renders to do, at most {size / 1e9:.2g} GB")
+    options: dict[str, Any] = {"settings": settings.augment, "network": network, "device": device}
+    options |= {"scene": settings.scene, "renderer": settings.renderer, "seed": settings.seed}
+    options |= {"first": own.start, "skip": finished, "views": settings.scene.views}
+    options["rasterizer"] = choose_rasterizer(settings.renderer)
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
-        renders = dataset.render_dataset(
-            list(objects.values()),
-            settings.size,
-            len(own),
-            first=own.start,
-            skip=finished,
-            seed=settings.seed,
-            settings=settings.augment,
-            network=network,
-            scene=settings.scene,
-            renderer=settings.renderer,
-            rasterizer=choose_rasterizer(settings.renderer),
-            views=settings.scene.views,
-            device=device,
-        )
+        shown = [*objects.values()]
+        renders = dataset.render_dataset(shown, settings.size, len(own), **options)
     data.write(progress(renders, "renders", missing))
     if data.is_finished():
         data.finish()

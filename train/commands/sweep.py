@@ -35,7 +35,7 @@ from train.run_folder import FAILURE, locked, state, writable_folder
 from train.settings import ExperimentSettings
 from train.system import is_verbose, shortened, user_message
 from train.training.inputs import load_inputs, with_label
-from train.training.run import Run, make_runs
+from train.training.run import Run
 
 # Largest number of lines of the table of finished runs, if --verbose is not set.
 MAX_TABLE_LINES = 10
@@ -152,7 +152,9 @@ def _run(config: DictConfig, folder: Path) -> None:
             settings = with_label(read_settings(ExperimentSettings, config))
             settings.train.resume = checkpoints.exists(folder)
             command = format_command([_unescaped(override) for override in job.overrides.task])
-            (run,) = make_runs({folder: settings}, command)
+            data, initial = load_inputs(settings)
+            run = Run(settings, data, folder, initial, command)
+            run.begin()
             run.train()
         except Exception as error:
             sentence = user_message(error)
@@ -172,8 +174,7 @@ def _unescaped(override: str) -> str:
     """
     value = OverridesParser.create().parse_override(override).value()
     if "\\" in override and isinstance(value, str):
-        key = override.partition("=")[0]
-        return f"{key}={quoted(value)}"
+        return f"{override.partition('=')[0]}={quoted(value)}"
     return override
 
 

@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -126,27 +126,34 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
     A mask has the path of its photograph with another folder, as in `MASK_FOLDERS`, and is a PNG
     file.
     """
-    for images, masks in MASK_FOLDERS:
-        if (folder / images).is_dir() and (folder / masks).is_dir():
+    for names in MASK_FOLDERS:
+        images, masks = (folder / name for name in names)
+        if images.is_dir() and masks.is_dir():
             break
     else:
         advice = "move them to its folders images and masks, under the same names"
         raise InputError(f"photos={folder} has no photographs with masks: {advice}", "photos")
     marked, paths, missing = [], {}, []
-    for item in find_unlabeled(folder / images):
-        mask = (folder / masks / item.path).with_suffix(".png")
-        if not mask.is_file():
-            missing.append(str(item.path))
-            continue
+    for item in find_unlabeled(images):
         name = str(item.path)
-        path = folder / images / item.path
-        nothing = np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, bool)
-        marked.append(Annotated(path, name, None, *nothing))
-        paths[name] = mask
+        mask = (masks / item.path).with_suffix(".png")
+        if mask.is_file():
+            marked.append(_annotated(images / item.path, name, None, []))
+            paths[name] = mask
+        else:
+            missing.append(name)
     if not marked:
         first = Path(missing[0]).with_suffix(".png")
-        raise InputError(f"{folder / masks} has no mask {first}: add it", "photos")
+        raise InputError(f"{masks} has no mask {first}: add it", "photos")
     return marked, paths, missing
+
+
+def _annotated(
+    path: Path, name: str, size: tuple[float, float] | None, rows: Sequence[Sequence[float]]
+) -> Annotated:
+    """Make an `Annotated` from rows with the label, the four sides of the box and `is_crowd`."""
+    table = np.array(rows, float).reshape(-1, 6)
+    return Annotated(path, name, size, table[:, 1:5], table[:, 0].astype(int), table[:, 5] > 0)
 
 
 def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, "H W"]:
@@ -159,12 +166,11 @@ def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, 
             labels = np.array(image)
     except Exception as error:  # Pillow raises errors of almost any type.
         raise InputError(f"{path} cannot be read ({single_line(error)}): replace it") from error
-    if labels.shape != (*fitted.size[::-1],):
-        width, height = fitted.size
-        raise InputError(
-            f"{path} has the shape {labels.shape}, and is no mask of its photograph: give a gray "
-            f"or palette image of {width:g} × {height:g} pixels, with indices of classes"
-        )
+    width, height = fitted.size
+    if labels.shape != (height, width):
+        fault = f"{path} has the shape {labels.shape}, and is no mask of its photograph"
+        advice = f"give a gray or palette image of {width:g} × {height:g} pixels"
+        raise InputError(f"{fault}: {advice}, with indices of classes")
     highest = int(labels[labels != UNSCORED].max(initial=0))
     if highest >= class_count:
         fault = f"{path} has the value {highest}, but the network has {class_count} classes"
@@ -206,7 +212,7 @@ def _read_coco(file: Path) -> Annotations:
         for key, found in (("images", images), ("images", names_of_images), ("categories", names)):
             if len(found) < len(content[key]):
                 raise ValueError(f"two of the {key} have the same id or file_name")
-        of_image: dict[Any, list[Mapping[str, Any]]] = defaultdict(list)
+        rows: dict[Any, list[Sequence[float]]] = defaultdict(list)
         for item in content["annotations"]:
             for key, known in (("image_id", images), ("category_id", names)):
                 if item[key] not in known:
@@ -214,30 +220,26 @@ def _read_coco(file: Path) -> Annotations:
             box = np.array(item["bbox"], float)
             if box.shape != (4,) or not (np.isfinite(box).all() and (box[2:] >= 0).all()):
                 raise ValueError(f"an annotation has the bbox {item['bbox']}")
-            of_image[item["image_id"]].append(item)
+            label = classes.index(names[item["category_id"]])
+            corners = (*box[:2], *(box[:2] + box[2:]))
+            rows[item["image_id"]].append((label, *corners, bool(item.get("iscrowd"))))
         find = _Finder(file)
         photographs, missing = [], []
         for key, image in images.items():
             name = str(image["file_name"]).replace("\\", "/")
             path = find(name)
+            size = (image["width"], image["height"]) if image.get("width") else None
             if path is None:
                 missing.append(name)
-                continue
-            items = of_image[key]
-            boxes = np.array([item["bbox"] for item in items], float).reshape(-1, 4)
-            boxes[:, 2:] += boxes[:, :2]
-            labels = np.array([classes.index(names[item["category_id"]]) for item in items], int)
-            is_crowd = np.array([bool(item.get("iscrowd")) for item in items], bool)
-            size = (image["width"], image["height"]) if image.get("width") else None
-            photographs.append(Annotated(path, name, size, boxes, labels, is_crowd))
+            else:
+                photographs.append(_annotated(path, name, size, rows[key]))
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         if isinstance(error, InputError):
             raise
         reason = f"no key {error}" if isinstance(error, KeyError) else single_line(error)
-        raise InputError(
-            f"{file} is no COCO file of detections ({reason}): it needs images, categories, and "
-            "annotations with image_id, category_id and bbox (x, y, width, height)"
-        ) from error
+        advice = "it needs images, categories, and annotations with image_id, category_id and bbox"
+        fault = f"{file} is no COCO file of detections ({reason})"
+        raise InputError(f"{fault}: {advice} (x, y, width, height)") from error
     if not photographs:
         first = f", such as {missing[0]}" if missing else ""
         raise InputError(f"{file} names no image that exists{first}: move the images beside it")
@@ -249,19 +251,22 @@ class _Finder:
 
     def __init__(self, file: Path):
         self.file = file
-        above = file.parent.parent
-        self.folders = [file.parent, *([above] if file.parent.name == "annotations" else [])]
-        self.by_name: dict[str, list[Path]] | None = None
+        is_beside = file.parent.name != "annotations"
+        self.folders = [file.parent] if is_beside else [file.parent, file.parent.parent]
+
+    @cached_property
+    def by_name(self) -> Mapping[str, list[Path]]:
+        """Images anywhere in the folder, by name without folder. Most files need no search."""
+        found = defaultdict(list)
+        for path in visible_files(self.folders[-1]):
+            if path.suffix.lower() in SUFFIXES:
+                found[path.name].append(self.folders[-1] / path)
+        return found
 
     def __call__(self, name: str) -> Path | None:
         for folder in self.folders:
             if (folder / name).is_file():
                 return folder / name
-        if self.by_name is None:
-            self.by_name = defaultdict(list)
-            for path in visible_files(self.folders[-1]):
-                if path.suffix.lower() in SUFFIXES:
-                    self.by_name[path.name].append(self.folders[-1] / path)
         paths = self.by_name.get(PurePosixPath(name).name, [])
         if len(paths) > 1:
             listed = " and ".join(map(str, paths[:2]))
@@ -283,11 +288,7 @@ def _read_yolo(folder: Path) -> Annotations:
         file = next(filter(Path.is_file, _label_files(path)), None)
         label_count += file is not None
         rows = [] if file is None else [*_yolo_rows(file, len(classes))]
-        labels = np.array([row[0] for row in rows], int)
-        boxes = np.array([row[1] for row in rows], float).reshape(-1, 4)
-        is_crowd = np.zeros(len(rows), bool)
-        name = str(photograph.path)
-        photographs.append(Annotated(path, name, (1, 1), boxes, labels, is_crowd))
+        photographs.append(_annotated(path, str(photograph.path), (1, 1), rows))
     if not label_count:
         first = _label_files(photographs[0].path.absolute())[0]
         fault = f"photos={folder} has neither a COCO file nor label files"
@@ -316,14 +317,14 @@ def _yolo_classes(folder: Path) -> tuple[str, ...]:
             except (OSError, ValueError, yaml.YAMLError) as error:
                 raise InputError(f"{file} cannot be read: {single_line(error)}") from error
             names = content.get("names") if isinstance(content, dict) else None
+            if isinstance(names, list):
+                return tuple(map(str, names))
             if isinstance(names, dict):
                 if not all(str(key).isdecimal() for key in names):
                     raise InputError(f"{file} has names {names}: give a list, or index: name")
                 # Some indices may be missing.
                 known = {int(key): str(name) for key, name in names.items()}
                 return tuple(known.get(i, str(i)) for i in range(max(known, default=-1) + 1))
-            if isinstance(names, list):
-                return tuple(map(str, names))
         for name in (*CLASS_FILES, *(f"labels/{name}" for name in CLASS_FILES)):
             if (parent / name).is_file():
                 lines = (parent / name).read_text(encoding="utf-8-sig").splitlines()
@@ -332,10 +333,8 @@ def _yolo_classes(folder: Path) -> tuple[str, ...]:
     raise InputError(f"photos={folder} does not name its classes: {advice}", "photos")
 
 
-def _yolo_rows(
-    file: Path, class_count: int
-) -> Iterator[tuple[int, tuple[float, float, float, float]]]:
-    """Yield the class and the box of each line of a label file."""
+def _yolo_rows(file: Path, class_count: int) -> Iterator[Sequence[float]]:
+    """Yield the row of each line of a label file, as `_annotated` takes it."""
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except ValueError as error:
@@ -359,7 +358,7 @@ def _yolo_rows(
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
         else:
             box = (min(values[::2]), min(values[1::2]), max(values[::2]), max(values[1::2]))
-        yield int(label), box
+        yield (label, *box, False)
 
 
 def fit(photograph: Annotated, size: tuple[int, int], how: str) -> Fitted:
@@ -396,11 +395,9 @@ def _upright_boxes(
         with open_image(photograph.path) as image:
             turn = TURNED.get(image.getexif().get(ExifTags.Base.Orientation, 1))
         if turn is None or not _is_similar(marked[::-1], upright):
-            width, height = upright.astype(int)
-            raise InputError(
-                f"{photograph.path} has {width} × {height} pixels, but its annotation says "
-                f"{marked[0]:g} × {marked[1]:g}: its boxes are of another image"
-            )
+            fault = f"{photograph.path} has {upright[0]:g} × {upright[1]:g} pixels"
+            said = f"its annotation says {marked[0]:g} × {marked[1]:g}"
+            raise InputError(f"{fault}, but {said}: its boxes are of another image")
         corners = np.stack(turn(corners[..., 0], corners[..., 1]), axis=-1)
     corners = np.concatenate([corners.min(1), corners.max(1)], axis=-1)
     return corners * np.tile(upright, 2)
@@ -420,26 +417,25 @@ def fit_batches(
     skip_unreadable: bool = False,
 ) -> Iterator[list[tuple[Annotated, Fitted]]]:
     """Read photographs in batches, by several threads. Unreadable ones are skipped, or an error."""
-    read_one = partial(_try_fit, size, how)
+
+    def read(photograph: Annotated) -> Fitted | Exception:
+        try:
+            return fit(photograph, size, how)
+        except InputError:
+            raise
+        except Exception as error:  # Pillow raises errors of almost any type.
+            return error
+
     with ThreadPoolExecutor() as pool:
         for start in range(0, len(photographs), batch_size):
             batch = photographs[start : start + batch_size]
-            results = [*zip(batch, pool.map(read_one, batch), strict=True)]
-            for item, result in results:
+            fitted = []
+            for item, result in zip(batch, pool.map(read, batch), strict=True):
                 if isinstance(result, Fitted):
-                    continue
-                if not skip_unreadable:
+                    fitted.append((item, result))
+                elif skip_unreadable:
+                    console.warning("%s is skipped, because it cannot be read", item.path)
+                else:
                     advice = "replace it, or set skip_unreadable=True"
                     raise InputError(f"{item.path} cannot be read ({result}): {advice}")
-                console.warning("%s is skipped, because it cannot be read", item.path)
-            yield [(item, read) for item, read in results if isinstance(read, Fitted)]
-
-
-def _try_fit(size: tuple[int, int], how: str, photograph: Annotated) -> Fitted | Exception:
-    """Read a photograph, or return why that fails. Pillow raises errors of almost any type."""
-    try:
-        return fit(photograph, size, how)
-    except InputError:
-        raise
-    except Exception as error:
-        return error
+            yield fitted

@@ -64,25 +64,23 @@ class Round(NamedTuple):
 
 
 def rounds_of_epoch(
-    image_count: int,
-    render_count: int,
-    seed: int,
-    epoch: int,
-    images_per_epoch: int | None,
-    images_per_round: int | None,
+    image_count: int, render_count: int, seed: int, epoch: int, *limits: int | None
 ) -> list[Round]:
     """Divide the training images of an epoch into rounds. Each round shows all renders.
 
-    A limit of None shows all images in the epoch, or in a single round.
+    `limits` are the largest numbers of images of the data set in the epoch and in a round. A limit
+    of None shows all images in the epoch, or in a single round.
     """
+    images_per_epoch, images_per_round = limits
     draws = generator(seed, epoch, "rounds")
     shown_images = torch.randperm(image_count, generator=draws)[:images_per_epoch]
     render_numbers = torch.arange(image_count, image_count + render_count)
     parts = shown_images.split(images_per_round or len(shown_images))
-    return [
-        Round(epoch * len(parts) + index, epoch, torch.cat([part.sort().values, render_numbers]))
-        for index, part in enumerate(parts)
-    ]
+    rounds = []
+    for index, part in enumerate(parts):
+        rows = torch.cat([part.sort().values, render_numbers])
+        rounds.append(Round(epoch * len(parts) + index, epoch, rows))
+    return rounds
 
 
 def training_batches(
@@ -104,9 +102,8 @@ def training_batches(
     own_size = batch_size // distributed.world_size()
     begin = distributed.rank() * own_size
     own = (..., slice(first, None), slice(begin, begin + own_size))
-    order, shifts, is_flipped, seeds = [
-        draws[own] for draws in _draw(images, batch_size, seed, this_round, flips)
-    ]
+    drawn = _draw(images, batch_size, seed, this_round, flips)
+    order, shifts, is_flipped, seeds = (draws[own] for draws in drawn)
     is_render = order >= len(rows)
     # `clamp` gives each render some valid row of the data set. It is replaced by the render below.
     row_of_image = rows[order.clamp(max=len(rows) - 1)]

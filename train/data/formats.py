@@ -82,12 +82,11 @@ class DataSet:
         image = self.image.format(part=part, number=number, label=first_label(render))
         # Depth, in world units, of one step of the depth image.
         depth_scale = float(render.depth.max()) / MAX_DEPTH
-        rows = zip(render.labels, render.boxes.tolist(), render.visible.tolist(), strict=True)
-        objects = [
-            {"class": str(label), "box": box, "visible": visible} for label, box, visible in rows
-        ]
-        for item, mask in zip(objects, render.masks.numpy(), strict=True):
-            item |= {"area": int(mask.sum()), "counts": run_lengths(mask)}
+        facts = render.boxes.tolist(), render.visible.tolist(), render.masks.numpy()
+        objects = []
+        for label, box, visible, mask in zip(render.labels, *facts, strict=True):
+            item = {"class": str(label), "box": box, "visible": visible}
+            objects.append(item | {"area": int(mask.sum()), "counts": run_lengths(mask)})
         details = {
             "image": image,
             "split": part,
@@ -212,12 +211,8 @@ class WebDataset(DataSet):
             tar.addfile(info, io.BytesIO(data))
 
 
-FORMATS: dict[str, type[DataSet]] = {
-    "imagefolder": ImageFolder,
-    "coco": Coco,
-    "yolo": Yolo,
-    "webdataset": WebDataset,
-}
+KINDS = (ImageFolder, Coco, Yolo, WebDataset)
+FORMATS: dict[str, type[DataSet]] = {kind.__name__.lower(): kind for kind in KINDS}
 
 
 def first_label(render: LabeledRender) -> str:

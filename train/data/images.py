@@ -79,10 +79,8 @@ class ImageFiles:
 
     def crops(self, rows: Iterable[Tensor], seeds: Iterable[Tensor]) -> Iterator[Tensor]:
         """Read random crops of images, batch by batch. A random half of the crops is flipped."""
-        return self._read(
-            list(zip(batch_rows.tolist(), batch_seeds.tolist(), strict=True))
-            for batch_rows, batch_seeds in zip(rows, seeds, strict=True)
-        )
+        pairs = zip(rows, seeds, strict=True)
+        return self._read([*zip(row.tolist(), seed.tolist(), strict=True)] for row, seed in pairs)
 
     def _read(self, batches: Iterable[list[Key]]) -> Iterator[Tensor]:
         """Read batches of images in worker processes.
@@ -95,8 +93,7 @@ class ImageFiles:
         loader: DataLoader = DataLoader(_Reader(self), batch_sampler=list(batches), **options)
         for images, errors_in_batch in loader:
             errors |= errors_in_batch
-            if errors and not self.skip:
-                path, error = next(iter(errors.items()))
+            for path, error in () if self.skip else errors.items():
                 advice = "replace the file, or set skip_unreadable=True"
                 raise InputError(f"{self.folder / path} cannot be read ({error}): {advice}")
             yield images

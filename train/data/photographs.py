@@ -89,16 +89,14 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     photographs = []
     for path in paths:
         name = composed(path.parts[0]) if has_class_folders else labels[0]
-        photographs.append(
-            Photograph(path, name, *rows.get(_composed_path(path), (None, (), None)))
-        )
+        row = rows.get(_composed_path(path), (None, (), None))
+        photographs.append(Photograph(path, name, *row))
     hard_negatives = {name for item in photographs for name in item.hard_negatives}
     unknown = hard_negatives - {item.source for item in photographs}
     if unknown:
-        raise InputError(
-            f"{table} names the source {min(unknown)!r} in the column hard_negatives, "
-            "but no image has this source: correct or remove this name"
-        )
+        fault = f"{table} names the source {min(unknown)!r} in the column hard_negatives"
+        advice = "correct or remove this name"
+        raise InputError(f"{fault}, but no image has this source: {advice}")
     return photographs
 
 
@@ -124,11 +122,9 @@ def choose_labels(
         advice = "name the sub-folders by classes, or give classes or label"
         raise InputError(f"{fault}: {advice}")
     if len(labels) > MAX_LABELS:
-        raise InputError(
-            f"photos={folder} has sub-folders of {len(labels)} classes, and at most {MAX_LABELS} "
-            "are scored one by one: choose the positive classes with label",
-            "label",
-        )
+        fault = f"photos={folder} has sub-folders of {len(labels)} classes"
+        reason = f"and at most {MAX_LABELS} are scored one by one"
+        raise InputError(f"{fault}, {reason}: choose the positive classes with label", "label")
     return labels
 
 
@@ -230,12 +226,10 @@ def _has_class_folders(
     for name in no_classes:
         is_misspelled = any(label in name.lower() for label in labels)
         if not known or is_misspelled or get_close_matches(name.lower(), labels):
-            suggestions = nearest(name, classes)
-            raise InputError(
-                f"{folder / name} is not named after a class of the network "
-                f"(such as {suggestions}): rename the folder to its class, or "
-                f"to {OTHER_PREFIX}{name} if it shows hard negatives"
-            )
+            fault = f"{folder / name} is not named after a class of the network"
+            advice = f"rename the folder to its class, or to {OTHER_PREFIX}{name}"
+            reason = f"{fault} (such as {nearest(name, classes)})"
+            raise InputError(f"{reason}: {advice} if it shows hard negatives")
     if no_classes:
         count = f"{len(no_classes)} of {len(names)} folders in {folder}"
         fault = "are not named after a class of the model and count as negatives"
@@ -243,8 +237,7 @@ def _has_class_folders(
     outside = [path for path in paths if len(path.parts) == 1]
     if names and outside:
         fault = f"{folder / outside[0]} lies beside class folders, not in one of them"
-        advice = "move the file into the folder of its class"
-        raise InputError(f"{fault}: {advice}")
+        raise InputError(f"{fault}: move the file into the folder of its class")
     return bool(names)
 
 
@@ -258,18 +251,17 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
         if not table.is_file():
             raise OSError("it is not a regular file")
         with table.open(newline="", encoding="utf-8-sig") as file:
-            composed_lines = (composed(line) for line in file)
-            for line in csv.DictReader(composed_lines, restval="", strict=True):
+            lines = (composed(line) for line in file)
+            for line in csv.DictReader(lines, restval="", strict=True):
                 path = PurePosixPath(line["path"].replace("\\", "/"))
                 hard_negatives = split_sources(line.get("hard_negatives", ""))
                 row = (line["source_tag"] or None, hard_negatives, line.get("mesh") or None)
                 if rows.setdefault(path, row) != row:
                     raise ValueError(f"two different rows for {path}")
     except (ValueError, LookupError, csv.Error, OSError) as error:
-        raise InputError(
-            f"{table} cannot be read ({single_line(error)}): write it as a UTF-8 text file "
-            "with the columns path and source_tag, separated by commas, and one row per image"
-        ) from error
+        advice = "write it as a UTF-8 text file with the columns path and source_tag"
+        fault = f"{table} cannot be read ({single_line(error)})"
+        raise InputError(f"{fault}: {advice}, separated by commas, one row per image") from error
     return rows
 
 
@@ -286,32 +278,32 @@ def load_photographs(
     their uint8 sRGB images, and the paths of the others.
     """
     height, width = height_and_width(size)
-    shape = (len(photographs), 3, height, width)
-    cpu = torch.device("cpu")
-    require_memory(f"{len(photographs)} photographs of {height} × {width} pixels", prod(shape), cpu)
+    count = len(photographs)
+    shape = (count, 3, height, width)
+    what = f"{count} photographs of {height} × {width} pixels"
+    require_memory(what, prod(shape), torch.device("cpu"))
     images = torch.empty(shape, dtype=torch.uint8)
     paths = [folder / photograph.path for photograph in photographs]
     # Threads read in parallel, because Pillow releases Python's global lock while
     # it decodes and resizes.
     pool = ThreadPoolExecutor()
     try:
-        errors = [*progress(pool.map(_read_image, images, paths), "photographs", len(paths))]
+        errors = [*progress(pool.map(_read_image, images, paths), "photographs", count)]
     finally:
         # If Ctrl-C is pressed, images that no thread has begun to read are not read.
         pool.shutdown(cancel_futures=True)
     readable = [index for index, error in enumerate(errors) if error is None]
     unreadable = [index for index, error in enumerate(errors) if error]
-    if unreadable and not (readable and skip_unreadable):
+    if not unreadable:
+        return list(photographs), images, []
+    if not (readable and skip_unreadable):
         first = unreadable[0]
+        fault = f"{len(unreadable)} of {count} photographs cannot be read"
         advice = ", or set skip_unreadable=True to skip them" if readable else ""
-        raise InputError(
-            f"{len(unreadable)} of {len(photographs)} photographs cannot be read, "
-            f"the first being {paths[first]} ({errors[first]}): replace them{advice}"
-        )
-    if unreadable:
-        images = images[readable]
+        example = f"the first being {paths[first]} ({errors[first]})"
+        raise InputError(f"{fault}, {example}: replace them{advice}")
     unreadable_paths = [str(photographs[index].path) for index in unreadable]
-    return [photographs[index] for index in readable], images, unreadable_paths
+    return [photographs[index] for index in readable], images[readable], unreadable_paths
 
 
 def _read_image(image: UInt8[Tensor, "3 height width"], path: Path) -> Exception | None:

@@ -46,12 +46,9 @@ def source_key(*packages: Path) -> str:
 
     As part of the key of a cache, the hash makes cached results of other code unused.
     """
-    files = [
-        (path.relative_to(folder).as_posix(), path.read_bytes())
-        for folder in packages
-        for path in folder.rglob("*.py")
-    ]
-    return content_hash([torch.__version__, np.__version__, sorted(files)])
+    paths = [(path, folder) for folder in packages for path in folder.rglob("*.py")]
+    files = sorted((path.relative_to(of).as_posix(), path.read_bytes()) for path, of in paths)
+    return content_hash([torch.__version__, np.__version__, files])
 
 
 # The data set is rendered again after a change of the code that renders it.
@@ -83,20 +80,19 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: Path | None 
     splits = []
     for split_name, images_per_class in (("train", train), ("test", test)):
         key = content_hash([CODE, CLASSES, images_per_class, seed, split_name, settings])
-        images = read_cached(cache, key)
+        images = read_cached(cache, key) if cache else None
         if images is None:
             images = _render(split_name, images_per_class, seed, settings)
-            write_cached(cache, key, images)
+            if cache:
+                write_cached(cache, key, images)
         console.debug("%s images: %d", split_name, len(images))
         labels = torch.arange(len(CLASSES)).repeat_interleave(images_per_class)
         splits.append(Split(images, labels))
     return DataSet(CLASSES, splits[0], splits[1], rendered=True)
 
 
-def read_cached(cache: Path | None, key: str) -> Tensor | None:
+def read_cached(cache: Path, key: str) -> Tensor | None:
     """Read a tensor from a folder. None if there is no such file, or if it is damaged."""
-    if cache is None:
-        return None
     try:
         # zipfile compares the checksum of the array.
         with open(cache / f"{key}.npz", "rb") as file, np.load(file) as archive:
@@ -106,10 +102,8 @@ def read_cached(cache: Path | None, key: str) -> Tensor | None:
         return None
 
 
-def write_cached(cache: Path | None, key: str, images: Tensor) -> None:
+def write_cached(cache: Path, key: str, images: Tensor) -> None:
     """Write a tensor to a folder, so that other processes never read a partly written file."""
-    if cache is None:
-        return
     content = io.BytesIO()
     np.savez(content, images=images.numpy())
     try:
@@ -151,10 +145,10 @@ def _render_solid(
 ) -> UInt8[Tensor, "_ 3 size size"]:
     """Render a random solid in another light for each pair of random camera and background."""
     mesh = solid(name, int(torch.randint(2**31, (1,), generator=draws)))
-    polar, azimuth, width = torch.rand(3, CAMERAS, generator=draws, dtype=torch.float64).tolist()
+    numbers = torch.rand(3, CAMERAS, generator=draws, dtype=torch.float64).T.tolist()
     cameras = [
-        OrthographicCamera(40 + 45 * polar[index], 360 * azimuth[index], 2 + width[index])
-        for index in range(CAMERAS)
+        OrthographicCamera(40 + 45 * polar, 360 * azimuth, 2 + width)
+        for polar, azimuth, width in numbers
     ]
     grays = torch.rand(BACKGROUNDS, generator=draws).tolist()
     lights = []

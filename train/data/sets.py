@@ -163,11 +163,9 @@ def held_out_rows(split: Split, fraction: float, argument: str = "fraction") -> 
         class_size = len(indices_of_class)
         count = round(fraction * class_size)
         if not 0 < count < class_size:
-            raise InputError(
-                f"{argument}={fraction} selects {count} of the {class_size} images of class "
-                f"{int(label)}: choose a fraction that leaves images of each class in both splits",
-                argument,
-            )
+            fault = f"{argument}={fraction} selects {count} of the {class_size} images of class"
+            advice = "choose a fraction that leaves images of each class in both splits"
+            raise InputError(f"{fault} {int(label)}: {advice}", argument)
         order = torch.randperm(class_size, generator=draws)
         is_held_out[indices_of_class[order[:count]]] = True
     return is_held_out
@@ -202,17 +200,16 @@ def load_cifar100(path: str) -> DataSet:
     from torchvision.datasets import CIFAR100
 
     try:
-        train = CIFAR100(path, train=True, download=True)
-        test = CIFAR100(path, train=False, download=True)
+        both = [CIFAR100(path, train=is_train, download=True) for is_train in (True, False)]
     except (OSError, RuntimeError) as error:
         fault = f"path={path} does not contain CIFAR-100, and the download failed ({error})"
         advice = "give the folder of a copy, or connect to the internet"
         raise InputError(f"{fault}: {advice}", "path") from error
     splits = []
-    for cifar in (train, test):
+    for cifar in both:
         images = torch.from_numpy(cifar.data).permute(0, 3, 1, 2).contiguous()
         splits.append(Split(images, torch.tensor(cifar.targets)))
-    return DataSet(tuple(train.classes), splits[0], splits[1])
+    return DataSet(tuple(both[0].classes), splits[0], splits[1])
 
 
 def load_npz(path: str) -> DataSet:
@@ -233,21 +230,19 @@ def load_npz(path: str) -> DataSet:
             classes = archive["classes"]
             if classes.ndim != 1 or classes.dtype.kind != "U" or len({*classes}) != len(classes):
                 raise ValueError("classes must be distinct strings, one per class")
-            train, test = (
+            splits = [
                 _npz_split(archive[f"{name}_images"], archive[f"{name}_labels"], len(classes))
                 for name in progress(("train", "test"), "reading the data")
-            )
-        if train.images.shape[1:] != test.images.shape[1:]:
+            ]
+        if splits[0].images.shape[1:] != splits[1].images.shape[1:]:
             raise ValueError("train_images and test_images differ in size")
+        train, test = splits
         return DataSet(tuple(classes.tolist()), train, test)
     # zipfile, zlib and NumPy raise errors of many types for a damaged file.
     except Exception as error:
-        raise InputError(
-            f"path={path} is not an .npz file of labeled images ({single_line(error)}): "
-            "give a file with the arrays train_images, train_labels, test_images, test_labels "
-            "and classes",
-            "path",
-        ) from error
+        fault = f"path={path} is not an .npz file of labeled images ({single_line(error)})"
+        arrays = "train_images, train_labels, test_images, test_labels and classes"
+        raise InputError(f"{fault}: give a file with the arrays {arrays}", "path") from error
 
 
 def _npz_split(images: np.ndarray, labels: np.ndarray, class_count: int) -> Split:
@@ -289,14 +284,11 @@ def load_folder(
     if other_files:
         shown = ", ".join(map(str, other_files[:3]))
         console.warning("%d files in %s are not images: %s", len(other_files), root, shown)
-
     options = (classes, size, skip_unreadable, workers)
     train = _read(train_root, *options)
-    empty_classes = set(range(len(classes))).difference(train.labels.tolist())
-    if empty_classes:
-        name = classes[min(empty_classes)]
+    for label in sorted(set(range(len(classes))).difference(train.labels.tolist())):
         advice = "put images there, or remove the folder"
-        raise InputError(f"{train_root / name} holds no image: {advice}")
+        raise InputError(f"{train_root / classes[label]} holds no image: {advice}")
     if split_names:
         return DataSet(classes, train, _read(root / "test", *options))
     is_test = held_out_rows(train, test_fraction, "test_fraction")
@@ -336,7 +328,7 @@ def _read(
         count = len(found)
         found, images, broken = photographs.load_photographs(root, found, size, skip_unreadable)
         if broken:
-            counts = f"{len(broken)} of {count} images cannot be read and are skipped"
-            console.warning("%s: %s", counts, broken[0])
+            line = "%d of %d images cannot be read and are skipped: %s"
+            console.warning(line, len(broken), count, broken[0])
     labels = [class_index(classes, item.label, str(root)) if classes else 0 for item in found]
     return Split(images, torch.tensor(labels))

@@ -25,7 +25,7 @@ from augment.tasks.classification import ClassCriterion, label_loss
 from renderer.errors import MAX_SCALE
 from renderer.image import decode, to_bytes, to_unit
 from renderer.vectors import Ball, nearest_in_box
-from train.train_settings import TrainSettings
+from train.train_settings import LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, TrainSettings
 
 # Norm-ball and step size of the attack on pixels. Madry et al. (2018) use a radius of
 # 8/255 on CIFAR-10.
@@ -34,16 +34,22 @@ PGD_STEPS = 3
 
 
 @dataclass
-class Baseline:
-    """Augmentation of training images, chosen by its name.
+class Augmentation:
+    """Augmentation of training images that `settings.augmentation` names.
 
-    "pgd" attacks the pixels of the images, and any other name but "none" is a transform of
-    torchvision.
+    A name that is not handled here is a transform of torchvision.
+
+    Attributes:
+        model: Network in training.
+        teacher: Network before the training, or None. With `settings.relight_steps`, light is
+            searched that changes its predictions.
+        absent: Classes that images with a complementary label do not show, either.
     """
 
-    name: str
+    settings: TrainSettings
     model: nn.Module
-    seed: int
+    teacher: nn.Module | None = None
+    seed: int = 0
     absent: Sequence[int] = ()
 
     def apply(
@@ -54,11 +60,22 @@ class Baseline:
         The random numbers for an image depend on the seed, the step and the index of the image in
         the batch.
         """
-        if self.name == "none":
+        name = self.settings.augmentation
+        if name == "none":
             return images
-        if self.name == "pgd":
-            draws = generator(self.seed, step, "pgd", distributed.rank())
-            return pgd(self.model, images, labels, draws, self.absent)
+        if name == "pgd":
+            return self._attack_pixels(images, labels, step)
+        if name == RELIGHT:
+            return self._relight(images, step)
+        if name in (LOW_LIGHT, RELIGHT_AND_LOW_LIGHT):
+            # This import takes a second, and most runs need no light.
+            from augment.lighting import relight_photographs
+
+            seed = stream_seed(self.seed, step, "low light", distributed.rank())
+            dark = relight_photographs(images, seed, lights=["low_light"])
+            if name == RELIGHT_AND_LOW_LIGHT:
+                dark[::2] = self._relight(images, step)[::2]
+            return dark
         # A transform of torchvision draws the same random numbers for all images of a batch, from
         # the global generator. So it is called for each image, with a seed of its own.
         transformed = []
@@ -80,25 +97,61 @@ class Baseline:
         transforms = {"color_jitter": jitter, "trivial_augment": v2.TrivialAugmentWide()}
         transforms["augmix"] = v2.AugMix()
         transforms["color_jitter+augmix"] = v2.Compose([jitter, v2.AugMix()])
-        return transforms[self.name]
+        return transforms[self.settings.augmentation]
 
+    def _relight(
+        self, images: UInt8[Tensor, "B 3 size size"], step: int
+    ) -> UInt8[Tensor, "B 3 size size"]:
+        """Show the images of a batch in the light of a projector, each in a light of its own.
 
-def pgd(
-    model: nn.Module,
-    images: UInt8[Tensor, "B 3 H W"],
-    labels: Int[Tensor, " B"],
-    draws: torch.Generator,
-    absent: Sequence[int] = (),
-) -> UInt8[Tensor, "B 3 H W"]:
-    """Attack images by projected gradient descent from a random start (Madry et al. 2018).
+        A slide is the picture that the projector shows. It is a random pattern or another image of
+        the batch, and each of its color channels is multiplied by smooth factors. The factors are
+        random, or are changed by gradient descent until the network predicts another class than
+        the teacher predicts for the unchanged image.
+        """
+        # The random numbers differ between steps, and between the processes of a run.
+        draws = generator(self.seed, step, "relight", distributed.rank())
+        count, _, size, _ = images.shape
+        light = draw_projected_light(count, size, draws, images).to(images.device)
+        unit = to_unit(images)
+        # The linear colors of an image stand for the albedo of what it shows.
+        albedo = decode(unit, "srgb")
+        steps = self.settings.relight_steps
+        relighting = RelightingSettings(self.settings.relight_gain, passes=2 * steps + 1)
+        problem = RelitPhotographs(albedo, light, relighting)
+        values = problem.sample(draws)
+        if steps and relighting.radius and self.teacher is not None:
+            with torch.no_grad():
+                criterion = ClassCriterion(self.teacher(unit).argmax(1)[:, None])
+            values = self._descend(problem, values, criterion, steps)
+        with torch.no_grad():
+            return to_bytes(light.expose(albedo, problem.log_gain(values)))
 
-    All PGD_STEPS steps are taken, also if an image is misclassified earlier. A negative label is
-    complementary: the image shows neither this class nor the classes `absent`.
-    """
-    problem = _Pixels(images)
-    criterion = _LossOfLabels(labels[:, None], absent=absent)
-    values = _attack(problem, problem.sample(draws), model, criterion, PGD_STEPS)
-    return to_bytes(values.view(images.shape))
+    def _attack_pixels(
+        self, images: UInt8[Tensor, "B 3 H W"], labels: Int[Tensor, " B"], step: int
+    ) -> UInt8[Tensor, "B 3 H W"]:
+        """Attack images by projected gradient descent from a random start (Madry et al. 2018).
+
+        All PGD_STEPS steps are taken, also if an image is misclassified earlier. A negative label
+        is complementary: the image shows neither this class nor the classes `absent`.
+        """
+        draws = generator(self.seed, step, "pgd", distributed.rank())
+        problem = _Pixels(images)
+        criterion = _LossOfLabels(labels[:, None], absent=self.absent)
+        values = self._descend(problem, problem.sample(draws), criterion, PGD_STEPS)
+        return to_bytes(values.view(images.shape))
+
+    def _descend(
+        self, problem: Any, start: Float[Tensor, "B D"], criterion: ClassCriterion, steps: int
+    ) -> Float[Tensor, "B D"]:
+        """Attack the images of a batch along the gradient. With this margin, none ends early."""
+        count = len(start)
+        options: dict[str, Any] = {"margin": MAX_SCALE, "quantized": False, "sensor_noise": 0.0}
+        settings = AttackSettings(max_steps=steps, batch_size=count, **options)
+        objective = Objective(self.model, criterion, settings)
+        optimizer = Gradient(problem, settings, seed=0)
+        rows = torch.arange(count, device=start.device)
+        return minimize_from(start, optimizer, objective, rows, scores_last=False).values
 
 
 class _Pixels(NormBalls):
@@ -139,84 +192,3 @@ class _LossOfLabels(ClassCriterion):
     def reached_in_views(self, predicted: Tensor) -> Tensor:
         """Return False for each image."""
         return torch.zeros_like(predicted, dtype=torch.bool)
-
-
-@dataclass
-class RelitBatches:
-    """Augmentation that shows the images of a batch in the light of a projector.
-
-    A slide is the picture that the projector shows. It is a random pattern or
-    another image of the batch, and each of its color channels is multiplied by
-    smooth factors. The factors are random, or are changed by gradient descent
-    until the network predicts another class than the teacher predicts for the unchanged image.
-    Without a teacher, they are random.
-    """
-
-    settings: TrainSettings
-    model: nn.Module
-    teacher: nn.Module | None
-    seed: int
-
-    def apply(
-        self, images: UInt8[Tensor, "B 3 size size"], labels: Tensor, step: int
-    ) -> UInt8[Tensor, "B 3 size size"]:
-        """Show the images of a batch in the light of a projector, each in a light of its own."""
-        # The random numbers differ between steps, and between the processes of a run.
-        draws = generator(self.seed, step, "relight", distributed.rank())
-        count, _, size, _ = images.shape
-        light = draw_projected_light(count, size, draws, images).to(images.device)
-        unit = to_unit(images)
-        # The linear colors of an image stand for the albedo of what it shows.
-        albedo = decode(unit, "srgb")
-        steps = self.settings.relight_steps
-        relighting = RelightingSettings(self.settings.relight_gain, passes=2 * steps + 1)
-        problem = RelitPhotographs(albedo, light, relighting)
-        values = problem.sample(draws)
-        if steps and relighting.radius and self.teacher is not None:
-            with torch.no_grad():
-                criterion = ClassCriterion(self.teacher(unit).argmax(1)[:, None])
-            values = _attack(problem, values, self.model, criterion, steps)
-        with torch.no_grad():
-            return to_bytes(light.expose(albedo, problem.log_gain(values)))
-
-
-@dataclass
-class LowLight:
-    """Augmentation that shows the images of a batch in low light, with the noise of a camera.
-
-    The light is that of `nb.lights.LowLight`. With `others`, every second image is instead
-    augmented by them.
-    """
-
-    seed: int
-    others: RelitBatches | None = None
-
-    def apply(
-        self, images: UInt8[Tensor, "B 3 H W"], labels: Tensor, step: int
-    ) -> UInt8[Tensor, "B 3 H W"]:
-        """Show each image of a batch in a low light of its own."""
-        # This import takes a second, and most runs need no light.
-        from augment.lighting import relight_photographs
-
-        seed = stream_seed(self.seed, step, "low light", distributed.rank())
-        dark = relight_photographs(images, seed, lights=["low_light"])
-        if self.others is not None:
-            dark[::2] = self.others.apply(images, labels, step)[::2]
-        return dark
-
-
-def _attack(
-    problem: _Pixels | RelitPhotographs,
-    start: Float[Tensor, "B D"],
-    model: nn.Module,
-    criterion: ClassCriterion,
-    steps: int,
-) -> Float[Tensor, "B D"]:
-    """Attack the images of a batch along the gradient. With this margin, no attack ends early."""
-    settings = AttackSettings(
-        max_steps=steps, margin=MAX_SCALE, quantized=False, sensor_noise=0.0, batch_size=len(start)
-    )
-    rows = torch.arange(len(start), device=start.device)
-    objective = Objective(model, criterion, settings)
-    optimizer = Gradient(problem, settings, seed=0)
-    return minimize_from(start, optimizer, objective, rows, scores_last=False).values

@@ -121,10 +121,8 @@ class Averages:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of the moving average and of the soup for a checkpoint."""
-        return {
-            "ema": self._ema.state_dict() if self._ema else None,
-            "soup": self._soup.state_dict() if self._soup else None,
-        }
+        averages = {"ema": self._ema, "soup": self._soup}
+        return {name: of.state_dict() if of else None for name, of in averages.items()}
 
     def load_state_dict(self, state: Mapping[str, Any], accuracies: list[float]) -> None:
         """Restore the averages from a checkpoint."""

@@ -21,13 +21,8 @@ from augment import distributed
 from augment.classifier import TaskNetwork
 from augment.network import device_of, eval_mode
 from augment.scene.truth import NO_OBJECT, boxes_of
-from augment.tasks.detection import (
-    CANDIDATE_BOXES,
-    CANDIDATE_LABELS,
-    CANDIDATE_SCORES,
-    SMALLEST_SCORE,
-    Detection,
-)
+from augment.tasks import detection
+from augment.tasks.detection import SMALLEST_SCORE, Detection
 from renderer.errors import InputError, describe, single_line
 from renderer.image import to_unit
 from renderer.settings import height_and_width
@@ -67,10 +62,9 @@ def losses_of(network: nn.Module, images: Tensor, targets: Sequence[Target]) -> 
     """Return the sum of the losses that a detector of torchvision returns in training mode."""
     losses = network(images, targets)
     if not isinstance(losses, Mapping) or not losses:
-        raise InputError(
-            f"network returned {describe(losses)} in training mode: it must take images and "
-            "targets and return its losses by name, as the detectors of torchvision do"
-        )
+        fault = f"network returned {describe(losses)} in training mode"
+        advice = "it must take images and targets and return its losses by name"
+        raise InputError(f"{fault}: {advice}, as the detectors of torchvision do")
     return torch.stack([*losses.values()]).sum()
 
 
@@ -131,20 +125,16 @@ class DetectionLoss:
         if rendered.any():
             terms.append((1.0, images[rendered], [*map(target_of, labels[rendered])]))
         if self.teacher is not None and is_photograph.any():
-            photographs = images[is_photograph]
             find = detected if self.task.decode is None else candidates
             with torch.no_grad(), eval_mode(self.teacher):
-                found = find(self.teacher, photographs, self.task)
-            terms.append((self.settings.distillation_weight, photographs, found))
+                found = find(self.teacher, images[is_photograph], self.task)
+            terms.append((self.settings.distillation_weight, images[is_photograph], found))
             if augmented is not None:
-                weight = self.settings.consistency_weight
-                terms.append((weight, augmented[is_photograph], found))
-        loss = sum(
-            weight * len(shown) / len(images) * self._loss(shown, found)
-            for weight, shown, found in terms
-            if weight
-        )
-        loss = torch.as_tensor(loss, device=images.device)
+                terms.append((self.settings.consistency_weight, augmented[is_photograph], found))
+        loss = images.new_zeros((), dtype=torch.float32)
+        for weight, shown, found in terms:
+            if weight:
+                loss = loss + weight * len(shown) / len(images) * self._loss(shown, found)
         return loss, torch.full_like(loss, torch.nan).detach()
 
     def _loss(self, images: UInt8[Tensor, "N 3 H W"], targets: Any) -> Float[Tensor, ""]:
@@ -161,9 +151,9 @@ def candidates(network: nn.Module, images: UInt8[Tensor, "N 3 H W"], task: Detec
     """Return boxes (K, 4) in pixels and scores (K, C) of all candidates of a raw network."""
     unit = to_unit(images)
     outputs = task.reader("network")(network(unit), unit)
-    if any(CANDIDATE_LABELS in item for item in outputs):
+    if any(detection.CANDIDATE_LABELS in item for item in outputs):
         raise InputError("decode returned labels: training needs the scores (K, C) of all classes")
-    return [(item[CANDIDATE_BOXES], item[CANDIDATE_SCORES]) for item in outputs]
+    return [(item[detection.CANDIDATE_BOXES], item[detection.CANDIDATE_SCORES]) for item in outputs]
 
 
 def candidate_loss(found: Candidates, expected: Candidates) -> Float[Tensor, ""]:
@@ -196,9 +186,8 @@ def detected(network: nn.Module, images: UInt8[Tensor, "N 3 H W"], task: Detecti
     unit = to_unit(images)
     with eval_mode(network):
         raw = network(unit)
-    outputs = task.reader("network")(raw, unit)
     targets = []
-    for index, item in enumerate(outputs):
+    for index, item in enumerate(task.reader("network")(raw, unit)):
         width, height = (item["boxes"][:, 2:] - item["boxes"][:, :2]).unbind(1)
         is_kept = (item["scores"] >= task.threshold) & (width > 0) & (height > 0)
         target = {key: item[key][is_kept] for key in ("boxes", "labels")}
@@ -221,13 +210,12 @@ def validate(
     for images in split.squares(own_rows.split(BATCH)):
         pair = (detected(one, images.to(device), task) for one in (teacher, network))
         for expected, found in zip(*pair, strict=True):
-            truth, boxes = (
-                {key: item[key].cpu().numpy() for key in ("boxes", "labels")}
-                for item in (expected, found)
+            boxes, labels, old_boxes, old_labels = (
+                item[key].cpu().numpy() for item in (found, expected) for key in ("boxes", "labels")
             )
-            marked = Marked(**truth, is_crowd=truth["labels"] < 0)
-            objects = match(Found(**boxes, scores=boxes["labels"] * 0.0), marked, task.iou)
-            counts += torch.tensor([(objects >= 0).sum(), len(truth["labels"])], device=device)
+            marked = Marked(old_boxes, old_labels, is_crowd=old_labels < 0)
+            objects = match(Found(boxes, labels, scores=labels * 0.0), marked, task.iou)
+            counts += torch.tensor([(objects >= 0).sum(), len(old_labels)], device=device)
     kept, total = all_reduce_sum(counts).tolist()
     accuracy = kept / total if total else 1.0
     return {"loss": 1 - accuracy, "accuracy": accuracy}

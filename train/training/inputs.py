@@ -108,18 +108,12 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         return _load_classifier(settings, name)
     source = Path(name.removeprefix(checkpoints.RUN))
     if checkpoints.is_state_dict(source):
-        raise InputError(
-            f"network={name} contains weights, but not their architecture: "
-            "give the architecture and the weights, as in "
-            f"network=torchvision:resnet50 weights={source}",
-            "network",
-        )
+        fault = f"network={name} contains weights, but not their architecture"
+        advice = f"give both, as in network=torchvision:resnet50 weights={source}"
+        raise InputError(f"{fault}: {advice}", "network")
     if settings.weights is not None:
-        raise InputError(
-            f"weights={settings.weights} cannot replace the weights of "
-            f"network={name}, which is a training run: leave weights out",
-            "weights",
-        )
+        fault = f"weights={settings.weights} cannot replace the weights of network={name}"
+        raise InputError(f"{fault}, which is a training run: leave weights out", "weights")
     # The network of a run has its own classes and its own normalization.
     given = as_facts(settings.classes, None, settings.normalization, settings.prompt)
     require_no_facts(f"network={name}", given)
@@ -129,7 +123,9 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     if built_by.startswith(PYTHON) and settings.model.name != built_by and not settings.trust:
         advice = f"give model.name={built_by} to run that code"
         raise InputError(f"the network in {path} is built by {built_by}: {advice}", "network")
-    return Initial(path, state["architecture"], checkpoints.plain_weights(state))
+    architecture = state["architecture"]
+    stated = checkpoints.stated_inputs(architecture)
+    return Initial(path, architecture, checkpoints.plain_weights(state), inputs=stated)
 
 
 def with_label(settings: ExperimentSettings) -> ExperimentSettings:
@@ -289,10 +285,9 @@ def relabel(
     """
     if not data.labeled:
         if not (initial and settings.train.distillation_weight):
-            raise InputError(
-                f"data.name={settings.data.name} has no labels, and requires a network to imitate: "
-                "set network and train.distillation_weight"
-            )
+            fault = f"data.name={settings.data.name} has no labels"
+            advice = "set network and train.distillation_weight"
+            raise InputError(f"{fault}, and requires a network to imitate: {advice}")
         return replace(data, classes=initial.classes)
     if initial and (data.rendered or initial.is_classifier):
         return sets.relabeled(data, initial.classes, f"data.name={settings.data.name}")
@@ -351,23 +346,13 @@ def build_service(
         labels = torch.tensor([label_of_class[name] for name in scene.labels])
     has_all = is_classifier and len(positive_classes) == len(data.classes)
     if has_all and (labels < 0).any():
-        raise InputError(
-            f"label={settings.label} has all classes of the network, but some renders show none "
-            "of them: remove the objects without a class, or give them a label"
-        )
-    return AugmentationService(
-        settings.augment,
-        scene,
-        labels.to(device),
-        settings.seed,
-        phases,
-        positive_classes if is_ranked else (),
-        distributed.rank(),
-        distributed.world_size(),
-        images,
-        task,
-        data.classes,
-    )
+        fault = f"label={settings.label} has all classes of the network"
+        advice = "remove the objects without a class, or give them a label"
+        raise InputError(f"{fault}, but some renders show none of them: {advice}")
+    rendered = (settings.augment, scene, labels.to(device), settings.seed, phases)
+    ranked = positive_classes if is_ranked else ()
+    processes = (distributed.rank(), distributed.world_size())
+    return AugmentationService(*rendered, ranked, *processes, images, task, data.classes)
 
 
 def _build_scene(

@@ -119,6 +119,8 @@ class Trainer:
         self.architecture = architecture
         self.service = service
         self.folder = folder
+        # Largest numbers of images of the data set in an epoch and in a round.
+        self._limits = settings.images_per_epoch, service.settings.regenerate_every
         self.phases = service.phases
         self.seed = service.seed
         self.epoch = 0
@@ -137,16 +139,14 @@ class Trainer:
 
         self.model = model
         self.device = next(model.parameters()).device
-        self.initial: MixedPrecision | None = None
-        if has_initial:
-            self.initial = deepcopy(model).eval().requires_grad_(False)
+        self.initial = deepcopy(model).eval().requires_grad_(False) if has_initial else None
         # The validation accuracy of data without labels is the agreement with the initial
         # network. It is highest before any training, and cannot choose an epoch.
         self.averages = Averages(model, settings.ema_decay, settings.soup, keeps_latest=not labeled)
         has_teacher = settings.distillation_weight or settings.consistency_weight
         teacher = self.initial if has_teacher else None
         size = architecture["size"]
-        self.step = TrainingStep(settings, model, self.averages, teacher, service, size, labeled)
+        self.step = TrainingStep(settings, model, teacher, service, size, labeled)
 
     @property
     def is_detector(self) -> bool:
@@ -170,8 +170,7 @@ class Trainer:
         train = torch.nonzero(~held_out).squeeze(1)
         validation = torch.nonzero(held_out).squeeze(1)
         # The batch size is limited to the images of a round and to the memory.
-        limits = (self.settings.images_per_epoch, self.service.settings.regenerate_every)
-        in_round = min([len(train), *filter(None, limits)]) + len(self.service)
+        in_round = min([len(train), *filter(None, self._limits)]) + len(self.service)
         size = split.images.shape[-1]
         batch_size = fitting_batch_size(self.settings, self.model, in_round, size)
         self.settings = replace(self.settings, batch_size=batch_size)
@@ -195,8 +194,7 @@ class Trainer:
         """
         settings = self.settings
         counts = (len(rows), len(self.service))
-        limits = (settings.images_per_epoch, self.service.settings.regenerate_every)
-        rounds = rounds_of_epoch(*counts, self.seed, self.epoch, *limits)
+        rounds = rounds_of_epoch(*counts, self.seed, self.epoch, *self._limits)
         steps = [math.ceil(len(one.rows) / settings.batch_size) for one in rounds]
         if self._epoch_state:
             # A resumed run continues within an epoch, with the random numbers of the first attempt.
@@ -209,9 +207,7 @@ class Trainer:
         state = self._epoch_state
         # The state has the diagnostics of each round that has begun.
         begun = len(state.diagnostics)
-        for index, now in enumerate(rounds):
-            if index < begun - 1:
-                continue
+        for index, now in [*enumerate(rounds)][begun - 1 :]:
             if index >= begun:
                 state.renders = self._regenerate(now)
                 state.diagnostics.append(state.renders.diagnostics)
@@ -223,12 +219,10 @@ class Trainer:
             shown = Split(to_bytes(state.renders.images), state.renders.labels)
             images = TrainingImages(split, rows, shown)
             with self.phases("training"):
-                task = self.service.task
-                has_losses = isinstance(task, Detection) and task.decode is None
+                has_losses = self.is_detector and getattr(self.service.task, "decode", None) is None
                 set_training_mode(self.model, settings, has_losses)
-                batches = training_batches(
-                    images, settings.batch_size, self.seed, now, settings.flips, first
-                )
+                options = settings.batch_size, self.seed, now, settings.flips, first
+                batches = training_batches(images, *options)
                 for batch in progress(batches, title, steps[index], first):
                     done = state.step / sum(steps)
                     # Each epoch of a soup runs through the whole schedule of the learning rate.
@@ -236,6 +230,7 @@ class Trainer:
                         done = (self.epoch + done) / settings.epochs
                     number = self.epoch * sum(steps) + state.step
                     state.sums += self.step.take(batch, done, number)
+                    self.averages.end_step()
                     state.step += 1
                     if signals.requested():
                         return state.step == sum(steps)
@@ -247,7 +242,7 @@ class Trainer:
         """Render the training renders of a round anew, and log images of a few attacks on them."""
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
-            renders = self.service.regenerate(self.step.attacked, now.number)
+            renders = self.service.regenerate(self.model, now.number)
         if renders.targets is not None:
             renders = replace(renders, labels=object_maps(renders.targets).to(self.device))
         if self._log and renders.attack_examples:
@@ -265,32 +260,26 @@ class Trainer:
         loss_sum, hits = all_reduce_sum(state.sums).tolist()
         self.averages.end_epoch()
         with self.phases("evaluation"):
-            task, teacher = self.service.task, self.initial
-            if isinstance(task, Detection) and teacher is not None:
-                validated = validate(self.step.validated, teacher, task, split, rows)
+            if self.is_detector and self.initial is not None:
+                networks = self.selected, self.initial
+                validated = validate(*networks, cast(Detection, self.service.task), split, rows)
             else:
-                validated = evaluate(self.step.validated, split, rows)
+                validated = evaluate(self.selected, split, rows)
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
+        accuracy = validated["accuracy"]
         # The network of this epoch replaces the selected network if it is better, or if the
         # settings select the last network.
-        if self.averages.is_kept(validated["accuracy"]):
+        if self.averages.is_kept(accuracy):
             self._best_is_new = True
-            self.best = {
-                "model": self.averages.weights(),
-                **self._description(),
-                "validation_accuracy": validated["accuracy"],
-            }
+            self.best = {"model": self.averages.weights(), **self._description()}
+            self.best["validation_accuracy"] = accuracy
         if self._log and len(state.renders.labels):
             with self.phases("input_output"):
                 self._log.renders(state.renders.images, self.epoch)
-
         image_count = state.step * self.settings.batch_size
-        trained = {
-            "loss": loss_sum / image_count,
-            "accuracy": hits / image_count,
-            "learning_rate": self.step.optimizer.param_groups[0]["lr"],
-        }
+        trained = {"loss": loss_sum / image_count, "accuracy": hits / image_count}
+        trained["learning_rate"] = self.step.optimizer.param_groups[0]["lr"]
         # A phase that this process did not run counts as 0 seconds. The attack is such a
         # phase if the run was resumed after it.
         seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()
@@ -306,11 +295,9 @@ class Trainer:
         is_finite = torch.stack([value.isfinite().all() for value in weights]).all()
         if not (math.isfinite(loss) and is_finite):
             rate, decay = self.settings.learning_rate, self.settings.weight_decay
-            raise InputError(
-                f"learning_rate={rate} with weight_decay={decay} made the loss or weights NaN or "
-                f"infinite in epoch {epoch}: set lower values",
-                "learning_rate",
-            )
+            fault = f"learning_rate={rate} with weight_decay={decay} made the loss or weights NaN"
+            advice = f"or infinite in epoch {epoch}: set lower values"
+            raise InputError(f"{fault} {advice}", "learning_rate")
 
     def _save(self) -> None:
         """Write last.pt (the former becomes previous.pt), and best.pt, in the first process."""
@@ -342,12 +329,8 @@ class Trainer:
 
     def _description(self) -> dict[str, Any]:
         """Return the entries of a checkpoint that say which run and epoch its weights are from."""
-        return {
-            "architecture": self.architecture,
-            "epoch": self.epoch,
-            "seed": self.seed,
-            "mode": self.service.settings.mode,
-        }
+        names = {"architecture": self.architecture, "epoch": self.epoch, "seed": self.seed}
+        return {**names, "mode": self.service.settings.mode}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the content of a checkpoint, from which a run continues as if it never stopped.
@@ -402,8 +385,8 @@ class Trainer:
                 raise ValueError("it has another architecture or other classes")
             self.load_state_dict(state)
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            reason = single_line(error)
-            fault = f"this run cannot continue from the checkpoint in {self.folder} ({reason})"
+            folder = f"{self.folder} ({single_line(error)})"
+            fault = f"this run cannot continue from the checkpoint in {folder}"
             advice = f"restore {run_folder.LAST}, or start in another folder"
             raise InputError(f"{fault}: {advice}") from error
         if self.epoch:
@@ -429,11 +412,9 @@ def evaluate(
     fraction of correct predictions as "accuracy".
     """
     device = split.labels.device
-    if rows is None:
-        rows = torch.arange(len(split))
-    rows = rows.to(device)
+    rows = torch.arange(len(split)) if rows is None else rows
     # Each of n processes scores every n-th image.
-    own_rows = rows[distributed.rank() :: distributed.world_size()]
+    own_rows = rows.to(device)[distributed.rank() :: distributed.world_size()]
     batches = own_rows.split(EVALUATION_BATCH)
     shown = progress(split.squares(batches), f"{len(rows)} images", len(batches))
     logits = compute_outputs(model, shown, EVALUATION_BATCH, device)

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from augment.classifier import log_odds, nearest
 from augment.network import eval_mode, keep_text_vectors, plain_outputs, text_vectors
 from augment.tasks.classification import is_correct, label_loss
-from renderer.errors import InputError
+from renderer.errors import MAX_SCALE, InputError
 from renderer.image import to_unit
 from train.device import PRECISIONS, MixedPrecision
 from train.train_settings import ALL_BUT_LAST, TrainSettings
@@ -59,18 +59,17 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
     paper. "adamw" (Loshchilov and Hutter 2019) ignores `settings.momentum`, and
     has no weight decay for biases and normalization layers, as is usual.
     """
+    rate, decay = settings.learning_rate, settings.weight_decay
     if settings.optimizer == "sgd":
-        momentum, decay = settings.momentum, settings.weight_decay
-        options: dict[str, Any] = {"momentum": momentum, "weight_decay": decay}
-        return torch.optim.SGD(
-            model.parameters(), settings.learning_rate, nesterov=momentum > 0, fused=True, **options
-        )
+        options: dict[str, Any] = {"momentum": settings.momentum, "weight_decay": decay}
+        options["nesterov"] = settings.momentum > 0
+        return torch.optim.SGD(model.parameters(), rate, fused=True, **options)
     # Biases and the weights of normalization layers are vectors.
     vectors = [parameter for parameter in model.parameters() if parameter.ndim <= 1]
     matrices = [parameter for parameter in model.parameters() if parameter.ndim > 1]
-    decayed = {"params": matrices, "weight_decay": settings.weight_decay}
+    decayed = {"params": matrices, "weight_decay": decay}
     groups = [{"params": vectors, "weight_decay": 0.0}, decayed]
-    return torch.optim.AdamW(groups, settings.learning_rate, fused=True)
+    return torch.optim.AdamW(groups, rate, fused=True)
 
 
 def last_layer(network: nn.Module) -> str:
@@ -168,17 +167,17 @@ def scale_learning_rate(
     same for all networks. It is not adapted if more than this layer learns, or without the setting
     `feature_norm`.
     """
-    if settings.feature_norm is None or settings.freeze != ALL_BUT_LAST:
+    wanted = settings.feature_norm
+    if wanted is None or settings.freeze != ALL_BUT_LAST:
         return settings.learning_rate
     norm = feature_norm(network, images)
-    if not 0 < norm < math.inf:
-        raise InputError(
-            f"feature_norm={settings.feature_norm:g} has no meaning for this network, since the "
-            f"norm of the features of its last layer is {norm:g}: check the weights, or set "
-            "feature_norm=null",
-            "feature_norm",
-        )
-    return settings.learning_rate * settings.feature_norm / norm
+    rate = settings.learning_rate * wanted / norm if norm else math.inf
+    if not 0 < rate <= MAX_SCALE:
+        fault = f"feature_norm={wanted:g} has no meaning for this network"
+        reason = f"since the norm of the features of its last layer is {norm:g}"
+        advice = "check the weights, or set feature_norm=null"
+        raise InputError(f"{fault}, {reason}: {advice}", "feature_norm")
+    return rate
 
 
 def feature_norm(network: nn.Module, images: Float[Tensor, "N 3 H W"]) -> float:
@@ -198,11 +197,10 @@ def feature_norm(network: nn.Module, images: Float[Tensor, "N 3 H W"]) -> float:
         for image in images.split(1):
             logit = network(image).max()
             if not (weights and logit.requires_grad):
-                raise InputError(
-                    f"freeze={ALL_BUT_LAST}: the logits do not depend on weights of the last "
-                    f"layer, {name!r}, by gradients: name the last module that stays as it is",
-                    "freeze",
-                )
+                fault = f"the logits do not depend on weights of the last layer, {name!r}"
+                advice = "name the last module that stays as it is"
+                reason = f"freeze={ALL_BUT_LAST}: {fault}, by gradients"
+                raise InputError(f"{reason}: {advice}", "freeze")
             gradients = torch.autograd.grad(logit, weights)
             squares.append(sum(float(gradient.square().sum()) for gradient in gradients))
     return math.sqrt(fmean(squares))
@@ -305,10 +303,8 @@ def kl_divergence(
     It is the Kullback–Leibler divergence Σ q log(q / p), summed over the classes, where p are the
     probabilities of the student and q are those of the teacher.
     """
-    student = logits.log_softmax(1)
-    teacher = predictions.log_softmax(1)
-    terms = F.kl_div(student, teacher, reduction="none", log_target=True)
-    return terms.sum(1)
+    student, teacher = logits.log_softmax(1), predictions.log_softmax(1)
+    return F.kl_div(student, teacher, reduction="none", log_target=True).sum(1)
 
 
 class SharedTeacher(nn.Module):

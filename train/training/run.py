@@ -1,7 +1,6 @@
 """One training run, from its settings to its scores."""
 
 import json
-from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -22,13 +21,7 @@ from renderer.image import to_unit
 from train import checkpoints, console, run_folder
 from train.data import photographs
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
-from train.device import (
-    MixedPrecision,
-    choose_device,
-    choose_precision,
-    choose_threads,
-    set_deterministic,
-)
+from train.device import MixedPrecision, place
 from train.laboratory.laboratory import is_laboratory, kept_aside_settings, write_laboratory
 from train.networks import CLASSIFIER, PYTHON, build_network, describe
 from train.results.metrics import METRICS
@@ -88,27 +81,24 @@ class Run:
             with keyed("photos"):
                 labels = photographs.choose_labels(scored, self.data.classes, settings.label)
                 photographs.find_photographs(scored, self.data.classes, labels)
-        set_deterministic(settings.train.deterministic)
         # Settings of the run that is resumed. None for a new run.
         earlier: DictConfig | None = None
         if checkpoints.exists(folder):
             if settings.train.resume:
                 earlier = require_same_run(folder, settings)
             elif not settings.overwrite:
-                raise InputError(
-                    f"out={folder} holds a run already: set train.resume=true to continue it, "
-                    "overwrite=true to replace it, or run to another folder"
-                )
+                fault = f"out={folder} holds a run already"
+                advice = "set train.resume=true to continue it, overwrite=true to replace it"
+                raise InputError(f"{fault}: {advice}, or run to another folder")
         self._is_resumed = earlier is not None
         # The number of threads changes the last bits of the results, so a resumed run keeps it.
-        threads = settings.train.threads
-        if earlier is not None:
-            threads = threads or OmegaConf.select(earlier, "hardware.threads")
+        known = None if earlier is None else OmegaConf.select(earlier, "hardware.threads")
+        threads = settings.train.threads or known
         fraction, record = inputs.choose_validation(settings, self.data, initial)
         with keyed(fraction="data.validation"):
             self.held_out = held_out_rows(self.data.train, fraction)
         with keyed(**keys_of("train", settings.train)):
-            self.trainer = _build_trainer(settings, self.data, folder, initial, record, threads)
+            self.trainer = self._build_trainer(initial, record, threads)
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if earlier is not None:
@@ -116,6 +106,60 @@ class Run:
             self._warn_of_stretched_schedule(earlier.train.epochs)
         elif settings.train.resume:
             console.info("nothing to resume in %s; starting at epoch 1", folder)
+
+    def _build_trainer(
+        self, initial: Initial | None, validation: dict[str, Any] | None, threads: int | None
+    ) -> Trainer:
+        """Build the network, the optimizer and the service of renders. No file is written.
+
+        `validation` is the record of the validation images. Without `threads`, `choose_threads`
+        chooses them.
+        """
+        settings, data, recipe = self.settings, self.data, self.settings.train
+        shape = _network_shape(settings, initial)
+        images = data.train.images
+        if not isinstance(images, Tensor):
+            images = data.train.sample(SAMPLED)
+        mean, std = channel_statistics(images)
+        torch.manual_seed(stream_seed(settings.seed, "weights"))
+        if initial and initial.network is not None:
+            network = deepcopy(initial.network).requires_grad_(True)
+        else:
+            # The shape of a classifier has the normalization of the classifier.
+            arguments: dict[str, Any] = {"mean": mean, "std": std, **shape}
+            arguments["trust_code"] = settings.trust
+            with keyed(**keys_of("model", settings.model)):
+                network = build_network(data.classes, data.size, **arguments)
+        encoding = settings.renderer.encoding
+        facts = {"classes": list(data.classes), "size": data.size, "encoding": encoding, **shape}
+        light = settings.normalize_light
+        if initial:
+            initial.copy_to(network, facts)
+            if initial.network is None:
+                say_inputs(str(settings.network), network, data.size, initial.inputs)
+            assumed = [name for name, source in vars(initial.inputs).items() if source is None]
+            facts |= {checkpoints.ASSUMED: assumed} if assumed else {}
+            light = light or initial.architecture.get(checkpoints.NORMALIZE_LIGHT)
+        if light is not None:
+            facts[checkpoints.NORMALIZE_LIGHT] = light
+            network = wrappers.with_normalized_light(network, light)
+        if recipe.freeze:
+            with keyed(stage="train.freeze"):
+                freeze(wrappers.unwrapped(network), recipe.freeze, data.size)
+        model = place(network, recipe, data.size, threads)
+        device = wrappers.device_of(model)
+        if recipe.eval_mode is None:
+            recipe = replace(recipe, eval_mode=bool(initial and initial.is_classifier))
+        rate = scale_learning_rate(recipe, model, to_unit(images[:NORM_IMAGES].to(device)))
+        if rate != recipe.learning_rate:
+            console.info("learning rate %.3g, by the norm of the features of the network", rate)
+            recipe = replace(recipe, learning_rate=rate)
+        inner = wrappers.without_normalized_light(network)
+        description = describe(inner, **facts, validation=validation)
+        task = initial.task if initial else Classification()
+        service = inputs.build_service(settings, data, device, task)
+        options = description, service, self.folder, data.labeled, initial is not None
+        return Trainer(recipe, model, *options)
 
     def begin(self) -> None:
         """Remove what an earlier run left in the folder, unless it is resumed; write config.yaml.
@@ -130,15 +174,12 @@ class Run:
         may_be_left = self.settings.overwrite or (self.folder / CONFIG).is_file()
         if may_be_left and not self._is_resumed:
             remove_run(self.folder, with_others=not self.settings.train.resume)
-        precision = self.trainer.model.precision
-        device = {"device": str(self.trainer.device), "precision": precision}
-        facts = {
-            "hardware": {**device, "threads": self._threads},
-            "command": self.command,
-            "images": self._inputs.describe(self.trainer.model, self.data.size),
-            "test_images": inputs.describe_test_images(self.settings, self.data),
-        }
-        write_config(self.folder, self.settings, **facts)
+        device, model = str(self.trainer.device), self.trainer.model
+        hardware = {"device": device, "precision": model.precision, "threads": self._threads}
+        images = self._inputs.describe(model, self.data.size)
+        test_images = inputs.describe_test_images(self.settings, self.data)
+        facts = {"hardware": hardware, "command": self.command}
+        write_config(self.folder, self.settings, **facts, images=images, test_images=test_images)
 
     def train(self, logger: Logger | None = None) -> dict[str, float]:
         """Train to the last epoch, score the network, and return the final scores by name.
@@ -200,11 +241,9 @@ class Run:
             return
         both = (settings.epochs, planned)
         rates = [learning_rate(settings, self.trainer.epoch / epochs) for epochs in both]
-        change = (
-            "train.epochs=%d, not %d, stretches train.schedule=%s: "
-            "the learning rate goes on at %.3g, not %.3g"
-        )
-        console.warning(change, *both, settings.schedule, *rates)
+        change = "train.epochs=%d, not %d, stretches train.schedule=%s"
+        now = "the learning rate goes on at %.3g, not %.3g"
+        console.warning(f"{change}: {now}", *both, settings.schedule, *rates)
 
     def _score_initial(self, model: MixedPrecision) -> dict[str, float]:
         """Score the initial network, whose predictions become labels if the data have none."""
@@ -236,15 +275,14 @@ class Run:
         if self.scored_folders or not self.settings.evaluate.laboratory_setups:
             return
         folder = self.folder / KEPT_ASIDE
-        classes = self.data.classes
-        settings = kept_aside_settings(self.settings, classes, self.data.size, folder)
-        if not (self._is_resumed and is_laboratory(folder, settings)):
-            try:
+        settings = kept_aside_settings(self.settings, self.data.classes, self.data.size, folder)
+        try:
+            if not (self._is_resumed and is_laboratory(folder, settings)):
                 write_laboratory(settings)
-            except InputError as error:
-                console.warning("no renders are kept aside: %s", error)
-                return
-        self.scored_folders = {LABORATORY: folder}
+        except InputError as error:
+            console.warning("no renders are kept aside: %s", error)
+        else:
+            self.scored_folders = {LABORATORY: folder}
 
     def _score(self) -> dict[str, float]:
         """Score the network after the last epoch and the selected one, whose weights remain."""
@@ -300,12 +338,9 @@ class Run:
         scores = {}
         for name, model in (("before", self.trainer.initial), ("after", self.trainer.selected)):
             relit = self._predict(cast(Model, model), self.data.test, self.settings.seed, "test")
-            agreement = (relit == targets).double().mean().item()
-            scores[f"test/relit_agreement_{name}"] = agreement
-        line = (
-            "agreement with the original on %d test images: unchanged %.3f; "
-            "in the light of a projector %.3f before, %.3f after"
-        )
+            scores[f"test/relit_agreement_{name}"] = (relit == targets).double().mean().item()
+        line = "agreement with the original on %d test images: unchanged %.3f; "
+        line += "in the light of a projector %.3f before, %.3f after"
         console.info(line, len(targets), unchanged, *scores.values())
         return scores
 
@@ -328,79 +363,6 @@ class Run:
                     if estimate is not None and estimate.value is not None:
                         values[f"{prefix}/{metric}"] = estimate.value
         return values
-
-
-def make_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[Run]:
-    """Make several runs before the first one is trained, so that mistakes are reported at once.
-
-    All of them have the data set and the initial network of the first one.
-    """
-    data, initial = inputs.load_inputs(next(iter(methods.values())))
-    runs = [Run(settings, data, folder, initial, command) for folder, settings in methods.items()]
-    # The main run is the last one. It begins first, because it also removes the earlier runs in the
-    # subfolders of its folder, to which the baselines write.
-    for run in reversed(runs):
-        run.begin()
-    return runs
-
-
-def _build_trainer(
-    settings: ExperimentSettings,
-    data: DataSet,
-    folder: Path,
-    initial: Initial | None,
-    validation: dict[str, Any] | None,
-    threads: int | None,
-) -> Trainer:
-    """Build the network, the optimizer and the service of renders of a run. No file is written.
-
-    `validation` is the record of the validation images. Without `threads`, `choose_threads`
-    chooses them.
-    """
-    recipe = settings.train
-    device = choose_device(recipe.device)
-    shape = _network_shape(settings, initial)
-    images = data.train.images
-    if not isinstance(images, Tensor):
-        images = data.train.sample(SAMPLED)
-    mean, std = channel_statistics(images)
-    torch.manual_seed(stream_seed(settings.seed, "weights"))
-    if initial and initial.network is not None:
-        network = deepcopy(initial.network).requires_grad_(True)
-    else:
-        with keyed(**keys_of("model", settings.model)):
-            # The shape of a classifier has the normalization of the classifier.
-            arguments: dict[str, Any] = {"mean": mean, "std": std, **shape}
-            network = build_network(data.classes, data.size, trust_code=settings.trust, **arguments)
-    encoding = settings.renderer.encoding
-    facts = {"classes": list(data.classes), "size": data.size, "encoding": encoding, **shape}
-    if initial:
-        initial.copy_to(network, facts)
-        if initial.network is None:
-            say_inputs(str(settings.network), network, data.size, initial.inputs)
-    of_initial = initial.architecture.get(checkpoints.NORMALIZE_LIGHT) if initial else None
-    light = settings.normalize_light or of_initial
-    if light is not None:
-        facts[checkpoints.NORMALIZE_LIGHT] = light
-        network = wrappers.with_normalized_light(network, light)
-    if recipe.freeze:
-        with keyed(stage="train.freeze"):
-            freeze(wrappers.unwrapped(network), recipe.freeze, data.size)
-    precision = choose_precision(recipe.precision, device, network)
-    model = MixedPrecision(network.to(device), precision)
-    torch.set_num_threads(threads or choose_threads(model, recipe.batch_size, data.size))
-    if recipe.eval_mode is None:
-        recipe = replace(recipe, eval_mode=bool(initial and initial.is_classifier))
-    rate = scale_learning_rate(recipe, model, to_unit(images[:NORM_IMAGES].to(device)))
-    if rate != recipe.learning_rate:
-        console.info("learning rate %.3g, by the norm of the features of the network", rate)
-        recipe = replace(recipe, learning_rate=rate)
-    inner = wrappers.without_normalized_light(network)
-    description = describe(inner, **facts, validation=validation)
-    task = initial.task if initial else Classification()
-    service = inputs.build_service(settings, data, device, task)
-    has_initial = initial is not None
-    return Trainer(recipe, model, description, service, folder, data.labeled, has_initial)
 
 
 def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:

@@ -17,30 +17,20 @@ from augment.tasks.detection import Detection
 from renderer.errors import InputError, keyed, require_memory
 from train import console
 from train.data.batches import Batch
-from train.device import GraphedNetwork, MixedPrecision, compiles, wrap_ddp
-from train.train_settings import LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, TrainSettings
-from train.training.augmentations import Baseline, LowLight, RelitBatches
-from train.training.averages import Averages
+from train.device import MixedPrecision, compiles, wrap_ddp
+from train.train_settings import TrainSettings
+from train.training.augmentations import Augmentation
 from train.training.detection import DetectionLoss
 from train.training.recipe import TrainingLoss, build_optimizer, learning_rate, share_layers
 
 
 class TrainingStep:
-    """Loss, augmentation and optimizer of a network, with which it takes training steps.
-
-    Attributes:
-        attacked: Network in training, as the attack on the renders calls it.
-        validated: Network that is validated, as the validation calls it.
-    """
-
-    attacked: nn.Module
-    validated: nn.Module
+    """Loss, augmentation and optimizer of a network, with which it takes training steps."""
 
     def __init__(
         self,
         settings: TrainSettings,
         model: MixedPrecision,
-        averages: Averages,
         teacher: MixedPrecision | None,
         service: AugmentationService,
         size: int,
@@ -52,7 +42,6 @@ class TrainingStep:
         """
         self._settings = settings
         self._model = model
-        self._averages = averages
         self._device = next(model.parameters()).device
         # `wrap_ddp` may replace layers of the network. The optimizer is built
         # afterwards, so that it has the parameters of the new layers.
@@ -62,42 +51,28 @@ class TrainingStep:
             self.optimizer = build_optimizer(model, settings)
         is_scaled = model.precision == "float16"
         self.scaler = torch.amp.GradScaler(self._device.type, enabled=is_scaled)
-        positive_classes = service.positive_classes
-        is_detector = isinstance(service.task, Detection)
-        if is_detector and settings.relight_steps:
-            raise InputError("relight_steps attacks classifiers: set it to 0", "relight_steps")
-        self._augmentation: Baseline | RelitBatches | LowLight
-        if settings.augmentation == RELIGHT:
-            self._augmentation = RelitBatches(settings, model, teacher, service.seed)
-        elif settings.augmentation in (LOW_LIGHT, RELIGHT_AND_LOW_LIGHT):
-            relit = None
-            if settings.augmentation == RELIGHT_AND_LOW_LIGHT:
-                relit = RelitBatches(settings, model, teacher, service.seed)
-            self._augmentation = LowLight(service.seed, relit)
-        else:
-            name, absent = settings.augmentation, positive_classes[1:]
-            self._augmentation = Baseline(name, model, service.seed, absent)
+        classes = service.positive_classes
+        self._augmentation = Augmentation(settings, model, teacher, service.seed, classes[1:])
         with keyed(choice="compile"):
-            is_compiled = compiles(settings.compile, self._device) and not is_detector
-        # Module that computes the logits of the teacher. It may take the features from
-        # the network in training.
-        pupil: nn.Module | None = teacher
-        if teacher is not None and not is_compiled and not is_detector:
-            pupil = share_layers(settings, model, teacher, size)
+            is_compiled = compiles(settings.compile, self._device)
         self._loss: Callable[..., tuple[Tensor, Tensor]]
         if isinstance(service.task, Detection):
+            if settings.relight_steps:
+                raise InputError("relight_steps attacks classifiers: set it to 0", "relight_steps")
+            is_compiled = False
             self._loss = DetectionLoss(replica, settings, teacher, service.task).compute
         else:
-            self._loss = TrainingLoss(replica, settings, positive_classes, pupil, labeled).compute
-        self.attacked = model
-        self.validated = averages.selected
+            # Module that computes the logits of the teacher. It may take the features from
+            # the network in training.
+            pupil: nn.Module | None = teacher
+            if teacher is not None and not is_compiled:
+                pupil = share_layers(settings, model, teacher, size)
+            self._loss = TrainingLoss(replica, settings, classes, pupil, labeled).compute
         if is_compiled:
             # torch limits the number of compiled functions in a process. Those of an
             # earlier run are removed.
             torch.compiler.reset()
             self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
-            self.attacked = GraphedNetwork(model)
-            self.validated = GraphedNetwork(averages.selected)
 
     def take(self, batch: Batch, done: float, number: int) -> Float[Tensor, " 2"]:
         """Change the weights by the gradient of the loss of a batch.
@@ -128,7 +103,6 @@ class TrainingStep:
             nn.utils.clip_grad_norm_(self._model.parameters(), settings.clip_gradient)
         self.scaler.step(self.optimizer)
         self.scaler.update()
-        self._averages.end_step()
         return sums
 
     def state_dict(self) -> dict[str, Any]:
@@ -147,14 +121,12 @@ def require_equal_shares(settings: TrainSettings) -> None:
     Each process gets an equal part of the batch, and divides it into
     `accumulation_steps` equal parts.
     """
-    process_count = distributed.world_size()
     steps = settings.accumulation_steps
-    if settings.batch_size % (process_count * steps):
-        raise InputError(
-            f"batch_size={settings.batch_size} is no multiple of {process_count} processes × "
-            f"accumulation_steps={steps}: set it to a multiple of {process_count * steps}",
-            "batch_size",
-        )
+    shares = distributed.world_size() * steps
+    if settings.batch_size % shares:
+        fault = f"batch_size={settings.batch_size} is no multiple of {shares // steps} processes"
+        advice = f"accumulation_steps={steps}: set it to a multiple of {shares}"
+        raise InputError(f"{fault} × {advice}", "batch_size")
 
 
 def fitting_batch_size(

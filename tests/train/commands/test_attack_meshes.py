@@ -1,5 +1,6 @@
 """The attack command makes scenes from its configuration, and prints what it found."""
 
+from dataclasses import replace
 from unittest.mock import Mock
 
 import pytest
@@ -16,7 +17,7 @@ from renderer.visibility import opengl
 from scripts.attack import main as attack_command
 from tests.runs import loaded_run
 from train.command_settings import AttackExperimentSettings
-from train.commands.attack import attacks, overrides
+from train.commands.attack import attacks
 
 
 def configured(*arguments: str) -> AttackExperimentSettings:
@@ -78,7 +79,7 @@ def test_a_scene_in_which_the_mesh_is_recognized_is_searched_for():
     ((name, scene, result),) = attacks(settings, classifier, torch.device("cpu"))
     assert name == "solid:orange:0"
     assert result.clean_correct.all()
-    assert overrides(scene, settings.scene) == "'scene.backgrounds=[0.9]'"
+    assert scene == replace(settings.scene, backgrounds=[0.9])
     with pytest.raises(InputError, match=r"^attack\.force=.* 1 of 1 images"):
         attacked("scene.search=0", classifier=classifier)
 

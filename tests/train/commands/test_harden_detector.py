@@ -23,7 +23,8 @@ from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
 from tests.detectors import BrightBox, OneBox, RawCells, small_detector
 from train.settings import ExperimentSettings
-from train.training.augmentations import LowLight
+from train.train_settings import TrainSettings
+from train.training.augmentations import Augmentation
 from train.training.detection import candidate_loss, detected, losses_of
 from train.training.inputs import load_initial
 from train.training.loop import Trainer
@@ -101,7 +102,7 @@ def test_the_loss_in_low_light_falls_and_boxes_in_unchanged_light_stay(detector,
     assert type(hardened) is type(detector) and not hardened.training
     images = as_batch(photographs)
     boxes = detected(detector, images, TASK)
-    dark = to_unit(LowLight(seed=9).apply(images, torch.zeros(len(images)), 0))
+    dark = to_unit(Augmentation(LOW_LIGHT, None, seed=9).apply(images, torch.zeros(len(images)), 0))
     losses = [
         losses_of(deepcopy(network).train(), dark, boxes).item() for network in (detector, hardened)
     ]
@@ -147,6 +148,7 @@ def test_a_detector_of_torchvision_is_trained_without_meshes(photographs):
     assert not all(torch.equal(*pair) for pair in weights)
 
 
+LOW_LIGHT = TrainSettings(augmentation="low_light")
 RAW = {"task": Detection(decode=RawCells.decode), "augment": None}
 
 
@@ -156,7 +158,7 @@ def test_a_raw_network_keeps_its_candidates_in_low_light(photographs):
     train["images_per_epoch"] = 24
     hardened = harden(network, photographs, (), train=train, **RAW)
     images = as_batch(photographs)
-    dark = to_unit(LowLight(seed=9).apply(images, torch.zeros(len(images)), 0))
+    dark = to_unit(Augmentation(LOW_LIGHT, None, seed=9).apply(images, torch.zeros(len(images)), 0))
     expected = network(to_unit(images)).sigmoid()
     changes = [(one(dark).sigmoid() - expected).abs().mean() for one in (network, hardened)]
     assert changes[1] < 0.9 * changes[0]

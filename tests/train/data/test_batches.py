@@ -135,7 +135,7 @@ def test_an_epoch_continues_from_any_batch_as_if_one_split_held_its_rows_and_ren
 
 class TestRounds:
     def test_divide_the_images_of_an_epoch_and_each_has_all_renders(self):
-        rounds = rounds_of_epoch(100, 7, seed=0, epoch=4, images_per_epoch=50, images_per_round=20)
+        rounds = rounds_of_epoch(100, 7, 0, 4, 50, 20)
         assert [(part.number, part.epoch) for part in rounds] == [(12, 4), (13, 4), (14, 4)]
         images = []
         for part, image_count in zip(rounds, [20, 20, 10], strict=True):

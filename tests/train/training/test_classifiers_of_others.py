@@ -98,11 +98,14 @@ def test_the_result_loads_where_the_original_did_and_in_every_command(tuned, wei
     original = normalized_logits(load_torchvision(weights), images)
     assert not torch.allclose(expected, original)
     assert load_run(folder).size == SIZE
+    # Nobody states the normalization of own weights, also not the file of the run.
+    assert load_run(folder).inputs.normalization is None
     torch.testing.assert_close(load_run(folder)(images), expected, rtol=1e-4, atol=1e-4)
 
     initial = [f"network={folder}", "weights=null"]
     continued, _ = tuned("unlabeled", *initial, ALMOST_FIXED)
     torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
+    assert load_run(continued).inputs.normalization is None
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from train.run_folder import BEST, LAST, PREVIOUS, read_metrics
 from train.settings import PHOTOGRAPHS_FIRST
 from train.train_settings import TrainSettings
 from train.training import run
-from train.training.augmentations import RelitBatches
+from train.training.augmentations import Augmentation
 from train.training.averages import FACTORS, INTERPOLATION
 from train.training.recipe import TrainingLoss
 
@@ -185,8 +185,10 @@ def test_gradient_steps_lower_the_confidence_of_relit_batches():
     labels = torch.zeros(16, dtype=torch.int64)
     confidence = {}
     for steps in (0, 3):
-        settings = TrainSettings(consistency_weight=1.0, relight_steps=steps)
-        batches = RelitBatches(settings, network, network, seed=0)
+        settings = TrainSettings(
+            augmentation="relight", consistency_weight=1.0, relight_steps=steps
+        )
+        batches = Augmentation(settings, network, network, seed=0)
         relit = batches.apply(images, labels, step=0)
         assert torch.equal(relit, batches.apply(images, labels, step=0))
         assert not torch.equal(relit, batches.apply(images, labels, step=1))
