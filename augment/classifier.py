@@ -209,7 +209,7 @@ class TaskNetwork(CheckedNetwork):
         """Write size, normalization and value range of the images, each with who states it."""
         return self.inputs.describe(self.network, self.size)
 
-    def is_differentiable(self, like: Tensor) -> bool:
+    def is_differentiable(self, render: Callable[[], Tensor]) -> bool:
         """Return whether the outputs are differentiable in the pixels.
 
         A network of torch with weights is assumed to have differentiable
@@ -218,13 +218,15 @@ class TaskNetwork(CheckedNetwork):
         nothing in a gray one.
 
         Args:
-            like: Images, or a tensor with their dtype and their device.
+            render: Function that makes the images of a scene.
         """
         if next(self.parameters(), None) is not None:
             return True
-        shown = like.new_full((1, 3, *height_and_width(self.size)), GRAY)
-        if like.ndim == 4 and not isinstance(self.task, Classification):
-            shown = like[:MAX_PROBED].clone()
+        images = render()[:MAX_PROBED]
+        if isinstance(self.task, Classification):
+            shown = images.new_full((1, 3, *height_and_width(self.size)), GRAY)
+        else:
+            shown = images.clone()
         try:
             with torch.enable_grad():
                 return self.task.has_gradient(super().forward(shown.requires_grad_()))

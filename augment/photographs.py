@@ -308,7 +308,7 @@ def _attack(
     """Attack all photographs with all slides, one batch after the other."""
     device = device_of(classifier)
     probed = to_unit(photographs[:MAX_PROBED]).to(device)
-    lights = LIGHTS if classifier.is_differentiable(probed) else LIGHTS[:-1]
+    lights = LIGHTS if classifier.is_differentiable(lambda: probed) else LIGHTS[:-1]
     quantizing = Network(classifier, [Quantization()])
     with frozen_eval_mode(classifier):
         outputs = compute_outputs(quantizing, photographs, success.batch_size, device)

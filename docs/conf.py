@@ -163,8 +163,17 @@ def resolve_public_name(
     return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", target, node, content)
 
 
+def write_audit(app: Sphinx, error: Exception | None) -> None:
+    """Audit the published detector in few views, and write the page beside the others."""
+    if error is None and app.builder.name == "html":
+        network = nb.load_run("pretrained/detector")
+        report = nb.audit(network, ["solid:orange"], environments=["grace"], budget=0.1)
+        report.save(Path(app.outdir) / "audit.html")
+
+
 def setup(app: Sphinx) -> None:
     """Connect the functions of this file to the events of Sphinx."""
+    app.connect("build-finished", write_audit)
     app.connect("source-read", link_in_source)
     app.connect("include-read", link_in_included)
     app.connect("missing-reference", resolve_public_name)

@@ -175,7 +175,7 @@ def _attack(
     images_before = problem.images(problem.start)
     warn_of_exposure(problem.scene)
 
-    has_gradients = classifier.is_differentiable(images_before.flatten(0, 1))
+    has_gradients = classifier.is_differentiable(lambda: images_before.flatten(0, 1))
     if settings.optimizer is None and not has_gradients:
         settings = replace(settings, optimizer=RANDOM_SEARCH)
         # `stacklevel` makes Python name the user's call of `attack` in the warning.

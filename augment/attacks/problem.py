@@ -135,7 +135,10 @@ def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
     scene.
     """
     if not settings.allow_negative:
-        scene = scene.changed(lights=scene.basis.project_nonnegative(scene.lights))
+        physical = scene.basis.project_nonnegative(scene.lights)
+        # A copy of the scene would be rasterized again.
+        if not torch.equal(physical, scene.lights):
+            scene = scene.changed(lights=physical)
     parameters = []
     for name, steps in settings.parameters.items():
         options = {}

@@ -120,8 +120,12 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
     channels of a light are projected separately, in float64. The result has no
     gradient. The radiance is at least -`TOLERANCE` times the largest one of the channel. The
     first coefficient stays, or becomes 0 if it was negative. A channel without negative radiance
-    is unchanged.
+    is unchanged. Above degree _COARSE_GRID_DEGREE, the highest degrees stay zero if all are.
     """
+    low = (_COARSE_GRID_DEGREE + 1) ** 2
+    if coefficients.shape[-2] > low and not coefficients[..., low:, :].any():
+        projected = project_nonnegative(coefficients[..., :low, :])
+        return F.pad(projected, (0, 0, 0, coefficients.shape[-2] - low))
     # Find the distinct channels, so that the equal channels of a gray light are projected
     # only once.
     channels = _split_channels(coefficients)[:, 0]
@@ -158,11 +162,13 @@ def _project_with_mean(light: Array) -> Array:
     # for each direction.
     constraints = _grid(degree, _COARSE_SUBDIVISIONS).harmonics.T
     nearest = light
+    # The time of a program grows with the sixth power of the degree: a minute at degree 39.
+    solution_count = _MAX_SOLUTIONS if degree <= _COARSE_GRID_DEGREE else 0
     for number in range(_MAX_ROUNDS):
         _, new_constraints = _find_negative_minima(nearest[None], rounding_radiance, _LOWEST_STARTS)
         if not len(new_constraints):
             break
-        if number < _MAX_SOLUTIONS:
+        if number < solution_count:
             constraints = np.concatenate([constraints, new_constraints])
             # `shortest` minimizes the length of the weighted change of the coefficients.
             # This length is the error of the irradiance.

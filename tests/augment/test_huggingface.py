@@ -1,6 +1,9 @@
 """Networks of transformers: loaded from a folder, they give what its own pipelines give."""
 
 import logging
+import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ import norm_balls as nb
 from augment.huggingface import _read_preprocessor
 from augment.network import ChannelNormalization
 from renderer import InputError
+from scripts.attack import main
 
 transformers = pytest.importorskip("transformers")
 pytestmark = [
@@ -193,6 +197,17 @@ def test_a_zero_shot_network_finds_classes_by_prompts_as_the_pipeline_does(name,
     assert (other - logits).abs().max() > 1e-3
     with pytest.raises(InputError, match="classes="):
         nb.load_classifier(f"hf:{folder}")
+
+
+@pytest.mark.parametrize("name", ZERO_SHOT)
+def test_the_command_of_the_guide_attacks_a_zero_shot_network(name, save, tokenizer, tmp_path):
+    guide = (Path(nb.__file__).parents[1] / "docs/guide.md").read_text()
+    [command] = re.findall("^pnb-attack (network=hf:.*)$", guide, re.MULTILINE)
+    words = [f"network=hf:{save(ZERO_SHOT[name])}", *shlex.split(command)[1:]]
+    fast = ["attack.force=true", "attack.max_steps=1", "attack.checks=false", "scene.views=1"]
+    main.run(main.compose([*main.to_overrides(words), *fast, f"out={tmp_path / 'out'}"]))
+    assert "images: 64 × 64 pixels" in (tmp_path / "out/config.yaml").read_text()
+    assert len([*tmp_path.glob("out/*/attack.jsonl")]) == 1
 
 
 @pytest.mark.parametrize("name", WITH_POSITIONS)

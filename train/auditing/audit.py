@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from augment.attack_settings import RelightingSettings
 from augment.classifier import Classifier
@@ -159,14 +160,17 @@ def _caveats(
     if settings.meshes and not (settings.hard_negatives or settings.laboratory):
         caveats.append(NO_HARD_NEGATIVES)
     for network in networks.values():
-        images = torch.empty(0, device=device_of(network))
-        if plan is not None:
+
+        def shown(network: Classifier = network) -> Tensor:
+            if plan is None:
+                return torch.empty(0, device=device_of(network))
             # Only an image with an object tells whether a detector has gradients.
             scene = plan.attacked_views.scene(network.size)
-            images = lights.render_in(scene, scene.lights[0])[:, 0]
-        elif not isinstance(network, Classifier):
+            return lights.render_in(scene, scene.lights[0])[:, 0]
+
+        if plan is None and not isinstance(network, Classifier):
             continue
-        if not network.is_differentiable(images):
+        if not network.is_differentiable(shown):
             attack = "only random search attacks it"
             if plan is not None:
                 queries = f"{lights.QUERIES} queries for each radius"

@@ -14,13 +14,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.attack_settings import AttackSettings, SkylightSettings, StepSettings
-from augment.attacks.problem import build_problem
 from augment.classifier import TaskNetwork
 from augment.network import compute_outputs, device_of
 from augment.progress import progress
 from augment.scene.truth import NO_OBJECT, Truth
 from augment.tasks.detection import Detection
+from renderer.image import to_unit
 from renderer.light.files import load_light
 from train.auditing import lights
 from train.auditing.lights import BATCH, KINDS, RANDOM, Views
@@ -107,17 +106,11 @@ def find_in_lights(
             pairs = _find(network, label, lights.render_in(scene, light), truth)
             group = "random light" if name.startswith(RANDOM) else "environments"
             add(group if name else "plain light", first, pairs)
+    truth = attacked_views.scene(network.size).truth(network.label)
     for kind, light_kind in KINDS.items():
-        scene = attacked_views.scene(network.size, kind)
-        of_kind = SkylightSettings if kind == "skylight" else StepSettings
-        settings: dict[str, Any] = {kind: of_kind("linf", light_kind.radii[-1])}
-        problem = build_problem(AttackSettings(**settings), scene)
         with np.load(out / f"{kind}.npz") as saved:
-            values = torch.from_numpy(saved["values"]).to(problem.start)
-        with torch.no_grad():
-            images = problem.images(values)
-        pairs = _find(network, label, images, scene.truth(network.label))
-        add(f"attacked: {light_kind.title}", 0, pairs)
+            images = to_unit(torch.from_numpy(saved["images"])).to(views.device)
+        add(f"attacked: {light_kind.title}", 0, _find(network, label, images, truth))
     task: Any = network.task
     metrics = {}
     for title, numbered in groups.items():

@@ -100,7 +100,7 @@ ENOUGH = 0.75
 FRAME_COUNT = 21
 # Number of classes whose probabilities are shown beside the slider.
 CLASS_COUNT = 5
-# Width and height of the image of the object, in pixels.
+# Height of the image of the object, in pixels.
 SIDE = 200
 # Width and height of the image of a white ball, which shows the light, in pixels.
 BALL_SIDE = 120
@@ -268,7 +268,7 @@ def adversaries(
     else:
         settings |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
     scene = views.scene(classifier.size, kind)
-    if not classifier.is_differentiable(render_in(scene, scene.lights[0])[:, 0]):
+    if not classifier.is_differentiable(lambda: render_in(scene, scene.lights[0])[:, 0]):
         settings |= {"optimizer": RANDOM_SEARCH, "max_queries": QUERIES}
     return attack(
         classifier,
@@ -282,11 +282,11 @@ def adversaries(
 def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path) -> dict[str, Any]:
     """Attack one kind of lighting, and count the misclassified views for each radius.
 
-    The attacked lighting of the largest radius is written to out/KIND.npz, which `transfer_success`
-    reads. If an attack succeeds, a picture of the first success, before and after the attack, is
-    written to out/KIND.png. "adversarial" and "random" of the result count, for each radius, the
-    "correct" of "n" views that become wrong even with the noise of a camera. "predicted",
-    "confidence" and "slider" are missing if no attack succeeds.
+    The attacked lighting of the largest radius and its images are written to out/KIND.npz. If an
+    attack succeeds, a picture of the first success, before and after the attack, is written to
+    out/KIND.png. "adversarial" and "random" of the result count, for each radius, the "correct" of
+    "n" views that become wrong even with the noise of a camera. "predicted", "confidence" and
+    "slider" are missing if no attack succeeds.
     """
     result = adversaries(classifier, views, kind)
     radii = KINDS[kind].radii
@@ -304,7 +304,8 @@ def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path
         counts[random] = [int(row[random].sum()) for row in by_radius]
     is_wrong = clean & result.success
     content = io.BytesIO()
-    np.savez(content, wrong=is_wrong.cpu(), values=result.minimum.values.cpu())
+    images = to_bytes(result.images_in_views.cpu())
+    np.savez(content, wrong=is_wrong.cpu(), values=result.minimum.values.cpu(), images=images)
     atomic_write(out / f"{kind}.npz", content.getbuffer())
     if is_wrong.any():
         example = int(is_wrong.nonzero()[0])
@@ -321,7 +322,8 @@ def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path
         # A small render is enlarged without smoothing, so that its pixels are visible.
         is_enlarged = pair.height < SIDE
         method = Image.Resampling.NEAREST if is_enlarged else Image.Resampling.LANCZOS
-        write_image(out / f"{kind}.png", pair.resize((2 * SIDE, SIDE), method))
+        width = round(SIDE * pair.width / pair.height)
+        write_image(out / f"{kind}.png", pair.resize((width, SIDE), method))
     return counts
 
 
@@ -395,11 +397,12 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     return {"classes": names, "label": names[0], "frames": frames}
 
 
-def _encode_jpeg(image: Float[Tensor, "3 H W"], side: int) -> str:
-    """Resize an image in [0, 1] to a square, and encode it as a JPEG file in base64."""
-    pixels = to_bytes(image.cpu().clamp(0, 1)).permute(1, 2, 0).numpy()
+def _encode_jpeg(image: Float[Tensor, "3 H W"], height: int) -> str:
+    """Resize an image in [0, 1] to a height, and encode it as a JPEG file in base64."""
+    pixels = Image.fromarray(to_bytes(image.cpu().clamp(0, 1)).permute(1, 2, 0).numpy())
     file = io.BytesIO()
-    Image.fromarray(pixels).resize((side, side)).save(file, "JPEG", quality=85)
+    width = round(height * pixels.width / pixels.height)
+    pixels.resize((width, height)).save(file, "JPEG", quality=85)
     return base64.b64encode(file.getvalue()).decode()
 
 

@@ -32,6 +32,7 @@ from renderer.light.environment import read_panorama, to_map
 from renderer.light.files import PROBES, load_light
 from renderer.mesh import Mesh
 from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
+from renderer.settings import Size
 from renderer.solids import HARD_NEGATIVES, SOLIDS
 from train.command_settings import OTHER_PATTERNS, LabSettings
 from train.data.photo import DESCRIPTION, TABLE
@@ -109,8 +110,8 @@ def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
 
 
 def path_traced(
-    parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int
-) -> Float[np.ndarray, "size size 3"]:
+    parts: Sequence[Part], shot: Shot, size: Size, spp: int, bounces: int, seed: int
+) -> Float[np.ndarray, "height width 3"]:
     """Render an object with the path tracer of Mitsuba 3.
 
     Each light source is rendered alone, and the images are added. With all
@@ -326,7 +327,7 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
 
 
 def kept_aside_settings(
-    settings: ExperimentSettings, classes: Sequence[str], size: int, out: Path
+    settings: ExperimentSettings, classes: Sequence[str], size: Size, out: Path
 ) -> LabSettings:
     """Choose objects and lighting for test renders that training does not use.
 

@@ -22,7 +22,7 @@ from augment.scene.patterns import draw_lab_color, draw_lab_pattern
 from renderer.light.harmonics import equirectangular
 from train.command_settings import LabSettings
 
-# Vertical and horizontal field of view of the camera in degrees.
+# Horizontal field of view of the camera in degrees.
 FOV = 25.0
 # A setup in an environment map is drawn with projectors of this pattern first. The
 # environment map then replaces the projectors.

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 import augment
 from augment.attack_settings import PARAMETER_NAMES
+from augment.attacks.problem import build_problem
 from augment.tasks.classification import ClassCriterion
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
@@ -194,3 +195,28 @@ def test_misclassified_examples_are_refused_unless_the_attack_is_forced(by_color
     with pytest.raises(InputError, match=r"1 of 1 images .*solid:orange"):
         augment.attack(by_color, scene)
     assert augment.attack(by_color, scene, force=True).minimum.success_before.all()
+
+
+LIT = {"degree": 6, "width": 3.0, "light": "uniform"}
+WIDE = {
+    "projector": ({"projector": {"pixels": 8, "pattern": 0.3}}, augment.StepSettings),
+    "lamps": ({"lamps": {"start": 5.0}}, augment.StepSettings),
+    "positions": ({"lamps": {"start": 5.0}}, augment.StepSettings),
+    "pose": ({"silhouettes": True}, augment.PoseSettings),
+    "material": ({}, augment.MaterialSettings),
+}
+
+
+@pytest.mark.parametrize("name", WIDE)
+def test_an_attack_on_wide_images_has_the_middle_rows_of_square_images(by_color, name):
+    options, kind = WIDE[name]
+    network = augment.Classifier(by_color.network, (4, 8), by_color.classes)
+    meshes = [("solid:orange", "orange")]
+    scene = augment.build_scene(meshes, network.size, **LIT, **options)
+    settings = {name: kind("linf", 0.5, "sign", 0.25), "max_steps": 2, "margin": 100.0}
+    result = augment.attack(network, scene, settings=augment.AttackSettings(**settings), force=True)
+    square = augment.build_scene(meshes, 8, **LIT, **options)
+    problem = build_problem(result.settings, square)
+    middle = problem.images(result.minimum.values)[..., 2:6, :]
+    assert not torch.equal(result.images, result.images_before)
+    torch.testing.assert_close(result.images_in_views, middle, rtol=0, atol=1e-5)

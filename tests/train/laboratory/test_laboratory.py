@@ -327,6 +327,16 @@ def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
 GRAY_CARD = card(np.full((4, 4, 3), 128, dtype=np.uint8))
 
 
+def test_a_wide_render_has_the_middle_rows_of_a_square_one():
+    """Means of 12 pixels with 512 paths each differ by the noise."""
+    shot = frontal(wall=np.array([0, 3.0, 1.0]), table=np.array([0.2, 0.1, 0.3]))
+    parts = lab_parts(GRAY_CARD, 1.0)
+    square = path_traced(parts, shot, 12, 512, bounces=1, seed=0)[3:9]
+    wide = path_traced(parts, shot, (6, 12), 512, bounces=1, seed=0)
+    means = [image.reshape(2, 3, 3, 4, 3).mean((1, 3)) for image in (square, wide)]
+    np.testing.assert_allclose(*means, rtol=0.05, atol=0.005)
+
+
 def test_two_projectors_at_one_place_share_the_brightness_of_one():
     parts = lab_parts(GRAY_CARD, 1.0)
     one = frontal(wall=np.array([0, 3.0, 1.0]), table=np.array([0.2, 0.1, 0.3]))
