@@ -61,9 +61,8 @@ class StepSettings(Settings):
         """Check that the attack can change something."""
         super().__post_init__()
         if self.parts and not any(getattr(self, name) for name in self.parts):
-            raise InputError(
-                f"{', '.join(self.parts)} are all 0, so nothing can change: set one of them above 0"
-            )
+            reason = f"{', '.join(self.parts)} are all 0, so nothing can change"
+            raise InputError(f"{reason}: set one of them above 0")
 
 
 @dataclass
@@ -310,11 +309,9 @@ class AttackSettings(ParameterSettings):
             raise InputError("lighting and skylight both set the light: choose one of them")
         has_radius = all(steps.radius is not None for steps in self.parameters.values())
         if self.restarts and not has_radius:
-            raise InputError(
-                "restarts draws from the norm-balls, but a parameter has no radius: "
-                "set the radius of every parameter, or restarts=0",
-                "restarts",
-            )
+            reason = "restarts draws from the norm-balls, but a parameter has no radius"
+            advice = "set the radius of every parameter, or restarts=0"
+            raise InputError(f"{reason}: {advice}", "restarts")
 
     @property
     def uses_gradients(self) -> bool:
@@ -379,6 +376,5 @@ class AttackSettings(ParameterSettings):
             InputError: If no parameter is set.
         """
         if not self.parameters:
-            raise InputError(
-                f"no parameter is attacked: set one or more of {', '.join(PARAMETER_NAMES)}"
-            )
+            choices = ", ".join(PARAMETER_NAMES)
+            raise InputError(f"no parameter is attacked: set one or more of {choices}")

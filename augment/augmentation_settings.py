@@ -217,9 +217,8 @@ class AugmentationSettings(Settings):
                 needed = "random values are drawn from the norm-ball: set a radius"
                 raise InputError(f"{missing} is None, but {needed}", missing)
         if self.warm_start and self.vary.instances:
-            raise self.wrong(
-                "warm_start", "continues an attack on shapes: set vary.instances=False"
-            )
+            reason = "continues an attack on shapes: set vary.instances=False"
+            raise self.wrong("warm_start", reason)
 
     @property
     def renders(self) -> bool:

@@ -104,19 +104,15 @@ class CheckedNetwork(wrappers.Network):
             # The caller handles errors of memory. An `InputError` already tells what is wrong.
             if isinstance(error, InputError) or errors.is_out_of_memory(error):
                 raise
-            raise InputError(self._failure(images, error)) from error
+            given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
+            kind = f"{type(error).__name__}: {errors.single_line(error)}"
+            remedy = "give the size of its images, or use a network that takes such images"
+            dtypes = {weight.dtype for weight in self.parameters() if weight.is_floating_point()}
+            if dtypes and images.dtype not in dtypes:
+                names = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
+                remedy = f"its weights are {names}, convert it with network.to({images.dtype})"
+            raise InputError(f"{self.title} fails on {given} ({kind}): {remedy}") from error
         return outputs if self._read is None else self._read(outputs, images)
-
-    def _failure(self, images: Float[Tensor, "N 3 H W"], error: Exception) -> str:
-        """Return the message of the error for a network that failed on images."""
-        given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
-        kind = type(error).__name__
-        remedy = "give the size of its images, or use a network that takes such images"
-        dtypes = {weight.dtype for weight in self.parameters() if weight.is_floating_point()}
-        if dtypes and images.dtype not in dtypes:
-            of_weights = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
-            remedy = f"its weights are {of_weights}, convert it with network.to({images.dtype})"
-        return f"{self.title} fails on {given} ({kind}: {errors.single_line(error)}): {remedy}"
 
 
 class TaskNetwork(CheckedNetwork):
@@ -191,8 +187,30 @@ class TaskNetwork(CheckedNetwork):
         """Settings with which the light of images is normalized. None if it is not normalized."""
         return wrappers.light_settings(self.network)
 
-    def normalizing_light(self, normalize_light: NormalizeLight = True) -> TaskNetwork:
-        """Return a network that first normalizes the light of images. It shares the weights."""
+    def normalizing_light(self, normalize_light: NormalizeLight = True) -> Self:
+        """Return a classifier that first normalizes the light of images.
+
+        It shares the network. It has no operating points, because its logits
+        differ.
+
+        Args:
+            normalize_light: True for the defaults, or a mapping with fields of
+                `NormalizedLightSettings`. With None or False, the classifier
+                itself is returned.
+
+        Raises:
+            InputError: If this classifier normalizes the light already.
+
+        Example:
+            >>> import torch
+            >>> import norm_balls as nb
+            >>> def logits(images):
+            ...     return images.mean((2, 3))
+            >>> classifier = nb.Classifier(logits, size=8, classes=["red", "green", "blue"])
+            >>> dark = torch.full((1, 3, 8, 8), 0.1)
+            >>> classifier.normalizing_light({"level": 1.0})(dark).round(decimals=3)
+            tensor([[1., 1., 1.]])
+        """
         if read_normalized_light(normalize_light) is None:
             return self
         return self.with_network(self.network, normalize_light)
@@ -302,34 +320,6 @@ class Classifier(TaskNetwork):
                 "each (for a network with a single output z, return the logits 0 and z)"
             )
 
-    def normalizing_light(self, normalize_light: NormalizeLight = True) -> Classifier:
-        """Return a classifier that first normalizes the light of images.
-
-        It shares the network. It has no operating points, because its logits
-        differ.
-
-        Args:
-            normalize_light: True for the defaults, or a mapping with fields of
-                `NormalizedLightSettings`. With None or False, the classifier
-                itself is returned.
-
-        Raises:
-            InputError: If this classifier normalizes the light already.
-
-        Example:
-            >>> import torch
-            >>> import norm_balls as nb
-            >>> def logits(images):
-            ...     return images.mean((2, 3))
-            >>> classifier = nb.Classifier(logits, size=8, classes=["red", "green", "blue"])
-            >>> dark = torch.full((1, 3, 8, 8), 0.1)
-            >>> classifier.normalizing_light({"level": 1.0})(dark).round(decimals=3)
-            tensor([[1., 1., 1.]])
-        """
-        if read_normalized_light(normalize_light) is None:
-            return self
-        return self.with_network(self.network, normalize_light)
-
     def detect(
         self, images: Float[Tensor, "N 3 height width"], label: str | None = None
     ) -> Bool[Tensor, " N"]:
@@ -412,13 +402,6 @@ def log_odds(logits: Float[Tensor, "N classes"], label: int) -> Float[Tensor, " 
     return logits[:, label] - others.logsumexp(dim=1)
 
 
-def as_classifier(network: Any, *options: Any, **named: Any) -> Classifier:
-    """Make a classifier of a plain network. See `as_network` for the options."""
-    made = as_network(network, *options, **named | {"task": Classification()})
-    assert isinstance(made, Classifier)
-    return made
-
-
 def as_network(
     network: TaskNetwork | Callable[[Tensor], Any],
     size: Size | None = None,
@@ -471,9 +454,8 @@ def as_network(
     device = wrappers.device_of(network) if device is None else errors.as_device(device)
     function = _preprocessed(network, normalization, value_range).to(device)
     name = name or type(network).__name__
-    normalizer = wrappers.NETWORK if wrappers.normalization_of(network) else None
-    if normalization is not None:
-        normalizer = wrappers.YOU
+    own = wrappers.NETWORK if wrappers.normalization_of(network) else None
+    normalizer = own if normalization is None else wrappers.YOU
     # A mean is in the units of the value range. The default range is an object of its own.
     is_stated = normalization is not None or value_range is not UNIT_RANGE
     limits = (0.0, 1.0) if normalization == IMAGENET else (value_range[0], value_range[1])
@@ -529,18 +511,18 @@ def _preprocessed(
     """Return a network that takes images in [0, 1], scales and normalizes them."""
     module = network if isinstance(network, nn.Module) else wrappers.Function(network)
     mean, std = mean_and_std(normalization)
-    expected = "the values of black and white"
-    black, white = errors.as_list("value_range", value_range, float | int, expected)
+    limits = "the values of black and white"
+    black, white = errors.as_list("value_range", value_range, float | int, limits)
     if not black < white:
         raise InputError(f"value_range is ({black}, {white}): give black before white")
     if normalization is None and (black, white) == UNIT_RANGE:
         return module.eval()
     if normalization is not None:
         # Networks of several libraries are known by the names of their modules and buffers.
-        kinds = {type(part).__name__ for part in module.modules()}
-        buffered = [name for name, _ in module.named_buffers()]
-        buffers = {name for name in buffered if name.rpartition(".")[2] in wrappers.MEANS}
-        found = sorted(kinds & NORMALIZING) + sorted(buffers)
+        kinds = {type(part).__name__ for part in module.modules()} & NORMALIZING
+        buffers = [name for name, _ in module.named_buffers()]
+        means = [name for name in buffers if name.rpartition(".")[2] in wrappers.MEANS]
+        found = sorted(kinds) + sorted(means)
         if found:
             reason = f"normalization is given, but the network contains {found[0]}"
             raise InputError(f"{reason}, which normalizes images again: leave normalization out")

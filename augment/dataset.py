@@ -26,7 +26,6 @@ from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT
 from augment.service import AugmentationService
-from augment.tasks.classification import Classification
 from renderer import errors
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
@@ -138,16 +137,15 @@ def render_dataset(
         raise InputError(f"mode={settings.mode} does not fit a data set that {missing}: set {mode}")
     scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **of_scene)
     if "cameras" not in of_scene:
-        examples = [
-            replace(
-                example, cameras=_show_all(example.cameras, scene.objects[example.object], size)
-            )
-            for example in scene.examples
-        ]
+        examples = []
+        for example in scene.examples:
+            item = scene.objects[example.object]
+            cameras = tuple(_show_all(camera, item, size) for camera in example.cameras)
+            examples.append(replace(example, cameras=cameras))
         scene = scene.changed(examples=examples)
     skipped = frozenset(skip)
     indices = [index for index in range(first, first + count) if index not in skipped]
-    return _render_blocks(scene, settings, network, indices, seed)
+    return _render_blocks(scene, replace(settings, examples=BLOCK), network, indices, seed)
 
 
 def _render_blocks(
@@ -158,6 +156,10 @@ def _render_blocks(
     seed: int,
 ) -> Iterator[LabeledRender]:
     """Yield renders with ascending indices, one block after another."""
+    # Without a network, nothing asks for the classes.
+    of_network: dict[str, Any] = {}
+    if network is not None:
+        of_network = {"task": network.task, "classes": network.classes}
     # The examples of the scene are sorted by object, view and background.
     shape = (len(scene.objects), -1, len(scene.backgrounds))
     in_turn = torch.arange(len(scene)).view(shape).permute(1, 2, 0).flatten().tolist()
@@ -166,14 +168,11 @@ def _render_blocks(
         chosen = [in_turn[index % len(scene)] for index in every]
         examples = [scene.examples[example] for example in chosen]
         shown = scene.changed(examples=examples, lights=scene.lights[chosen])
-        labels = _labels(shown, network)
-        of_service = (replace(settings, examples=BLOCK), shown, labels, seed)
-        service = AugmentationService(
-            *of_service,
-            Phases(labels.device),
-            task=Classification() if network is None else network.task,
-            classes=() if network is None else network.classes,
-        )
+        labels = torch.zeros(BLOCK, dtype=torch.int64, device=scene.lights.device)
+        if network is not None:
+            labels = source_labels(shown, labels.device, network)[:, 0]
+        of_service = settings, shown, labels, seed, Phases(labels.device)
+        service = AugmentationService(*of_service, **of_network)
         problem = service.problem(block)
         values = service.values(network, problem, block)
         if block == indices[0] // BLOCK:
@@ -182,38 +181,23 @@ def _render_blocks(
         yield from _renders(problem, values, rows, every.start)
 
 
-def _show_all(cameras: Sequence[Camera], item: SceneObject, size: Size) -> tuple[Camera, ...]:
-    """Widen cameras such that the shorter side of images shows all objects of an entry."""
+def _show_all(camera: Camera, item: SceneObject, size: Size) -> Camera:
+    """Widen a camera such that the shorter side of images shows all objects of an entry."""
     height, width = height_and_width(size)
     aspect = max(1.0, width / height)
-    if not item.others and aspect == 1:
-        return tuple(cameras)
     points = item.mesh.vertices[np.unique(item.mesh.faces[: item.ends[-1]])]
     span = float(np.ptp(points, axis=0).max()) / 2 if item.others else 1.0
-    factor = aspect * span
-    shown = []
-    for camera in cameras:
-        scaled = {"width": camera.width * factor}
-        if isinstance(camera, PerspectiveCamera):
-            scaled["distance"] = camera.distance * factor
-        camera = replace(camera, **scaled)
-        seen = camera.project(points)[:, :2]
-        if not item.others:
-            shown.append(camera)
-            continue
-        right, up = ((seen.min(0) + seen.max(0)) / 2 * camera.width / 2).tolist()
-        # Near objects are larger in perspective.
-        wider = camera.width * max(1.0, float((np.ptp(seen, axis=0) * [1, aspect]).max()) / 2)
-        shown.append(replace(camera, right=camera.right - right, up=camera.up - up, width=wider))
-    return tuple(shown)
-
-
-def _labels(scene: Scene, network: TaskNetwork | None) -> Int[Tensor, " E"]:
-    """Return the classes of the examples for an attack, as indices of the network."""
-    device = scene.lights.device
-    if network is None:
-        return torch.zeros(len(scene), dtype=torch.int64, device=device)
-    return source_labels(scene, device, network)[:, 0]
+    scaled = {"width": camera.width * aspect * span}
+    if isinstance(camera, PerspectiveCamera):
+        scaled["distance"] = camera.distance * aspect * span
+    camera = replace(camera, **scaled)
+    if not item.others:
+        return camera
+    seen = camera.project(points)[:, :2]
+    right, up = ((seen.min(0) + seen.max(0)) / 2 * camera.width / 2).tolist()
+    # Near objects are larger in perspective.
+    wider = camera.width * max(1.0, float((np.ptp(seen, axis=0) * [1, aspect]).max()) / 2)
+    return replace(camera, right=camera.right - right, up=camera.up - up, width=wider)
 
 
 def _renders(

@@ -169,16 +169,15 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
         advice = "set trust=true (trust_code=True in Python) if you trust its author"
         reason = f"is a program, which can run any code and overwrite your files: {advice}"
         raise name_error(path, f"{reason}, otherwise ask for a state dict, safetensors or ONNX")
-    readers = {EXPORTED: _read_exported, ONNX: _read_onnx}
+    read = {EXPORTED: _read_exported, ONNX: _read_onnx}.get(path.suffix.lower(), _read_torchscript)
     try:
-        content = readers.get(path.suffix.lower(), _read_torchscript)(path)
+        network, (batch_size, _, height, width) = read(path)
     except InputError:
         raise
     except Exception as error:  # A damaged file may raise many types of errors.
         advice = "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
         raise name_error(path, f"cannot be read ({single_line(error)}): {advice}") from error
 
-    network, (batch_size, _, height, width) = content
     if batch_size is not None:
         network = InBatches(network, batch_size)
     if isinstance(network, nn.Module):
@@ -201,9 +200,8 @@ def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
     images = levels[torch.randperm(len(levels), generator=torch.Generator().manual_seed(0))]
     images = images.view(shape)
     with torch.no_grad():
-        first, second = (
-            plain_outputs(classifier.network(images[[0, other]])).float() for other in (1, 2)
-        )
+        outputs = [classifier.network(images[[0, other]]) for other in (1, 2)]
+    first, second = (plain_outputs(output).float() for output in outputs)
     if (first[0] - second[0]).abs().max() > MAX_CHANGE * (first.max() - first.min()):
         raise name_error(name, IN_TRAINING_MODE)
 
@@ -211,11 +209,10 @@ def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
 def _read_torchscript(path: Path) -> Content:
     """Read a file of TorchScript, which `torch.jit.save` wrote."""
     if not is_torchscript(path):
-        advice = advice_for_pickles(path) or (
-            "contains weights without their network: give its architecture and the weights, "
-            f"as in network=torchvision:resnet50 weights={path}"
-        )
-        raise name_error(path, f"cannot be loaded, because it {advice}")
+        reason = "contains weights without their network: give its architecture and the weights"
+        example = f"as in network=torchvision:resnet50 weights={path}"
+        reason = advice_for_pickles(path) or f"{reason}, {example}"
+        raise name_error(path, f"cannot be loaded, because it {reason}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
         network = Scripted(torch.jit.load(path, map_location="cpu").eval())

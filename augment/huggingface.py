@@ -79,16 +79,14 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
     is_zero_shot = architecture in zero_shot
     if not is_zero_shot and architecture not in _architectures(auto, _TASKS):
         kinds = "image classification, zero-shot classification, detection or segmentation"
-        raise name_error(
-            name, f"is {architecture or config.model_type}: give a network for {kinds}"
-        )
+        found = architecture or config.model_type
+        raise name_error(name, f"is {found}: give a network for {kinds}")
     if is_zero_shot and not facts.classes:
         raise name_error(name, f"finds classes by their names: set classes=, and prompt='{PROMPT}'")
     if facts.prompt is not None and (not is_zero_shot or "{}" not in facts.prompt):
         reason = "lacks {} for the class" if is_zero_shot else f"is not for {name}, which has names"
-        raise InputError(
-            f"prompt={facts.prompt} {reason}: give '{PROMPT}', or leave it out", "prompt"
-        )
+        advice = f"give '{PROMPT}', or leave it out"
+        raise InputError(f"prompt={facts.prompt} {reason}: {advice}", "prompt")
 
     network = _model(getattr(library, architecture), model, config, name, is_random)
     size, mean, std, is_bgr, inputs = _read_preprocessor(library, model, config, name)
@@ -100,7 +98,8 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
     normalization = ChannelNormalization(mean, std, is_bgr)
     classes: Sequence[str] | None = facts.classes
     if is_zero_shot:
-        network = _zero_shot(library, network, model, facts, normalization, size, is_random)
+        gray = normalization(torch.full((1, 3, *height_and_width(size)), 0.5))
+        network = _zero_shot(library, network, model, facts, gray, is_random)
     elif architecture in _architectures(auto, _TASKS[:1]):
         classes = classes or _class_names(config.id2label)
     normalized = Network(network.eval(), [normalization])
@@ -111,11 +110,9 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
 
 def _architectures(auto: Any, tasks: Sequence[str]) -> set[str]:
     """Return the names of the classes of transformers for some tasks."""
-    known: set[str] = set()
-    for task in tasks:
-        for names in getattr(auto, f"MODEL_FOR_{task}_MAPPING_NAMES").values():
-            known |= {names} if isinstance(names, str) else {*names}
-    return known
+    mappings = [getattr(auto, f"MODEL_FOR_{task}_MAPPING_NAMES").values() for task in tasks]
+    entries = [entry for mapping in mappings for entry in mapping]
+    return {name for entry in entries for name in ([entry] if isinstance(entry, str) else entry)}
 
 
 def _model(kind: Any, model: str, config: Any, name: str, is_random: bool) -> Any:
@@ -128,9 +125,8 @@ def _model(kind: Any, model: str, config: Any, name: str, is_random: bool) -> An
         reason = f"cannot be loaded ({single_line(error)}): check the files of its weights"
         raise name_error(name, reason) from error
     if missing := sorted(report["missing_keys"]):
-        raise name_error(
-            name, f"lacks weights, such as {missing[0]}: give a trained {kind.__name__}"
-        )
+        reason = f"lacks weights, such as {missing[0]}"
+        raise name_error(name, f"{reason}: give a trained {kind.__name__}")
     return loaded.float()
 
 
@@ -187,17 +183,10 @@ def _read_preprocessor(
 
 @torch.no_grad()
 def _zero_shot(
-    library: Any,
-    model: Any,
-    name: str,
-    facts: NetworkFacts,
-    normalization: nn.Module,
-    size: Size,
-    is_random: bool,
+    library: Any, model: Any, name: str, facts: NetworkFacts, gray: Tensor, is_random: bool
 ) -> ZeroShot:
-    """Make a classifier of a model with an image and a text encoder."""
+    """Make a classifier of a model with an image and a text encoder, and check it on an image."""
     classes = facts.classes or ()
-    gray = normalization(torch.full((1, 3, *height_and_width(size)), 0.5))
     if is_random:
         features = model.eval().get_image_features(pixel_values=gray)
         return ZeroShot(model, len(classes), getattr(features, "pooler_output", features).shape[-1])
@@ -207,9 +196,8 @@ def _zero_shot(
     if "siglip" in model.config.model_type:
         options = {"padding": "max_length", "max_length": 64, "truncation": True}
     try:
-        tokens = library.AutoTokenizer.from_pretrained(name)(
-            prompts, return_tensors="pt", **options
-        )
+        tokenizer = library.AutoTokenizer.from_pretrained(name)
+        tokens = tokenizer(prompts, return_tensors="pt", **options)
         output = model.eval()(pixel_values=gray, **tokens)
         vectors = F.normalize(output.text_embeds, dim=-1) * model.logit_scale.exp()
         network = ZeroShot(model, *vectors.shape)

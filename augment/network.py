@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
 
@@ -445,6 +445,11 @@ def compute_outputs(
         return [output for batch in outputs for output in batch]
     joined = torch.cat(outputs)
     return joined.unflatten(0, images.shape[:-3]) if isinstance(images, Tensor) else joined
+
+
+def evenly_spaced(count: int, limit: int) -> Int[Tensor, " N"]:
+    """Return up to `limit` indices of a list of some length, at equal distances."""
+    return torch.linspace(0, max(count - 1, 0), min(limit, count)).round().long()
 
 
 @dataclass

@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Generator, Tensor
 
+from augment import network as wrappers
 from augment.attack_settings import (
     GRADIENT,
     RANDOM_SEARCH,
@@ -29,17 +30,9 @@ from augment.attack_settings import (
     StepSettings,
 )
 from augment.attacks.loop import minimize
-from augment.attacks.objective import Objective
+from augment.attacks.objective import Objective, preprocessed_model
 from augment.attacks.optimizers import Gradient, NormBalls, Optimizer, sample
 from augment.classifier import MAX_PROBED, UNIT_RANGE, Normalization, TaskNetwork, as_network
-from augment.network import (
-    Network,
-    Quantization,
-    compute_outputs,
-    device_of,
-    frozen_eval_mode,
-    gradient_flags_kept,
-)
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.patterns import ProjectedLight, draw_projected_light, require_photographs
@@ -105,9 +98,8 @@ class RelitPhotographs(NormBalls):
 
     def draw(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
         """Draw random factors of some photographs, whose logarithms are uniform in the ball."""
-        draws, start = self._generators, self.start
-        rows = examples.tolist()
-        return torch.cat([sample(self.settings, start[[row]], draws[row]) for row in rows])
+        draws = [(self.start[[row]], self._generators[row]) for row in examples.tolist()]
+        return torch.cat([sample(self.settings, *each) for each in draws])
 
 
 class UniformDraws(Optimizer):
@@ -285,15 +277,13 @@ def attack_photographs(
     settings = settings or RelightingSettings()
     success_settings = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
     size = as_size("photographs", photographs.shape[-2:])
-    with gradient_flags_kept(network):
-        device = device_of(network)
+    with wrappers.gradient_flags_kept(network):
+        device = wrappers.device_of(network)
         given = size, classes, normalization, value_range, device
         classifier = as_network(network, *given, task=task, size_from="the photographs")
         if classifier.size != size:
-            raise InputError(
-                f"photographs have the size {size} in pixels, "
-                f"but the network takes {classifier.size}: resize them"
-            )
+            reason = f"photographs have the size {size} in pixels"
+            raise InputError(f"{reason}, but the network takes {classifier.size}: resize them")
         return _attack(classifier, photographs, settings, success_settings, limit, seed)
 
 
@@ -306,18 +296,18 @@ def _attack(
     seed: int,
 ) -> PhotographAttackResult:
     """Attack all photographs with all slides, one batch after the other."""
-    device = device_of(classifier)
+    device = wrappers.device_of(classifier)
     probed = to_unit(photographs[:MAX_PROBED]).to(device)
     lights = LIGHTS if classifier.is_differentiable(lambda: probed) else LIGHTS[:-1]
-    quantizing = Network(classifier, [Quantization()])
-    with frozen_eval_mode(classifier):
-        outputs = compute_outputs(quantizing, photographs, success.batch_size, device)
+    with wrappers.frozen_eval_mode(classifier):
+        quantizing = preprocessed_model(success, classifier)
+        outputs = wrappers.compute_outputs(quantizing, photographs, success.batch_size, device)
     index, criterion = classifier.task.as_found(outputs, classifier.classes)
     if len(photographs) and not len(index):
         found, count = classifier.task.finds[0], len(photographs)
         raise InputError(f"{classifier.title} has no {found} in {count} photographs: give others")
     if limit is not None and limit < len(index):
-        chosen = torch.linspace(0, len(index) - 1, limit).round().long()
+        chosen = wrappers.evenly_spaced(len(index), limit)
         index, criterion = index[chosen], criterion.select(chosen.to(device))
     shape = (len(index), settings.slides)
     shape_of_gains = (*shape, 3, settings.cells, settings.cells)
@@ -333,7 +323,7 @@ def _attack(
         log_gain={light: torch.zeros(shape_of_gains) for light in lights},
     )
     batches = torch.arange(len(index)).split(success.batch_size)
-    with frozen_eval_mode(classifier):
+    with wrappers.frozen_eval_mode(classifier):
         for rows in progress(batches, "relighting photographs", len(batches)):
             images = to_unit(result.photographs[rows]).to(device)
             for slide in range(settings.slides):

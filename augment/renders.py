@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from augment.attacks.problem import SceneProblem
-from augment.network import frozen_eval_mode
+from augment.network import evenly_spaced, frozen_eval_mode
 from renderer.light.basis import HARMONICS, Basis
 
 # Largest number of successfully attacked renders that are kept for figures each time that the
@@ -94,9 +94,7 @@ def select_examples_to_log(
     the network is restored afterwards.
     """
     successful = torch.nonzero(success).squeeze(1)
-    last = max(len(successful) - 1, 0)
-    chosen = torch.linspace(0, last, min(SHOWN_EXAMPLES, len(successful))).round().long()
-    rows = successful[chosen.to(successful.device)]
+    rows = successful[evenly_spaced(len(successful), SHOWN_EXAMPLES).to(successful.device)]
     before = problem.conditions(problem.start[rows], rows)
     after = problem.conditions(values[rows], rows)
     with frozen_eval_mode(model), torch.no_grad():

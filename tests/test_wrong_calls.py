@@ -379,7 +379,7 @@ SERVICES = [
     ),
     *calls_of("amplitude", RandomLightSettings, 0),
     *by_name(service_of, scene=[3, MESH], labels=["orange", [0]], positive_classes=["orange"]),
-    *by_name(service_of, phases=[None], seed=[None, 0.5], images=[BYTES, [1]]),
+    *by_name(service_of, seed=[None, 0.5]),
     *calls_of("meshes", lambda x: of_meshes(x, SIZE), [(MESH,)], [MESH], 3),
     *calls_of("label", small_service, "orange", 1.5, None),
     *calls_of("size", lambda x: of_meshes([(MESH, 0)], x), 16.5, 0),

@@ -185,8 +185,7 @@ class Adversary(ShortRepr):
 
 def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> SceneObject:
     """Copy an object with the shape, colors and gloss of conditions; None changes nothing."""
-    mesh = item.mesh
-    albedo_scale = item.albedo_scale
+    mesh, albedo_scale = item.mesh, item.albedo_scale
     albedo, hue, vertices = (
         None if values is None else values.detach().cpu().double().numpy()
         for values in (changed.albedo, changed.hue, changed.vertices)
@@ -208,10 +207,8 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     environment light that is negative, under the key "negative_light".
     """
     folder.mkdir(parents=True, exist_ok=True)
-    shown = adversary.shown
-    settings = adversary.settings
+    shown, settings, cameras = adversary.shown, adversary.settings, adversary.cameras
     height, width = settings.shape
-    cameras = adversary.cameras
     export_mesh(shown.mesh, folder / MESH, settings.normals, cameras, shown.own, width / height)
     (_, light), *local_lights = save_lights(folder, adversary.light, adversary.basis)
     gray = float(adversary.background.flatten()[0])
@@ -360,8 +357,7 @@ def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
     try:
         images = torch.from_numpy(read_numbers(path))
         errors.require_bounded(images=images)
-        if images.shape != shape:
-            raise InputError(f"the images have shape {tuple(images.shape)}, not {shape}")
+        errors.require_shape("images", images, *shape)
     # A damaged file may raise many types of errors.
     except Exception as error:
         message = f"{path} cannot be read ({errors.single_line(error)}): write the adversary again"
@@ -381,11 +377,8 @@ def final_images(
     scene = problem.scene
     conditions = problem.conditions(values, examples)
     changes = (conditions.vertices, conditions.albedo, conditions.gloss)
-    if not (
-        any(change is not None for change in changes)
-        and scene.settings.global_illumination
-        and len(examples)
-    ):
+    is_changed = any(change is not None for change in changes)
+    if not (is_changed and scene.settings.global_illumination and len(examples)):
         return images
     rendered = []
     for row, example in enumerate(progress(examples.tolist(), "final images")):

@@ -147,15 +147,10 @@ def attack(
     settings = settings or AttackSettings(lighting=StepSettings())
     like = scene.lights
     given = scene.settings.size, classes, normalization, value_range, like.device, "classifier"
+    options: dict[str, Any] = {"dtype": like.dtype, "task": task, "size_from": "the scene"}
+    options["normalize_light"] = normalize_light
     with gradient_flags_kept(classifier):
-        adapted = classifiers.as_network(
-            classifier,
-            *given,
-            normalize_light=normalize_light,
-            dtype=like.dtype,
-            task=task,
-            size_from="the scene",
-        )
+        adapted = classifiers.as_network(classifier, *given, **options)
         return _attack(adapted, scene, target, settings, seed, force)
 
 
@@ -178,12 +173,10 @@ def _attack(
     has_gradients = classifier.is_differentiable(lambda: images_before.flatten(0, 1))
     if settings.optimizer is None and not has_gradients:
         settings = replace(settings, optimizer=RANDOM_SEARCH)
+        limit = f"at most {settings.query_limit} queries for each example (max_queries, optimizer)"
+        reason = f"classifier {classifier.name} has no gradients: random search attacks it with"
         # `stacklevel` makes Python name the user's call of `attack` in the warning.
-        warnings.warn(
-            f"classifier {classifier.name} has no gradients: random search attacks it with at most "
-            f"{settings.query_limit} queries for each example (max_queries, optimizer)",
-            stacklevel=3,
-        )
+        warnings.warn(f"{reason} {limit}", stacklevel=3)
     if settings.eot.draws and not isinstance(classifier.task, Classification):
         advice = "set eot.draws=0"
         raise InputError(f"eot averages logits, but the task is {classifier.task}: {advice}", "eot")
@@ -209,9 +202,8 @@ def _attack(
     if minimum.zero_gradient.any():
         warnings.warn(ZERO_GRADIENT, stacklevel=3)
 
-    if criterion.needs_truth:
-        # The attack may have moved the objects.
-        objective = objective.at(problem.truth(minimum.values, problem.all_examples))
+    # The attack may have moved the objects.
+    objective = objective.moved(problem, minimum.values, problem.all_examples)
     criterion = objective.criterion
     evidence, success_in_views, _ = objective.judge(images, problem.all_examples)
     # Images that the search or `final_images` showed to the classifier.
@@ -246,16 +238,13 @@ def require_clean_correct(
     The error says what it finds in the first other image.
     """
     wrong = (criterion.predicted(evidence) != criterion.source).nonzero().tolist()
-    if not wrong:
-        return
-    example, view = wrong[0]
-    item = scene.objects[scene.examples[example].object]
-    found = network.task.describe(evidence[example, view], network.classes)
-    missed = network.task.missed
-    count = f"{len(wrong)} of {criterion.source.numel()} images {missed}"
-    first = f"the first, of {item.name}, class {item.label!r}: {found}"
-    advice = "change the scene, or set force=True"
-    raise InputError(f"force=False, and {count} ({first}): {advice}", "force")
+    for example, view in wrong[:1]:
+        item = scene.objects[scene.examples[example].object]
+        found = network.task.describe(evidence[example, view], network.classes)
+        count = f"{len(wrong)} of {criterion.source.numel()} images {network.task.missed}"
+        first = f"the first, of {item.name}, class {item.label!r}: {found}"
+        advice = "change the scene, or set force=True"
+        raise InputError(f"force=False, and {count} ({first}): {advice}", "force")
 
 
 def target_labels(
@@ -281,9 +270,9 @@ def target_labels(
     if len(names) != view_count:
         advice = f"give one for each of the {view_count} views, in a scene with shared=True"
         raise InputError(f"target={names} names {len(names)} classes: {advice}")
-    labels = torch.empty_like(source)
-    for view, name in enumerate(names):
-        labels[:, view] = classifiers.class_index(classifier.classes, name, f"target={name}")
+    classes = classifier.classes
+    indices = [classifiers.class_index(classes, name, f"target={name}") for name in names]
+    labels = source.new_tensor(indices).repeat(len(source), 1)
     if torch.eq(labels, source).any():
         raise InputError(f"target={target} is the true class of an example: choose another class")
     return labels

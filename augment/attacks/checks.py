@@ -91,9 +91,8 @@ def check(result: AttackResult) -> dict[str, Any]:
         longer = replace(result, settings=result.settings.with_budget(factor))
         _attack_others(found, longer, result.problem, result.problem.start.clone())
         rates[longer.settings.step_limit] = _rates(found, is_clean)
-    rates_by_steps = [
-        dict(zip(rates, column, strict=True)) for column in zip(*rates.values(), strict=True)
-    ]
+    columns = zip(*rates.values(), strict=True)
+    rates_by_steps = [dict(zip(rates, column, strict=True)) for column in columns]
     return {
         "cost_before": float(minimum.cost_before.mean()),
         "cost": float(minimum.cost.mean()),
@@ -315,9 +314,8 @@ def _add_successes(
     again with exact shadows and bounces, and these images decide, without and with sensor noise.
     """
     objective = result.objective().select(examples)
+    objective = objective.moved(problem, values, examples)
     criterion = objective.criterion
-    if criterion.needs_truth:
-        objective = objective.at(problem.truth(values, examples))
     is_reached = criterion.reached(criterion.predicted(objective.evidence(images)))
     rows = torch.nonzero(is_reached)[:, 0]
     if len(rows):
@@ -375,11 +373,12 @@ def _classify(
     """Change adversaries, and classify their images by class names, since orders may differ."""
     changed = [change(adversary) for adversary in adversaries]
     classes = result.classifier.classes
-    labels = [adversary.shown.label for adversary in changed[len(examples) :]]
+    task, count = classifier.task, len(examples)
+    labels = [adversary.shown.label for adversary in changed[count:]]
     names = [label if isinstance(label, str) else classes[label] for label in labels]
     source = torch.tensor([*map(classifier.label, names)]).long()
-    criterion = result.criterion.select(examples)
-    target = criterion.target
+    source = source[:, None].expand(-1, result.criterion.view_count)
+    target = result.criterion.select(examples).target
     if target is not None:
         target = target.cpu().apply_(lambda index: classifier.label(classes[index]))
     rasterizer = result.problem.scene.rasterizer
@@ -387,19 +386,15 @@ def _classify(
     def truth_of(some: Sequence[Adversary]) -> Truth:
         return Truth.join([item.scene(rasterizer).truth(unlabeled) for item in some])
 
-    task, count = classifier.task, len(examples)
-    source = source[:, None].expand(-1, criterion.view_count)
     criterion = task.criterion(source, lambda: truth_of(changed[:count]), len(classifier.classes))
     criterion = replace(criterion, target=target).map(lambda rows: rows.to(examples.device))
     objective = Objective(classifier, criterion, result.settings, result.seed)
     if len(examples):
-        images = []
-        for adversary in progress(changed, "transfer"):
-            images.append(adversary.render_views(rasterizer))
+        images = [item.render_views(rasterizer) for item in progress(changed, "transfer")]
         images_before, images_after = torch.stack(images).to(result.images_in_views).chunk(2)
         evidence_before = objective.evidence(images_before)
         if criterion.needs_truth:
-            objective = objective.at(truth_of(changed[count:]))
+            objective.criterion = criterion.at(truth_of(changed[count:]))
         evidence, fooled_in_views, without_noise = objective.judge(images_after, examples)
     else:
         evidence_before = evidence = result.evidence_in_views[examples]

@@ -92,14 +92,11 @@ def save(
     verify = as_list("verify", verify, str, "a list of renderers")
     require_renderers(verify)
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"example_{example:03d}" for example in range(len(result.images_in_views))]
-    after = result.conditions
-    lines = [
-        _write_example(result, after, example, path)
-        for example, path in enumerate(progress(paths, "saving"))
-    ]
-
     images = result.images_in_views.cpu()
+    paths = [folder / f"example_{example:03d}" for example in range(len(images))]
+    after = result.conditions
+    shown_paths = enumerate(progress(paths, "saving"))
+    lines = [_write_example(result, after, example, path) for example, path in shown_paths]
     versions = {
         "float": images,
         "8 bits": to_unit(to_bytes(images)),
@@ -107,10 +104,9 @@ def save(
     }
     if verify:
         rasterizer = result.problem.scene.rasterizer
-        shown_paths = progress(paths, "rendering the saved files")
-        rendered = [render_again(path, verify, rasterizer) for path in shown_paths]
-        for name in verify:
-            versions[name] = torch.stack([by_renderer[name] for by_renderer in rendered])
+        folders = progress(paths, "rendering the saved files")
+        rendered = [render_again(path, verify, rasterizer) for path in folders]
+        versions |= {name: torch.stack([views[name] for views in rendered]) for name in verify}
     for name, version in versions.items():
         numbers = _numbers_of_version(result, version.to(result.images_in_views))
         for line, of_example in zip(lines, numbers, strict=True):
@@ -138,8 +134,7 @@ def _write_example(
 
     Return its numbers for attack.jsonl, where the dictionary "versions" is empty.
     """
-    problem = result.problem
-    scene = problem.scene
+    problem, scene = result.problem, result.problem.scene
     images = result.images_in_views_before[example], result.images_in_views[example]
     write_image(path.with_suffix(".png"), figure(result, example))
     adversary = Adversary.of(scene, example, after, *images)
@@ -200,9 +195,8 @@ def render_again(
         images["reload"] = adversary.render_views(rasterizer)
     if MITSUBA in renderers:
         encoding = adversary.settings.encoding
-        rgba = render_mitsuba_scene(
-            folder / MITSUBA / SCENE, len(adversary.cameras), adversary.settings.shape
-        )
+        shape = adversary.settings.shape
+        rgba = render_mitsuba_scene(folder / MITSUBA / SCENE, len(adversary.cameras), shape)
         # The fourth channel is the coverage of each pixel by the object.
         background = background_term(rgba[:, 3:], adversary.background, encoding)
         rendered = encode(clamp(rgba[:, :3] + background), encoding)
@@ -220,8 +214,7 @@ def figure(result: AttackResult, example: int) -> Image.Image:
     after. In the difference, unchanged values are gray, and the largest change
     of all views is black or white.
     """
-    before = result.images_in_views_before[example]
-    after = result.images_in_views[example]
+    before, after = result.images_in_views_before[example], result.images_in_views[example]
     drawn = [torch.stack([*map(result.drawn, images)]) for images in (before, after)]
     differences = after - before
     largest = differences.abs().amax((1, 2, 3)).tolist()
@@ -235,17 +228,14 @@ def figure(result: AttackResult, example: int) -> Image.Image:
         "adversarial": tiles_of(drawn[1], captions_after, SIDE),
         "difference": tiles_of((1 + scale * differences) / 2, captions, SIDE),
     }
-    lights = [
-        result.light(values, example) for values in (result.problem.start, result.minimum.values)
-    ]
-    (light_before, basis_before), (light_after, basis_after) = lights
+    light_before, basis_before = result.light(result.problem.start, example)
+    light_after, basis_after = result.light(result.minimum.values, example)
     if not torch.equal(light_before, light_after) or basis_before != basis_after:
         cameras = result.problem.scene.cameras[example]
-        for title, (light, basis) in zip(
-            ("initial light", "adversarial light"), lights, strict=True
-        ):
-            balls = [light_sphere(light, SIDE, camera, basis) for camera in cameras]
-            columns[title] = tiles_of(balls)
+        balls = [light_sphere(light_before, SIDE, camera, basis_before) for camera in cameras]
+        columns["initial light"] = tiles_of(balls)
+        balls = [light_sphere(light_after, SIDE, camera, basis_after) for camera in cameras]
+        columns["adversarial light"] = tiles_of(balls)
     return draw_grid(list(zip(*columns.values(), strict=True)), list(columns))
 
 
@@ -257,13 +247,13 @@ def _captions(
     The first line has the confidence and the name of the predicted class. If it is wrong, a second
     line has those of the true class.
     """
-    task, classes = result.classifier.task, result.classifier.classes
-    labels = result.criterion.source[example].tolist()
+    source = result.criterion.source[example]
+    of_label = result.classifier.task.confidences(evidence).gather(1, source[:, None])[:, 0]
     found = result.predictions(evidence, example)
     captions = []
-    columns = (task.confidences(evidence), found["predicted"], found["confidence"], labels)
-    for confidences, name, confidence, label in zip(*columns, strict=True):
+    columns = (found["predicted"], found["confidence"], source.tolist(), of_label.tolist())
+    for name, confidence, label, label_confidence in zip(*columns, strict=True):
         # A dictionary has each class once.
-        shown = {name: confidence} | {classes[label]: float(confidences[label])}
+        shown = {name: confidence, result.classifier.classes[label]: label_confidence}
         captions.append(tuple(f"{value:.1%} {text}" for text, value in shown.items()))
     return captions

@@ -24,7 +24,7 @@ from augment.attacks.objective import NOISE_DRAWS, Examples, Images, Objective, 
 from augment.attacks.optimizers import CMAES, Evaluation, Gradient, Optimizer, Problem, RandomSearch
 from augment.network import frozen_eval_mode
 from augment.progress import progress
-from augment.tasks.task import Rows
+from augment.scene.truth import Rows
 from renderer.errors import ShortRepr
 
 # Fields of a `Minimum` that belong to the returned candidate: the keys of `Evaluation.found`.
@@ -272,9 +272,7 @@ def evaluate(
             rendered = problem.render(part, examples[rows[group]])
         images.append(rendered.detach())
         chosen = objective.select(rows[group])
-        if objective.criterion.needs_truth:
-            truth = problem.truth(part.detach(), examples[rows[group]])
-            chosen = chosen if truth is None else chosen.at(truth)
+        chosen = chosen.moved(problem, part.detach(), examples[rows[group]])
         score, image_gradient = chosen.score(images[-1], needs_gradient)
         scores.append(score)
         if needs_gradient:

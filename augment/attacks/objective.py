@@ -15,20 +15,21 @@ import io
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from PIL import Image
 from torch import Tensor, nn
 
 from augment.network import BatchSize, Network, Quantization, eval_mode, straight_through
 from augment.progress import Phases
 from augment.random_streams import generator
-from augment.scene.truth import Truth
-from augment.tasks.task import Criterion, Rows
+from augment.scene.truth import Rows
+from augment.tasks.task import Criterion
 from renderer.image import clamp, to_bytes, to_unit
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ Values = Float[Tensor, "E D"]
 Examples = Int[Tensor, " E"]
 Images = Float[Tensor, "E V _ H W"]
 
+# Function that puts the rows of all views of examples one after the other.
+of_single_images = partial(torch.flatten, start_dim=0, end_dim=1)
 # Gradients below this number are not scaled before they enter the network.
 MIN_GRADIENT = 1e-30
 # Number of noisy versions of an image that `add_sensor_noise` yields. An attack counts as a success
@@ -108,8 +111,11 @@ class Objective:
         selected.criterion = self.criterion.select(examples)
         return selected
 
-    def at(self, truth: Truth) -> Objective:
-        """Return the objective for other positions of the objects."""
+    def moved(self, problem: Any, values: Values, examples: Examples) -> Objective:
+        """Return the objective for the positions that the objects have with some attack values."""
+        truth = problem.truth(values, examples) if self.criterion.needs_truth else None
+        if truth is None:
+            return self
         moved = copy(self)
         moved.criterion = self.criterion.at(truth)
         return moved
@@ -128,7 +134,7 @@ class Objective:
         Return also the gradients of the costs with respect to the images, if they are needed.
         """
         all_images = images.flatten(0, 1)
-        criterion = self.criterion.map(_of_single_images)
+        criterion = self.criterion.map(of_single_images)
         gradients = torch.empty_like(all_images) if needs_gradient else None
 
         def score_batch(rows: slice) -> Score:
@@ -219,7 +225,7 @@ class Objective:
     def evidence(self, images: Images) -> Float[Tensor, "E V K"]:
         """Compute the evidence of all views, batch by batch."""
         all_images = images.flatten(0, 1)
-        criterion = self.criterion.map(_of_single_images)
+        criterion = self.criterion.map(of_single_images)
 
         def compute(rows: slice) -> Tensor:
             return criterion.select(rows).evidence(self._outputs(all_images[rows]))
@@ -267,11 +273,6 @@ class Objective:
             # A view must be fooled in every draw of the noise.
             is_fooled[tested] &= criterion.reached_in_views(noisy_predicted)
         return is_fooled
-
-
-def _of_single_images(rows: Shaped[Tensor, "E V ..."]) -> Shaped[Tensor, "N ..."]:
-    """Return the rows of all views, one after the other."""
-    return rows.flatten(0, 1)
 
 
 def _image_gradient(
@@ -326,11 +327,9 @@ def average_transformed(
     The log-probabilities of each image and of its transformed copies are averaged. Gradients ignore
     the JPEG compression (straight-through estimator).
     """
-    log_probabilities = [logits.log_softmax(1)]
-    for _ in range(settings.draws):
-        transformed_logits = model(_transformed(images, settings, draws)).to(logits.dtype)
-        log_probabilities.append(transformed_logits.log_softmax(1))
-    return torch.stack(log_probabilities).mean(0)
+    transformed = (model(_transformed(images, settings, draws)) for _ in range(settings.draws))
+    versions = [logits, *(version.to(logits.dtype) for version in transformed)]
+    return torch.stack([version.log_softmax(1) for version in versions]).mean(0)
 
 
 def _transformed(

@@ -83,9 +83,8 @@ def sample(
     Values outside of the mask `used` are those of the center. None draws all values.
     """
     if settings.radius is None:
-        raise InputError(
-            "radius is None, but random values are drawn from the norm-ball: set radius"
-        )
+        reason = "radius is None, but random values are drawn from the norm-ball"
+        raise InputError(f"{reason}: set radius")
     is_used = None if used is None else used.cpu()
     if settings.norm == "linf":
         offset = 2 * torch.rand(center.shape, generator=draws) - 1
@@ -422,10 +421,8 @@ class CMAES(Optimizer):
         try:
             cma: Any = importlib.import_module("cma")
         except ImportError as error:
-            raise InputError(
-                'optimizer=cma_es needs cma: pip install "parametric-norm-balls[search]"',
-                "optimizer",
-            ) from error
+            advice = 'pip install "parametric-norm-balls[search]"'
+            raise InputError(f"optimizer=cma_es needs cma: {advice}", "optimizer") from error
         draws = np.random.default_rng(seed)
         value_count = self.values.shape[1]
         options = {

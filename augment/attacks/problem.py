@@ -43,8 +43,7 @@ class SceneProblem:
         self.scene = scene
         self.parameters = parameters
         self.group_size = scene.group_size
-        starts = [parameter.start.to(scene.lights) for parameter in parameters]
-        self.start = torch.cat(starts, dim=1)
+        self.start = torch.cat([each.start.to(scene.lights) for each in parameters], dim=1)
         self.all_examples = torch.arange(len(scene), device=self.start.device)
         self._value_counts = [parameter.start.shape[1] for parameter in parameters]
 
@@ -106,8 +105,7 @@ class SceneProblem:
         The values of each parameter are projected separately.
         """
         parts = self.split_by_parameter(values)
-        projected = [parameter.project(part, examples) for parameter, part in parts]
-        return torch.cat(projected, dim=1)
+        return torch.cat([parameter.project(part, examples) for parameter, part in parts], dim=1)
 
     def sample(self, generator: torch.Generator, reached: Values | None = None) -> Values:
         """Draw random feasible attack values for all examples.
@@ -139,12 +137,12 @@ def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
         # A copy of the scene would be rasterized again.
         if not torch.equal(physical, scene.lights):
             scene = scene.changed(lights=physical)
-    parameters = []
-    for name, steps in settings.parameters.items():
-        options = {}
-        if name in (Lighting.name, Skylight.name):
-            options["nonnegative"] = not settings.allow_negative
-        parameters.append(make_parameter(name, scene, steps, **options))
+    of_light = {"nonnegative": not settings.allow_negative}
+    options = {Lighting.name: of_light, Skylight.name: of_light}
+    parameters = [
+        make_parameter(name, scene, steps, **options.get(name, {}))
+        for name, steps in settings.parameters.items()
+    ]
     return SceneProblem(scene, parameters)
 
 
@@ -160,11 +158,9 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
     rows, basis = environment_light(given)  # Its rows in the coefficients of all lights.
     error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
     if error > MAX_IRRADIANCE_ERROR:
-        message = (
-            "the light has negative radiance, and after its removal the irradiance is off by "
-            f"{error:.0%} (rms) in {basis}: give a higher degree, "
-            "or set allow_negative=True to keep the light as it is"
-        )
+        reason = "the light has negative radiance, and after its removal the irradiance is off by"
+        advice = "give a higher degree, or set allow_negative=True to keep the light as it is"
+        message = f"{reason} {error:.0%} (rms) in {basis}: {advice}"
         warnings.warn(message, stacklevel=stacklevel)
 
 

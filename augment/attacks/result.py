@@ -243,11 +243,8 @@ class AttackResult(ShortRepr):
 
         example, view = self._shown_view(example, view)
         classes = self.classifier.classes
-        views = [
-            part[example, [view]]
-            for part in (self.evidence_in_views_before, self.evidence_in_views)
-        ]
-        evidence = torch.cat(views)
+        parts = (self.evidence_in_views_before, self.evidence_in_views)
+        evidence = torch.stack([part[example, view] for part in parts])
         before_title, after_title = self._titles(evidence, example, view)
         images = (self.images_in_views_before, self.images_in_views)
         before_image, after_image = (self.drawn(part[example, view]) for part in images)
@@ -286,19 +283,17 @@ class AttackResult(ShortRepr):
     def _shown_view(self, example: int | None, view: int | None) -> tuple[int, int]:
         """Return an example and a view, where None is replaced by what shows the attack best."""
         example_count, view_count = self.images_in_views.shape[:2]
-        if example is not None:
-            require_whole("example", example, 0, example_count - 1)
-        if view is not None:
-            require_whole("view", view, 0, view_count - 1)
         was_correct = self._is_found_before
         # 2 for views that the attack turned from correct to wrong, 1 for others that were correct.
         scores = was_correct * (1 + self.success_in_views.to(was_correct.device).int())
-        rows = slice(None) if example is None else example
-        columns = slice(None) if view is None else view
-        # Views that are not chosen from have a score of -1.
-        chosen = torch.full_like(scores, -1)
-        chosen[rows, columns] = scores[rows, columns]
-        return divmod(int(chosen.argmax()), view_count)
+        # The score of a given example or view is the highest.
+        if example is not None:
+            require_whole("example", example, 0, example_count - 1)
+            scores[example] += 3
+        if view is not None:
+            require_whole("view", view, 0, view_count - 1)
+            scores[:, view] += 3
+        return divmod(int(scores.argmax()), view_count)
 
     def save_animation(
         self, path: str | Path, example: int = 0, view: int = 0, frame_count: int = 20
@@ -353,30 +348,21 @@ class AttackResult(ShortRepr):
                 rendered = self.images_in_views[examples]
             images.append(self.drawn(rendered[0, view]))
             objective = self.objective().select(examples)
-            if self.criterion.needs_truth:
-                objective = objective.at(self.problem.truth(values[examples], examples))
+            objective = objective.moved(self.problem, values[examples], examples)
             evidence.append(objective.evidence(rendered)[0, view])
             light, basis = self.light(values, example)
             balls.append(light_sphere(light, SIDE, basis=basis))
         titles = self._titles(torch.stack(evidence), example, view)
-        shown = torch.stack(images)
-        height, width = shown.shape[-2:]
-        scale = MAX_SIDE / max(height, width)
+        shown = torch.stack(images).float()
+        scale = MAX_SIDE / max(shown.shape[-2:])
         if scale < 1:
-            shown = F.interpolate(
-                shown.float(),
-                (max(1, round(scale * height)), max(1, round(scale * width))),
-                mode="bilinear",
-                antialias=True,
-            )
-        tiles = tiles_of(shown.cpu().float(), [(title,) for title in titles], SIDE)
+            size = [max(1, round(scale * side)) for side in shown.shape[-2:]]
+            shown = F.interpolate(shown, size, mode="bilinear", antialias=True)
+        tiles = tiles_of(shown.cpu(), [(title,) for title in titles], SIDE)
         ball_tiles = tiles_of(balls, [("light",)] * frame_count, SIDE)
-        pairs = zip(tiles, ball_tiles, strict=True)
-        frames = [draw_grid([pair]) for pair in pairs]
+        frames = [draw_grid([pair]) for pair in zip(tiles, ball_tiles, strict=True)]
         # All frames get the same size, by empty space at the right and the bottom.
-        width, height = (
-            max(sizes) for sizes in zip(*(frame.size for frame in frames), strict=True)
-        )
+        width, height = np.max([frame.size for frame in frames], axis=0).tolist()
         first, *others = (
             ImageOps.expand(frame, (0, 0, width - frame.width, height - frame.height), PAPER)
             for frame in frames

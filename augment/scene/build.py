@@ -22,15 +22,9 @@ from torch import Tensor
 from augment.attack_settings import AttackSettings, MaterialSettings
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 from augment.progress import progress
+from augment.scene import objects as placed
 from augment.scene.exposure import expose
-from augment.scene.objects import (
-    ROUGHNESS,
-    SceneObject,
-    add_table,
-    initial_materials,
-    load_object,
-    name_mesh,
-)
+from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from augment.settings import (
     AUTO,
@@ -152,8 +146,7 @@ def build_scene(
     given_cameras = _as_cameras(cameras, views, normalize)
     views = len(given_cameras) or views
     image = ImageSettings(size)
-    unknown = sorted(options.keys() - SCENE_OPTIONS - RENDERER_OPTIONS)
-    if unknown:
+    if unknown := sorted(options.keys() - SCENE_OPTIONS - RENDERER_OPTIONS):
         choices = ", ".join(sorted(SCENE_OPTIONS | RENDERER_OPTIONS))
         raise InputError(f"{unknown[0]} is no option of build_scene: choose from {choices}")
     scene_options = {name: options[name] for name in options.keys() & SCENE_OPTIONS}
@@ -169,9 +162,8 @@ def build_scene(
     if isinstance(environment, str | Path):
         material = attack.material if attack else None
         smoothest = reached_gloss(objects, material, vary.gloss if vary else None)
-        degree = degree_of_scene(
-            smoothest, settings.degree, views * len(objects) * image.pixel_count
-        )
+        pixels = views * len(objects) * image.pixel_count
+        degree = degree_of_scene(smoothest, settings.degree, pixels)
         environment = load_light(environment, degree, smoothest.gloss_roughness)
         _warn_of_wrong_irradiance(settings.light, environment, degree)
         if settings.degree is None:
@@ -183,10 +175,10 @@ def build_scene(
         errors.require_bounded(light=environment)
     basis, lights = _build_lights(settings, environment, degree)
     rasterizer = renderer_settings.rasterizer
+    orbit = settings.width, settings.polar, settings.azimuth, settings.fov
     built = Scene.grid(
         objects,
-        given_cameras
-        or orbit_cameras(views, settings.width, settings.polar, settings.azimuth, settings.fov),
+        given_cameras or orbit_cameras(views, *orbit),
         load_backgrounds(settings.backgrounds, size),
         lights.to(errors.as_device(device)),
         renderer_settings.image(size),
@@ -215,11 +207,12 @@ def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
         parts = [_as_object(f"{name}[{part}]", item) for part, item in given]
         (first, label), *others = parts or [_as_object(name, member)]
         together = replace(first, others=[*first.others, *(other for other, _ in others)])
-        item = load_object(together, settings.vertices)
+        item = placed.load_object(together, settings.vertices)
         # An index remains a number, because a class may have this number as its name.
         labels = [*item.labels[1 : 1 + len(first.others)], *(label for _, label in others)]
         pairs = [(of, mesh) for of, (_, mesh) in zip(labels, item.others, strict=True)]
-        objects.append(add_table(replace(item, label=label, others=pairs), settings.ground))
+        item = replace(item, label=label, others=pairs)
+        objects.append(placed.add_table(item, settings.ground))
     return objects
 
 
@@ -238,7 +231,7 @@ def _as_object(name: str, given: Any) -> tuple[ObjectSettings, str | int]:
         errors.require_kind(f"{name}: its label", label, str, expected)
     if not isinstance(mesh, str | Path):
         require_mesh(name, mesh)
-        mesh = name_mesh(mesh)
+        mesh = placed.name_mesh(mesh)
     return ObjectSettings(str(mesh)), label if isinstance(label, str) else int(label)
 
 
@@ -370,9 +363,9 @@ def reached_gloss(
     """
     candidates = [Smoothest(MATTE, "")]
     for item in objects:
+        reached = _reached_roughness(item, material, layer)
         candidates.append(Smoothest(smallest_roughness(item.mesh), item.name))
-        reached_roughness = _reached_roughness(item, material, layer)
-        candidates.append(Smoothest(reached_roughness, item.name, "can reach"))
+        candidates.append(Smoothest(reached, item.name, "can reach"))
     return min(candidates, key=lambda smoothest: smoothest.roughness)
 
 
@@ -385,14 +378,12 @@ def _reached_roughness(
     """
     if layer is not None and not any(layer.specular_factor):
         layer = None
-    is_attacked = material is not None and any(
-        (material.roughness, material.metallic, material.specular_factor)
-    )
-    if layer is None and not is_attacked:
+    parts = (material.roughness, material.metallic, material.specular_factor) if material else ()
+    if layer is None and not any(parts):
         return MATTE
-    materials = initial_materials(item)
+    materials = placed.initial_materials(item)
     # Roughness of each face of the object itself.
-    roughness = materials.face_gloss[materials.object_mask, ROUGHNESS]
+    roughness = materials.face_gloss[materials.object_mask, placed.ROUGHNESS]
     if layer is not None:
         roughness = torch.full_like(roughness, layer.roughness[0])
     if material is not None and material.roughness:
@@ -435,11 +426,9 @@ def _warn_of_wrong_irradiance(name: str, light: Tensor, degree: int) -> None:
         return
     error = float(irradiance_error(light, load_light(name, REFERENCE_DEGREE)))
     if error > MAX_IRRADIANCE_ERROR:
-        warnings.warn(
-            f"light {name} of degree={degree} has an irradiance that is off by {error:.0%} (rms "
-            "over normals), and attacks of it have the same degree: give a higher degree",
-            stacklevel=3,
-        )
+        reason = f"has an irradiance that is off by {error:.0%} (rms over normals)"
+        advice = "and attacks of it have the same degree: give a higher degree"
+        warnings.warn(f"light {name} of degree={degree} {reason}, {advice}", stacklevel=3)
 
 
 def with_needed_degree(

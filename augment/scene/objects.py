@@ -92,9 +92,8 @@ class SceneObject:
 
         The other faces belong to other objects or to a table.
         """
-        face_count = len(self.mesh.faces)
-        own_count = face_count if self.own is None else self.own
-        return np.arange(face_count) < own_count
+        count = len(self.mesh.faces)
+        return np.arange(count) < (count if self.own is None else self.own)
 
     @property
     def labels(self) -> list[str | int]:
@@ -192,8 +191,8 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
     others = [_load_other(other) for other in item.others]
     # Smallest and largest y of all objects with a position. The first may turn about the origin.
     spans = [_span_of_y(mesh) for mesh, given in zip(others, item.others, strict=True) if given.at]
-    left = min(-loaded.radius, *(low for low, _ in spans), 0)
-    right = max(loaded.radius, *(high for _, high in spans), 0)
+    ends = np.array([-loaded.radius, loaded.radius, *(end for span in spans for end in span)])
+    left, right = ends.min(), ends.max()
     for index, given in enumerate(item.others):
         if given.at is None:
             low, high = _span_of_y(others[index])
@@ -270,9 +269,7 @@ def with_own_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
 
 def _turn(azimuth: float) -> Float[np.ndarray, "3 3"]:
     """Return the matrix of a rotation about the vertical, by an angle in degrees."""
-    angle = math.radians(azimuth)
-    cosine = math.cos(angle)
-    sine = math.sin(angle)
+    cosine, sine = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
@@ -309,10 +306,10 @@ def _load(item: MeshSettings) -> Mesh:
 
         mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
     has_colors = bool(mesh.textures) or bool((mesh.corner_colors != 1).any())
-    if item.color is not None and has_colors:
-        advice = "remove color, and set albedo_scale to make them brighter or darker"
-        raise InputError(f"color is set, but {item.mesh} has its own colors: {advice}")
     if item.color is not None:
+        if has_colors:
+            advice = "remove color, and set albedo_scale to make them brighter or darker"
+            raise InputError(f"color is set, but {item.mesh} has its own colors: {advice}")
         colored = Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
         mesh = replace(colored, gloss=mesh.gloss)
     if item.gloss not in (None, "file"):
@@ -446,10 +443,8 @@ class Conditions(ShortRepr):
             mesh: Mesh of the example. Entries of vertices and faces are cut to the numbers of
                 its vertices and faces.
         """
+        rows = {name: field[index] for name, field in vars(self).items() if field is not None}
         counts = {"vertices": len(mesh.vertices)} | dict.fromkeys(OF_FACES, len(mesh.faces))
-        rows = {
-            name: values[index][: counts[name]] if name in counts else values[index]
-            for name, values in vars(self).items()
-            if values is not None
-        }
+        for name in rows.keys() & counts:
+            rows[name] = rows[name][: counts[name]]
         return Conditions(**rows)

@@ -144,8 +144,7 @@ class OperatorRenderer:
             built = self._built[index]
             row_indices = torch.nonzero(row_to_stack == index).squeeze(1)
             rows: Rows = row_indices.to(light.device, non_blocking=True)
-            first = int(row_indices[0])
-            end = int(row_indices[-1]) + 1
+            first, end = int(row_indices[0]), int(row_indices[-1]) + 1
             if end - first == len(row_indices):
                 # Consecutive rows are a slice, which is faster.
                 rows = slice(first, end)
@@ -159,19 +158,16 @@ class OperatorRenderer:
     def _build_missing(self, indices: Iterable[int]) -> None:
         """Build the stacks of transfer operators with the given indices that do not exist yet."""
         missing = [index for index in indices if index not in self._built]
-        if not missing:
-            return
-        for index in progress(missing, "rendering views"):
-            built = self._build_stack(index)
-            self._built[index] = built
+        for index in progress(missing, "rendering views") if missing else ():
+            built = self._built[index] = self._build_stack(index)
             if len(self._built) == 1:
                 # All other stacks must fit in memory, if each is as large as the first one.
                 tensors = (built.operators.transfer, built.operators.albedo, built.background_terms)
                 stack_bytes = sum(tensor.nbytes for tensor in tensors)
                 needed = (self._stack_count - 1) * stack_bytes + self.attack_bytes
-                view_count = len(self._views_of_operators)
                 height, width = self.settings.shape
-                name = f"{view_count} views of {height} × {width} pixels (views)"
+                count = len(self._views_of_operators)
+                name = f"{count} views of {height} × {width} pixels (views)"
                 require_memory(name, needed, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> _BuiltStack:
@@ -188,12 +184,10 @@ class OperatorRenderer:
         # Index of the operator of each of these images in the stack, shape (M,).
         operator_of_image = (self._operator_of_image[is_in_stack] - first_operator).cpu()
         stack = OperatorStack(operators, operator_of_image, self.backgrounds.device)
-        background_pixels = self.backgrounds.index_select(2, stack.pixels)
-        background_terms = background_term(
-            stack.coverage[stack.shown],
-            background_pixels[self.image_to_background[is_in_stack]],
-            self.settings.encoding,
-        )
+        backgrounds = self.backgrounds.index_select(2, stack.pixels)
+        backgrounds = backgrounds[self.image_to_background[is_in_stack]]
+        coverage = stack.coverage[stack.shown]
+        background_terms = background_term(coverage, backgrounds, self.settings.encoding)
         # Number the images of the stack in their order: 0 for the first True of the mask, and so
         # on.
         image_to_stack_image = is_in_stack.cumsum(0) - 1
@@ -341,13 +335,12 @@ class DirectRenderer:
         Return the S samples that the camera sees, and the albedo at the samples, shape (S, 3).
         """
         key = (object_index, camera)
-        if key in self._views:
-            return self._views[key]
-        view = self._rasterize(object_index, camera, self.objects[object_index].mesh.vertices)
-        if not self.cached:
-            self._views.clear()
-        self._views[key] = view
-        return view
+        if key not in self._views:
+            if not self.cached:
+                self._views.clear()
+            vertices = self.objects[object_index].mesh.vertices
+            self._views[key] = self._rasterize(object_index, camera, vertices)
+        return self._views[key]
 
     def local_view(self, object_index: int, camera: Camera) -> LocalLightView:
         """Prepare a view of an unmoved object for the light of projector and lamps.
@@ -370,18 +363,8 @@ class DirectRenderer:
         Return also the fraction of each object that nothing hides. It is 0 outside of the view.
         `vertices` None are those of the unmoved objects.
         """
-        key = (object_index, camera)
         item = self.objects[object_index]
-        positions = item.mesh.vertices
-        if vertices is not None:
-            positions = vertices.detach().cpu().double().numpy()
-
-        def fragments_of(faces: Int[np.ndarray, "F 3"]) -> Fragments:
-            shown = (positions, faces, [camera], self.settings, self.rasterizer)
-            return build_fragments(*shown)[0]
-
-        seen = fragments_of(item.mesh.faces) if vertices is not None else self.view(*key)[0]
-        seen = seen.to("cpu")
+        mesh, seen = self._seen(object_index, camera, vertices)
         # Index of the object that each sample shows. The table comes after the objects.
         owner_of_face = np.searchsorted(item.ends, seen.faces.numpy(), side="right")
         owner = torch.from_numpy(owner_of_face)[seen.sample_to_seen_face]
@@ -391,15 +374,14 @@ class DirectRenderer:
         counts = torch.bincount(keys, minlength=(owner_count + 1) * pixel_count)
         counts = counts.view(-1, *self.settings.shape)[:owner_count]
         own_counts = counts.sum((1, 2))
+        visible = (own_counts > 0).float()
         if item.own is not None:
-            starts = [0, *item.ends[:-1]]
-            alone = [
-                len(fragments_of(item.mesh.faces[start:end]).sample_numbers)
-                for start, end in zip(starts, item.ends, strict=True)
-            ]
-            visible = own_counts / torch.tensor(alone).clamp(min=1)
-        else:
-            visible = (own_counts > 0).float()
+            ends = zip([0, *item.ends[:-1]], item.ends, strict=True)
+            parts = [mesh.faces[start:end] for start, end in ends]
+            shown = [camera], self.settings, self.rasterizer
+            alone = [build_fragments(mesh.vertices, faces, *shown)[0] for faces in parts]
+            counts_alone = torch.tensor([len(each.sample_numbers) for each in alone])
+            visible = own_counts / counts_alone.clamp(min=1)
         return counts >= COVERED * self.settings.samples**2, visible
 
     def surface_maps(
@@ -410,13 +392,7 @@ class DirectRenderer:
         The depth is the distance from the camera along the viewing direction in world units, and
         normals are along the axes right, up and back of the camera. Both are 0 in other pixels.
         """
-        mesh = self.objects[object_index].mesh
-        if vertices is None:
-            fragments, _ = self.view(object_index, camera)
-        else:
-            mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
-            fragments, _ = self._rasterize(object_index, camera, mesh.vertices)
-        fragments = fragments.to("cpu")
+        mesh, fragments = self._seen(object_index, camera, vertices)
         pose = torch.from_numpy(camera.pose())
         from_camera = pose[:3, 3] - torch.from_numpy(mesh.vertices)[fragments.corners]
         depths = fragments.interpolate((from_camera @ pose[:3, 2])[:, :, None])[:, 0]
@@ -426,11 +402,10 @@ class DirectRenderer:
         numbers = torch.arange(len(pixel)).masked_fill(depths > depth[pixel], len(pixel))
         nearest = torch.full((count,), len(pixel)).scatter_reduce_(0, pixel, numbers, "amin")
         seen_face = fragments.sample_to_seen_face[nearest]
-        if self.settings.normals == "smooth":
-            corner_normals = torch.from_numpy(mesh.corner_normals)
-        else:
-            corner_normals = torch.from_numpy(mesh.face_normals())[:, None]
-        corner_normals = corner_normals[fragments.faces[seen_face]] @ pose[:3, :3]
+        is_smooth = self.settings.normals == "smooth"
+        in_world = mesh.corner_normals if is_smooth else mesh.face_normals()[:, None]
+        faces = fragments.faces[seen_face]
+        corner_normals = torch.from_numpy(in_world)[faces] @ pose[:3, :3]
         normals = (fragments.barycentric[nearest][:, :, None] * corner_normals).sum(1)
         normals = normalize(normals, dim=1) * fragments.facing[seen_face]
         at_pixels = torch.cat([depth[None], normals.T])
@@ -439,6 +414,16 @@ class DirectRenderer:
         maps[:, fragments.pixels[is_covered]] = at_pixels[:, is_covered].float()
         maps = maps.unflatten(1, fragments.shape)
         return maps[0], maps[1:]
+
+    def _seen(
+        self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"] | None
+    ) -> tuple[Mesh, Fragments]:
+        """Return the mesh of an object with other vertices, if given, and what a camera sees."""
+        mesh = self.objects[object_index].mesh
+        if vertices is None:
+            return mesh, self.view(object_index, camera)[0].to("cpu")
+        mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
+        return mesh, self._rasterize(object_index, camera, mesh.vertices)[0].to("cpu")
 
     def radiance(
         self,
@@ -457,15 +442,13 @@ class DirectRenderer:
         """
         item = self.objects[object_index]
         fixed_camera = camera.fixed()
-        is_moved = changed.vertices is not None
-        # `vertices` is a tensor, which may have a gradient. `positions` is the same as an array.
-        if changed.vertices is None:
-            vertices = self.vertices[object_index]
+        # `moved` is a tensor, which may have a gradient. `positions` is the same as an array.
+        moved = changed.vertices
+        if moved is None:
             positions = item.mesh.vertices
             fragments, albedo = self.view(object_index, fixed_camera)
         else:
-            vertices = changed.vertices
-            positions = vertices.detach().cpu().double().numpy()
+            positions = moved.detach().cpu().double().numpy()
             fragments, albedo = self._rasterize(object_index, fixed_camera, positions)
         if changed.albedo is not None:
             of_view = (item.mesh, fragments, self.settings.encoding, item.albedo_scale)
@@ -477,12 +460,11 @@ class DirectRenderer:
         # Projector and lamps need rays for their shadows. For an unmoved object with its own
         # gloss, the view is prepared once.
         lamp_view = None
-        if split.local_lights and not is_moved and gloss is None:
+        if split.local_lights and moved is None and gloss is None:
             lamp_view = self.local_view(object_index, fixed_camera)
         elif split.local_lights:
             moved_mesh = replace(item.mesh, vertices=positions)
-            rays = Rays(moved_mesh) if is_moved else self._rays_among(object_index)
-            moved = vertices if is_moved else None
+            rays = self._rays_among(object_index) if moved is None else Rays(moved_mesh)
             lamp_view = LocalLightView(rays, item.mesh, fragments, self.settings, moved, gloss)
         indirect = None
         if self.settings.global_illumination:
@@ -491,16 +473,16 @@ class DirectRenderer:
             # are not kept. `fixed` returns the same camera if no field is a tensor.
             indirect = partial(self._indirect_radiance, *view, camera is fixed_camera)
         corner_normals = None
-        if not is_moved and self.settings.normals == "smooth":
+        if moved is None and self.settings.normals == "smooth":
             corner_normals = torch.from_numpy(item.mesh.corner_normals).to(self.like.device)
         shown = ShadedView(
             mesh=item.mesh,
             fragments=fragments,
             settings=self.settings,
-            vertices=vertices,
+            vertices=self.vertices[object_index] if moved is None else moved,
             albedo=albedo,
             light=split,
-            is_moved=is_moved,
+            is_moved=moved is not None,
             gloss=gloss,
             corner_normals=corner_normals,
             lamp_view=lamp_view,

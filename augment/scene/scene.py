@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from inspect import signature
-from itertools import product
+from itertools import cycle, islice, product
 from typing import Any
 
 import torch
@@ -151,6 +151,7 @@ class Scene:
         height, width = settings.shape
         count = f"{len(self) * self.views} renders of {height} × {width} pixels"
         errors.require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
+        built_with: dict[str, Any] = {"rasterizer": rasterizer, "basis": basis}
         self._operator_renderer = OperatorRenderer(
             self.objects,
             [(item.object, camera) for item in self.examples for camera in item.cameras],
@@ -158,13 +159,7 @@ class Scene:
             self.backgrounds.flatten(2),
             settings,
             # `build` must not refer to `self`. Python frees objects with circular references late.
-            build=partial(
-                build_operators,
-                settings=settings,
-                rasterizer=rasterizer,
-                basis=basis,
-                dtype=lights.dtype,
-            ),
+            partial(build_operators, settings=settings, dtype=lights.dtype, **built_with),
             attack_bytes=self.attack_bytes,
         )
         self._direct_renderer = DirectRenderer(
@@ -179,19 +174,17 @@ class Scene:
             raise InputError("examples is empty: give a mesh, a view and a background")
         highest = max(example.object for example in examples)
         if highest >= len(self.objects):
-            raise InputError(
-                f"objects has {len(self.objects)} objects, but an example refers to index "
-                f"{highest}: give an object for each index"
-            )
+            reason = f"objects has {len(self.objects)} objects"
+            advice = "give an object for each index"
+            raise InputError(f"{reason}, but an example refers to index {highest}: {advice}")
         errors.require_bounded(lights=lights)
         errors.require_shape("lights", lights, "...", self.basis.size, 3)
         shape = self.settings.shape
         is_image = backgrounds.shape[1:] in ((1, *shape), (3, *shape))
         if not (is_image and backgrounds.min() >= 0 and backgrounds.max() <= 1):
-            raise InputError(
-                f"backgrounds has shape {tuple(backgrounds.shape)}, or values outside of [0, 1]: "
-                f"give images of shape (count, 3, {shape[0]}, {shape[1]}) with values in [0, 1]"
-            )
+            given = f"shape {tuple(backgrounds.shape)}, or values outside of [0, 1]"
+            advice = f"give images (count, 3, {shape[0]}, {shape[1]}) with values in [0, 1]"
+            raise InputError(f"backgrounds has {given}: {advice}")
 
     @classmethod
     def grid(
@@ -250,7 +243,7 @@ class Scene:
         rows: list[int] = []
         for index, own in enumerate(of_object):
             share = count // len(of_object) + (index < count % len(of_object))
-            rows += [own[number % len(own)] for number in range(share)]
+            rows += islice(cycle(own), share)
         if rows == [*range(len(self))]:
             return self
         return self.changed(examples=[self.examples[row] for row in rows], lights=self.lights[rows])
@@ -405,17 +398,14 @@ class Scene:
             labels[row, :, :count] = torch.tensor([index_of(item.labels[i]) for i in kept[row]])
             for view, camera in enumerate(self.cameras_under(conditions, row, example)):
                 found = self._direct_renderer.masks(index, camera.fixed(), vertices)
-                masks[row, view, :count], visible[row, view, :count] = (
-                    part[kept[row]] for part in found
-                )
+                mask, fraction = (part[kept[row]] for part in found)
+                masks[row, view, :count], visible[row, view, :count] = mask, fraction
         is_hidden = (labels != NO_OBJECT) & (visible < LEAST_VISIBLE)
         if is_hidden.any():
             row, _, kept_index = is_hidden.nonzero()[0].tolist()
-            say_once(
-                f"objects are left out of the truth of views that show less than "
-                f"{LEAST_VISIBLE:.0%} of them, such as object {kept[row][kept_index]} of "
-                f"{items[row].name}"
-            )
+            reason = f"views that show less than {LEAST_VISIBLE:.0%} of them"
+            hidden = f"object {kept[row][kept_index]} of {items[row].name}"
+            say_once(f"objects are left out of the truth of {reason}, such as {hidden}")
         labels[is_hidden] = NO_OBJECT
         masks[is_hidden] = False
         truth = (labels, boxes_of(masks), masks, visible)
@@ -447,11 +437,10 @@ class Scene:
         errors.require_shape("examples", indices, "count" if count is None else count)
         if indices.device.type != "cpu" or not len(indices):
             return indices.to(self.lights.device)
-        if int(indices.min()) < 0 or int(indices.max()) >= len(self):
-            raise InputError(
-                f"examples has indices from {int(indices.min())} to {int(indices.max())}: "
-                f"give indices from 0 to {len(self) - 1}"
-            )
+        low, high = (int(end) for end in indices.aminmax())
+        if low < 0 or high >= len(self):
+            advice = f"give indices from 0 to {len(self) - 1}"
+            raise InputError(f"examples has indices from {low} to {high}: {advice}")
         return indices.to(self.lights.device)
 
     def layers(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Iterator[Layer]:
@@ -508,11 +497,11 @@ class Scene:
             for image in batch_images[rows].tolist():
                 row, view = divmod(image, self.views)
                 example = self.examples[int(examples[row])]
-                view_key = (example.object, example.cameras[view])
-                fragments, albedo = self._direct_renderer.view(*view_key)
-                radiance = self._direct_renderer.local_view(*view_key).radiance(
-                    lamps, albedo, light[row, lamp_rows], positions[row]
-                )
+                shown = (example.object, example.cameras[view])
+                fragments, albedo = self._direct_renderer.view(*shown)
+                local = self._direct_renderer.local_view(*shown)
+                lit = (albedo, light[row, lamp_rows], positions[row])
+                radiance = local.radiance(lamps, *lit)
                 # Positions of the pixels that the object covers in the sorted list `pixels`.
                 covered = torch.searchsorted(pixels, fragments.pixels)
                 canvas = radiance.new_zeros(3, len(pixels))

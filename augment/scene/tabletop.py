@@ -255,20 +255,6 @@ def project_along_light(
     pattern lights it. The coordinates are 0 on the ray through the origin, and their unit is half
     of the width that the camera sees. `towards` is the unit vector towards the projector.
     """
-    points = _find_shown_points(room, mesh, camera, image)
-    # Horizontal direction perpendicular to the rays of the projector. If these are vertical, the
-    # small number keeps the vector from being zero.
-    right = torch.stack([-towards[1], towards[0] + 1e-9, towards.new_zeros(())])
-    right = F.normalize(right, dim=0)
-    axes = torch.stack([right, torch.linalg.cross(towards, right)])
-    coordinates = points @ axes.T / (camera.width / 2)
-    return coordinates.T.unflatten(1, image.shape)
-
-
-def _find_shown_points(
-    room: Room, mesh: Mesh, camera: Camera, image: ImageSettings
-) -> Float[Tensor, "P 3"]:
-    """Find the points of an object, a table or a wall that the centers of the pixels show."""
     # Points of table or wall that the pixels would show without the object, shape (P, 3).
     centers = replace(image, samples=1)
     points = _find_seen_points(camera, centers, room, image.shape).points[0]
@@ -286,7 +272,13 @@ def _find_shown_points(
     height = ((first - starts[mesh_pixels]) * face_normals).sum(1)
     length = height / (forward[mesh_pixels] * face_normals).sum(1)
     points[mesh_pixels] = starts[mesh_pixels] + length[:, None] * forward[mesh_pixels]
-    return points
+    # Horizontal direction perpendicular to the rays of the projector. If these are vertical, the
+    # small number keeps the vector from being zero.
+    right = torch.stack([-towards[1], towards[0] + 1e-9, towards.new_zeros(())])
+    right = F.normalize(right, dim=0)
+    axes = torch.stack([right, torch.linalg.cross(towards, right)])
+    coordinates = points @ axes.T / (camera.width / 2)
+    return coordinates.T.unflatten(1, image.shape)
 
 
 def _passes_near_origin(
@@ -371,25 +363,20 @@ def _sample_positions(
     """
     # Distances of the rows down, and of the columns to the right, from the center of the image in
     # world units.
+    counts = [side * image.samples for side in image.shape]
+    extents = camera.width * relative_height, camera.width
     down, right = (
         ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * extent
-        for count, extent in zip(
-            (side * image.samples for side in image.shape),
-            (camera.width * relative_height, camera.width),
-            strict=True,
-        )
+        for count, extent in zip(counts, extents, strict=True)
     )
     # Measure from the principal point, which may be off the center of the image.
     half_width = camera.width / 2
-    up_of_rows = (-down - camera.principal_up * half_width) / camera.pixel_aspect
-    right_of_columns = right - camera.principal_right * half_width
-    up, right = torch.meshgrid(
-        up_of_rows - camera.up, right_of_columns - camera.right, indexing="ij"
-    )
+    rows = (-down - camera.principal_up * half_width) / camera.pixel_aspect - camera.up
+    columns = right - camera.principal_right * half_width - camera.right
+    samples = torch.stack(torch.meshgrid(columns, rows, indexing="xy"))
     # Split rows and columns of samples: (2, pixel row, sample row, pixel column, sample column).
     height, width = image.shape
-    split = (height, image.samples, width, image.samples)
-    by_pixel = torch.stack([right, up]).view(2, *split)
+    by_pixel = samples.view(2, height, image.samples, width, image.samples)
     # Bring the two axes of samples to the front, and join each pair of axes.
     right, up = by_pixel.permute(0, 2, 4, 1, 3).reshape(2, image.samples**2, -1, 1)
     return right, up

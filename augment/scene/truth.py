@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,7 +19,28 @@ LEAST_VISIBLE = 0.1
 
 
 @dataclass(frozen=True)
-class Truth:
+class Rows:
+    """Base of data classes whose tensors have one row for each example."""
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """Return a copy with changed tensors."""
+        tensors = {name: item for name, item in vars(self).items() if isinstance(item, Tensor)}
+        changed = {name: change(tensor) for name, tensor in tensors.items()}
+        return replace(self, **changed)
+
+    def select(self, rows: Tensor | slice) -> Self:
+        """Return some of the rows."""
+        return self.map(lambda tensor: tensor[rows])
+
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        """Return the rows of several parts, one after the other."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return cls(*map(torch.cat, columns))
+
+
+@dataclass(frozen=True)
+class Truth(Rows):
     """Labels, boxes and masks of the O objects in each of the V views of E examples.
 
     The first object of an example is the one that an attack is about. Sizes are in pixels, and the
@@ -37,15 +59,6 @@ class Truth:
     boxes: Float[Tensor, "E V O 4"]
     masks: Bool[Tensor, "E V O H W"]
     visible: Float[Tensor, "E V O"]
-
-    @classmethod
-    def join(cls, parts: Sequence[Truth]) -> Truth:
-        """Return the examples of several parts, one after the other."""
-        return cls(*map(torch.cat, zip(*(vars(part).values() for part in parts), strict=True)))
-
-    def select(self, examples: Int[Tensor, " A"]) -> Truth:
-        """Return the truth of some examples."""
-        return Truth(*(part[examples] for part in vars(self).values()))
 
     @property
     def is_shown(self) -> Bool[Tensor, "E V O"]:

@@ -79,23 +79,20 @@ class _Variation:
 
     def change_geometry(self, once: bool) -> Scene:
         """Return a copy of the scene with random cameras, backgrounds and objects (see `vary`)."""
-        scene = self.scene
-        settings = self.settings
+        scene, settings = self.scene, self.settings
         examples = self._draw_cameras()
         # Arguments of `Scene` that differ in the copy.
         changed: dict[str, Any] = {}
         if settings.backgrounds is not None:
-            changed["backgrounds"] = _draw_image_files(
-                settings.backgrounds, "backgrounds", len(scene), scene.settings.size, self.draws
-            )
+            files = settings.backgrounds, "backgrounds", len(scene), scene.settings.size
+            changed["backgrounds"] = _draw_image_files(*files, self.draws)
             examples = _number_backgrounds(examples)
         if settings.instances or settings.rotation or any(settings.gloss.specular_factor):
             # Examples of the same object and the same cameras get the same random object. They
             # differ in their backgrounds only.
             pairs = [(example.object, example.cameras) for example in scene.examples]
-            different_pairs = dict.fromkeys(pairs)
-            pair_to_new_object = {pair: index for index, pair in enumerate(different_pairs)}
-            objects = [scene.objects[object_index] for object_index, _ in different_pairs]
+            pair_to_new_object = {pair: index for index, pair in enumerate(dict.fromkeys(pairs))}
+            objects = [scene.objects[object_index] for object_index, _ in pair_to_new_object]
             changed["objects"] = self._draw_objects(objects)
             examples = [
                 replace(example, object=pair_to_new_object[pair])
@@ -113,15 +110,12 @@ class _Variation:
         All cameras of one example get the same changes.
         """
         settings = self.settings
-        count = len(self.scene)
         shifts = self._draw_pairs(settings.shift)
         scales = self._draw_log_uniform(settings.scale)
         angles = self._draw_pairs(settings.azimuth)
-        fovs = [0.0] * count
+        fovs = [0.0] * len(shifts)
         if any(settings.fov):
-            low, high = settings.fov
-            fractions = torch.rand(count, generator=self.draws, dtype=torch.float64)
-            fovs = (low + (high - low) * fractions).tolist()
+            fovs = self._draw_uniform(*settings.fov).tolist()
         changes = zip(shifts, scales, angles, fovs, self.is_on_table.tolist(), strict=True)
         return [
             replace(example, cameras=tuple(_move(camera, *change) for camera in example.cameras))
@@ -133,8 +127,7 @@ class _Variation:
 
         A random shape is possible for generated solids only: another orange, for example.
         """
-        settings = self.settings
-        count = len(objects)
+        settings, count = self.settings, len(objects)
         if settings.instances:
             seeds = torch.randint(2**31, (count,), generator=self.draws).tolist()
             pairs = progress(zip(objects, seeds, strict=True), "new instances", count)
@@ -158,8 +151,7 @@ class _Variation:
 
     def change_lighting(self) -> Scene:
         """Return a copy of the scene with random lighting and random effects of the camera."""
-        scene = self.scene
-        settings = self.settings
+        scene, settings = self.scene, self.settings
         exposures = self._draw_log_uniform(settings.exposure)
         examples = [
             replace(example, exposure=example.exposure * factor)
@@ -184,16 +176,13 @@ class _Variation:
         pattern_points = None
         if albedo is not None:
             lit = replace(self, scene=scene.changed(examples=examples, lights=lights))
-            changed["backgrounds"], pattern_points = lit._light_backgrounds(
-                albedo, environment, directions
-            )
+            backgrounds = lit._light_backgrounds(albedo, environment, directions)
+            changed["backgrounds"], pattern_points = backgrounds
             # Each example now has a background of its own.
             examples = _number_backgrounds(examples)
         if settings.camera != CameraEffectSettings():
-            device = scene.lights.device
-            changed["camera_effects"] = draw_camera_effects(
-                settings.camera, len(scene), scene.settings, self.draws, device, pattern_points
-            )
+            drawn = len(scene), scene.settings, self.draws, scene.lights.device, pattern_points
+            changed["camera_effects"] = draw_camera_effects(settings.camera, *drawn)
         return scene.changed(examples=examples, **changed)
 
     def _draw_lights(self) -> tuple[Float[Tensor, "E K 3"], Float[Tensor, "E 3"]]:
@@ -203,9 +192,7 @@ class _Variation:
         directions differ from that of the camera by at most `MAX_LIGHT_ANGLE` in polar angle and
         in azimuth.
         """
-        scene = self.scene
-        settings = self.settings
-        count = len(scene)
+        scene, settings, count = self.scene, self.settings, len(self.scene)
         harmonics = harmonics_of(scene.basis)
         environment = scene.lights[:, : harmonics.size]
         if settings.environments:
@@ -254,10 +241,8 @@ class _Variation:
         """
         scene = self.scene
         # If backgrounds are not lit, an irradiance of 1 leaves the albedo as it is.
-        background_irradiance = albedo.new_ones(3, 1, 1)
-        if self.settings.lit_background:
-            background_irradiance = _facing_irradiance(scene)
-        linear = albedo * background_irradiance
+        is_lit = self.settings.lit_background
+        linear = albedo * (_facing_irradiance(scene) if is_lit else albedo.new_ones(3, 1, 1))
         pattern_points = None
         if self.settings.tables:
             # Without a table, the pattern fills the image.
@@ -269,17 +254,39 @@ class _Variation:
             for object_index, rows in groups:
                 rays = Rays(scene.objects[object_index].mesh)
                 for row in rows:
-                    arriving, pattern_points[:, row] = _light_room(
-                        scene, row, rays, distances[row], environment[row], directions[row]
-                    )
+                    shown = row, rays, distances[row], environment[row], directions[row]
+                    arriving, pattern_points[:, row] = self._light_room(*shown)
                     linear[row] = albedo[row] * arriving.to(albedo)
         return encode(clamp(linear), scene.settings.encoding), pattern_points
 
+    def _light_room(
+        self, row: int, rays: Rays, wall_distance: float, sky: Tensor, lamp: Float[Tensor, " 3"]
+    ) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "2 height width"]]:
+        """Light a table and a wall in an example, and find where a projected pattern falls.
+
+        The pattern falls on table, wall and object along the directional light of the example or,
+        if it has none, along the direction of the view. Return the irradiance of table and wall,
+        and the x and y of the point of the pattern that each pixel shows.
+        """
+        scene = self.scene
+        example = scene.examples[row]
+        item, camera = scene.objects[example.object], example.cameras[0]
+        room = Room(rays, item.radius, item.lowest, wall_distance)
+        local = split_light(scene.basis, scene.lights[row].cpu().double()).local_lights
+        arriving = irradiance(room, camera, scene.settings, sky.cpu().double(), lamp, local)
+        # A lamp at zero stands for no directional light.
+        towards = lamp if lamp.any() else torch.from_numpy(camera.axes()[2])
+        points = project_along_light(room, item.mesh, camera, scene.settings, towards)
+        return example.exposure * arriving, points.float()
+
     def _draw_log_uniform(self, limits: Sequence[float]) -> list[float]:
         """Draw a number for each example, whose logarithm is uniformly distributed."""
-        low, high = (math.log(limit) for limit in limits)
+        return self._draw_uniform(*map(math.log, limits)).exp().tolist()
+
+    def _draw_uniform(self, low: float, high: float) -> Float[Tensor, " E"]:
+        """Draw a uniformly distributed number for each example."""
         fractions = torch.rand(len(self.scene), generator=self.draws, dtype=torch.float64)
-        return (low + (high - low) * fractions).exp().tolist()
+        return low + (high - low) * fractions
 
     def _draw_pairs(self, limit: float) -> list[list[float]]:
         """Draw a pair of numbers for each example uniformly from [-limit, limit]."""
@@ -362,34 +369,6 @@ def _facing_irradiance(scene: Scene) -> Float[Tensor, "E 3 1 1"]:
     return facing.to(scene.backgrounds)[:, :, None, None]
 
 
-def _light_room(
-    scene: Scene,
-    index: int,
-    rays: Rays,
-    wall_distance: float,
-    environment: Float[Tensor, "K 3"],
-    direction: Float[Tensor, " 3"],
-) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "2 height width"]]:
-    """Light a table and a wall in an example, and find where a projected pattern falls.
-
-    The pattern falls on table, wall and object along the directional light of the example or, if it
-    has none, along the direction of the view. Return the irradiance of table and wall, and the x
-    and y of the point of the pattern that each pixel shows.
-    """
-    example = scene.examples[index]
-    item = scene.objects[example.object]
-    camera = example.cameras[0]
-    room = Room(rays, item.radius, item.lowest, wall_distance)
-    local = split_light(scene.basis, scene.lights[index].cpu().double()).local_lights
-    sky = environment.cpu().double()
-    arriving = irradiance(room, camera, scene.settings, sky, direction, local)
-    # A direction of zero stands for no directional light.
-    if not direction.any():
-        direction = torch.from_numpy(camera.axes()[2])
-    points = project_along_light(room, item.mesh, camera, scene.settings, direction)
-    return example.exposure * arriving, points.float()
-
-
 def draw_camera_effects(
     settings: CameraEffectSettings,
     count: int,
@@ -414,9 +393,8 @@ def draw_camera_effects(
             photograph_count = int(is_photograph.sum())
             files = _draw_image_files(settings.slides, "slides", photograph_count, size, draws)
             shown = patterns.pixel_centers(size) if points is None else points[:, is_photograph]
-            light[is_photograph] = patterns.draw_photograph_patterns(
-                decode(files, "srgb"), shown, draws
-            )
+            slides = patterns.draw_photograph_patterns(decode(files, "srgb"), shown, draws)
+            light[is_photograph] = slides
     low, high = settings.pattern_fill
     # Fraction of the light of each example that does not come from the projector.
     fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Self
 
 import torch
@@ -22,15 +21,8 @@ from torch import Tensor
 from augment.network import unwrapped
 from augment.scene.truth import Truth
 from augment.tasks.task import NO_CLASS, ObjectCriterion, Task, visible_boxes
-from renderer.errors import (
-    InputError,
-    as_tensor,
-    describe,
-    require_choice,
-    require_kind,
-    require_number,
-    single_line,
-)
+from renderer import errors
+from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
 
 # What an attack on a detector reaches: no box of the true class, or a box of another class.
@@ -117,10 +109,11 @@ class Detection(Task):
     decode: Callable[[Any], Any] | None = None
 
     def __post_init__(self) -> None:
-        require_number("threshold", self.threshold, SMALLEST_SCORE, 1 - SMALLEST_SCORE)
-        require_number("iou", self.iou, 0.01, 1)
-        require_choice("goal", self.goal, (HIDE, MISLABEL))
-        require_kind("decode", self.decode, Callable | None, "a function of outputs of the network")
+        errors.require_number("threshold", self.threshold, SMALLEST_SCORE, 1 - SMALLEST_SCORE)
+        errors.require_number("iou", self.iou, 0.01, 1)
+        errors.require_choice("goal", self.goal, (HIDE, MISLABEL))
+        expected = "a function of outputs of the network"
+        errors.require_kind("decode", self.decode, Callable | None, expected)
 
     def recognizes(self, outputs: Any) -> bool:
         """Return whether outputs are dictionaries of boxes, or those of a library of detectors."""
@@ -131,21 +124,24 @@ class Detection(Task):
 
     def class_names(self, network: Any, count: int | None) -> Sequence[str] | None:
         """Return the names of COCO for torchvision, or those that transformers stores."""
-        known = id2label(network)
-        names = [str(known[index]) for index in sorted(known)]
-        if not names and _torchvision_count(network) == len(_coco_names()):
-            names = _coco_names()
+        names = stored_names(network)
+        if not names and _torchvision_count(network):
+            from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights as Weights
+
+            # The names of COCO by the numbers that torchvision's detectors return.
+            names = Weights.COCO_V1.meta["categories"]
+            if len(names) != _torchvision_count(network):
+                return None
         # Names that occur again get their number, because labels are found by name.
-        is_new = [name != UNUSED and name not in names[:i] for i, name in enumerate(names)]
         unique = [
-            name if new else f"{name} {index}"
-            for index, (name, new) in enumerate(zip(names, is_new, strict=True))
+            f"{name} {index}" if name == UNUSED or name in names[:index] else name
+            for index, name in enumerate(names)
         ]
         return unique or None
 
     def output_count(self, network: Any, outputs: Any) -> int | None:
         """Return the number of classes of the network, which may have a background as class 0."""
-        return len(id2label(network)) or _torchvision_count(network)
+        return len(stored_names(network)) or _torchvision_count(network)
 
     def outputs(self, network: Any, images: Tensor) -> Any:
         """Return the outputs of a network. Those of torchvision get candidates, too.
@@ -169,8 +165,7 @@ class Detection(Task):
             finally:
                 vars(owner).update(limits)
             if isinstance(found, tuple):  # Heads with regions of interest return three lists.
-                names = "boxes", "scores", "labels"
-                found = [dict(zip(names, item, strict=True)) for item in zip(*found, strict=True)]
+                found = [dict(zip(FINAL, item, strict=True)) for item in zip(*found, strict=True)]
             candidates.extend(zip(found, args[-1], strict=True))
             return final
 
@@ -186,73 +181,9 @@ class Detection(Task):
             item[CANDIDATE_SCORES], item[CANDIDATE_LABELS] = found["scores"], found["labels"]
         return outputs
 
-    def reader(
-        self, title: str, class_count: int | None = None
-    ) -> Callable[[Any, Tensor], list[Detections]]:
+    def reader(self, title: str, class_count: int | None = None) -> _Reader:
         """Return a function that brings outputs into the form of torchvision, and checks them."""
-        return partial(self._read, title, class_count)
-
-    def _read(
-        self, title: str, class_count: int | None, outputs: Any, images: Float[Tensor, "N 3 H W"]
-    ) -> list[Detections]:
-        if self.decode is not None:
-            given, title = outputs, f"decode of {title}"
-            try:
-                outputs = self.decode(given)
-            except Exception as error:  # Users' functions raise errors of many kinds.
-                kind = f"{type(error).__name__}: {single_line(error)}"
-                raise InputError(f"{title} fails on {describe(given)} ({kind})") from error
-        elif _is_transformer(outputs):
-            outputs = _of_transformer(outputs, images, title, class_count)
-        is_raw = self.decode is not None or _is_ultralytics(outputs)
-        if _is_ultralytics(outputs):
-            outputs = _of_ultralytics(outputs[0])
-        if not len(images):
-            return []
-        if not self.recognizes(outputs) or len(outputs) != len(images):
-            count = len(images)
-            reason = f"{title} returned {describe(outputs)} for {count} images"
-            raise InputError(f"{reason}: it must return {self.returns}")
-        return [self._detections(title, class_count, item, images, is_raw) for item in outputs]
-
-    def _detections(
-        self,
-        title: str,
-        class_count: int | None,
-        item: Mapping[str, Any],
-        images: Tensor,
-        is_raw: bool,
-    ) -> Detections:
-        """Check the boxes of one image. Raw boxes become candidates, and lose their duplicates."""
-        found: Detections = {}
-        for keys in FINAL, CANDIDATES_OF:
-            if keys[0] in item:
-                found |= _checked_shapes(title, class_count, item, images, keys)
-        if "labels" not in found:
-            found[CANDIDATE_BOXES], found[CANDIDATE_SCORES] = found["boxes"], found["scores"]
-            found["scores"], found["labels"] = found["scores"].max(1)
-        self._require_possible(found, title, images)
-        if is_raw:
-            if CANDIDATE_BOXES not in found:
-                found |= zip(CANDIDATES_OF, [found[key] for key in FINAL], strict=True)
-            kept = _without_duplicates(found)
-            found |= {key: found[key][kept] for key in ("boxes", "labels", "scores")}
-        return found
-
-    def _require_possible(self, found: Detections, title: str, images: Tensor) -> None:
-        """Check the boxes whose scores reach the threshold."""
-        height, width = images.shape[2:]
-        scores = found["scores"]
-        left, top, right, bottom = found["boxes"].detach()[scores >= self.threshold].unbind(1)
-        if (right < left).any() or (bottom < top).any():
-            advice = "give left, top, right, bottom, and not width and height"
-            raise InputError(f"{title} returned boxes that end before they begin: {advice}")
-        is_outside = (left >= width) | (right <= 0) | (top >= height) | (bottom <= 0)
-        is_fraction = len(right) > 0 and bool((right <= 1).all() & (bottom <= 1).all())
-        if is_outside.any() or (is_fraction and min(height, width) > 1):
-            reason = "fractions of the image" if is_fraction else "outside of the image"
-            advice = f"give pixels, up to {width} across and {height} down"
-            raise InputError(f"{title} returned boxes that are {reason}: {advice}")
+        return _Reader(self, title, class_count)
 
     def criterion(
         self, source: Int[Tensor, "E V"], truth: Callable[[], Truth], class_count: int
@@ -283,7 +214,8 @@ class Detection(Task):
         """Check that boxes of another class are the goal of the attack."""
         if self.goal != MISLABEL or target == "least_likely":
             advice = "leave it out, or set goal='mislabel' and name a class"
-            raise InputError(f"target is {describe(target)}, and {self} hides objects: {advice}")
+            given = errors.describe(target)
+            raise InputError(f"target is {given}, and {self} hides objects: {advice}")
 
     def confidences(self, evidence: Float[Tensor, "... K"]) -> Float[Tensor, "... C"]:
         """Return the score of the best box of each class at the object."""
@@ -356,8 +288,10 @@ class DetectionCriterion(ObjectCriterion):
             is_near = _iou(boxes, box) >= NEAR * self.task.iou
             near = scores[is_near]
             if scores.ndim == 1:
-                labels = item.get(CANDIDATE_LABELS, item["labels"])
-                near = _of_all_classes(near, labels[is_near], self.class_count)
+                labels = item.get(CANDIDATE_LABELS, item["labels"])[is_near]
+                # Scores of all classes, which are 0 for those that are not the label.
+                zeros = near.new_zeros(len(near), self.class_count)
+                near = zeros.scatter(1, labels[:, None], near[:, None])
             # The first row is the smallest score, so that an image without candidates has a cost.
             smallest = scores.new_full((1, self.class_count), SMALLEST_SCORE)
             odds = log_odds_of(torch.cat([smallest, near]))
@@ -397,45 +331,104 @@ class DetectionCriterion(ObjectCriterion):
         return reached & (predicted != self.class_count) if self.task.goal == MISLABEL else reached
 
 
-def _checked_shapes(
-    title: str,
-    class_count: int | None,
-    item: Mapping[str, Any],
-    images: Tensor,
-    keys: tuple[str, str, str],
-) -> Detections:
-    """Return the boxes, scores and labels of an output, after checks of shapes and ranges."""
-    found = {key: as_tensor(key, item[key]).to(images.device) for key in keys if key in item}
-    # Labels keep their digits, which half precision cannot hold.
-    found |= {key: found[key].to(images.dtype) for key in keys[:2] if key in found}
-    if not found[keys[0]].numel():
-        found[keys[0]] = found[keys[0]].reshape(0, 4)
-    boxes = found[keys[0]]
-    scores = found.setdefault(keys[1], boxes.new_zeros(()))
-    labels = found.get(keys[2])
-    # Without labels, there is a score for each class.
-    columns = () if labels is not None else (class_count or scores.shape[-1:].numel(),)
-    is_labeled = labels is None or labels.shape == boxes.shape[:1]
-    if boxes.shape[1:] != (4,) or scores.shape != (len(boxes), *columns) or not is_labeled:
-        shapes = ", ".join(f"{key} {tuple(value.shape)}" for key, value in found.items())
-        advice = f"labels (n,) and scores (n,), or scores (n, {class_count or 'classes'})"
-        raise InputError(f"{title} returned {shapes}: give boxes (n, 4), and {advice}")
-    scores = scores.detach()
-    if not scores.isfinite().all() or not boxes.isfinite().all():
-        raise InputError(f"{title} returned NaN or infinite scores or boxes: check its weights")
-    if scores.numel() and not (scores.min() >= 0 and scores.max() <= 1):
-        span = f"from {float(scores.min()):g} to {float(scores.max()):g}"
-        raise InputError(f"{title} returned scores {span}: give probabilities from 0 to 1")
-    if labels is None:
+@dataclass(frozen=True)
+class _Reader:
+    """Function that brings outputs of a detector into the form of torchvision, and checks them."""
+
+    task: Detection
+    title: str
+    class_count: int | None
+
+    def __call__(self, outputs: Any, images: Float[Tensor, "N 3 H W"]) -> list[Detections]:
+        title, task = self.title, self.task
+        is_raw = task.decode is not None
+        if task.decode is not None:
+            given, title = outputs, f"decode of {title}"
+            try:
+                outputs = task.decode(given)
+            except Exception as error:  # Users' functions raise errors of many kinds.
+                kind = f"{type(error).__name__}: {errors.single_line(error)}"
+                raise InputError(f"{title} fails on {errors.describe(given)} ({kind})") from error
+        elif _is_transformer(outputs):
+            outputs = _of_transformer(outputs, images, title, self.class_count)
+        if _is_ultralytics(outputs):
+            outputs, is_raw = _of_ultralytics(outputs[0]), True
+        if not len(images):
+            return []
+        if not task.recognizes(outputs) or len(outputs) != len(images):
+            reason = f"{title} returned {errors.describe(outputs)} for {len(images)} images"
+            raise InputError(f"{reason}: it must return {task.returns}")
+        reader = replace(self, title=title)
+        return [reader.detections(item, images, is_raw) for item in outputs]
+
+    def detections(self, item: Mapping[str, Any], images: Tensor, is_raw: bool) -> Detections:
+        """Check the boxes of one image. Raw boxes become candidates, and lose their duplicates."""
+        found: Detections = {}
+        for keys in FINAL, CANDIDATES_OF:
+            if keys[0] in item:
+                tensors = {key: errors.as_tensor(key, item[key]) for key in keys if key in item}
+                found |= self.checked(keys, tensors, images)
+        if "labels" not in found:
+            found[CANDIDATE_BOXES], found[CANDIDATE_SCORES] = found["boxes"], found["scores"]
+            found["scores"], found["labels"] = found["scores"].max(1)
+        self.require_possible(found, *images.shape[2:])
+        if is_raw:
+            from torchvision.ops import batched_nms  # torchvision takes half a second.
+
+            boxes, scores, labels = (found[key] for key in FINAL)
+            if CANDIDATE_BOXES not in found:
+                found |= zip(CANDIDATES_OF, (boxes, scores, labels), strict=True)
+            kept = batched_nms(boxes.detach(), scores.detach(), labels, MAX_OVERLAP)
+            found |= {key: found[key][kept] for key in FINAL}
         return found
-    if not torch.equal(labels, labels.round()):
-        raise InputError(f"{title} returned labels with fractions: give indices of classes")
-    last = (class_count or int(NO_LIMIT)) - 1
-    if len(labels) and not (labels.min() >= 0 and labels.max() <= last):
-        span = f"from {int(labels.min())} to {int(labels.max())}"
-        advice = f"give indices of the {class_count} classes, from 0 to {last}"
-        raise InputError(f"{title} returned labels {span}: {advice}")
-    return found | {keys[2]: labels.detach().long()}
+
+    def checked(self, keys: Sequence[str], found: Detections, images: Tensor) -> Detections:
+        """Return the boxes, scores and labels of an output, after checks of shapes and ranges."""
+        title, class_count = self.title, self.class_count
+        # Labels keep their digits, which half precision cannot hold.
+        found = {key: found[key].to(images if key in keys[:2] else images.device) for key in found}
+        boxes = found[keys[0]]
+        if not boxes.numel():
+            boxes = found[keys[0]] = boxes.reshape(0, 4)
+        scores = found.setdefault(keys[1], boxes.new_zeros(()))
+        labels = found.get(keys[2])
+        # Without labels, there is a score for each class.
+        columns = () if labels is not None else (class_count or scores.shape[-1:].numel(),)
+        is_labeled = labels is None or labels.shape == boxes.shape[:1]
+        if boxes.shape[1:] != (4,) or scores.shape != (len(boxes), *columns) or not is_labeled:
+            shapes = ", ".join(f"{key} {tuple(value.shape)}" for key, value in found.items())
+            advice = f"labels (n,) and scores (n,), or scores (n, {class_count or 'classes'})"
+            raise InputError(f"{title} returned {shapes}: give boxes (n, 4), and {advice}")
+        scores = scores.detach()
+        if not scores.isfinite().all() or not boxes.isfinite().all():
+            raise InputError(f"{title} returned NaN or infinite scores or boxes: check its weights")
+        if scores.numel() and not (scores.min() >= 0 and scores.max() <= 1):
+            span = f"from {float(scores.min()):g} to {float(scores.max()):g}"
+            raise InputError(f"{title} returned scores {span}: give probabilities from 0 to 1")
+        if labels is None:
+            return found
+        if not torch.equal(labels, labels.round()):
+            raise InputError(f"{title} returned labels with fractions: give indices of classes")
+        last = (class_count or int(NO_LIMIT)) - 1
+        if len(labels) and not (labels.min() >= 0 and labels.max() <= last):
+            span = f"from {int(labels.min())} to {int(labels.max())}"
+            advice = f"give indices of the {class_count} classes, from 0 to {last}"
+            raise InputError(f"{title} returned labels {span}: {advice}")
+        return found | {keys[2]: labels.detach().long()}
+
+    def require_possible(self, found: Detections, height: int, width: int) -> None:
+        """Check the boxes whose scores reach the threshold."""
+        is_sure = found["scores"] >= self.task.threshold
+        left, top, right, bottom = found["boxes"].detach()[is_sure].unbind(1)
+        if (right < left).any() or (bottom < top).any():
+            advice = "give left, top, right, bottom, and not width and height"
+            raise InputError(f"{self.title} returned boxes that end before they begin: {advice}")
+        is_outside = (left >= width) | (right <= 0) | (top >= height) | (bottom <= 0)
+        is_fraction = len(right) > 0 and bool((right <= 1).all() & (bottom <= 1).all())
+        if is_outside.any() or (is_fraction and min(height, width) > 1):
+            reason = "fractions of the image" if is_fraction else "outside of the image"
+            advice = f"give pixels, up to {width} across and {height} down"
+            raise InputError(f"{self.title} returned boxes that are {reason}: {advice}")
 
 
 def _iou(boxes: Float[Tensor, "K 4"], box: Float[Tensor, " 4"]) -> Float[Tensor, " K"]:
@@ -451,22 +444,6 @@ def log_odds_of(scores: Tensor) -> Tensor:
     """Return log(s / (1 − s)) of scores, whose gradient does not vanish at scores of 0 and 1."""
     limited = scores.clamp(SMALLEST_SCORE, 1 - SMALLEST_SCORE)
     return torch.logit(scores + (limited - scores).detach())
-
-
-def _of_all_classes(
-    scores: Float[Tensor, " K"], labels: Int[Tensor, " K"], class_count: int
-) -> Float[Tensor, "K C"]:
-    """Arrange the scores of labeled boxes as scores of all classes, which are 0 for the others."""
-    zeros = scores.new_zeros(len(scores), class_count)
-    return zeros.scatter(1, labels[:, None], scores[:, None])
-
-
-def _without_duplicates(found: Detections) -> Int[Tensor, " n"]:
-    """Return the indices of the boxes that no better box of their class overlaps."""
-    from torchvision.ops import batched_nms  # torchvision takes half a second.
-
-    scores = found["scores"].detach()
-    return batched_nms(found["boxes"].detach(), scores, found["labels"], MAX_OVERLAP)
 
 
 def _is_transformer(outputs: Any) -> bool:
@@ -527,13 +504,13 @@ def _of_ultralytics(outputs: Tensor) -> list[dict[str, Tensor]]:
     return [{"boxes": one, "scores": scores} for one, scores in pairs]
 
 
-def id2label(network: Any) -> Mapping[int, Any]:
+def stored_names(network: Any) -> list[str]:
     """Return the names of the classes that a network of transformers or Ultralytics stores."""
     raw = unwrapped(network)
     names = getattr(raw, "names", None)
-    if isinstance(names, Mapping):
-        return names
-    return getattr(getattr(raw, "config", None), "id2label", None) or {}
+    if not isinstance(names, Mapping):
+        names = getattr(getattr(raw, "config", None), "id2label", None) or {}
+    return [str(names[index]) for index in sorted(names)]
 
 
 def _is_of_torchvision(raw: Any) -> bool:
@@ -554,10 +531,3 @@ def _torchvision_count(network: Any) -> int | None:
         if hasattr(module, "cls_score"):
             return int(module.cls_score.out_features)
     return None
-
-
-def _coco_names() -> list[str]:
-    """Return the names of COCO by the numbers that torchvision's detectors return."""
-    from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
-
-    return [*FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]]

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from augment.network import plain_outputs
 from augment.scene.truth import Truth
-from augment.tasks.detection import id2label, log_odds_of
+from augment.tasks.detection import log_odds_of, stored_names
 from augment.tasks.task import ObjectCriterion, Task, visible_boxes
 from renderer.errors import InputError, describe, require_number
 
@@ -76,8 +76,7 @@ class Segmentation(Task):
 
     def class_names(self, network: Any, count: int | None) -> Sequence[str] | None:
         """Return the names that transformers stores. A network of another library has none."""
-        known = id2label(network)
-        return [str(known[index]) for index in sorted(known)] or None
+        return stored_names(network) or None
 
     def output_count(self, network: Any, outputs: Tensor) -> int:
         """Return the number of logits of a pixel."""
@@ -93,17 +92,14 @@ class Segmentation(Task):
         self, title: str, class_count: int | None, outputs: Any, images: Float[Tensor, "N 3 H W"]
     ) -> Float[Tensor, "N C H W"]:
         logits = _logits(outputs)
-        is_full = isinstance(outputs, Mapping) and "out" in outputs
         is_tensor = isinstance(logits, Tensor) and logits.ndim == 4
-        if is_tensor and logits is not outputs and not is_full:
+        is_full = logits is outputs or (isinstance(outputs, Mapping) and "out" in outputs)
+        if is_tensor and not is_full:
             # Segmenters of transformers return smaller logits, which its own reader enlarges.
             logits = F.interpolate(logits, images.shape[2:], mode="bilinear", align_corners=False)
-        count = class_count or "C"
-        expected = (
-            (len(images), class_count or logits.shape[1], *images.shape[2:]) if is_tensor else ()
-        )
-        if not is_tensor or logits.shape != expected:
-            shape = (len(images), count, *images.shape[2:])
+        count = class_count or (logits.shape[1] if is_tensor else "C")
+        shape = (len(images), count, *images.shape[2:])
+        if not is_tensor or logits.shape != shape:
             raise InputError(f"{title} returned {describe(logits)}: it must return logits {shape}")
         return logits
 

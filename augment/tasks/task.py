@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from augment.scene.truth import Truth
+from augment.scene.truth import Rows, Truth
 from renderer.errors import InputError
 
 # Index that stands for "no class" in attacks without a source or a target class. It differs from
@@ -28,27 +28,6 @@ NO_CLASS = -(10**9)
 NOTHING = "nothing"
 # Function from the outputs of a network, and from the images that it got, to outputs of a task.
 Reader = Callable[[Any, Tensor], Any]
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Base of data classes whose tensors have one row for each example."""
-
-    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
-        """Return a copy with changed tensors."""
-        tensors = {name: item for name, item in vars(self).items() if isinstance(item, Tensor)}
-        changed = {name: change(tensor) for name, tensor in tensors.items()}
-        return replace(self, **changed)
-
-    def select(self, rows: Tensor | slice) -> Self:
-        """Return some of the rows."""
-        return self.map(lambda tensor: tensor[rows])
-
-    @classmethod
-    def join(cls, parts: Sequence[Self]) -> Self:
-        """Return the rows of several parts, one after the other."""
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        return cls(*map(torch.cat, columns))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torchvision.transforms import Normalize
 import augment
 import norm_balls as nb
 import renderer
-from augment.classifier import Classifier, as_classifier, remembering
+from augment.classifier import Classifier, as_network, remembering
 from augment.network import ChannelNormalization, Network, say_once
 from renderer import InputError
 
@@ -129,7 +129,7 @@ BYTES = ((100.0, 110.0, 120.0), (50.0, 60.0, 70.0))
     ],
 )
 def test_a_network_gets_images_in_its_own_units(network, images, options, expected):
-    classifier = as_classifier(network, SIZE, **options)
+    classifier = as_network(network, SIZE, **options)
     torch.testing.assert_close(classifier(images), network(expected(images)))
     assert classifier.classes == ("0", "1", "2")
 
@@ -199,7 +199,7 @@ def with_pixel_mean(network: nn.Module) -> nn.Module:
 )
 def test_a_mistake_is_refused(network, change, options, message):
     with pytest.raises(InputError, match=message):
-        as_classifier(change(network), SIZE, **options)
+        as_network(change(network), SIZE, **options)
 
 
 def test_a_network_with_a_single_output_is_refused():
@@ -233,8 +233,8 @@ def test_adversaries_are_shown_to_a_plain_network_as_to_its_classifier(network):
 def test_a_function_whose_network_is_in_training_mode_is_refused(layer, wrap):
     network = nn.Sequential(layer, nn.AdaptiveAvgPool2d(1), nn.Flatten()).train()
     with pytest.raises(InputError, match=r"eval\(\)"):
-        as_classifier(wrap(network), size=8)
-    as_classifier(wrap(network.eval()), size=8)
+        as_network(wrap(network), size=8)
+    as_network(wrap(network.eval()), size=8)
 
 
 IMAGENET = "normalized by mean (0.485, 0.456, 0.406) and std (0.229, 0.224, 0.225)"
@@ -301,14 +301,14 @@ def test_what_is_known_of_own_weights_is_said_once_and_what_the_user_leaves_out_
     ],
 )
 def test_what_a_plain_network_gets_is_said_in_the_units_of_the_user(options, facts, said):
-    as_classifier(nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval(), **options)
+    as_network(nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval(), **options)
     assert said() == [f"network Sequential: images of {facts}"]
 
 
 def test_a_network_that_normalizes_images_itself_states_its_normalization(said):
     normalize = Normalize(MEAN, STD)
     network = nn.Sequential(normalize, nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()
-    as_classifier(network, 8)
+    as_network(network, 8)
     assert f"{IMAGENET}, stated by the network; values from 0 to 1, assumed" in said()[0]
 
 
@@ -316,7 +316,7 @@ def test_a_network_that_normalizes_images_itself_states_its_normalization(said):
     "wrap", [lambda logits: {"logits": logits}, lambda logits: (logits, 0), SimpleLogits]
 )
 def test_logits_in_the_output_of_a_library_are_read_with_their_gradient(wrap, images):
-    classifier = as_classifier(lambda given: wrap(given.mean((2, 3))), 8)
+    classifier = as_network(lambda given: wrap(given.mean((2, 3))), 8)
     images.requires_grad_()
     logits = classifier(images)
     assert torch.equal(logits, images.mean((2, 3)))
@@ -325,7 +325,7 @@ def test_logits_in_the_output_of_a_library_are_read_with_their_gradient(wrap, im
 
 
 def test_facts_of_a_classifier_stay_with_copies_of_it():
-    classifier = as_classifier(lambda images: images.mean((2, 3)), 8, normalization="imagenet")
+    classifier = as_network(lambda images: images.mean((2, 3)), 8, normalization="imagenet")
     for copy in (classifier.normalizing_light(), remembering(classifier)):
         assert copy.describe_inputs() == classifier.describe_inputs()
 
@@ -382,6 +382,6 @@ def test_timm_tells_the_size_of_a_network_in_memory_which_is_assumed(said, warne
     timm = pytest.importorskip("timm")
     # timm records the size of the images in the configuration of a network.
     network = timm.create_model("test_efficientnet", num_classes=3).eval()
-    assert as_classifier(network).size == 160
+    assert as_network(network).size == 160
     assert "160 × 160 pixels, assumed" in said()[0]
     assert warned() == ["size=160"]

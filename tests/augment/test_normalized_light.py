@@ -6,7 +6,7 @@ import torch
 from oracles import linear_of, srgb_of
 from torch import Tensor, nn
 
-from augment.classifier import Classifier, as_classifier
+from augment.classifier import Classifier, as_network
 from augment.network import normalize_light
 from augment.settings import NormalizedLightSettings
 from renderer import InputError
@@ -115,7 +115,7 @@ def test_a_classifier_sees_normalized_images(radiance):
     for classifier in (
         Classifier(Spy(), SIZE, classes, normalize_light={"white_balance": 0.25}),
         Classifier(Spy(), SIZE, classes).normalizing_light(settings),
-        as_classifier(Spy().eval(), SIZE, classes, normalize_light={"white_balance": 0.25}),
+        as_network(Spy().eval(), SIZE, classes, normalize_light={"white_balance": 0.25}),
     ):
         torch.testing.assert_close(classifier(images), expected)
         assert classifier.normalized_light == settings
@@ -124,7 +124,7 @@ def test_a_classifier_sees_normalized_images(radiance):
 def test_light_is_normalized_before_the_mean_is_subtracted(radiance):
     images = torch.from_numpy(srgb_of(radiance)).float()
     mean, std = (0.4, 0.5, 0.6), (0.1, 0.2, 0.3)
-    classifier = as_classifier(Spy().eval(), SIZE, normalization=(mean, std), normalize_light=True)
+    classifier = as_network(Spy().eval(), SIZE, normalization=(mean, std), normalize_light=True)
     light = normalize_light(images, NormalizedLightSettings())
     expected = (light.mean((2, 3)) - torch.tensor(mean)) / torch.tensor(std)
     torch.testing.assert_close(classifier(images), expected)

@@ -150,9 +150,9 @@ def test_a_function_without_gradients_is_attacked_by_random_search(photographs):
 
 
 def test_photographs_of_another_size_are_an_error(photographs):
-    from augment.classifier import as_classifier
+    from augment.classifier import as_network
 
-    classifier = as_classifier(HueNetwork().eval(), SIZE, None)
+    classifier = as_network(HueNetwork().eval(), SIZE, None)
     with pytest.raises(InputError, match="use the size of its images, 16"):
         attack_photographs(classifier, photographs[:, :, :8, :8])
 
