@@ -139,10 +139,15 @@ class AdversarialLighting:
             with torch.no_grad():
                 outputs = network(unit)
         elif isinstance(self.task, Detection):
-            outputs = [item | {"scores": torch.ones(len(item["boxes"]))} for item in targets]
+            expected = 'a dictionary with "boxes" and "labels" for each image'
+            given = errors.as_list("targets", targets, Mapping, expected)
+            if not all({"boxes", "labels"} <= item.keys() for item in given):
+                raise InputError(f"targets has no boxes or no labels: give {expected}")
+            outputs = [_as_found(item["boxes"], item["labels"], unit.device) for item in given]
         else:
-            count = len(self.classes) or int(targets.max()) + 1
-            outputs = F.one_hot(targets.long(), count).movedim(-1, 1).float()
+            targets = errors.as_integers("targets", targets)
+            count = len(self.classes) or max(targets.flatten().tolist(), default=0) + 1
+            outputs = F.one_hot(targets, count).movedim(-1, 1).float()
         if len(outputs) != len(unit):
             raise InputError(f"{len(outputs)} targets are given for {len(unit)} images: give each")
         image_of_row, criterion = self.task.as_found(outputs, self.classes)
@@ -172,6 +177,14 @@ class AdversarialLighting:
             moved = values[smooth] - STEP / self.steps * gradient[smooth].sign()
             values[smooth] = moved.clamp(0, 1)
         return light._replace(values=values)
+
+
+def _as_found(boxes: Any, labels: Any, device: torch.device) -> dict[str, Tensor]:
+    """Return the boxes and labels of an image as a detector that is sure of them does."""
+    boxes = torch.as_tensor(boxes, dtype=torch.float32, device=device).as_subclass(Tensor)
+    labels = errors.as_integers("labels", labels).to(device)
+    found = {"boxes": boxes.reshape(-1, 4), "labels": labels}
+    return found | {"scores": torch.ones(len(labels), device=device)}
 
 
 def _leaf(light: Light) -> Light:

@@ -32,6 +32,8 @@ from renderer.image import decode, encode, to_bytes, to_unit
 
 # Linear values are looked up in so many bins. Each has at most one limit between two bytes.
 BINS = 4096
+# Keys of a sample at which a plain tensor is an image, whatever stands before it.
+IMAGES = ("image", "images", "img", "pixel_values")
 # Modes of Pillow's images that are relit as they are, and those that are converted before.
 MODES = ("L", "LA", "RGB", "RGBA", "F", "I;16", "I;16L", "I;16B", "I;16N")
 CONVERTED = {"1": "L", "P": "RGB", "PA": "RGBA", "CMYK": "RGB", "YCbCr": "RGB", "HSV": "RGB"}
@@ -52,9 +54,11 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
     A transform of torchvision (v2). It takes an image or a sample with images,
     and changes the images only. An image is a PIL image, or a tensor of any
     dtype and of shape (..., C, H, W), with 1 to 4 channels. A second or fourth
-    channel is alpha and stays. Each image of a batch has its own light, and all
-    frames of a `tv_tensors.Video` have the same. Values above 1 (HDR) are not
-    clipped. The random numbers are from torch's global generator on the CPU.
+    channel is alpha and stays. Of plain tensors in a sample, only the first is an
+    image, or that of a key "image", "images", "img" or "pixel_values". Each image
+    of a batch has its own light, and all frames of a `tv_tensors.Video` have the
+    same. Values above 1 (HDR) are not clipped. The random numbers are from torch's
+    global generator on the CPU.
 
     The colors of an image (sRGB) stand for the albedo of what it shows. They
     are decoded to linear light, multiplied by the light of a model, and encoded
@@ -186,20 +190,20 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
             InputError: If the sample has no image.
         """
         paths, spec = tree_flatten_with_path(inputs if len(inputs) > 1 else inputs[0])
-        is_depth = [getattr(path[-1], "key", None) == "depth" for path, _ in paths if path]
-        is_depth = is_depth or [False]
         leaves = [leaf for _, leaf in paths]
-        # Without the depth, torchvision tells which of the leaves are images.
-        others = [None if is_it else leaf for leaf, is_it in zip(leaves, is_depth, strict=True)]
+        keys = [getattr(path[-1], "key", None) if path else None for path, _ in paths]
+        hidden = {"depth"} if {*IMAGES}.isdisjoint(keys) else {*keys} - {*IMAGES}
+        # Torchvision tells which of the others are images: the first of plain tensors.
+        others = [
+            None if key in hidden and (key == "depth" or v2._utils.is_pure_tensor(leaf)) else leaf
+            for key, leaf in zip(keys, leaves, strict=True)
+        ]
         is_image = self._needs_transform_list(others)
         if not any(is_image):
             raise InputError("the sample has no image: give a PIL image or a tensor (C, H, W)")
-        images = [leaf for leaf, is_it in zip(leaves, is_image, strict=True) if is_it]
-        params = self.make_params(images)
-        params["depth"] = next(
-            (leaf for leaf, is_it in zip(leaves, is_depth, strict=True) if is_it), None
-        )
-        pairs = zip(leaves, is_image, strict=True)
+        pairs = [*zip(leaves, is_image, strict=True)]
+        params = self.make_params([leaf for leaf, is_it in pairs if is_it])
+        params["depth"] = leaves[keys.index("depth")] if "depth" in keys else None
         return tree_unflatten(
             [self.transform(leaf, params) if is_it else leaf for leaf, is_it in pairs], spec
         )
@@ -324,7 +328,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
     if plain.is_complex():
         raise InputError(f"the image is {image.dtype}: give real numbers")
     count = math.prod(_batch_shape(image))
-    if not plain.numel() or not any(lights):
+    if not plain.numel() or plain.is_meta or not any(lights):
         return plain
     if len(lights) < count and len(lights) != 1:
         raise InputError(f"{len(lights)} lights were drawn for {count} images: draw one for each")
@@ -332,8 +336,9 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
     frames = plain.reshape(-1, *plain.shape[-3:])
     # All frames of a video have the light of their video.
     lights = [light for light in lights for _ in range(len(frames) // count)]
-    if frames.is_floating_point() and not frames.isfinite().all():
-        raise InputError("the image has values that are NaN or infinite: replace them")
+    if frames.is_floating_point() and not frames.detach().abs().max() <= errors.MAX_MAGNITUDE:
+        limit = f"{errors.MAX_MAGNITUDE:g}"
+        raise InputError(f"the image has values that are NaN or beyond ±{limit}: replace them")
     depths = None if depth is None else _as_depth(depth, frames, count)
     groups: dict[Any, list[int]] = {}
     for row, light in enumerate(lights):
@@ -343,7 +348,8 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         chosen = [light for light in (lights[row] for row in rows) if light is not None]
         part = frames if len(rows) == len(frames) else frames[rows]
         depth_of_rows = None if depths is None else depths[rows]
-        parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
+        with torch.autocast(plain.device.type, enabled=False):
+            parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
     if len(parts) == 1:
         return parts[0].reshape(plain.shape)
     order = torch.tensor([row for rows in groups.values() for row in rows]).argsort()
@@ -408,7 +414,8 @@ def _relight(
             most = math.nextafter(largest, 0) if float(largest) > largest else largest
             relit = (encoded * largest).round().clamp(max=most).to(images.dtype)
         else:
-            relit = encoded.clamp(max=torch.finfo(images.dtype).max).to(images.dtype)
+            most = torch.finfo(images.dtype).max
+            relit = encoded.clamp(-most, most).to(images.dtype)
     return relit if colored == images.shape[1] else torch.cat([relit, images[:, colored:]], 1)
 
 

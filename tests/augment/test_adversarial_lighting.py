@@ -1,8 +1,10 @@
 """Light that is found by gradient among the models of random light."""
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
+from torchvision import tv_tensors
 
 import norm_balls as nb
 from renderer.errors import InputError
@@ -95,3 +97,38 @@ def test_gradients_need_not_be_enabled_and_bits_of_a_pixel_do_not_matter(images)
         with torch.no_grad():
             found.append(lighting(given, torch.zeros(8, dtype=torch.int64)))
     torch.testing.assert_close(found[1].float() / 65535, found[0], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("given", [list, np.array, lambda labels: torch.tensor(labels).int()])
+def test_labels_may_be_lists_arrays_and_tensors_of_any_integers(images, given):
+    labels = [0, 1, 1, 0, 1, 0, 0, 1]
+    found = []
+    for targets in (given(labels), torch.tensor(labels)):
+        torch.manual_seed(0)
+        found.append(nb.AdversarialLighting(Mean(), lights="linear")(images, targets))
+    assert torch.equal(*found)
+
+
+def test_boxes_may_be_whole_numbers_lists_or_those_of_a_sample(images):
+    box, size = [2, 2, 12, 12], images.shape[-2:]
+    detector, classes = BrightBox([float(number) for number in box]), ["background", "lamp"]
+    found = []
+    for boxes in (
+        torch.tensor([box]).float(),
+        torch.tensor([box]),
+        [box],
+        tv_tensors.BoundingBoxes([box], format="XYXY", canvas_size=size),
+    ):
+        lighting = nb.AdversarialLighting(detector, nb.Detection(), classes=classes)
+        targets = [{"boxes": boxes, "labels": [1]}] * 7 + [{"boxes": [], "labels": []}]
+        torch.manual_seed(0)
+        found.append(lighting(images, targets))
+    assert all(torch.equal(found[0], other) for other in found[1:])
+
+
+@pytest.mark.parametrize("targets", [3, {"boxes": []}, [{"boxes": []}]])
+def test_targets_of_a_detector_without_boxes_or_labels_are_refused(images, targets):
+    detector = BrightBox((2.0, 2.0, 12.0, 12.0))
+    lighting = nb.AdversarialLighting(detector, nb.Detection(), classes=["background", "lamp"])
+    with pytest.raises(InputError, match="targets"):
+        lighting(images, targets)

@@ -96,6 +96,19 @@ def test_labels_of_a_sample_stay_and_its_image_changes():
     assert not torch.equal(relit["image"], sample["image"])
 
 
+@pytest.mark.parametrize("key", ["image", "img", "pixel_values"])
+def test_plain_tensors_before_a_named_image_stay(key):
+    sample = {"boxes": torch.rand(2, 4), "mask": picture(1, 6, 6), "labels": torch.tensor([1, 2])}
+    relit = nb.RandomLighting("linear")(sample | {key: picture(3, 6, 6)})
+    assert all(relit[label] is sample[label] for label in sample)
+    assert not torch.equal(relit[key], picture(3, 6, 6))
+
+
+def test_labels_beside_an_array_are_not_taken_for_its_image():
+    with pytest.raises(InputError, match="no image"):
+        nb.RandomLighting()({"image": np.zeros((4, 4, 3), np.uint8), "mask": picture(1, 4, 4)})
+
+
 def test_a_plain_tensor_is_the_image_even_behind_its_depth():
     depth, image = torch.rand(6, 6) + 1, picture(3, 6, 6)
     relit = nb.RandomLighting("directional")(depth_first := {"depth": depth, "image": image})
@@ -133,6 +146,26 @@ def test_images_of_a_batch_without_light_stay_for_every_dtype(dtype):
     assert torch.equal(relit[2], images[2]) and torch.equal(relit[5], images[5])
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_autocast_changes_nothing(name):
+    images, transform = torch.rand(2, 3, 6, 6), nb.RandomLighting(name)
+    light = transform.make_params([images])
+    expected = transform.apply(images, light)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(transform.apply(images, light), expected)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("value", [-65504.0, 65504.0, 6e-8])
+def test_the_limits_of_half_precision_stay_finite(name, value):
+    image = torch.full((3, 4, 4), value, dtype=torch.float16)
+    assert nb.RandomLighting(name)(image).isfinite().all()
+
+
+def test_an_image_without_memory_keeps_its_device():
+    assert nb.RandomLighting()(torch.rand(3, 4, 4, device="meta")).is_meta
+
+
 @pytest.mark.parametrize("settings", [{"p": 0.0}, {"strength": 0.0}])
 def test_without_light_an_image_stays(settings):
     image = torch.rand(3, 4, 4)
@@ -163,11 +196,15 @@ def test_values_above_1_are_not_clipped_unless_the_sensor_is_full(name):
         assert relit.max() > 2
 
 
-def test_a_transform_is_pickled_and_works_in_two_workers():
+def test_workers_draw_other_lights_in_each_epoch_and_the_same_in_each_run():
     transform = pickle.loads(pickle.dumps(nb.RandomLighting(["cast_shadow", "low_light"])))
-    data = [picture(3, 8, 8, seed=seed) for seed in range(4)]
-    loader = DataLoader(_Relit(data, transform), batch_size=2, num_workers=2)
-    assert [tuple(batch.shape) for batch in loader] == [(2, 3, 8, 8)] * 2
+    data, runs = [picture(3, 8, 8)] * 4, []
+    for _ in range(2):
+        torch.manual_seed(3)
+        loader = DataLoader(_Relit(data, transform), 2, num_workers=2, persistent_workers=True)
+        runs.append(torch.cat([batch for _ in range(2) for batch in loader]))
+    assert torch.equal(*runs)
+    assert len(runs[0].flatten(1).unique(dim=0)) == 8
 
 
 class _Relit(torch.utils.data.Dataset):
@@ -202,6 +239,7 @@ def test_torch_draws_the_light():
         lambda: nb.RandomLighting()(picture(5, 4, 4)),
         lambda: nb.RandomLighting()(np.zeros((4, 4, 3))),
         lambda: nb.RandomLighting()(torch.full((3, 2, 2), torch.nan)),
+        lambda: nb.RandomLighting("low_light")(torch.full((3, 2, 2), 3e38)),
         lambda: nb.RandomLighting()({"image": picture(3, 4, 4), "depth": torch.ones(5, 4)}),
         lambda: nb.RandomLighting()({"image": picture(3, 4, 4), "depth": "far"}),
         lambda: nb.lights.CastShadow(("sun",)),
