@@ -5,7 +5,10 @@ Run it as a module in the root of the repository, after `pip install ".[ecosyste
     python -m benchmarks.detectors --data DATA --out detectors.md
 
 DATA has `meshes/` and, in `weights/`, fastestdet_coco.onnx and coco.names. The table has a row for
-each attacked quantity and radius. It is written anew after each object.
+each attacked quantity and radius. It is written anew after each object. The following audit of a
+detector that finds an orange everywhere is for its time:
+
+    pnb-audit network=python:benchmarks.detectors:ssdlite meshes=[solid:orange]
 """
 
 import argparse
@@ -80,6 +83,20 @@ def decode(raw: Tensor) -> list[dict[str, Tensor]]:
     boxes = SIZE * torch.stack(sides, -1).flatten(1, 2)
     pairs = zip(boxes, scores.flatten(2).transpose(1, 2), strict=True)
     return [{"boxes": box, "scores": score} for box, score in pairs]
+
+
+def ssdlite() -> tuple[nn.Module, int, list[str]]:
+    """Return an SSDlite of torchvision, whose random weights find an orange everywhere.
+
+    No attack succeeds, so its audit takes longest. Returned are also size and classes.
+    """
+    from torchvision.models.detection import ssdlite320_mobilenet_v3_large
+
+    network = ssdlite320_mobilenet_v3_large(weights=None, weights_backbone=None).eval()
+    names = [*nb.Detection().class_names(network, 91)]
+    for layers in network.head.classification_head.module_list:
+        layers[-1].bias.data.view(-1, len(names))[:, names.index("orange")] = 5.0
+    return network, 320, names
 
 
 def settings_of(quantity: str, radius: float, optimizer: str, passes: int) -> nb.AttackSettings:
