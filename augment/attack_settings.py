@@ -17,13 +17,6 @@ from renderer.settings import TURBIDITY, Settings, setting
 NORMS = ("linf", "l2")
 STEPS = ("unit", "raw", "sign")
 
-# Names of the fields of `PoseSettings` that have the units of an attack on the pose.
-POSE_PARTS = ("rotation", "shift", "scale", "view", "distance")
-
-# Names of the fields of `MaterialSettings` that have the units of the four values of an attack on
-# the material, in the order of these values.
-MATERIAL_PARTS = ("roughness", "metallic", "specular_factor", "hue")
-
 
 @dataclass
 class StepSettings(Settings):
@@ -47,13 +40,9 @@ class StepSettings(Settings):
     parts: ClassVar[tuple[str, ...]] = ()
 
     norm: str = setting("linf", "Norm of the ball.", choices=NORMS)
-    radius: float | None = setting(
-        None, "Radius of the norm-ball. null permits all values.", within=(0, MAX_SCALE)
-    )
+    radius: float | None = setting(None, "Ball's radius. null: no limit.", within=(0, MAX_SCALE))
     step: str = setting(
-        "unit",
-        "Direction of a step: the gradient with L2 norm 1 (unit), the gradient (raw) or its sign.",
-        choices=STEPS,
+        "unit", "Step: the gradient of L2 norm 1 (unit), itself (raw) or its sign.", choices=STEPS
     )
     step_size: float = setting(0.05, "Factor of each step.", within=(1 / MAX_MAGNITUDE, MAX_SCALE))
 
@@ -75,15 +64,9 @@ class SkylightSettings(StepSettings):
     """
 
     zenith: float = setting(45.0, "Initial zenith angle of the sun.", "degrees", within=(0, 90))
-    azimuth: float = setting(
-        0.0, "Initial azimuth of the sun.", "degrees", within=(-MAX_SCALE, MAX_SCALE)
-    )
-    turbidity: float = setting(
-        3.0, "Initial turbidity of the air, from 2 (clear) to 10 (hazy).", within=TURBIDITY
-    )
-    sun: float = setting(
-        math.degrees(1), "Change of both angles for a value of 1.", "degrees", within=(0.1, 360)
-    )
+    azimuth: float = setting(0.0, "Its initial azimuth.", "degrees", within=(-MAX_SCALE, MAX_SCALE))
+    turbidity: float = setting(3.0, "Initial turbidity: 2 (clear) to 10 (hazy).", within=TURBIDITY)
+    sun: float = setting(math.degrees(1), "Unit of both angles.", "degrees", within=(0.1, 360))
 
 
 @dataclass
@@ -95,23 +78,13 @@ class PoseSettings(StepSettings):
     """
 
     needs_noise_margin = True
-    parts = POSE_PARTS
+    parts = ("rotation", "shift", "scale", "view", "distance")
 
-    rotation: float = setting(
-        10.0, "Rotation of the object for a value of 1.", "degrees", within=(0, 180)
-    )
-    shift: float = setting(
-        0.1, "Shift of the object, which spans [-1, 1], for a value of 1.", within=(0, 10)
-    )
-    scale: float = setting(
-        0.1, "Growth of the object for a value of 1. 0.1 is a factor of 1.1.", within=(0, 1)
-    )
-    view: float = setting(
-        10.0, "Change of the camera's angles for a value of 1.", "degrees", within=(0, 180)
-    )
-    distance: float = setting(
-        0.1, "Growth of the distance of the camera for a value of 1.", within=(0, 1)
-    )
+    rotation: float = setting(10.0, "Rotation of the object per unit.", "degrees", within=(0, 180))
+    shift: float = setting(0.1, "Shift of the object, whose size is 2, per unit.", within=(0, 10))
+    scale: float = setting(0.1, "Growth of the object per unit. 0.1: factor 1.1.", within=(0, 1))
+    view: float = setting(10.0, "Turn of the camera per unit.", "degrees", within=(0, 180))
+    distance: float = setting(0.1, "Growth of the camera's distance per unit.", within=(0, 1))
 
 
 @dataclass
@@ -123,23 +96,14 @@ class MaterialSettings(StepSettings):
     """
 
     needs_noise_margin = True
-    parts = MATERIAL_PARTS
+    parts = ("roughness", "metallic", "specular_factor", "hue")
 
     roughness: float = setting(
-        0.3,
-        "Change of the roughness for a value of 1. It stays between 0.2 and 1. A matte mesh "
-        "starts with a dielectric specular layer of roughness 0.5 and strength 1.",
-        within=(0, 1),
+        0.3, "Change of the roughness per unit. A matte mesh starts at 0.5.", within=(0, 1)
     )
-    metallic: float = setting(
-        0.3, "Change of the metallic factor of metals for a value of 1.", within=(0, 1)
-    )
-    specular_factor: float = setting(
-        1.0, "Change of the strength of the highlight for a value of 1.", within=(0, 1)
-    )
-    hue: float = setting(
-        0.0, "Rotation of the albedo about gray for a value of 1.", "degrees", within=(0, 180)
-    )
+    metallic: float = setting(0.3, "Change of metals' metallic factor per unit.", within=(0, 1))
+    specular_factor: float = setting(1.0, "Change of the highlight per unit.", within=(0, 1))
+    hue: float = setting(0.0, "Turn of the albedo about gray per unit.", "degrees", within=(0, 180))
 
 
 @dataclass
@@ -173,8 +137,6 @@ PARAMETER_NAMES = tuple(field.name for field in fields(ParameterSettings))
 
 # File with one JSON line for each attacked example, and a last line with the checks.
 LINES = "attack.jsonl"
-# Largest standard deviation of noise, in units of 1/255.
-MAX_NOISE = 255.0
 # Default of `AttackSettings.noise_margin`.
 NOISE_MARGIN = 2.0
 
@@ -191,14 +153,9 @@ DEFAULT_QUERIES = 1000
 class EOTSettings(Settings):
     """Random transformations of an image over which an attack averages (Athalye et al. 2018)."""
 
-    draws: int = setting(
-        0, "Transformations of each image at each step. 0 transforms nothing.", within=(0, 1000)
-    )
+    draws: int = setting(0, "Transformations of an image at each step. 0: none.", within=(0, 1000))
     jitter: float = setting(
-        0.03,
-        "Largest shift of the camera as a fraction of the width of the image, approach as a "
-        "fraction of the distance, and roll in radians.",
-        within=(0, 0.5),
+        0.03, "Largest relative shift and approach of the camera, and roll (rad).", within=(0, 0.5)
     )
     exposure: float = setting(0.2, "Largest change of the exposure.", "stops", within=(0, 5))
     noise: float = setting(0.02, "Standard deviation of the pixel noise.", within=(0, 1))
@@ -218,12 +175,8 @@ class RelightingSettings(Settings):
     gain: float = setting(
         3.0, "Largest factor of a channel. The smallest is its inverse.", within=(1, 100)
     )
-    cells: int = setting(
-        6, "Cells per side with factors of their own, interpolated between.", within=(1, 64)
-    )
-    passes: int = setting(
-        21, "Forward and backward passes of each search through the classifier.", within=(1, 10**6)
-    )
+    cells: int = setting(6, "Cells per side with factors of their own.", within=(1, 64))
+    passes: int = setting(21, "Forward and backward passes of each search.", within=(1, 10**6))
     slides: int = setting(1, "Number of random slides for each photograph.", within=(1, 10**4))
 
     @property
@@ -256,21 +209,15 @@ class AttackSettings(ParameterSettings):
         "need no gradients. null: gradient, or random_search if the classifier has no gradients.",
         choices=OPTIMIZERS,
     )
-    max_steps: int = setting(
-        30, "Largest number of steps along the gradient. The paper takes 30.", within=(0, 10**6)
-    )
+    max_steps: int = setting(30, "Largest number of steps along the gradient.", within=(0, 10**6))
     max_queries: int | None = setting(
         None,
         "Largest number of forward passes for each example. All starts have the same share of it. "
         f"null: {DEFAULT_QUERIES}, and no limit besides max_steps for optimizer=gradient.",
         within=(1, 10**9),
     )
-    backtracking: bool = setting(
-        False, "Take back a step that did not lower the cost, and try half of it (backtracking)."
-    )
-    restarts: int = setting(
-        0, "Random starts that examples without success get in addition.", within=(0, 10**6)
-    )
+    backtracking: bool = setting(False, "Halve steps that do not lower the cost (backtracking).")
+    restarts: int = setting(0, "More random starts of examples without success.", within=(0, 10**6))
     margin: float = setting(
         2.0,
         "Stop an example when, in every view, the logit gap is at least this large: the target "
@@ -284,7 +231,7 @@ class AttackSettings(ParameterSettings):
         "Standard deviation of the noise of a camera. A success counts only if it survives three "
         "draws of this noise. 0 counts without noise.",
         "steps of 8 bits",
-        within=(0, MAX_NOISE),
+        within=(0, 255),
     )
     noise_margin: float | None = setting(
         None,
@@ -295,12 +242,8 @@ class AttackSettings(ParameterSettings):
         within=(0, MAX_SCALE),
     )
     eot: EOTSettings = setting(EOTSettings, "Attack the mean over random transformations.")
-    allow_negative: bool = setting(
-        False, "Permit lighting with negative radiance, which is not physically possible."
-    )
-    batch_size: int = setting(
-        32, "Images per pass through the classifier, or fewer if memory is full.", within=(1, 10**6)
-    )
+    allow_negative: bool = setting(False, "Permit lighting with negative, unphysical radiance.")
+    batch_size: int = setting(32, "Images per pass, or fewer if memory is full.", within=(1, 10**6))
 
     def __post_init__(self) -> None:
         """Check that the settings do not contradict each other."""

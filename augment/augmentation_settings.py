@@ -18,10 +18,7 @@ MODES = {
     "adversarial": "attacked renders",
     "folder": "images",
 }
-INITS = ("scene", "random")
 MAX_EXAMPLES = 10**6
-MAX_INTERVAL = 10**9  # Largest number of training images between two regenerations of renders.
-MAX_BLUR = 1.5  # pixels
 # Limits of a random field of view in degrees. The larger it is, the closer is the camera. Beyond
 # 45 degrees, the camera could be inside of a mesh that spans [-1, 1].
 MIN_FOV = 1.0
@@ -51,14 +48,10 @@ class CameraEffectSettings(Settings):
     """
 
     pattern_fraction: float = setting(0.0, "Fraction of renders with a pattern.", within=FRACTION)
-    slides: str | None = setting(
-        None, "Folder of photographs, which half of the patterns show. null: none."
-    )
-    pattern_fill: list[float] = pair(
-        list(NONE), "factor of the lighting of the scene beneath the pattern.", FRACTION
-    )
+    slides: str | None = setting(None, "Folder of photographs in half of the patterns. null: none.")
+    pattern_fill: list[float] = pair(list(NONE), "factor of the light beneath a pattern.", FRACTION)
     white_balance: float = setting(0.0, "Largest change of each channel.", "stops", within=(0, 5))
-    blur: float = setting(0.0, "Largest deviation of the blur.", "pixels", within=(0, MAX_BLUR))
+    blur: float = setting(0.0, "Largest deviation of the blur.", "pixels", within=(0, 1.5))
     noise: float = setting(0.0, "Largest standard deviation of the pixel noise.", within=FRACTION)
 
 
@@ -74,37 +67,23 @@ class VariationSettings(Settings):
     (True, False)
     """
 
-    shift: float = setting(
-        0.0, "Largest shift of the mesh in the image, as a fraction of its width.", within=FRACTION
-    )
+    shift: float = setting(0.0, "Largest shift as a fraction of the image width.", within=FRACTION)
     scale: list[float] = pair(list(UNCHANGED), "factor of the size in the image.", FACTOR)
     exposure: list[float] = pair(list(UNCHANGED), "factor of the lighting.", FACTOR)
-    backgrounds: str | None = setting(
-        None, "Folder of images that replace scene.backgrounds. null: none."
-    )
+    backgrounds: str | None = setting(None, "Folder of images for scene.backgrounds. null: none.")
     instances: bool = setting(False, "Draw another instance of each solid without a seed.")
     azimuth: float = setting(
         0.0, "Largest turn of the camera to either side, up and down.", "degrees", within=(0, 180)
     )
-    fov: list[float] = pair(
-        list(NONE), "field of view. [0, 0]: the camera of the scene.", (0, MAX_FOV), "degrees"
-    )
-    rotation: float = setting(
-        0.0, "Largest rotation of the mesh about a random axis.", "degrees", within=(0, 180)
-    )
-    environments: list[str] = setting(
-        [], "Environment lightings that replace scene.light, one of them for each render."
-    )
+    fov: list[float] = pair(list(NONE), "field of view. [0, 0]: as it is.", (0, MAX_FOV), "degrees")
+    rotation: float = setting(0.0, "Largest turn about a random axis.", "degrees", within=(0, 180))
+    environments: list[str] = setting([], "Lightings that replace scene.light, one in each render.")
     directional_fraction: float = setting(
         0.0, "Fraction of renders in directional light from near the camera.", within=FRACTION
     )
-    fill_light: list[float] = pair(
-        list(NONE), "factor of the environment lighting of these renders.", FRACTION
-    )
+    fill_light: list[float] = pair(list(NONE), "factor of their environment lighting.", FRACTION)
     lit_background: bool = setting(False, "Light the backgrounds as walls that face the camera.")
-    tables: float = setting(
-        0.0, "Fraction of renders on a table in front of a wall, with shadows.", within=FRACTION
-    )
+    tables: float = setting(0.0, "Fraction of renders on a table before a wall.", within=FRACTION)
     background_saturation: float = setting(
         0.0, "Largest saturation of a random color of each background.", within=FRACTION
     )
@@ -132,12 +111,8 @@ class VariationSettings(Settings):
 class RandomLightSettings(Settings):
     """Random perturbation of the lighting of the scene."""
 
-    amplitude: float = setting(
-        0.5, "Largest change of a coefficient, which is drawn uniformly.", within=FACTOR
-    )
-    radius: float | None = setting(
-        None, "L2 norm of the perturbation. null: the amplitude applies.", within=FACTOR
-    )
+    amplitude: float = setting(0.5, "Largest uniform change of a coefficient.", within=FACTOR)
+    radius: float | None = setting(None, "L2 norm of the change. null: amplitude.", within=FACTOR)
 
 
 @dataclass
@@ -179,23 +154,17 @@ class AugmentationSettings(Settings):
     """
 
     mode: str = setting("adversarial", "Kind of renders.", choices=MODES)
-    folder: str | None = setting(
-        None, "Folder of images for mode=folder: a folder per class, or other_NAME."
-    )
+    folder: str | None = setting(None, "Folder for mode=folder: a folder per class, or other_NAME.")
     examples: int | None = setting(
         None,
         "Renders per regeneration, as many of each mesh as possible. null: meshes × views × "
         "backgrounds (100 without scene.views), or all images of the folder.",
         within=(0, MAX_EXAMPLES),
     )
-    init: str = setting(
-        "scene", "Start of an attack: the light of the scene, or a random one.", choices=INITS
-    )
-    warm_start: bool = setting(
-        False, "Start each attack where the attack of the previous regeneration ended."
-    )
+    init: str = setting("scene", "Light at the start of attacks.", choices=("scene", "random"))
+    warm_start: bool = setting(False, "Start each attack where the previous one ended.")
     regenerate_every: int | None = setting(
-        None, "Training images between regenerations. null: an epoch.", within=(1, MAX_INTERVAL)
+        None, "Training images between regenerations. null: an epoch.", within=(1, 10**9)
     )
     vary: VariationSettings = setting(VariationSettings, "What is drawn anew for each render.")
     random_light: RandomLightSettings = setting(

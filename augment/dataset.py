@@ -218,21 +218,13 @@ def _renders(
         truth = [part[0, 0].cpu() for part in vars(scene.truth(index_of, row, conditions)).values()]
         classes, boxes, masks, visible = (part[truth[0] != NO_OBJECT] for part in truth)
         [camera] = scene.cameras_under(conditions, 0, example)
-        depth, normals = scene.surface_maps(conditions, 0, example)
+        facts = describe_camera(camera.fixed(), scene.settings.shape)
+        labels = [names[index] for index in classes.tolist()]
+        seen = labels, boxes, masks, visible, *scene.surface_maps(conditions, 0, example)
         shown = scene.examples[example]
-        yield LabeledRender(
-            start + example,
-            image,
-            [names[index] for index in classes.tolist()],
-            boxes,
-            masks,
-            visible,
-            depth,
-            normals,
-            describe_camera(camera.fixed(), scene.settings.shape),
-            conditions.light[0].cpu() * shown.exposure,
-            scene.objects[shown.object].name,
-        )
+        light = conditions.light[0].cpu() * shown.exposure
+        name = scene.objects[shown.object].name
+        yield LabeledRender(start + example, image, *seen, facts, light, name)
 
 
 def describe_camera(camera: Camera, shape: tuple[int, int]) -> dict[str, Any]:

@@ -70,15 +70,12 @@ class Inputs:
         """Write the facts about the images of a network, each with who states it."""
         black, white = self.limits
         height, width = height_and_width(size)
-        facts = {
-            f"{height} × {width} pixels": self.size,
-            normalization_of(network, self.limits) or "not normalized": self.normalization,
-            f"values from {black:g} to {white:g}": self.value_range,
-        }
-        return "; ".join(
-            f"{fact}, {f'stated by {source}' if source else 'assumed'}"
-            for fact, source in facts.items()
+        facts = (
+            (f"{height} × {width} pixels", self.size),
+            (normalization_of(network, self.limits) or "not normalized", self.normalization),
+            (f"values from {black:g} to {white:g}", self.value_range),
         )
+        return "; ".join(f"{fact}, {f'stated by {by}' if by else 'assumed'}" for fact, by in facts)
 
 
 FROM_FILE = Inputs(FILE, FILE, FILE)
@@ -247,9 +244,7 @@ def without_normalized_light(network: Any) -> Any:
     return network if light_settings(network) is None else network.network
 
 
-def normalize_light(
-    images: Float[Tensor, "N 3 H W"], settings: NormalizedLightSettings
-) -> Float[Tensor, "N 3 H W"]:
+def normalize_light(images: Float[Tensor, "N 3 H W"], settings: NormalizedLightSettings) -> Tensor:
     """Normalize color and brightness of the light of each image.
 
     Each image is treated by itself, in linear light:

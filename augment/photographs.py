@@ -21,14 +21,9 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Generator, Tensor
 
+from augment import attack_settings
 from augment import network as wrappers
-from augment.attack_settings import (
-    GRADIENT,
-    RANDOM_SEARCH,
-    AttackSettings,
-    RelightingSettings,
-    StepSettings,
-)
+from augment.attack_settings import AttackSettings, RelightingSettings, StepSettings
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Objective, preprocessed_model
 from augment.attacks.optimizers import Gradient, NormBalls, Optimizer, sample
@@ -89,9 +84,7 @@ class RelitPhotographs(NormBalls):
         """Return the logarithms of the factors of each channel in each cell."""
         return values.unflatten(1, (3, self._cells, self._cells))
 
-    def render(
-        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A 1 3 H W"]:
+    def render(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Tensor:
         """Show photographs in the light of the projector, each in one view."""
         light = ProjectedLight(*(values[examples] for values in self._light))
         return light.expose(self._albedo[examples], self.log_gain(values))[:, None]
@@ -357,7 +350,9 @@ def _attack_slide(
         # No search reaches this margin, so each uses all passes. The slide as it is takes no step.
         search = replace(
             success,
-            optimizer=RANDOM_SEARCH if light == RANDOM else GRADIENT,
+            optimizer=attack_settings.RANDOM_SEARCH
+            if light == RANDOM
+            else attack_settings.GRADIENT,
             max_steps=0 if light == SLIDE else settings.steps,
             max_queries=settings.passes,
             margin=errors.MAX_SCALE,

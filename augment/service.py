@@ -12,18 +12,16 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from augment import distributed
+from augment import distributed, network, random_streams, tasks
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Objective, preprocessed_model
 from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed_light
 from augment.augmentation_settings import AugmentationSettings, views_of
 from augment.classifier import CheckedNetwork, class_index
-from augment.network import compute_outputs, evenly_spaced, frozen_eval_mode
 from augment.progress import Phases
-from augment.random_streams import generator, stream_seed
 from augment.renders import Renders, select_examples_to_log
 from augment.scene.build import MeshItem, build_scene, with_needed_degree
 from augment.scene.exposure import warn_of_exposure
@@ -31,7 +29,6 @@ from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT, Truth
 from augment.scene.vary import vary
-from augment.tasks import classification
 from augment.tasks.classification import ClassCriterion, Classification
 from augment.tasks.task import NO_CLASS, Criterion, Task
 from renderer.errors import InputError, as_integers, require_kind, require_whole
@@ -256,14 +253,12 @@ class AugmentationService:
     def problem(self, number: int) -> SceneProblem:
         """Vary the scene at random, and return what an attack on it may change."""
         assert self.scene is not None
-        draws = generator(self.seed, number, "rows")
+        draws = random_streams.generator(self.seed, number, "rows")
         is_random = self.settings.mode == "random"
         scene = vary(self.scene, self.settings.vary, draws, once=is_random)
         return build_problem(self.settings.attack, scene)
 
-    def values(
-        self, model: nn.Module | None, problem: SceneProblem, number: int
-    ) -> Float[Tensor, "E D"]:
+    def values(self, model: nn.Module | None, problem: SceneProblem, number: int) -> Tensor:
         """Return the values of a problem with this number: random ones, or those of an attack."""
         if self.settings.mode == "random" or model is None:
             return self._random_values(problem, number)
@@ -324,9 +319,7 @@ class AugmentationService:
         digest = hashlib.sha256(repr(shown).encode()).digest()
         return torch.tensor(list(digest), dtype=torch.uint8)
 
-    def _from_folder(
-        self, model: nn.Module, images: UInt8[Tensor, "F 3 H W"], number: int
-    ) -> Renders:
+    def _from_folder(self, model: nn.Module, images: Tensor, number: int) -> Renders:
         """Select the next images of a folder in place of renders, and classify some of them.
 
         Each pass through the folder has another random order, and a selection may begin in one pass
@@ -336,7 +329,7 @@ class AugmentationService:
         # Imagine all passes one after the other. The first selected image is at this position.
         first = number * count
         passes = range(first // image_count, (first + count - 1) // image_count + 1)
-        draws = [generator(self.seed, index, "folder") for index in passes]
+        draws = [random_streams.generator(self.seed, index, "folder") for index in passes]
         orders = [torch.randperm(image_count, generator=each) for each in draws]
         rows = torch.cat(orders)[first % image_count :][:count].to(images.device)
         selected = to_unit(images[rows])
@@ -366,17 +359,15 @@ class AugmentationService:
         truth = problem.scene.truth(index_of, every, problem.conditions(values, every))
         return replace(truth, labels=truth.labels.clamp(min=NO_OBJECT))
 
-    def _find(
-        self, model: nn.Module, images: Float[Tensor, "E 3 H W"], truth: Truth
-    ) -> dict[str, float]:
+    def _find(self, model: nn.Module, images: Tensor, truth: Truth) -> dict[str, float]:
         """Measure in how many of up to `CLASSIFIED` images the first object is not found."""
         rows = self._shown(truth)
         if not len(rows):
             return {}
-        rows = rows[evenly_spaced(len(rows), CLASSIFIED).to(rows.device)]
+        rows = rows[network.evenly_spaced(len(rows), CLASSIFIED).to(rows.device)]
         criterion = self._criterion(truth, rows)
         objective = Objective(model, criterion, self.settings.attack, phases=self.phases)
-        with frozen_eval_mode(model):
+        with network.frozen_eval_mode(model):
             score, _ = objective.score(images[rows, None], needs_gradient=False)
         return {"attack_success": _mean(score.is_success), "loss": -_mean(score.cost)}
 
@@ -397,15 +388,15 @@ class AugmentationService:
         Return the mask of the images known to be misclassified, and the diagnostics
         "attack_success" (their fraction) and "loss" (the mean).
         """
-        rows = evenly_spaced(len(labels), CLASSIFIED).to(labels.device)
-        with frozen_eval_mode(model), self.phases("attack_classifier"):
+        rows = network.evenly_spaced(len(labels), CLASSIFIED).to(labels.device)
+        with network.frozen_eval_mode(model), self.phases("attack_classifier"):
             attacked_model = preprocessed_model(self.settings.attack, model)
             batch_size = self.settings.attack.batch_size
-            logits = compute_outputs(attacked_model, images[rows], batch_size)
-        classification.require_known(labels, logits)
+            logits = network.compute_outputs(attacked_model, images[rows], batch_size)
+        tasks.classification.require_known(labels, logits)
         absent = self.positive_classes[1:]
-        is_misclassified = ~classification.is_correct(logits.argmax(1), labels[rows], absent)
-        loss = classification.label_loss(logits, labels[rows], absent=absent)
+        is_misclassified = ~tasks.classification.is_correct(logits.argmax(1), labels[rows], absent)
+        loss = tasks.classification.label_loss(logits, labels[rows], absent=absent)
         is_error = torch.zeros_like(labels, dtype=torch.bool)
         is_error[rows] = is_misclassified
         return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
@@ -416,7 +407,7 @@ class AugmentationService:
         Examples that show a detector no object with a class get random values instead.
         """
         attack = self.settings.attack
-        seed = stream_seed(self.seed, number)
+        seed = random_streams.stream_seed(self.seed, number)
         start = values = self._attack_start(problem, number)
         # Indices of the attacked examples.
         attacked = problem.all_examples
@@ -432,11 +423,11 @@ class AugmentationService:
         own = self._own_rows(len(attacked))
         shard = attacked[own]
         objective = Objective(model, criterion.select(own), attack, seed, self.phases)
-        draws = generator(self.seed, number, "restart")
+        draws = random_streams.generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
         result = minimize(problem, objective, examples=shard, start=start[shard], restarts=restarts)
         objective = objective.moved(problem, result.values, shard)
-        with frozen_eval_mode(model), self.phases("attack_classifier"):
+        with network.frozen_eval_mode(model), self.phases("attack_classifier"):
             is_fooled = objective.fooled_in_views(result.images, result.predicted, shard)
         # Examples that are misclassified before the attack count as successes.
         success = self._gather(is_fooled.all(1) | result.success_before, own, len(attacked))
@@ -467,9 +458,7 @@ class AugmentationService:
         """Return the indices of those of some examples that this process renders or attacks."""
         return distributed.shard(count, self.rank, self.world_size).to(self.labels.device)
 
-    def _gather(
-        self, part: Shaped[Tensor, "A ..."], own: Int[Tensor, " A"], count: int
-    ) -> Shaped[Tensor, "E ..."]:
+    def _gather(self, part: Tensor, own: Int[Tensor, " A"], count: int) -> Tensor:
         """Collect from all processes what each computed for its `_own_rows` of the examples."""
         return distributed.all_gather_rows(part, own, count, self.world_size)
 
@@ -513,11 +502,11 @@ class AugmentationService:
                 # `perturb` returns a light plus random changes. Give it a light of zero, to get
                 # the changes alone.
                 no_light = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
-                draws = generator(self.seed, number, "lights")
+                draws = random_streams.generator(self.seed, number, "lights")
                 offsets = perturb(no_light, len(start), settings.amplitude, settings.radius, draws)
                 parts.append(start + offsets.flatten(1).to(start))
             else:
-                draws = generator(self.seed, number, parameter.name)
+                draws = random_streams.generator(self.seed, number, parameter.name)
                 parts.append(parameter.sample(draws).to(start))
         return problem.project(torch.cat(parts, dim=1), problem.all_examples)
 

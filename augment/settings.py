@@ -12,26 +12,9 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
+from renderer import settings as base
 from renderer.errors import MAX_SCALE, InputError, is_number, require_choice, require_range
-from renderer.settings import (
-    MAX_DEGREE,
-    MAX_SAMPLES,
-    MAX_VERTICES,
-    MAX_VIEWS,
-    RASTERIZERS,
-    REQUIRED,
-    ImageSettings,
-    Settings,
-    Size,
-    samples_per_side,
-    setting,
-    setting_like,
-    settings_from,
-)
-
-UP_AXES = ("auto", "y", "z")
-OBJECT_DISTANCES = (-10.0, 10.0)  # Range of the coordinates of objects beside the first one.
-MAX_PROJECTOR_PIXELS = 256  # per side
+from renderer.settings import REQUIRED, ImageSettings, Settings, Size, setting, setting_like
 
 
 @dataclass
@@ -40,7 +23,7 @@ class MeshSettings(Settings):
 
     mesh: str = setting(REQUIRED, "A mesh file, or a solid: solid:NAME or solid:NAME:SEED.")
     _: KW_ONLY
-    up: str = setting("auto", "Axis that points up in the file.", choices=UP_AXES)
+    up: str = setting("auto", "Axis that points up in the file.", choices=("auto", "y", "z"))
     color: list[float] | None = setting(
         None, "Color of a mesh without colors: [r, g, b] in sRGB.", length=3, within=(0, 1)
     )
@@ -86,7 +69,7 @@ class ObjectSettings(MeshSettings):
         "x and y of its center on the ground, in units in which the first object spans [-1, 1]. "
         "null: beside the objects before it, without touching them.",
         length=2,
-        within=OBJECT_DISTANCES,
+        within=(-10, 10),
     )
     scale: float = setting(1.0, "Its largest coordinate. The first has 1.", within=(0.1, 10))
     azimuth: float = setting(0.0, "Rotation about the vertical.", "degrees", within=(-360, 360))
@@ -97,7 +80,7 @@ class ObjectSettings(MeshSettings):
         super().__post_init__()
         for index, other in enumerate(self.others):
             key = f"others[{index}]"
-            self.others[index] = item = settings_from(ObjectSettings, other, key)
+            self.others[index] = item = base.settings_from(ObjectSettings, other, key)
             if item.others or item.albedo_scale != 1:
                 reason = f"{key} has others or albedo_scale={item.albedo_scale}"
                 raise InputError(f"{reason}: give both to the first object", key)
@@ -111,7 +94,7 @@ class ObjectSettings(MeshSettings):
 class ProjectorSettings(Settings):
     """A projector, and the pattern that it shows before an attack."""
 
-    pixels: int = setting(16, "Pixels per side of its pattern.", within=(1, MAX_PROJECTOR_PIXELS))
+    pixels: int = setting(16, "Pixels per side of its pattern.", within=(1, 256))
     polar: float = setting(45.0, "Its polar angle from +z.", "degrees", within=(0, 180))
     azimuth: float = setting(45.0, "Its azimuth.", "degrees", within=(-360, 360))
     distance: float = setting(4.0, "Its distance in world units.", within=(2, MAX_SCALE))
@@ -153,11 +136,11 @@ class SceneSettings(Settings):
     """Cameras, backgrounds and lighting of a scene."""
 
     backgrounds: list[Any] = setting([0.5], "Gray values in [0, 1] or image files.")
-    views: int | None = setting(1, "Cameras per mesh, at equal azimuths.", within=(1, MAX_VIEWS))
-    polar: float = setting(60.0, "Polar angle of the cameras from +z.", "degrees", within=(0, 180))
-    azimuth: float = setting(
-        0.0, "Azimuth of the first camera from +x toward +y.", "degrees", within=(-360, 360)
+    views: int | None = setting(
+        1, "Cameras per mesh at equal azimuths.", within=(1, base.MAX_VIEWS)
     )
+    polar: float = setting(60.0, "Polar angle of the cameras from +z.", "degrees", within=(0, 180))
+    azimuth: float = setting(0.0, "First azimuth from +x toward +y.", "degrees", within=(-360, 360))
     width: float = setting(2.0, "Width of the image at the mesh, which spans [-1, 1].")
     fov: float | None = setting(
         None, "Field of view. null: orthographic.", "degrees", within=(0.1, 150)
@@ -165,7 +148,7 @@ class SceneSettings(Settings):
     vertices: int = setting(
         0,
         "Subdivide each mesh until it has more vertices than this, such as 1e4 in the paper.",
-        within=(0, MAX_VERTICES),
+        within=(0, base.MAX_VERTICES),
         checks_type=False,  # A float such as 1e4 is valid, too.
     )
     light: str = setting(
@@ -178,12 +161,9 @@ class SceneSettings(Settings):
         None,
         "Spherical-harmonic degree of the lighting. "
         "null: 6, or what the smoothest specular material needs that the run can reach.",
-        within=(0, MAX_DEGREE),
+        within=(0, base.MAX_DEGREE),
     )
-    exposure: Any = setting(
-        1.0,
-        "Factor of the lighting. auto: one for each mesh, at which its pixels have the mean 0.4.",
-    )
+    exposure: Any = setting(1.0, "Factor of the lighting. auto: a mean of 0.4 for each mesh.")
     # `projector` and `lamps` are dictionaries that `__post_init__` converts to settings, because
     # OmegaConf cannot set a single field of an optional dataclass.
     projector: Any = setting(
@@ -206,7 +186,7 @@ class SceneSettings(Settings):
             require_range("exposure", self.exposure, 1 / MAX_SCALE, MAX_SCALE)
         for name, kind in LOCAL_LIGHT_SETTINGS.items():
             if getattr(self, name) is not None:
-                setattr(self, name, settings_from(kind, getattr(self, name), name))
+                setattr(self, name, base.settings_from(kind, getattr(self, name), name))
 
     @property
     def given_exposure(self) -> float:
@@ -224,9 +204,7 @@ class RendererSettings(Settings):
         checks_type=False,  # A `Rasterizer` is valid, too.
     )
     samples: int | None = setting(
-        None,
-        "Samples per side of a pixel. null: 2, or 8 with silhouettes.",
-        within=(1, MAX_SAMPLES),
+        None, "Samples per pixel side. null: 2 (8 with silhouettes).", within=(1, base.MAX_SAMPLES)
     )
     encoding: str = setting_like(ImageSettings, "encoding", "linear")
     normals: str = setting_like(ImageSettings, "normals", "smooth")
@@ -237,13 +215,13 @@ class RendererSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not hasattr(self.rasterizer, "rasterize"):
-            require_choice("rasterizer", self.rasterizer, RASTERIZERS)
+            require_choice("rasterizer", self.rasterizer, base.RASTERIZERS)
 
     def image(self, size: Size) -> ImageSettings:
         """Return the settings of images with a size: pixels per side, or height and width."""
-        names = ("encoding", "normals", "shadows", "bounces", "silhouettes")
-        options = {name: getattr(self, name) for name in names}
-        return ImageSettings(size, samples_per_side(self.samples, self.silhouettes), **options)
+        options = {name: value for name, value in vars(self).items() if name != "rasterizer"}
+        options["samples"] = base.samples_per_side(self.samples, self.silhouettes)
+        return ImageSettings(size, **options)
 
 
 @dataclass
@@ -253,16 +231,10 @@ class NormalizedLightSettings(Settings):
     `benchmarks/normalized_light.py` chose the defaults on validation data.
     """
 
-    percentile: float = setting(
-        95.0, "Percentile of the pixels that the exposure maps to `level`.", above=0, maximum=100
-    )
+    percentile: float = setting(95.0, "Percentile that is mapped to `level`.", above=0, maximum=100)
     level: float = setting(1.0, "Linear value of this percentile.", above=0, maximum=1)
-    white_balance: float = setting(
-        0.0, "White balance. 0: none. 1: all channels have the same mean.", within=(0, 1)
-    )
-    gamma: float = setting(
-        1.25, "Exponent of the encoded image. Less than 1 brightens it.", within=(0.1, 10)
-    )
+    white_balance: float = setting(0.0, "Balance. 0: none. 1: equal channel means.", within=(0, 1))
+    gamma: float = setting(1.25, "Exponent of encoded values. Below 1: brighter.", within=(0.1, 10))
 
 
 # Type of the argument `normalize_light` of several functions.
@@ -276,4 +248,5 @@ def read_normalized_light(value: NormalizeLight) -> NormalizedLightSettings | No
     """
     if value is None or value is False:
         return None
-    return settings_from(NormalizedLightSettings, {} if value is True else value, "normalize_light")
+    given = {} if value is True else value
+    return base.settings_from(NormalizedLightSettings, given, "normalize_light")

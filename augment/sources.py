@@ -17,14 +17,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from augment import files, huggingface
+from augment import files, huggingface, progress, tasks
 from augment import network as wrappers
 from augment.classifier import Classifier, Normalization, as_network, mean_and_std, nearest
 from augment.files import NetworkFacts
 from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network, unwrapped
-from augment.progress import progress_message
 from augment.settings import NormalizeLight
-from augment.tasks import recognized_task
 from augment.tasks.classification import Classification
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
@@ -333,7 +331,7 @@ def _python(name: str, weights: Path | None, *_: object) -> Any:
     gray = torch.full((1, 3, size, size), 0.5)
     try:
         with torch.no_grad(), wrappers.eval_mode(network):
-            task = recognized_task(Network(network)(gray), title)
+            task = tasks.recognized_task(Network(network)(gray), title)
     except Exception:  # A classifier reports its errors itself when it is used.
         task = Classification()
     if isinstance(task, Classification):
@@ -447,7 +445,7 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
         files.require_no_facts(name, facts)
     elif source != "hf":
         files.require_no_facts(name, NetworkFacts(prompt=facts.prompt, task=facts.task))
-    with progress_message(f"loading {name}"):
+    with progress.progress_message(f"loading {name}"):
         if known is None:
             return files.load_file(name, facts, trust_code)
         return known(*([model] if colon else []), path, facts, False)

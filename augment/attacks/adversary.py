@@ -23,10 +23,8 @@ from renderer.errors import MAX_SCALE, InputError, ShortRepr
 from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.io.images import gray_or_image, write_image
 from renderer.io.meshes import export_mesh
+from renderer.light import environment, files, lamps
 from renderer.light.basis import Basis, with_local_lights
-from renderer.light.environment import negative_fraction, to_map, write_map
-from renderer.light.files import load_light, read_light, save_light
-from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.mesh import select_faces
 from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.pinhole import PinholeCamera
@@ -121,16 +119,15 @@ class Adversary(ShortRepr):
             The adversary.
         """
         row = example if row is None else row
-        scene_example = scene.examples[example]
-        clean_object = scene.objects[scene_example.object]
-        changes = after.row(row, clean_object.mesh)
+        before_attack = scene.examples[example]
+        item = scene.objects[before_attack.object]
         cameras = scene.cameras_under(after, row, example)
         return Adversary(
-            shown=_attacked_object(clean_object, changes, scene.settings.encoding),
+            shown=_attacked_object(item, after.row(row, item.mesh), scene.settings.encoding),
             cameras=tuple(camera.fixed() for camera in cameras),
-            light=after.light[row].detach().cpu() * scene_example.exposure,
+            light=after.light[row].detach().cpu() * before_attack.exposure,
             basis=scene.basis_under(after, row),
-            background=scene.backgrounds[scene_example.background].cpu(),
+            background=scene.backgrounds[before_attack.background].cpu(),
             settings=scene.settings,
             images_in_views_before=before.cpu(),
             images_in_views=images.cpu(),
@@ -238,15 +235,15 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     }
     atomic_write(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
 
-    radiance = to_map(light, MAP_HEIGHT)
+    radiance = environment.to_map(light, MAP_HEIGHT)
     if radiance.min() >= -RGBE_TOLERANCE * radiance.max():
         for suffix in (".hdr", ".exr"):
-            write_map(folder / f"light{suffix}", radiance)
+            environment.write_map(folder / f"light{suffix}", radiance)
     mitsuba = folder / MITSUBA
     scale = shown.albedo_scale
     write_mitsuba_scene(mitsuba, shown.mesh, scale, cameras, settings, "light.exr", local_lights)
-    write_map(mitsuba / "light.exr", mitsuba_map(light, MAP_HEIGHT).clamp(min=0))
-    return {"negative_light": negative_fraction(radiance)}
+    environment.write_map(mitsuba / "light.exr", mitsuba_map(light, MAP_HEIGHT).clamp(min=0))
+    return {"negative_light": environment.negative_fraction(radiance)}
 
 
 def _as_numpy(values: Tensor) -> np.ndarray:
@@ -267,7 +264,7 @@ def save_lights(
         coefficients = light[rows]
         # The first light is the environment.
         name = basis_of_light.name if lights else Path(LIGHT).stem
-        save_light(folder / f"{name}{when}.json", coefficients, basis_of_light)
+        files.save_light(folder / f"{name}{when}.json", coefficients, basis_of_light)
         lights.append((basis_of_light, coefficients))
     return lights
 
@@ -331,8 +328,8 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
         # This raises InputError if the camera is inside of the mesh.
         camera.depths(mesh.vertices)
     paths = [folder / f"{Path(light).name}.json" for light in description["local_lights"]]
-    local_lights = [read_light(path, *LOCAL_LIGHTS.values()) for path in paths]
-    sky = load_light(str(folder / LIGHT), degree=None)
+    local_lights = [files.read_light(path, *lamps.LOCAL_LIGHTS.values()) for path in paths]
+    sky = files.load_light(str(folder / LIGHT), degree=None)
     basis, light = with_local_lights(sky, local_lights)
     background = description["background"]
     if isinstance(background, str):

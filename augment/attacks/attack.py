@@ -32,8 +32,7 @@ from augment.settings import NormalizeLight, SceneSettings
 from augment.tasks.classification import Classification
 from augment.tasks.task import Criterion, Task
 from renderer.errors import InputError, as_list, is_whole, require_flag, require_kind, require_whole
-from renderer.light.basis import harmonics_of
-from renderer.light.files import PROBES, UNIFORM, load_light
+from renderer.light import basis, files
 
 # `attack(..., target="least_likely")` makes the target the class with the lowest confidence
 # before the attack.
@@ -241,7 +240,7 @@ def require_clean_correct(
     for example, view in wrong[:1]:
         item = scene.objects[scene.examples[example].object]
         found = network.task.describe(evidence[example, view], network.classes)
-        count = f"{len(wrong)} of {criterion.source.numel()} images {network.task.missed}"
+        count = f"in {len(wrong)} of {criterion.source.numel()} images, the class is not found"
         first = f"the first, of {item.name}, class {item.label!r}: {found}"
         advice = "change the scene, or set force=True"
         raise InputError(f"force=False, and {count} ({first}): {advice}", "force")
@@ -294,9 +293,8 @@ def find_scene(
     `CONFIDENCE_TO_STOP` in all images. The given settings are returned if the classifier is right
     in all their images, or if no other scene is recognized.
     """
-    [confidence] = _confidences(build(settings), attack_settings, classifier)
-    # `_confidences` returns 0 if an image is misclassified.
-    if confidence > 0:
+    # The confidence is 0 if an image is misclassified.
+    if _confidences(build(settings), attack_settings, classifier).any():
         return settings
     highest, best_settings = 0.0, settings
     for candidate in progress(_candidates(settings, cameras, draws), "search for a scene"):
@@ -339,10 +337,10 @@ def _best_light(
     scene: Scene, settings: Settings, attack_settings: AttackSettings, classifier: Classifier
 ) -> tuple[float, Settings]:
     """Return the highest confidence in a scene in any light and exposure, and its settings."""
-    degree = harmonics_of(scene.basis).degree
+    degree = basis.harmonics_of(scene.basis).degree
     candidates, coefficients = [], []
-    for name in dict.fromkeys([settings.light, *PROBES, UNIFORM]):
-        light = load_light(name, degree)
+    for name in dict.fromkeys([settings.light, *files.PROBES, files.UNIFORM]):
+        light = files.load_light(name, degree)
         for factor in EXPOSURES:
             exposure = settings.given_exposure * factor
             candidates.append(replace(settings, light=name, exposure=exposure))

@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
 from augment.attack_settings import LINES
 from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
-from augment.attacks.objective import as_jpeg
+from augment.attacks.objective import Images, as_jpeg
 from augment.attacks.result import AttackResult, require_result, warnings
 from augment.progress import progress
 from augment.scene.objects import Conditions
@@ -162,9 +161,7 @@ def _write_example(
     }
 
 
-def _numbers_of_version(
-    result: AttackResult, images: Float[Tensor, "E V 3 height width"]
-) -> list[dict[str, Any]]:
+def _numbers_of_version(result: AttackResult, images: Images) -> list[dict[str, Any]]:
     """Return successes, predictions and differences of another version for each example."""
     judged = result.objective().judge(images, result.problem.all_examples)
     evidence, fooled_in_views, without_noise = judged
@@ -182,18 +179,16 @@ def _numbers_of_version(
     ]
 
 
-def render_again(
-    folder: Path, renderers: Sequence[str], rasterizer: Rasterizer
-) -> dict[str, Tensor]:
+def render_again(folder: Path, names: Sequence[str], rasterizer: Rasterizer) -> dict[str, Tensor]:
     """Render the V views of an example from its saved files alone.
 
-    Return images of shape (V, 3, height, width) by the name of the renderer.
+    Return images of shape (V, 3, height, width) by the names of the renderers.
     """
     adversary = reload(folder)
     images = {}
-    if "reload" in renderers:
+    if "reload" in names:
         images["reload"] = adversary.render_views(rasterizer)
-    if MITSUBA in renderers:
+    if MITSUBA in names:
         encoding = adversary.settings.encoding
         shape = adversary.settings.shape
         rgba = render_mitsuba_scene(folder / MITSUBA / SCENE, len(adversary.cameras), shape)
@@ -239,9 +234,7 @@ def figure(result: AttackResult, example: int) -> Image.Image:
     return draw_grid(list(zip(*columns.values(), strict=True)), list(columns))
 
 
-def _captions(
-    result: AttackResult, evidence: Float[Tensor, "V K"], example: int
-) -> list[tuple[str, ...]]:
+def _captions(result: AttackResult, evidence: Tensor, example: int) -> list[tuple[str, ...]]:
     """Return the captions of the V views of an example in the figure of an attack.
 
     The first line has the confidence and the name of the predicted class. If it is wrong, a second

@@ -12,7 +12,7 @@ The loop tests with sensor noise of its own. Whether a success counts is finally
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -30,11 +30,7 @@ from renderer.errors import ShortRepr
 # Fields of a `Minimum` that belong to the returned candidate: the keys of `Evaluation.found`.
 FOUND = ("values", "images", "success", "cost", "predicted")
 # Optimizers by their names in the settings.
-OPTIMIZERS: dict[str, type[Optimizer]] = {
-    GRADIENT: Gradient,
-    RANDOM_SEARCH: RandomSearch,
-    CMA_ES: CMAES,
-}
+KINDS: dict[str, type[Optimizer]] = {GRADIENT: Gradient, RANDOM_SEARCH: RandomSearch, CMA_ES: CMAES}
 
 
 @dataclass(frozen=True, repr=False)
@@ -100,11 +96,9 @@ class Minimum(Rows, ShortRepr):
         # Each tensor is changed in place.
         return minimum.map(torch.clone)
 
-    def record(
-        self, rows: Int[Tensor, " N"], found: Mapping[str, Tensor], is_kept: Bool[Tensor, " N"]
-    ) -> None:
+    def record(self, rows: Examples, found: dict[str, Tensor], mask: Bool[Tensor, " E"]) -> None:
         """Make candidates the present results of some examples, where the mask is true."""
-        kept = is_kept.nonzero()[:, 0]
+        kept = mask.nonzero()[:, 0]
         for name, candidates in found.items():
             getattr(self, name)[rows[kept]] = candidates[kept]
 
@@ -147,7 +141,7 @@ def minimize(
         # Each group uses all restarts, and an iterator would be empty after the first.
         restarts = list(restarts)
         groups = progress(groups, "groups of examples")
-    kind = optimizer or OPTIMIZERS[objective.settings.optimizer or GRADIENT]
+    kind = optimizer or KINDS[objective.settings.optimizer or GRADIENT]
     search = kind(problem, objective.settings, objective.seed)
     minima = []
     for rows in groups:
@@ -187,9 +181,8 @@ def _minimize_group(
         result.queries[rows[checked]] += noisy_count
         is_success = latest.success.clone()
         with frozen_eval_mode(objective.model):
-            is_success[checked] = objective.select(rows[checked]).is_robust(
-                latest.images[checked], examples[rows[checked]]
-            )
+            part = objective.select(rows[checked])
+            is_success[checked] = part.is_robust(latest.images[checked], examples[rows[checked]])
         rows = rows[~is_success]
         if not len(rows):
             break
@@ -222,9 +215,8 @@ def minimize_from(
             candidates = optimizer.ask(active) if step else start[:, None]
             needs_gradient = optimizer.uses_gradients and step < settings.step_limit
             part = objective.select(active)
-            evaluation = evaluate(
-                optimizer.problem, part, candidates, examples[active], needs_gradient
-            )
+            shown = candidates, examples[active], needs_gradient
+            evaluation = evaluate(optimizer.problem, part, *shown)
             if not step:
                 result = Minimum.at_start(evaluation)
             is_accepted = optimizer.tell(active, evaluation)

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from PIL import Image
 from torch import Tensor, nn
@@ -147,9 +146,7 @@ class Objective:
             gradients = gradients.unflatten(0, images.shape[:2])
         return Score.join(batches).of_examples(images.shape[1]), gradients
 
-    def _score_batch(
-        self, batch: Float[Tensor, "N _ H W"], criterion: Criterion, gradients: Tensor | None
-    ) -> Score:
+    def _score_batch(self, batch: Tensor, criterion: Criterion, gradients: Tensor | None) -> Score:
         """Score single images, and write the gradients of their costs if a tensor is given."""
         batch = batch.detach().requires_grad_(gradients is not None)
         outputs = self._outputs(batch)
@@ -178,9 +175,7 @@ class Objective:
         outputs = self.model(batch)
         return outputs.to(batch.dtype) if isinstance(outputs, Tensor) else outputs
 
-    def finished(
-        self, score: Score, images: Images, examples: Examples
-    ) -> tuple[Bool[Tensor, " E"], Int[Tensor, " E"]]:
+    def finished(self, score: Score, images: Images, examples: Examples) -> tuple[Tensor, Tensor]:
         """Return a mask of the successes with the required margin, also with sensor noise.
 
         Only overconfident networks, and settings with a noise margin, are shown noisy images. Their
@@ -248,9 +243,7 @@ class Objective:
         fooled_in_views = self.fooled_in_views(images, predicted, examples)
         return evidence, fooled_in_views, self.criterion.reached(predicted)
 
-    def fooled_in_views(
-        self, images: Images, predicted: Int[Tensor, "E V"], examples: Examples
-    ) -> Bool[Tensor, "E V"]:
+    def fooled_in_views(self, images: Images, predicted: Tensor, examples: Examples) -> Tensor:
         """Decide which views count as a success of an attack.
 
         A view is a success if it meets the criterion without noise and with each of `NOISE_DRAWS`
@@ -275,9 +268,7 @@ class Objective:
         return is_fooled
 
 
-def _image_gradient(
-    cost: Float[Tensor, " N"], outputs: Any, batch: Float[Tensor, "N _ H W"]
-) -> Float[Tensor, "N _ H W"]:
+def _image_gradient(cost: Tensor, outputs: Any, batch: Float[Tensor, "N _ H W"]) -> Tensor:
     """Compute the gradient of the costs with respect to the images."""
     if not cost.requires_grad:
         # A detector that finds nothing returns nothing that depends on the image.
@@ -386,5 +377,5 @@ def _moved(
     # Rotations are those of square pixels.
     aspect = images.shape[-1] / images.shape[-2]
     matrices *= matrices.new_tensor([[1, 1 / aspect, 1], [aspect, 1, 1]])
-    grid = F.affine_grid(matrices, list(images.shape), align_corners=False)
-    return F.grid_sample(images, grid, padding_mode="border", align_corners=False)
+    grid = torch.nn.functional.affine_grid(matrices, list(images.shape), align_corners=False)
+    return torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)

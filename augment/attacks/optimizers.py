@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -151,7 +150,7 @@ class NormBalls:
         tiny = torch.finfo(gradient.dtype).tiny
         largest = gradient.abs().amax(1, keepdim=True)
         scaled = gradient / largest.clamp(min=tiny)
-        return self.settings.step_size * F.normalize(scaled, eps=tiny)
+        return self.settings.step_size * torch.nn.functional.normalize(scaled, eps=tiny)
 
     def search_scale(self, examples: Examples) -> Values:
         """Return how much a search without gradients should change each value at first.

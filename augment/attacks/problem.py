@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings
@@ -62,9 +62,7 @@ class SceneProblem:
         return self.scene.render(self.conditions(values, examples), examples)
 
     @torch.no_grad()
-    def images(
-        self, values: Values, examples: Int[Tensor, " A"] | None = None
-    ) -> Float[Tensor, "A V 3 height width"]:
+    def images(self, values: Values, examples: Int[Tensor, " A"] | None = None) -> Tensor:
         """Render the V views of examples without gradients, `group_size` examples at a time.
 
         The values are those of all E examples. `examples` are the indices of those to render, and
@@ -164,9 +162,7 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
         warnings.warn(message, stacklevel=stacklevel)
 
 
-def source_labels(
-    scene: Scene, device: torch.device, classifier: TaskNetwork
-) -> Int[Tensor, "E V"]:
-    """Return the true class of each view as an index of the classifier."""
-    labels = [classifier.label(label) for label in scene.labels]
+def source_labels(scene: Scene, device: torch.device, network: TaskNetwork) -> Int[Tensor, "E V"]:
+    """Return the true class of each view as an index of the network."""
+    labels = [network.label(label) for label in scene.labels]
     return torch.tensor(labels, device=device)[:, None].expand(-1, scene.views)

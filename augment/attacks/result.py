@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from PIL import ImageOps
 from torch import Tensor, nn
@@ -53,9 +52,7 @@ FRAME_TIME = 120
 # Milliseconds for which the first and the last frame of an animation are shown.
 PAUSE = 1200
 # What `attack` and its checks say if gradient descent finds no direction.
-ZERO_GRADIENT = (
-    "the first gradient of some examples is exactly zero: optimizer=random_search needs none"
-)
+ZERO_GRADIENT = "the first gradient of some examples is zero: optimizer=random_search needs none"
 
 
 @dataclass(frozen=True, repr=False)
@@ -357,7 +354,7 @@ class AttackResult(ShortRepr):
         scale = MAX_SIDE / max(shown.shape[-2:])
         if scale < 1:
             size = [max(1, round(scale * side)) for side in shown.shape[-2:]]
-            shown = F.interpolate(shown, size, mode="bilinear", antialias=True)
+            shown = torch.nn.functional.interpolate(shown, size, mode="bilinear", antialias=True)
         tiles = tiles_of(shown.cpu(), [(title,) for title in titles], SIDE)
         ball_tiles = tiles_of(balls, [("light",)] * frame_count, SIDE)
         frames = [draw_grid([pair]) for pair in zip(tiles, ball_tiles, strict=True)]
@@ -380,15 +377,15 @@ class AttackResult(ShortRepr):
         return task.draw(image, output, self.classifier.classes)
 
     def predictions(
-        self, evidence: Float[Tensor, "V K"], example: int, when: str = ""
+        self, evidence: Float[Tensor, "V K"], example: int, when: str = "", views: Any = ...
     ) -> dict[str, Any]:
-        """Return what the network finds in the views of an example, for a JSON file.
+        """Return what the network finds in all or some views of an example, for a JSON file.
 
         `Task.found` explains the keys. Tasks with objects also have the confidence of the true
         class.
         """
         task = self.classifier.task
-        criterion = self.criterion.map(lambda rows: rows[example])
+        criterion = self.criterion.map(lambda rows: rows[example][views])
         predicted = criterion.predicted(evidence)
         found = task.found(evidence, predicted, self.classifier.classes, when)
         if criterion.needs_truth:
@@ -398,9 +395,7 @@ class AttackResult(ShortRepr):
 
     def _titles(self, evidence: Float[Tensor, "F K"], example: int, view: int) -> list[str]:
         """Write what is found in frames of a view, with its confidence, such as "orange 97%"."""
-        criterion = self.criterion.map(lambda rows: rows[example, [view] * len(evidence)])
-        predicted = criterion.predicted(evidence)
-        found = self.classifier.task.found(evidence, predicted, self.classifier.classes)
+        found = self.predictions(evidence, example, views=[view] * len(evidence))
         pairs = zip(found["predicted"], found["confidence"], strict=True)
         return [f"{name} {confidence:.0%}" for name, confidence in pairs]
 

@@ -37,11 +37,10 @@ from renderer import errors
 from renderer.camera import Camera, orbit_cameras
 from renderer.errors import InputError
 from renderer.io.images import gray_or_image
+from renderer.light import harmonics, ringing
 from renderer.light.basis import DEGREE, Basis, LocalBasis, harmonics_of, with_local_lights
 from renderer.light.files import load_light
-from renderer.light.harmonics import degree_of, irradiance_error
 from renderer.light.lamps import LOCAL_LIGHTS
-from renderer.light.ringing import highlight_error, required_degree
 from renderer.mesh import Mesh, require_mesh
 from renderer.settings import MIN_ROUGHNESS, ImageSettings, Size, settings_from
 from renderer.surface.gloss import Gloss, smallest_roughness
@@ -171,7 +170,7 @@ def build_scene(
     else:
         environment = errors.as_tensor("light", environment)
         # `degree_of` raises InputError if the shape is not that of coefficients.
-        degree_of(environment)
+        harmonics.degree_of(environment)
         errors.require_bounded(light=environment)
     basis, lights = _build_lights(settings, environment, degree)
     rasterizer = renderer_settings.rasterizer
@@ -328,7 +327,7 @@ class Smoothest(NamedTuple):
     @property
     def degree(self) -> int:
         """Return the degree of lighting that shows the highlights, or 0 without gloss."""
-        return required_degree(self.roughness) if self.roughness < MATTE else 0
+        return ringing.required_degree(self.roughness) if self.roughness < MATTE else 0
 
     def affordable_degree(self, pixels: int) -> int:
         """Return the degree of lighting that the surface needs, as far as memory permits."""
@@ -342,8 +341,8 @@ class Smoothest(NamedTuple):
 
     def warn(self, subject: str, degree: int) -> None:
         """Warn that the degree of the lighting is too low for the highlights of the surface."""
-        error = highlight_error(degree, self.roughness)
-        least_error = highlight_error(self.degree, self.roughness)
+        error = ringing.highlight_error(degree, self.roughness)
+        least_error = ringing.highlight_error(self.degree, self.roughness)
         warnings.warn(
             f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}, which takes light "
             f"of degree {self.degree}: {subject} shows the highlight of a point of light off by "
@@ -424,7 +423,7 @@ def _warn_of_wrong_irradiance(name: str, light: Tensor, degree: int) -> None:
     """
     if degree >= REFERENCE_DEGREE // 2:
         return
-    error = float(irradiance_error(light, load_light(name, REFERENCE_DEGREE)))
+    error = float(harmonics.irradiance_error(light, load_light(name, REFERENCE_DEGREE)))
     if error > MAX_IRRADIANCE_ERROR:
         reason = f"has an irradiance that is off by {error:.0%} (rms over normals)"
         advice = "and attacks of it have the same degree: give a higher degree"

@@ -36,10 +36,9 @@ def expose(scene: Scene) -> Scene:
             mean = encode(clamp(values * 2**middle), scene.settings.encoding).mean()
             low, high = (middle, high) if mean < MEAN else (low, middle)
         # Nothing brightens what is black.
-        factor = 2**low if (values > 0).any() else 1.0
-        factors.append(factor)
+        factors.append(2**low if (values > 0).any() else 1.0)
         if rows:
-            say_once(f"{item.name}: exposure={factor:.3g}, at which its mean is {MEAN}")
+            say_once(f"{item.name}: exposure={factors[-1]:.3g}, at which its mean is {MEAN}")
     examples = [
         replace(example, exposure=example.exposure * factors[example.object])
         for example in scene.examples

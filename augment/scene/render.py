@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
 from typing import NamedTuple
@@ -199,18 +199,10 @@ class OperatorRenderer:
 NEAR = 0.001
 
 
-class FrozenView(NamedTuple):
-    """What shadows and bounces of light add to one view of a mesh.
-
-    Attributes:
-        added_transfer: Radiance that is added to each channel of each pixel, for each of the K
-            harmonic coefficients of the light.
-        albedo_sums: Sum of the albedo of the samples of each pixel with which `added_transfer` was
-            computed.
-    """
-
-    added_transfer: Float[Tensor, "3 K P"]
-    albedo_sums: Float[Tensor, "3 P"]
+# What shadows and bounces add to one view of a mesh: the radiance of each channel and pixel, for
+# each of the K harmonic coefficients of the light, and the sum of the albedo of the samples of
+# each pixel with which it was computed.
+FrozenView = tuple[Float[Tensor, "3 K P"], Float[Tensor, "3 P"]]
 
 
 class FrozenTransport:
@@ -255,8 +247,7 @@ class FrozenTransport:
         all_pixels[..., surface.fragments.pixels] = added_transfer
         # The method `radiance` scales the added radiance of a pixel by the ratio of its new albedo
         # to this albedo.
-        albedo_sums = _sum_by_pixel(fragments, albedo)
-        self.views[camera] = FrozenView(all_pixels.to(albedo), albedo_sums)
+        self.views[camera] = all_pixels.to(albedo), _sum_by_pixel(fragments, albedo)
 
     def radiance(
         self,
@@ -273,8 +264,7 @@ class FrozenTransport:
         view = self.views[camera]
         if view is None:
             return light.new_zeros(3, len(fragments.pixels))
-        added_transfer = view.added_transfer[..., fragments.pixels]
-        old_sums = view.albedo_sums[..., fragments.pixels]
+        added_transfer, old_sums = (part[..., fragments.pixels] for part in view)
         new_sums = _sum_by_pixel(fragments, albedo)[:, fragments.pixels]
         # Radiance with the albedo of the mesh, shape (3, P).
         added = torch.einsum("ckp,kc->cp", added_transfer.to(light), light)
@@ -466,12 +456,20 @@ class DirectRenderer:
             moved_mesh = replace(item.mesh, vertices=positions)
             rays = self._rays_among(object_index) if moved is None else Rays(moved_mesh)
             lamp_view = LocalLightView(rays, item.mesh, fragments, self.settings, moved, gloss)
-        indirect = None
-        if self.settings.global_illumination:
-            view = (example, object_index, fixed_camera, fragments, positions)
+
+        def indirect(albedo: Float[Tensor, "S 3"], light: Float[Tensor, "K 3"]) -> Tensor:
+            """Compute the radiance that shadows and bounces of environment light add."""
+            frozen = self._transport(example, object_index, positions)
+            if fixed_camera not in frozen.views:
+                vertices = frozen.mesh.vertices
+                frozen.add(fixed_camera, *self._rasterize(object_index, fixed_camera, vertices))
+            added = frozen.radiance(fixed_camera, fragments, albedo, light)
             # A camera whose fields are tensors is attacked, so it differs in each call. Its views
             # are not kept. `fixed` returns the same camera if no field is a tensor.
-            indirect = partial(self._indirect_radiance, *view, camera is fixed_camera)
+            if camera is not fixed_camera:
+                del frozen.views[fixed_camera]
+            return added
+
         corner_normals = None
         if moved is None and self.settings.normals == "smooth":
             corner_normals = torch.from_numpy(item.mesh.corner_normals).to(self.like.device)
@@ -486,7 +484,7 @@ class DirectRenderer:
             gloss=gloss,
             corner_normals=corner_normals,
             lamp_view=lamp_view,
-            indirect=indirect,
+            indirect=indirect if self.settings.global_illumination else None,
             lamp_positions=changed.positions,
         )
         return shown.pixel_radiance(camera, background)
@@ -497,30 +495,18 @@ class DirectRenderer:
             self._rays[object_index] = Rays(self.objects[object_index].mesh)
         return self._rays[object_index]
 
-    def _indirect_radiance(
-        self,
-        example: int,
-        object_index: int,
-        camera: Camera,
-        fragments: Fragments,
-        positions: Float[np.ndarray, "V 3"],
-        is_kept: bool,
-        albedo: Float[Tensor, "S 3"],
-        light: Float[Tensor, "K 3"],
-    ) -> Float[Tensor, "3 P"]:
-        """Compute the radiance that shadows and bounces of environment light add to a view.
+    def _transport(self, example: int, object_index: int, positions: np.ndarray) -> FrozenTransport:
+        """Return the shadows and bounces of a shape that is near the given one.
 
-        The S samples in P pixels are those of a shape with the given positions of its vertices.
-        Unless `is_kept`, the view is not needed again, and is removed to save memory.
+        One shape is kept for each example, in addition to the unmoved objects. If the unmoved mesh
+        is not close to the shape, the shape that was kept for the example is tried. If that is not
+        close either, shadows and bounces of the new shape are computed.
         """
         item = self.objects[object_index]
 
         def trace(mesh: Mesh) -> FrozenTransport:
             return FrozenTransport(mesh, self.settings, item.albedo_scale, self.basis)
 
-        # One shape is kept for each example, in addition to the unmoved objects. If the unmoved
-        # mesh is not close to the shape, try the shape that was kept for the example. If that is
-        # not close either, compute shadows and bounces of the new shape.
         frozen = self._transport_of_object.get(object_index) or trace(item.mesh)
         self._transport_of_object[object_index] = frozen
         if not frozen.is_near(positions):
@@ -528,12 +514,7 @@ class DirectRenderer:
             if not frozen.is_near(positions):
                 frozen = trace(replace(item.mesh, vertices=positions))
             self._transport_of_example[example] = frozen
-        if camera not in frozen.views:
-            frozen.add(camera, *self._rasterize(object_index, camera, frozen.mesh.vertices))
-        added = frozen.radiance(camera, fragments, albedo, light)
-        if not is_kept:
-            del frozen.views[camera]
-        return added
+        return frozen
 
     def _rasterize(
         self, object_index: int, camera: Camera, vertices: Float[np.ndarray, "V 3"]

@@ -20,7 +20,6 @@ from augment.scene.render import DirectRenderer, Layer, OperatorRenderer
 from augment.scene.truth import LEAST_VISIBLE, NO_OBJECT, Truth, boxes_of
 from renderer import errors
 from renderer.camera import Camera
-from renderer.errors import InputError
 from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
 from renderer.mesh import Mesh
@@ -123,7 +122,7 @@ class Scene:
         self.camera_effects = camera_effects
         self.one_light = one_light
         self.lights_of_degree = lights_of_degree
-        self._require_fitting(examples, lights, backgrounds)
+        self._require_fit(examples, lights, backgrounds)
         # The depth range of each camera must contain the whole object.
         self.examples = []
         for example in examples:
@@ -166,17 +165,15 @@ class Scene:
             self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light
         )
 
-    def _require_fitting(
-        self, examples: Sequence[Example], lights: Tensor, backgrounds: Tensor
-    ) -> None:
+    def _require_fit(self, examples: list[Example], lights: Tensor, backgrounds: Tensor) -> None:
         """Check that examples, lights and backgrounds fit the objects, the basis and the size."""
         if not examples:
-            raise InputError("examples is empty: give a mesh, a view and a background")
+            raise errors.InputError("examples is empty: give a mesh, a view and a background")
         highest = max(example.object for example in examples)
         if highest >= len(self.objects):
             reason = f"objects has {len(self.objects)} objects"
             advice = "give an object for each index"
-            raise InputError(f"{reason}, but an example refers to index {highest}: {advice}")
+            raise errors.InputError(f"{reason}, but an example refers to index {highest}: {advice}")
         errors.require_bounded(lights=lights)
         errors.require_shape("lights", lights, "...", self.basis.size, 3)
         shape = self.settings.shape
@@ -184,7 +181,7 @@ class Scene:
         if not (is_image and backgrounds.min() >= 0 and backgrounds.max() <= 1):
             given = f"shape {tuple(backgrounds.shape)}, or values outside of [0, 1]"
             advice = f"give images (count, 3, {shape[0]}, {shape[1]}) with values in [0, 1]"
-            raise InputError(f"backgrounds has {given}: {advice}")
+            raise errors.InputError(f"backgrounds has {given}: {advice}")
 
     @classmethod
     def grid(
@@ -214,12 +211,11 @@ class Scene:
         """
         # Cameras of the examples of an object in front of a background: one tuple per example.
         camera_groups = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
-        examples = [
-            Example(index, item.move_cameras(group) if placed else group, background)
-            for index, item in enumerate(objects)
-            for group in camera_groups
-            for background in range(len(backgrounds))
-        ]
+        examples = []
+        for index, item in enumerate(objects):
+            groups = [*map(item.move_cameras, camera_groups)] if placed else camera_groups
+            pairs = product(groups, range(len(backgrounds)))
+            examples += [Example(index, *pair) for pair in pairs]
         return cls(objects, examples, backgrounds, *of_scene, **options)
 
     def changed(self, **arguments: Any) -> Scene:
@@ -440,7 +436,7 @@ class Scene:
         low, high = (int(end) for end in indices.aminmax())
         if low < 0 or high >= len(self):
             advice = f"give indices from 0 to {len(self) - 1}"
-            raise InputError(f"examples has indices from {low} to {high}: {advice}")
+            raise errors.InputError(f"examples has indices from {low} to {high}: {advice}")
         return indices.to(self.lights.device)
 
     def layers(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Iterator[Layer]:
@@ -463,9 +459,7 @@ class Scene:
             return self._render_with_moved_lamps(light, conditions.positions, examples)
         return self._render_with_operators(light, examples)
 
-    def _render_with_operators(
-        self, light: Float[Tensor, "A K 3"], examples: Int[Tensor, " A"]
-    ) -> Iterator[Layer]:
+    def _render_with_operators(self, light: Tensor, examples: Int[Tensor, " A"]) -> Iterator[Layer]:
         """Render the V views of examples with transfer operators, which map light to images.
 
         The light is multiplied by the exposure already. There is one layer for each stack of

@@ -27,9 +27,7 @@ MAX_POLAR = 60.0
 FIELD_OF_VIEW = 60.0
 
 
-def interpolate_smoothly(
-    values: Float[Tensor, "N C n n"], size: Size
-) -> Float[Tensor, "N C height width"]:
+def interpolate_smoothly(values: Float[Tensor, "N C n n"], size: Size) -> Float[Tensor, "N C H W"]:
     """Interpolate the values of a coarse grid to the pixels of an image, by bicubic splines.
 
     Interpolated values may be outside of the range of the given values.

@@ -352,19 +352,17 @@ def _ray_starts(camera: Camera, points: Float[Tensor, "... 3"]) -> Float[Tensor,
     return points + FAR * torch.from_numpy(camera.axes()[2])
 
 
-def _sample_positions(
-    camera: Camera, image: ImageSettings, relative_height: float
-) -> tuple[Tensor, Tensor]:
+def _sample_positions(camera: Camera, image: ImageSettings, ratio: float) -> tuple[Tensor, Tensor]:
     """Compute where the samples of an image lie in the plane through the origin.
 
-    The plane faces the camera. `relative_height` is the height of what the image shows, divided by
-    its width. Return the distances to the right and up in world units, each of shape (S, P, 1) for
-    S samples of each of P pixels.
+    The plane faces the camera. `ratio` is the height of what the image shows, divided by its width.
+    Return the distances to the right and up in world units, each of shape (S, P, 1) for S samples
+    of each of P pixels.
     """
     # Distances of the rows down, and of the columns to the right, from the center of the image in
     # world units.
     counts = [side * image.samples for side in image.shape]
-    extents = camera.width * relative_height, camera.width
+    extents = camera.width * ratio, camera.width
     down, right = (
         ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * extent
         for count, extent in zip(counts, extents, strict=True)

@@ -341,9 +341,7 @@ def _move(
     return moved
 
 
-def _with_directional(
-    environment: Float[Tensor, "E K 3"], directions: Float[Tensor, "E 3"]
-) -> Float[Tensor, "E K 3"]:
+def _with_directional(environment: Float[Tensor, "E K 3"], directions: Tensor) -> Tensor:
     """Add white directional lights to environments, except where the direction is zero.
 
     A surface that faces such a light has irradiance 1.
@@ -420,9 +418,7 @@ def draw_camera_effects(
     return apply_effects
 
 
-def _blur(
-    images: Float[Tensor, "A V 3 height width"], deviations: Float[Tensor, " A"]
-) -> Float[Tensor, "A V 3 height width"]:
+def _blur(images: Float[Tensor, "A V 3 height width"], deviations: Float[Tensor, " A"]) -> Tensor:
     """Blur the images of each example by a Gaussian of its own width.
 
     The pixels at the border of an image are repeated beyond the border. Deviations are in pixels.

@@ -7,7 +7,7 @@ other classes that images with a complementary label do not show, either.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.network import are_probabilities, plain_outputs
-from augment.scene.truth import Truth
-from augment.tasks.task import NO_CLASS, Criterion, Task
+from augment.tasks.task import NO_CLASS, Criterion, GetTruth, Task
 from renderer.errors import InputError, require_range
 
 # A network is overconfident where its log-odds exceed this number. Networks rarely do so, unless
@@ -51,8 +50,6 @@ class Classification(Task):
 
     name = "classification"
     returns = "a tensor of logits (N, C)"
-    missed = "are not classified as their class"
-    measure = "logits"
     confidence = "probability"
     finds = "photographs", "keeps the class of"
 
@@ -73,15 +70,11 @@ class Classification(Task):
         """Return the number of logits of an image."""
         return outputs.shape[1]
 
-    def criterion(
-        self, source: Int[Tensor, "E V"], truth: Callable[[], Truth], class_count: int
-    ) -> ClassCriterion:
+    def criterion(self, source: Tensor, truth: GetTruth, class_count: int) -> ClassCriterion:
         """Return the criterion of an untargeted attack, for which positions do not matter."""
         return ClassCriterion(source)
 
-    def as_found(
-        self, outputs: Float[Tensor, "N C"], classes: Sequence[str]
-    ) -> tuple[Int[Tensor, " N"], ClassCriterion]:
+    def as_found(self, outputs: Tensor, classes: Sequence[str]) -> tuple[Tensor, ClassCriterion]:
         """Return the criterion of an attack on the class of each image."""
         return torch.arange(len(outputs)), ClassCriterion(outputs.argmax(1, keepdim=True))
 
@@ -145,8 +138,9 @@ class ClassCriterion(Criterion):
         return evidence.argmax(-1)
 
     def is_overconfident(self, evidence: Float[Tensor, "... C"]) -> Bool[Tensor, " ..."]:
-        """See `is_overconfident`."""
-        return is_overconfident(evidence)
+        """Return a mask of the images with a class of log-odds above 50 or below −50."""
+        lowest, highest = evidence.aminmax(dim=-1)
+        return highest - lowest > OVERCONFIDENT
 
     def cost(self, logits: Float[Tensor, "N C"]) -> Float[Tensor, " N"]:
         """Compute the cost of single images, for a criterion that is flat.
@@ -167,12 +161,9 @@ class ClassCriterion(Criterion):
             is_added = is_added & (self.target == NO_CLASS)
         cost = F.logsigmoid(odds) + torch.where(is_added, odds - OVERCONFIDENT, 0)
         cost = torch.where(self.source == NO_CLASS, 0, cost)
-        if self.target is not None:
-            target_cost = F.cross_entropy(
-                logits, self.target, reduction="none", ignore_index=NO_CLASS
-            )
-            cost = cost + target_cost
-        return cost
+        if self.target is None:
+            return cost
+        return cost + F.cross_entropy(logits, self.target, reduction="none", ignore_index=NO_CLASS)
 
     def gap(self, logits: Float[Tensor, "... C"]) -> Float[Tensor, " ..."]:
         """Compute by how much each view reaches the criterion: its logit gap.
@@ -189,12 +180,6 @@ class ClassCriterion(Criterion):
         largest_other = logits.scatter(-1, compared_class, -torch.inf).amax(-1)
         difference = compared_logit - largest_other
         return torch.where(has_target, difference, -difference)
-
-
-def is_overconfident(logits: Float[Tensor, "... classes"]) -> Bool[Tensor, " ..."]:
-    """Return a mask of the images with a class of log-odds above 50 or below −50."""
-    lowest, highest = logits.aminmax(dim=-1)
-    return highest - lowest > OVERCONFIDENT
 
 
 def complementary_label(label: int) -> int:
@@ -223,8 +208,7 @@ def label_loss(
     # Set the logits of the classes that are not shown to -∞. Only the logits of the other
     # classes remain.
     other_logits = logits.scatter(1, classes[:, None], -torch.inf)
-    for index in absent:
-        other_logits[:, index] = -torch.inf
+    other_logits[:, list(absent)] = -torch.inf
     # The other classes have the probability Σ exp(other_logits) / Σ exp(logits) = 1 - p.
     complementary = logits.logsumexp(1) - other_logits.logsumexp(1)
     cross_entropy = F.cross_entropy(
@@ -243,10 +227,8 @@ def is_correct(
     nor one of the classes `absent`.
     """
     is_class_of_label = predicted == _class_of(labels)
-    is_excluded = is_class_of_label
-    for index in absent:
-        is_excluded = is_excluded | (predicted == index)
-    return torch.where(labels < 0, ~is_excluded, is_class_of_label)
+    is_absent = torch.isin(predicted, predicted.new_tensor(absent))
+    return torch.where(labels < 0, ~(is_class_of_label | is_absent), is_class_of_label)
 
 
 def _class_of(labels: Tensor) -> Tensor:

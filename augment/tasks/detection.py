@@ -21,7 +21,7 @@ from torch import Tensor
 
 from augment.network import unwrapped
 from augment.scene.truth import Truth
-from augment.tasks.task import NO_CLASS, ObjectCriterion, Task, visible_boxes
+from augment.tasks.task import NO_CLASS, GetTruth, ObjectCriterion, Task, visible_boxes
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
@@ -99,8 +99,6 @@ class Detection(Task):
 
     name = "detection"
     returns = "a list of a dictionary for each image (boxes, labels, scores)"
-    missed = "have no detection of the object"
-    measure = "scores"
     confidence = "score at the object"
     finds = "detections", "still detects"
 
@@ -193,9 +191,7 @@ class Detection(Task):
         """Return a function that brings outputs into the form of torchvision, and checks them."""
         return _Reader(self, title, class_count)
 
-    def criterion(
-        self, source: Int[Tensor, "E V"], truth: Callable[[], Truth], class_count: int
-    ) -> DetectionCriterion:
+    def criterion(self, source: Tensor, truth: GetTruth, class_count: int) -> DetectionCriterion:
         """Return the criterion of an untargeted attack on the first object of each example."""
         boxes = visible_boxes(truth())
         return DetectionCriterion(source, task=self, class_count=class_count, boxes=boxes)
@@ -204,14 +200,12 @@ class Detection(Task):
         self, outputs: list[Detections], classes: Sequence[str]
     ) -> tuple[Int[Tensor, " E"], DetectionCriterion]:
         """Return the criterion of an attack on each box whose score reaches the threshold."""
-        is_found = [item["scores"] >= self.threshold for item in outputs]
-        boxes, labels = (
-            torch.cat([item[key][rows] for item, rows in zip(outputs, is_found, strict=True)])
-            for key in ("boxes", "labels")
-        )
-        image = torch.repeat_interleave(torch.tensor([int(rows.sum()) for rows in is_found]))
+        boxes, scores, labels = (torch.cat([item[key] for item in outputs]) for key in FINAL)
+        image = torch.repeat_interleave(torch.tensor([len(item["scores"]) for item in outputs]))
         options: dict[str, Any] = {"task": self, "class_count": len(classes)}
         criterion = DetectionCriterion(labels[:, None], boxes=boxes[:, None], **options)
+        is_found = scores >= self.threshold
+        image, criterion = image[is_found.cpu()], criterion.select(is_found)
         flat = criterion.map(lambda rows: rows[:, 0])
         evidence = flat.evidence([outputs[index] for index in image.tolist()])
         # A box at which another class is surer is mislabeled already.
@@ -229,9 +223,7 @@ class Detection(Task):
         """Return the score of the best box of each class at the object."""
         return evidence[..., :-1].sigmoid()
 
-    def draw(
-        self, image: Float[Tensor, "3 H W"], output: Detections, classes: Sequence[str]
-    ) -> Float[Tensor, "3 H W"]:
+    def draw(self, image: Tensor, output: Detections, classes: Sequence[str]) -> Tensor:
         """Draw the boxes whose scores reach the threshold, with their classes and scores."""
         from torchvision.utils import draw_bounding_boxes  # torchvision takes half a second.
 

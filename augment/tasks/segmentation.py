@@ -6,7 +6,7 @@ pixels of the class within the box of the mask. It is compared as log-odds, as a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Self
@@ -19,7 +19,7 @@ from torch import Tensor
 from augment.network import plain_outputs
 from augment.scene.truth import Truth
 from augment.tasks.detection import log_odds_of, stored_names
-from augment.tasks.task import ObjectCriterion, Task, visible_boxes
+from augment.tasks.task import GetTruth, ObjectCriterion, Reader, Task, visible_boxes
 from renderer.errors import InputError, describe, require_number
 
 # Class of the pixels that show no object, and the least fraction of an image that shows one.
@@ -59,8 +59,6 @@ class Segmentation(Task):
 
     name = "segmentation"
     returns = "a tensor of logits (N, C, H, W), or a dictionary with 'out'"
-    missed = "have no segment of the object"
-    measure = "logits"
     confidence = "IoU at the object"
     finds = "segments", "still finds"
 
@@ -82,9 +80,7 @@ class Segmentation(Task):
         """Return the number of logits of a pixel."""
         return outputs.shape[1]
 
-    def reader(
-        self, title: str, class_count: int | None = None
-    ) -> Callable[[Any, Tensor], Float[Tensor, "N C H W"]]:
+    def reader(self, title: str, class_count: int | None = None) -> Reader:
         """Return a function that checks the logits of pixels."""
         return partial(self._read, title, class_count)
 
@@ -103,9 +99,7 @@ class Segmentation(Task):
             raise InputError(f"{title} returned {describe(logits)}: it must return logits {shape}")
         return logits
 
-    def criterion(
-        self, source: Int[Tensor, "E V"], truth: Callable[[], Truth], class_count: int
-    ) -> SegmentationCriterion:
+    def criterion(self, source: Tensor, truth: GetTruth, class_count: int) -> SegmentationCriterion:
         """Return the criterion of an untargeted attack on the first object of each example."""
         found = truth()
         visible_boxes(found)
@@ -133,9 +127,7 @@ class Segmentation(Task):
         """Return the IoU of each class with the object."""
         return evidence[..., :-1].sigmoid()
 
-    def draw(
-        self, image: Float[Tensor, "3 H W"], output: Float[Tensor, "C H W"], classes: Sequence[str]
-    ) -> Float[Tensor, "3 H W"]:
+    def draw(self, image: Tensor, output: Tensor, classes: Sequence[str]) -> Tensor:
         """Draw the classes of the pixels as colors, except the first, over the image."""
         label = output.argmax(0)
         # Hues that follow each other by the golden ratio are far from each other.

@@ -28,6 +28,8 @@ NO_CLASS = -(10**9)
 NOTHING = "nothing"
 # Function from the outputs of a network, and from the images that it got, to outputs of a task.
 Reader = Callable[[Any, Tensor], Any]
+# Function that finds where the objects of the images of an attack are.
+GetTruth = Callable[[], Truth]
 
 
 @dataclass(frozen=True)
@@ -143,16 +145,12 @@ class Task(ABC):
     Attributes:
         name: Name of the task in messages.
         returns: What a network of the task returns, in messages.
-        missed: What is said of images in which the true class is not found.
-        measure: The numbers that a network of the task returns, in messages.
         confidence: What `confidences` are, on the axis of a chart.
         finds: What `as_found` gives, and how a network keeps them, in sentences.
     """
 
     name: ClassVar[str]
     returns: ClassVar[str]
-    missed: ClassVar[str]
-    measure: ClassVar[str]
     confidence: ClassVar[str]
     finds: ClassVar[tuple[str, str]]
 
@@ -184,22 +182,20 @@ class Task(ABC):
         """Check that outputs of an attacked network are finite, and have the gradient of images."""
         values = [item for item in _tensors(outputs) if item.is_floating_point()]
         if not values or not all(item.isfinite().all() for item in values):
-            raise InputError(f"{title} returned NaN or infinite {self.measure}: check its weights")
+            raise InputError(f"{title} returned NaN or infinite outputs: check its weights")
         # A detector that finds nothing has no gradient.
         is_empty = not any(item.numel() for item in values)
         needs_gradient = torch.is_grad_enabled() and images.requires_grad and not is_empty
         if needs_gradient and not self.has_gradient(outputs):
             advice = "compute them in torch, or choose optimizer='random_search'"
-            raise InputError(f"{title} returned {self.measure} without a gradient: {advice}")
+            raise InputError(f"{title} returned outputs without a gradient: {advice}")
 
     def has_gradient(self, outputs: Any) -> bool:
         """Return whether outputs have a gradient."""
         return any(item.requires_grad for item in _tensors(outputs))
 
     @abstractmethod
-    def criterion(
-        self, source: Int[Tensor, " ..."], truth: Callable[[], Truth], class_count: int
-    ) -> Criterion:
+    def criterion(self, source: Tensor, truth: GetTruth, class_count: int) -> Criterion:
         """Return the criterion of an untargeted attack. `truth` computes where objects are."""
 
     @abstractmethod
@@ -241,9 +237,7 @@ class Task(ABC):
         indices = confidences.topk(min(5, len(confidences))).indices.tolist()
         return ", ".join(f"{classes[i]} {confidences[i]:.1%}" for i in indices)
 
-    def draw(
-        self, image: Float[Tensor, "3 H W"], output: Any, classes: Sequence[str]
-    ) -> Float[Tensor, "3 H W"]:
+    def draw(self, image: Tensor, output: Any, classes: Sequence[str]) -> Tensor:
         """Draw the output of one image on it. By default, nothing is drawn."""
         return image
 

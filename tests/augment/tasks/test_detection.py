@@ -163,7 +163,7 @@ def test_a_list_of_boxes_is_recognized_and_said(caplog):
 
 def test_an_object_that_is_not_found_before_is_reported_and_no_success():
     scene, task = ball_scene(), nb.Detection(threshold=0.9)
-    with pytest.raises(nb.InputError, match="no detection"):
+    with pytest.raises(nb.InputError, match="not found"):
         nb.attack(brightness_detector, scene, task=task, settings=SETTINGS, classes=CLASSES)
     options = {"task": task, "settings": SETTINGS, "classes": CLASSES, "force": True}
     result = nb.attack(brightness_detector, scene, **options)

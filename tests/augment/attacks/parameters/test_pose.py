@@ -6,13 +6,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import augment
-from augment.attack_settings import POSE_PARTS
+from augment.attack_settings import PoseSettings
 from augment.attacks.parameters.pose import Pose
 from augment.attacks.problem import SceneProblem
 from augment.scene.scene import Scene
 from renderer.errors import InputError
 
-ONLY = dict.fromkeys(POSE_PARTS, 0.0)  # Add the parts that may change.
+ONLY = dict.fromkeys(PoseSettings.parts, 0.0)  # Add the parts that may change.
 FIRST = torch.zeros(1, dtype=torch.int64)  # index of the only example
 GRAY = [0.5, 0.5, 0.5]
 
