@@ -240,7 +240,7 @@ def require_clean_correct(
     for example, view in wrong[:1]:
         item = scene.objects[scene.examples[example].object]
         found = network.task.describe(evidence[example, view], network.classes)
-        count = f"in {len(wrong)} of {criterion.source.numel()} images, the class is not found"
+        count = f"in {len(wrong)} of {criterion.source.numel()} images the class is not found"
         first = f"the first, of {item.name}, class {item.label!r}: {found}"
         advice = "change the scene, or set force=True"
         raise InputError(f"force=False, and {count} ({first}): {advice}", "force")
