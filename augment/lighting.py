@@ -516,6 +516,12 @@ def _relit_bytes(
 
 def _albumentations(lighting: RandomLighting) -> Any:
     """Wrap a transform for Albumentations."""
+    return _albumentations_class()(lighting.lights, lighting.strength, lighting.p)
+
+
+@cache
+def _albumentations_class() -> Any:
+    """Define the transform of Albumentations once, as its `from_dict` looks for it by its name."""
     try:
         import albumentations
     except ImportError as error:
@@ -526,11 +532,15 @@ def _albumentations(lighting: RandomLighting) -> Any:
     class Lighting(albumentations.ImageOnlyTransform):  # type: ignore[misc, unused-ignore]
         """Random light on arrays (H, W, C)."""
 
+        def __init__(self, lights: Any = None, strength: float = 1.0, p: float = 1.0):
+            super().__init__(p=p)
+            self.lighting = RandomLighting(lights, strength=strength)
+
         def get_params(self) -> dict[str, Any]:
             """Draw a light with a seed of Albumentations."""
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(self.py_random.getrandbits(62))
-                return RandomLighting(lighting.lights, strength=lighting.strength).make_params()
+                return self.lighting.make_params()
 
         def apply(self, img: np.ndarray, lights: Sequence[Light | None], **_: Any) -> np.ndarray:
             """Relight an array."""
@@ -539,7 +549,14 @@ def _albumentations(lighting: RandomLighting) -> Any:
             relit = _apply_to_tensor(image, lights, None).permute(1, 2, 0).numpy()
             return np.ascontiguousarray(relit).reshape(img.shape)
 
-        def __reduce__(self) -> tuple[Any, ...]:
-            return _albumentations, (lighting,)
+        def get_transform_init_args(self) -> dict[str, Any]:
+            """Return the arguments for `to_dict`: names of models that have no settings."""
+            names = {repr(kind()): name for name, kind in MODELS.items()}
+            lights = self.lighting.lights.items()
+            named = {names.get(repr(model), model): weight for model, weight in lights}
+            return {"lights": named, "strength": self.lighting.strength}
 
-    return Lighting(p=lighting.p)
+        def __reduce__(self) -> tuple[Any, ...]:
+            return _albumentations, (self.lighting,), self.__dict__
+
+    return Lighting

@@ -13,10 +13,14 @@ import trimesh
 from PIL import Image
 from torch import nn
 from torch.utils.data import Dataset
+from torchvision import models, tv_tensors
 
 import norm_balls
 import renderer
+from augment import lighting
 from renderer.image import to_bytes
+from train.command_settings import RenderSettings
+from train.commands.render import run as write_renders
 
 ROOT = Path(__file__).parents[1]
 PAGES = ("README.md", "docs/guide.md", "pretrained/README.md")
@@ -24,7 +28,7 @@ BLOCKS = {
     heading: "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     for page in PAGES
     for heading, text in re.findall(
-        r"^#{2,3} (.*?)\n(.*?)(?=^#{2,3} |\Z)", (ROOT / page).read_text(), re.M | re.DOTALL
+        r"^#{2,4} (.*?)\n(.*?)(?=^#{2,4} |\Z)", (ROOT / page).read_text(), re.M | re.DOTALL
     )
     if "```python" in text
 }
@@ -58,13 +62,107 @@ def test_every_block_of_python_is_run_here():
         "Load",
         "Photographs",
         "Random light on your own images",
+        "In torchvision, for a classifier",
+        "In torchvision, for a detector",
+        "In Ultralytics",
+        "In a Lightning module",
+        "In a plain loop",
     }
+
+
+def test_examples_of_random_light_have_at_most_25_lines():
+    assert max(len(BLOCKS[name].splitlines()) for name in BLOCKS if name.startswith("In ")) <= 25
 
 
 def test_random_light_block_relights_a_batch_and_a_clip():
     names = run("Random light on your own images")
     assert names["images"].dtype == torch.uint8 and names["images"].shape == (8, 3, 64, 96)
     assert len(names["frames"]) == 8
+
+
+@pytest.fixture
+def relit(monkeypatch) -> list[object]:
+    """The types of the images that random light has changed."""
+    types, apply = [], norm_balls.RandomLighting.apply
+
+    def applied(self, image, params, depth=None):
+        types.append(type(image))
+        return apply(self, image, params, depth)
+
+    monkeypatch.setattr(norm_balls.RandomLighting, "apply", applied)
+    return types
+
+
+def write_data_set(name: str) -> None:
+    meshes = [{"mesh": f"solid:{name}"} for name in ("orange", "cup")]
+    write_renders(RenderSettings(meshes=meshes, out=name, format=name, count=4, size=[64, 64]))
+
+
+@pytest.mark.slow
+def test_torchvision_classifier_block_trains_on_relit_photographs(folder, monkeypatch):
+    for index, name in enumerate(("orange", "cup") * 2):
+        path = folder / "photographs" / "train" / name / f"{index}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (64, 48), (90, 60 * index, 30)).save(path)
+    build = models.mobilenet_v3_small
+    monkeypatch.setattr(models, "mobilenet_v3_small", lambda weights: build())
+    names = run("In torchvision, for a classifier")
+    assert names["images"].shape == (4, 3, 224, 224) and names["labels"].sum() == 2
+    assert names["model"].classifier[-1].weight.grad.any()
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("default")
+def test_torchvision_detector_block_trains_on_relit_images_with_boxes(monkeypatch, relit):
+    pytest.importorskip("pycocotools")
+    write_data_set("coco")
+    build = models.detection.fasterrcnn_mobilenet_v3_large_320_fpn
+    monkeypatch.setattr(
+        models.detection, build.__name__, lambda weights: build(weights_backbone=None)
+    )
+    names = run("In torchvision, for a detector")
+    assert relit == [tv_tensors.Image] * 3
+    assert all(value.isfinite() and value > 0 for value in names["losses"].values())
+    assert names["detector"].roi_heads.box_predictor.bbox_pred.weight.grad.any()
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("ignore")
+def test_ultralytics_block_trains_on_relit_images(folder, monkeypatch):
+    pytest.importorskip("ultralytics")
+    pytest.importorskip("albumentations")
+    write_data_set("yolo")
+    # In one process, so that the test sees what is relit. All images, since p is drawn anew.
+    monkeypatch.setattr("ultralytics.cfg.DEFAULT_CFG.workers", 0)
+    relit, apply = [], lighting._apply_to_tensor
+    counted = lambda *given: (relit.append(given), apply(*given))[1]  # noqa: E731
+    monkeypatch.setattr(lighting, "_apply_to_tensor", counted)
+    names = run("In Ultralytics")
+    assert "Lighting" in str(names["detector"].trainer.args.augmentations)
+    assert relit and names["detector"].trainer.last.exists()
+
+
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("default")
+def test_lightning_module_block_trains_on_relit_images(relit):
+    pytest.importorskip("lightning")
+    network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
+    before = network[1].weight.detach().clone()
+    run("In a Lightning module", network=network, data=Photographs())
+    assert relit == [torch.Tensor]
+    assert not torch.equal(network[1].weight, before)
+
+
+def test_plain_loop_block_trains_on_relit_and_worst_images(relit):
+    network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
+    before = network[1].weight.detach().clone()
+    options = {"optimizer": torch.optim.SGD(network.parameters(), lr=0.01)}
+    run(
+        "In a plain loop", network=network, data=[(torch.full((3, 32, 32), 0.5), 1)] * 40, **options
+    )
+    # The second batch is seen in two lights, and shown in the worse one.
+    assert len(relit) == 4
+    assert not torch.equal(network[1].weight, before)
 
 
 def test_detector_block_hides_an_orange_from_the_published_detector(folder):

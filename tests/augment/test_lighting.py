@@ -1,5 +1,6 @@
 """Random light on images of all kinds, and its models against closed forms."""
 
+import json
 import math
 import pickle
 
@@ -390,6 +391,23 @@ def test_albumentations_relights_arrays_and_pickles():
     assert np.array_equal(*relit) and not np.array_equal(relit[0], array)
     unit = albumentations.Compose([transform], seed=3)(image=(array / 255).astype(np.float32))
     assert np.abs(unit["image"] * 255 - relit[0]).max() < 0.51
+
+
+@pytest.mark.ecosystem
+def test_albumentations_keeps_lights_in_dictionaries_and_random_numbers_in_pickles():
+    albumentations = pytest.importorskip("albumentations")
+    shadow = nb.lights.CastShadow(("leaves",))
+    first = nb.RandomLighting({"linear": 2.0, shadow: 1.0}, p=0.9, strength=0.7).albumentations()
+    nb.RandomLighting("low_light").albumentations()
+    restored = albumentations.from_dict(albumentations.to_dict(first))
+    assert albumentations.to_dict(restored) == albumentations.to_dict(first)
+    assert repr(restored.lighting) == repr(first.lighting) and restored.p == 0.9
+    named = albumentations.to_dict(nb.RandomLighting("point").albumentations())
+    assert json.loads(json.dumps(named))["transform"]["lights"] == {"point": 1.0}
+    compose = albumentations.Compose([first], seed=5)
+    copy, array = pickle.loads(pickle.dumps(compose)), picture(6, 8, 3).numpy()
+    for _ in range(3):
+        assert np.array_equal(compose(image=array)["image"], copy(image=array)["image"])
 
 
 def test_a_compiled_model_may_hold_the_transform():
