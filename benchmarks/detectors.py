@@ -6,7 +6,7 @@ Run it as a module in the root of the repository, after `pip install ".[ecosyste
 
 DATA has `meshes/` and, in `weights/`, fastestdet_coco.onnx and coco.names. The table has a row for
 each attacked quantity and radius. It is written anew after each object. The following audit of a
-detector that finds an orange everywhere is for its time:
+detector that finds an orange in each image is for its time:
 
     pnb-audit network=python:benchmarks.detectors:ssdlite meshes=[solid:orange]
 """
@@ -86,16 +86,17 @@ def decode(raw: Tensor) -> list[dict[str, Tensor]]:
 
 
 def ssdlite() -> tuple[nn.Module, int, list[str]]:
-    """Return an SSDlite of torchvision, whose random weights find an orange everywhere.
+    """Return an SSDlite of torchvision, whose random weights find a large orange in each image.
 
-    No attack succeeds, so its audit takes longest. Returned are also size and classes.
+    Hardly any attack succeeds, so its audit takes longest. Returned are also size and classes.
     """
     from torchvision.models.detection import ssdlite320_mobilenet_v3_large
 
     network = ssdlite320_mobilenet_v3_large(weights=None, weights_backbone=None).eval()
     names = [*nb.Detection().class_names(network, 91)]
-    for layers in network.head.classification_head.module_list:
-        layers[-1].bias.data.view(-1, len(names))[:, names.index("orange")] = 5.0
+    # The last layers are those of the largest boxes.
+    layers = network.head.classification_head.module_list[-1]
+    layers[-1].bias.data.view(-1, len(names))[:, names.index("orange")] = 5.0
     return network, 320, names
 
 
