@@ -51,9 +51,10 @@ class LabeledRender:
         visible: Fraction of each object that nothing hides, shape (n,).
         depth: Distance from the camera along the viewing direction in world
             units, at the nearest sample of each pixel. 0 where nothing is
-            rendered, as in front of a background. Float32, shape (H, W).
+            rendered, as in front of a background. Float32, shape (H, W). None
+            without maps.
         normals: Unit normals there, along the axes right, up and back of the
-            camera, float32, shape (3, H, W).
+            camera, float32, shape (3, H, W). None without maps.
         camera: Camera as numbers: "pose" (4 × 4, from the camera's axes right, up
             and back to the world), and "fx", "fy", "cx", "cy" in pixels, or
             "width" of an orthographic image in world units.
@@ -67,8 +68,8 @@ class LabeledRender:
     boxes: Float[Tensor, "n 4"]
     masks: Bool[Tensor, "n H W"]
     visible: Float[Tensor, " n"]
-    depth: Float[Tensor, "H W"]
-    normals: Float[Tensor, "3 H W"]
+    depth: Float[Tensor, "H W"] | None
+    normals: Float[Tensor, "3 H W"] | None
     camera: Mapping[str, Any]
     light: Float[Tensor, "K 3"]
     mesh: str
@@ -84,6 +85,7 @@ def render_dataset(
     seed: int = 0,
     settings: AugmentationSettings | None = None,
     network: TaskNetwork | None = None,
+    maps: bool = True,
     **of_scene: Any,
 ) -> Iterator[LabeledRender]:
     """Render labeled images one after another.
@@ -106,6 +108,7 @@ def render_dataset(
         settings: What is drawn at random. None for random light only.
         network: Network for whose mistakes each render is attacked, as
             `nb.load_classifier` returns it. None for random light.
+        maps: Whether depth and normals are computed.
         of_scene: Further arguments of `build_scene`, such as light, backgrounds
             and views.
 
@@ -145,7 +148,8 @@ def render_dataset(
         scene = scene.changed(examples=examples)
     skipped = frozenset(skip)
     indices = [index for index in range(first, first + count) if index not in skipped]
-    return _render_blocks(scene, replace(settings, examples=BLOCK), network, indices, seed)
+    settings = replace(settings, examples=BLOCK)
+    return _render_blocks(scene, settings, network, indices, seed, maps)
 
 
 def _render_blocks(
@@ -154,6 +158,7 @@ def _render_blocks(
     network: TaskNetwork | None,
     indices: Sequence[int],
     seed: int,
+    maps: bool,
 ) -> Iterator[LabeledRender]:
     """Yield renders with ascending indices, one block after another."""
     # Without a network, nothing asks for the classes.
@@ -167,7 +172,12 @@ def _render_blocks(
         every = range(block * BLOCK, (block + 1) * BLOCK)
         chosen = [in_turn[index % len(scene)] for index in every]
         examples = [scene.examples[example] for example in chosen]
-        shown = scene.changed(examples=examples, lights=scene.lights[chosen])
+        views = {(example.object, example.cameras) for example in examples}
+        # A transfer operator pays if it renders about four lights.
+        one_light = network is None and not scene.needs_rays and 4 * len(views) > BLOCK
+        shown = scene.changed(
+            examples=examples, lights=scene.lights[chosen], one_light=one_light or scene.one_light
+        )
         labels = torch.zeros(BLOCK, dtype=torch.int64, device=scene.lights.device)
         if network is not None:
             labels = source_labels(shown, labels.device, network)[:, 0]
@@ -178,7 +188,7 @@ def _render_blocks(
         if block == indices[0] // BLOCK:
             warn_of_exposure(problem.scene)
         rows = torch.tensor([index - every.start for index in members], device=values.device)
-        yield from _renders(problem, values, rows, every.start)
+        yield from _renders(problem, values, rows, every.start, maps)
 
 
 def _show_all(camera: Camera, item: SceneObject, size: Size) -> Camera:
@@ -201,7 +211,11 @@ def _show_all(camera: Camera, item: SceneObject, size: Size) -> Camera:
 
 
 def _renders(
-    problem: SceneProblem, values: Float[Tensor, "E D"], rows: Int[Tensor, " A"], start: int
+    problem: SceneProblem,
+    values: Float[Tensor, "E D"],
+    rows: Int[Tensor, " A"],
+    start: int,
+    maps: bool,
 ) -> Iterator[LabeledRender]:
     """Yield the renders of some examples of a problem, with indices from `start`."""
     scene = problem.scene
@@ -220,7 +234,8 @@ def _renders(
         [camera] = scene.cameras_under(conditions, 0, example)
         facts = describe_camera(camera.fixed(), scene.settings.shape)
         labels = [names[index] for index in classes.tolist()]
-        seen = labels, boxes, masks, visible, *scene.surface_maps(conditions, 0, example)
+        depth, normals = scene.surface_maps(conditions, 0, example) if maps else (None, None)
+        seen = labels, boxes, masks, visible, depth, normals
         shown = scene.examples[example]
         light = conditions.light[0].cpu() * shown.exposure
         name = scene.objects[shown.object].name

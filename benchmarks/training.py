@@ -3,6 +3,7 @@
     python -m benchmarks.training speed --data cifar100.npz --csv speed.csv
     python -m benchmarks.training renders --numbers 100 1000 10000 --csv renders.csv
     python -m benchmarks.training moved --views 2 --rounds 5 --csv moved.csv
+    python -m benchmarks.training files --count 96 --rounds 3 --csv files.csv
 
 `speed` compares `python -m train` without renders, `python -m train` with
 adversarial renders, and a plain loop. They take turns, so that a busy machine
@@ -17,6 +18,9 @@ the peak memory of the process is that of the round.
 
 `moved` measures rounds of `experiment=best`, in which each render has its own
 view and light. They are shaded directly and by operators.
+
+`files` measures `pnb-render` with its defaults, at 224 pixels per side and with
+PNG files: renders per second of one core, with and without maps.
 """
 
 import argparse
@@ -42,6 +46,7 @@ from torchvision import transforms
 
 from augment import AugmentationService, AugmentationSettings
 from augment.augmentation_settings import TrainingAttackSettings
+from augment.dataset import BLOCK
 from augment.random_streams import generator
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
@@ -49,6 +54,8 @@ from augment.scene.vary import vary
 from benchmarks.common import Row, record, with_median
 from train import checkpoints, run_folder
 from train.__main__ import main as train_command
+from train.command_settings import DATA_SET_MAPS, RenderSettings
+from train.commands.render import run as write_data_set
 from train.device import MixedPrecision
 from train.networks import Dropout, WideResNet
 from train.run_folder import read_metrics
@@ -479,6 +486,45 @@ def render_varied(scene: Scene, settings: ExperimentSettings, number: int, is_di
     varied.render(varied.conditions(examples), examples)
 
 
+# ---------------------------------------------------------------------------- files
+
+
+def measure_files(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure labeled renders on disk, on one core.
+
+    Args:
+        options: Parsed command line.
+
+    Yields:
+        A row for each round, with the renders per second of process time. The
+        time in which the command prepares its scene is left out.
+    """
+    torch.set_num_threads(1)
+    for number in range(options.rounds + 1):
+        row: Row = {"round": number, "renders": options.count}
+        for name, maps in (("without_maps", []), ("with_maps", [*DATA_SET_MAPS])):
+            seconds = [write_renders(count, maps) for count in (BLOCK, BLOCK + options.count)]
+            row[f"renders_per_second_{name}"] = options.count / (seconds[1] - seconds[0])
+        if number > 0:
+            yield row
+
+
+def write_renders(count: int, maps: list[str]) -> float:
+    """Write a data set of labeled renders, and return the seconds of process time.
+
+    Args:
+        count: Number of renders.
+        maps: Further images of each render.
+
+    Returns:
+        Seconds.
+    """
+    with TemporaryDirectory() as folder:
+        start = time.process_time()
+        write_data_set(RenderSettings(out=folder, device="cpu", size=224, count=count, maps=maps))
+        return time.process_time() - start
+
+
 # ---------------------------------------------------------------------------- command
 
 
@@ -509,7 +555,11 @@ def make_parser() -> argparse.ArgumentParser:
     moved.set_defaults(measure=lambda options: with_median(measure_moved(options)), device="cpu")
     moved.add_argument("--views", type=int, default=20, help="number of views of each mesh")
     moved.add_argument("--rounds", type=int, default=3)
-    for command in (speed, renders, moved):
+    files = commands.add_parser("files", help="labeled renders on disk by pnb-render")
+    files.set_defaults(measure=lambda options: with_median(measure_files(options)), device="cpu")
+    files.add_argument("--count", type=int, default=96, help="renders of a measurement")
+    files.add_argument("--rounds", type=int, default=3)
+    for command in (speed, renders, moved, files):
         command.add_argument("--csv", type=Path)
     return parser
 

@@ -439,6 +439,11 @@ class Scene:
             raise errors.InputError(f"examples has indices from {low} to {high}: {advice}")
         return indices.to(self.lights.device)
 
+    @property
+    def needs_rays(self) -> bool:
+        """Whether direct rendering traces rays for each view, which operators do once."""
+        return bool(self.basis.local_lights) or self.settings.global_illumination
+
     def layers(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Iterator[Layer]:
         """Render the pixels that objects cover, by the fastest method that is exact.
 

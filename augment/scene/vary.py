@@ -100,8 +100,7 @@ class _Variation:
             ]
         # Direct rendering of a view in one lighting is faster than the construction of its transfer
         # operator, except if direct rendering would trace rays.
-        needs_rays = bool(scene.basis.local_lights) or scene.settings.global_illumination
-        one_light = once and settings.moves and not needs_rays
+        one_light = scene.one_light or (once and settings.moves and not scene.needs_rays)
         return scene.changed(examples=examples, one_light=one_light, **changed)
 
     def _draw_cameras(self) -> list[Example]:

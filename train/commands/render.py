@@ -60,6 +60,7 @@ def run(settings: RenderSettings) -> None:
     options |= {"scene": settings.scene, "renderer": settings.renderer, "seed": settings.seed}
     options |= {"first": own.start, "skip": finished, "views": settings.scene.views}
     options["rasterizer"] = choose_rasterizer(settings.renderer)
+    options["maps"] = not {"depth", "normals"}.isdisjoint(settings.maps)
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
         shown = [*objects.values()]

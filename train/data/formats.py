@@ -80,8 +80,6 @@ class DataSet:
         part = self.split(render.index)
         number = f"{render.index:06d}"
         image = self.image.format(part=part, number=number, label=first_label(render))
-        # Depth, in world units, of one step of the depth image.
-        depth_scale = float(render.depth.max()) / MAX_DEPTH
         facts = render.boxes.tolist(), render.visible.tolist(), render.masks.numpy()
         objects = []
         for label, box, visible, mask in zip(render.labels, *facts, strict=True):
@@ -96,11 +94,13 @@ class DataSet:
             "objects": objects,
             "camera": render.camera,
             "light": render.light.tolist(),
-            "depth_scale": depth_scale,
         }
+        if render.depth is not None:
+            # Depth, in world units, of one step of the depth image.
+            details["depth_scale"] = float(render.depth.max()) / MAX_DEPTH
         files: dict[str, bytes | str] = {image: png(render.image)}
         for name in self.maps:
-            files[f"{DETAILS}/{number}_{name}.png"] = png(_map(render, name, depth_scale))
+            files[f"{DETAILS}/{number}_{name}.png"] = png(_map(render, name))
         return files | {f"{DETAILS}/{number}.json": json.dumps(details)}
 
     def is_finished(self) -> bool:
@@ -229,7 +229,7 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
     return counts if counts[-1] else counts[:-1]
 
 
-def _map(render: LabeledRender, name: str, depth_scale: float) -> np.ndarray:
+def _map(render: LabeledRender, name: str) -> np.ndarray:
     """Return a map of a render as an array of 8 or 16 bits.
 
     A mask has 1 for the first visible object, 2 for the second, and so on. Normals in [-1, 1]
@@ -237,10 +237,12 @@ def _map(render: LabeledRender, name: str, depth_scale: float) -> np.ndarray:
     """
     if name == "mask":
         numbers = np.arange(1, len(render.masks) + 1, dtype=np.uint8)[:, None, None]
-        shape = render.depth.shape
+        shape = render.image.shape[1:]
         return (render.masks.numpy() * numbers).max(0, initial=0).reshape(shape).astype(np.uint8)
+    assert render.depth is not None and render.normals is not None
     if name == "depth":
-        return np.rint(render.depth.numpy() / (depth_scale or 1.0)).astype(np.uint16)
+        scale = float(render.depth.max()) / MAX_DEPTH or 1.0
+        return np.rint(render.depth.numpy() / scale).astype(np.uint16)
     normals = render.normals.permute(1, 2, 0).numpy()
     return np.rint((normals + 1) / 2 * 255).astype(np.uint8)
 

@@ -23,6 +23,7 @@ from train.command_settings import RenderSettings
 from train.commands.render import run
 
 COUNT = 11
+MAPS = ["mask", "depth", "normals"]
 
 
 @pytest.fixture(autouse=True)
@@ -96,6 +97,24 @@ def test_lines_of_yolo_are_centers_and_sizes_as_fractions(meshes, tmp_path):
         assert names[int(label)] == item["class"]
         found = [16 * (x - width / 2), 8 * (y - height / 2), 16 * width, 8 * height]
         assert found == pytest.approx([left, top, right - left, bottom - top], abs=1e-4)
+
+
+@pytest.mark.parametrize("maps", [[], ["mask"]])
+def test_without_maps_of_depth_the_pictures_are_the_same(meshes, tmp_path, maps):
+    every, some = (write(meshes, tmp_path / str(i), maps=of) for i, of in enumerate((MAPS, maps)))
+    assert pictures(every).items() >= pictures(some).items()
+    assert len(pictures(some)) == COUNT * (1 + len(maps))
+    assert "depth_scale" not in details(some, 0)
+
+
+def test_views_of_one_light_each_are_shaded_as_operators_shade_them(meshes):
+    # Two views in a block of four renders are shaded directly, and one view has an operator.
+    pairs = [(meshes[1]["mesh"], "ball")]
+    [direct], [operator] = (
+        [*render_dataset(pairs, 24, 1, views=views, fov=30.0)] for views in (2, 1)
+    )
+    assert (direct.image.int() - operator.image.int()).abs().max() <= 1
+    assert torch.equal(direct.masks, operator.masks)
 
 
 def test_a_tar_file_has_the_same_pictures_as_a_folder(meshes, tmp_path):
