@@ -142,9 +142,6 @@ def read_numbers(path: Path) -> np.ndarray:
     """
     array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
     if array.dtype.kind not in "fiu" or not array.size:
-        raise ValueError(
-            f"the array has the type {array.dtype} and the shape {array.shape}, but real numbers "
-            "are needed"
-        )
+        raise ValueError(f"it is {array.dtype} of shape {array.shape}: save real numbers")
     with np.errstate(over="ignore"):
         return array.astype(np.float32)

@@ -111,14 +111,13 @@ def _require_memory(file: GltfFile, nodes: list[int]) -> None:
     needed = 0
     for index in nodes:
         node = file.tree["nodes"][index]
+        copies = len(file.instances(index))
+        vertex_bytes = SKINNED_VERTEX_BYTES if "skin" in node else VERTEX_BYTES
         for primitive in file.entry("meshes", node["mesh"])["primitives"]:
-            vertices = file.entry("accessors", primitive["attributes"]["POSITION"])["count"]
-            corners = vertices
-            if "indices" in primitive:
-                corners = file.entry("accessors", primitive["indices"])["count"]
+            position = primitive["attributes"]["POSITION"]
+            vertices = file.entry("accessors", position)["count"]
+            corners = file.entry("accessors", primitive.get("indices", position))["count"]
             faces = corners / 3 if primitive.get("mode", TRIANGLES) == TRIANGLES else corners
-            copies = file.instance_count(index)
-            vertex_bytes = SKINNED_VERTEX_BYTES if "skin" in node else VERTEX_BYTES
             needed += copies * int(FACE_BYTES * faces + vertex_bytes * vertices)
     require_memory("its faces", needed, CPU)
 
@@ -220,8 +219,6 @@ def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
     """Place a part in the scene, once for each copy that a node shows, and cut out its holes."""
     poses = file.instances(index)
     surface = part.surface
-    if not len(surface.faces):
-        return []
     node = file.tree["nodes"][index]
     if "skin" in node:
         if len(poses) > 1:
@@ -301,10 +298,7 @@ def _visible(material: Material, surface: _Surface) -> _Surface:
     cutoff = ALMOST_ONE if material.mode == "BLEND" else material.cutoff
     visible = _cut_out(surface, material.alpha, cutoff)
     if material.mode == "BLEND" and visible is not surface:
-        raise ValueError(
-            "its surface is transparent (alphaMode BLEND with alpha below 1): "
-            "make it opaque, or use alphaMode MASK"
-        )
+        raise ValueError("its surface is transparent (alphaMode BLEND): use OPAQUE or MASK")
     return visible
 
 
@@ -373,8 +367,7 @@ def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: f
             break
         if len(faces) > MAX_FACES:
             raise ValueError(
-                f"the border of its alpha needs more than {MAX_FACES} faces: use fewer texels "
-                "or fewer repetitions of the texture"
+                f"the border of its alpha needs more than {MAX_FACES} faces: smooth it"
             )
         surface = _halve(values, faces[is_shown], lengths[is_shown], is_large[is_shown])
     # SciPy has rows first.

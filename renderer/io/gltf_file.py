@@ -9,7 +9,6 @@ metallic value and specular factor. Its other properties are ignored
 (`ignored_features`). What lets light pass through the surface is refused.
 """
 
-import io
 import json
 import math
 import struct
@@ -26,8 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from renderer.errors import require_memory
 from renderer.image import decode, encode, to_bytes
-from renderer.io.images import eight_bits, identify
-from renderer.io.mesh_file import CPU, MeshFile
+from renderer.io.mesh_file import CPU, TEXEL_BYTES, MeshFile, decode_image
 
 # Types of the numbers in accessors (3.6.2.2).
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -41,8 +39,6 @@ INSTANCING = "EXT_mesh_gpu_instancing"
 VISIBILITY = "KHR_node_visibility"
 # Bytes that a number of an accessor takes while it is read.
 ARRAY_BYTES = 16
-# Bytes that a texel takes while its image is read and as a texture.
-TEXEL_BYTES = 20
 
 
 class GltfFile:
@@ -163,9 +159,7 @@ class GltfFile:
         entry = self.entry("images", source)
         uri = entry.get("uri")
         content = self._view(entry["bufferView"]) if uri is None else self._resource(uri)
-        image = identify(io.BytesIO(content))
-        require_memory("textures", TEXEL_BYTES * image.width * image.height, CPU)
-        return eight_bits(image)
+        return decode_image(content)
 
     # Nodes
 
@@ -205,27 +199,18 @@ class GltfFile:
                 waiting += reversed(entry.get("children", []))
         return list(listed)
 
-    def instance_count(self, index: int) -> int:
-        """Count the copies of its mesh that a node shows (EXT_mesh_gpu_instancing)."""
-        counts = {self.entry("accessors", i)["count"] for i in self._instancing(index).values()}
-        if len(counts) > 1:
-            raise ValueError(f"the arrays of {INSTANCING} have different lengths")
-        return min(counts, default=1)
-
     def instances(self, index: int) -> np.ndarray:
-        """Return the matrices (N, 4, 4) that place the N copies of a node's mesh in the scene."""
-        arrays = {name: self.array(i) for name, i in self._instancing(index).items()}
-        rows = range(self.instance_count(index))
-        copies = [_local_matrix({name: arrays[name][row] for name in arrays}) for row in rows]
-        return self.poses[index] @ np.stack(copies)
-
-    def _instancing(self, index: int) -> dict[str, int]:
-        """Return the accessors of the translations, rotations and scales of the copies."""
+        """Return the matrices (N, 4, 4) of the N copies of its mesh that a node shows."""
         extensions = self.tree["nodes"][index].get("extensions", {})
-        attributes: dict[str, int] = extensions.get(INSTANCING, {}).get("attributes", {})
         # Files may have more attributes, such as a number of each copy.
-        places = ("translation", "rotation", "scale")
-        return {name: attributes[name.upper()] for name in places if name.upper() in attributes}
+        arrays = {
+            name.lower(): self.array(accessor)
+            for name, accessor in extensions.get(INSTANCING, {}).get("attributes", {}).items()
+            if name in ("TRANSLATION", "ROTATION", "SCALE")
+        }
+        if len(set(map(len, arrays.values()))) > 1:
+            raise ValueError(f"the arrays of {INSTANCING} have different lengths")
+        return (self.poses[index] @ _local_matrix(arrays)).reshape(-1, 4, 4)
 
 
 def _chunks(content: bytes) -> dict[int, bytes]:
@@ -245,13 +230,16 @@ def _chunks(content: bytes) -> dict[int, bytes]:
 
 
 def _local_matrix(node: dict[str, Any]) -> np.ndarray:
-    """Return the matrix (4, 4) of a node relative to its parent (3.5.2)."""
+    """Return the matrix (4, 4) of a node relative to its parent (3.5.2), or those of N copies."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    matrix = np.eye(4)
     rotation = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix()
-    matrix[:3, :3] = rotation * np.asarray(node.get("scale", (1, 1, 1)))
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    linear = rotation * np.expand_dims(node.get("scale", (1, 1, 1)), -2)
+    translation = np.expand_dims(node.get("translation", (0, 0, 0)), -1)
+    copies = np.broadcast_shapes(linear.shape[:-2], translation.shape[:-2])
+    matrix = np.broadcast_to(np.eye(4), (*copies, 4, 4)).copy()
+    matrix[..., :3, :3] = linear
+    matrix[..., :3, 3:] = translation
     return matrix
 
 
@@ -360,10 +348,7 @@ class Material:
             white = np.full((*shape, 3), 255, dtype=np.uint8)
             return replace(self, placement=placement, texture=white)
         if self.placement != placement:
-            raise ValueError(
-                "the textures of a material differ in texture coordinates, transform or wrap "
-                "mode: use the same for all"
-            )
+            raise ValueError("its textures differ in texture coordinates, transform or wrap mode")
         return self
 
     def with_gloss_texture(self, texels: np.ndarray, placement: Placement) -> "Material":
@@ -444,9 +429,7 @@ def _specular_factor(extensions: dict[str, Any]) -> float:
     colors = _factor(specular, "specularColorFactor", 3)
     textures = {"specularTexture", "specularColorTexture"} & specular.keys()
     if textures or np.ptp(colors) > 0:
-        raise ValueError(
-            f"a material has a specular color or texture ({SPECULAR}): read it without gloss"
-        )
+        raise ValueError("a material has a specular color or texture: read it without gloss")
     ior = extensions.get(IOR, {}).get("ior", 1.5)
     reflectance = ((ior - 1) / (ior + 1)) ** 2
     factor: float = specular.get("specularFactor", 1.0) * colors[0] * reflectance / DIELECTRIC

@@ -59,9 +59,7 @@ def read_image(path: str | Path, size: Size) -> Float[Tensor, "3 height width"]:
     try:
         square = read_center(path, size)
     except Exception as error:
-        raise InputError(
-            f"{path} cannot be read as an image ({error}): give another one"
-        ) from error
+        raise InputError(f"{path} cannot be read as an image ({error}): give another") from error
     # Pages of results need no tensors, and do not wait for this import.
     import torch
 
@@ -139,10 +137,7 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
         levels.putpixel((1, 0), (1,) * len(color.getbands()))
         darkest, next_level = np.asarray(convert(levels), dtype=int)[0]
         if has_more_bits and np.abs(next_level - darkest).max() > MAX_STEP:
-            raise ValueError(
-                "it is linear light of 12 or 16 bits, whose dark values are not read: "
-                "save it in sRGB"
-            )
+            raise ValueError("it is linear light of 12 or 16 bits: save it in sRGB")
         color = convert(color)
     color = color.convert("RGB")
     if alpha is None:
@@ -364,10 +359,7 @@ def conversion_to_srgb(image: Image.Image, path: str | Path) -> Conversion | Non
     if codes is not None:
         primaries_code, curve_code = codes
         if primaries_code not in CODED_PRIMARIES or curve_code not in CODED_GAMMAS:
-            raise ValueError(
-                f"its chunk cICP has the colors {primaries_code} and the curve {curve_code}, "
-                "such as HDR: save it in sRGB"
-            )
+            raise ValueError(f"its chunk cICP has the codes {codes}, such as HDR: save it in sRGB")
         return _conversion(CODED_GAMMAS[curve_code], CODED_PRIMARIES[primaries_code])
     if profile := image.info.get("icc_profile"):
         return partial(_apply_profile, profile)

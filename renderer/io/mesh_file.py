@@ -14,6 +14,7 @@ import mapbox_earcut
 import numpy as np
 import torch
 from jaxtyping import Float, Int, Num
+from PIL import Image
 
 from renderer.errors import MAX_MAGNITUDE, require_memory
 from renderer.image import decode, encode
@@ -23,8 +24,8 @@ from renderer.mesh import NO_TEXTURE, Mesh, transformed
 
 # Largest difference from the range [0, 1] that counts as rounding of a color.
 TOLERANCE = 1e-3
-# Bytes for each texel of a texture, while it is read and in the mesh.
-_TEXEL_BYTES = 16
+# Bytes that a texel takes while its image is read and as a texture.
+TEXEL_BYTES = 20
 # Device of the textures.
 CPU = torch.device("cpu")
 # Opacity above which a surface counts as opaque.
@@ -100,10 +101,7 @@ class MeshFile:
         """Read an image file as a texture, uint8, shape (H, W, 3)."""
         key = folder + name
         if key not in self._textures:
-            with identify(io.BytesIO(self.read(name, folder))) as image:
-                needed = _TEXEL_BYTES * image.width * image.height
-                require_memory(f"the texels of {name}", needed, CPU)
-                pixels = np.array(eight_bits(image).convert("RGBA"))
+            pixels = np.array(decode_image(self.read(name, folder)).convert("RGBA"))
             if pixels[..., 3].min() < 255:
                 self.assume(f"the alpha of {name} is ignored")
             self._textures[key] = np.ascontiguousarray(pixels[..., :3])
@@ -126,6 +124,13 @@ class MeshFile:
             names = ", ".join(sorted(self._ignored))
             text = f"ignored in {kind} files, as they change neither shape nor color: {names}"
             warn_once(text, stacklevel + 1)
+
+
+def decode_image(content: bytes | memoryview) -> Image.Image:
+    """Decode an image file with 8 bits per channel, if it fits into memory as a texture."""
+    image = identify(io.BytesIO(content))
+    require_memory("textures", TEXEL_BYTES * image.width * image.height, CPU)
+    return eight_bits(image)
 
 
 # Python's own filter forgets what it has shown whenever a library changes the filters.

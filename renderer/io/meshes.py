@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from PIL import Image
 
 from renderer import errors
@@ -321,20 +321,21 @@ def _glb(
     rotation = Y_UP_TO_Z_UP[:3, :3]
     primitives = []
     for is_written, texture_id, gloss in by_material(mesh, is_later):
-        # Eight values for each corner: color (3), texture coordinates (2) and normal (3).
-        parts = [mesh.corner_colors[is_written], mesh.corner_uvs[is_written], normals[is_written]]
-        corner_values = np.concatenate(parts, axis=-1)
-        vertex_ids, values, faces = _split_vertices(mesh.faces[is_written], corner_values)
+        # Corners with the same values become one vertex: the index of the vertex (1), color (3),
+        # texture coordinates (2) and normal (3). float64 does not round the index.
+        columns = (mesh.faces[..., None], mesh.corner_colors, mesh.corner_uvs, normals)
+        corner_values = np.concatenate([column[is_written] for column in columns], axis=-1)
+        values, corners = np.unique(corner_values.reshape(-1, 9), axis=0, return_inverse=True)
         attributes = {
-            "POSITION": mesh.vertices[vertex_ids] @ rotation,
+            "POSITION": mesh.vertices[values[:, 0].astype(np.int64)] @ rotation,
             # v points down in glTF.
-            "TEXCOORD_0": values[:, 3:5] * [1, -1] + [0, 1],
-            "COLOR_0": decode(torch.from_numpy(values[:, :3]), "srgb").numpy(),
-            "NORMAL": values[:, 5:] @ rotation,
+            "TEXCOORD_0": values[:, 4:6] * [1, -1] + [0, 1],
+            "COLOR_0": decode(torch.from_numpy(values[:, 1:4]), "srgb").numpy(),
+            "NORMAL": values[:, 6:] @ rotation,
         }
         primitive = {
             "attributes": {n: tree.add_array(a.astype(np.float32)) for n, a in attributes.items()},
-            "indices": tree.add_array(faces.astype(np.uint32).ravel()),
+            "indices": tree.add_array(corners.astype(np.uint32).ravel()),
             "material": _add_material(tree, mesh, texture_id, gloss),
         }
         primitives.append(primitive)
@@ -383,21 +384,3 @@ def _gltf_camera(camera: Camera, aspect: float) -> dict[str, Any]:
     half_width = camera.width / 2
     orthographic = {"xmag": half_width, "ymag": half_width / aspect, **planes}
     return {"type": "orthographic", "orthographic": orthographic}
-
-
-def _split_vertices(
-    faces: Int[np.ndarray, "F 3"], corner_values: Float[np.ndarray, "F 3 D"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Repeat vertices until all face corners at a vertex have the same values, as in a file.
-
-    The results are the original vertex (N,) and the values (N, D) of each new vertex, and the
-    faces.
-    """
-    # Corners with the same key become one new vertex. The key
-    # of a corner is its original vertex, followed by its
-    # values. Converting the index to float64 does not round it.
-    keys = np.concatenate([faces[..., None], corner_values], axis=-1)
-    corner_keys = keys.reshape(-1, keys.shape[-1])
-    vertex_keys, corner_to_vertex = np.unique(corner_keys, axis=0, return_inverse=True)
-    original_vertices = vertex_keys[:, 0].astype(np.int64)
-    return original_vertices, vertex_keys[:, 1:], corner_to_vertex.reshape(-1, 3)

@@ -124,9 +124,7 @@ def _table(lines: _Lines, lengths: tuple[int, ...]) -> tuple[np.ndarray, np.ndar
     counts, text = lines.words()
     wrong = counts[~np.isin(counts, lengths)]
     if len(wrong):
-        raise ValueError(
-            f"a line {lines.keyword} has {wrong[0]} numbers: give {' or '.join(map(str, lengths))}"
-        )
+        raise ValueError(f"a line {lines.keyword} has {wrong[0]} numbers, not one of {lengths}")
     table = np.zeros((len(counts), max(lengths)))
     is_given = np.arange(max(lengths)) < counts[:, None]
     table[is_given] = mesh_file.parse_numbers(text, np.float64)
@@ -164,10 +162,7 @@ def _polygons(lines: dict[str, _Lines]) -> tuple[np.ndarray, np.ndarray]:
         is_given = written != _LEFT_OUT
         wrong = written[is_given & ((resolved < 0) | (resolved >= len(numbers)))]
         if len(wrong):
-            raise ValueError(
-                f"a face has the index {wrong[0]} of {keyword}, "
-                f"but the file has {len(numbers)} lines {keyword}"
-            )
+            raise ValueError(f"a face has the index {wrong[0]} of {len(numbers)} lines {keyword}")
         indices[:, column] = np.where(is_given, resolved, -1)
     return indices, sizes
 

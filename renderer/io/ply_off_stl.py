@@ -1,7 +1,6 @@
 """Read .ply, .off and .stl files, which have colors of vertices and faces."""
 
 import re
-import struct
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +15,8 @@ _TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
+# Beginning of the name under which the length of a list is read.
+_LENGTH = "length of "
 # Byte orders of NumPy. The numbers of an ASCII file become little-endian float64.
 _BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 # Names of red, green, blue and alpha.
@@ -208,8 +209,7 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
         stored = [_Property(item.name, "f8", item.length_type and "f8") for item in items]
         layout = stored if form == "ascii" else items
         values, offset = _rows(body, offset, counts[name], layout, _BYTE_ORDERS[form])
-        for column, item in zip(values, items, strict=True):
-            elements.setdefault(name, {})[item.name] = _cast(column, item)
+        elements[name] = {item.name: _cast(values[item.name], item) for item in items}
     if form == "ascii" and offset != len(body):
         raise ValueError("the lines have more numbers than the header says")
     return elements, texture_names
@@ -217,68 +217,53 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
 
 def _rows(
     body: bytes, offset: int, count: int, properties: list[_Property], order: str
-) -> tuple[list[np.ndarray | _Lists], int]:
+) -> tuple[_Values, int]:
     """Read the values of each property of an element, and find the byte after them."""
     # Each value has at least one byte. A damaged header
     # could otherwise announce more rows than fit into memory.
     if not 0 <= count * len(properties) <= len(body) - offset:
         raise ValueError(_TRUNCATED)
-    try:
-        if count:
-            # NumPy reads rows at once if their lists are as long as those of the first row.
+    blocks: list[np.ndarray] = []
+    while count:
+        # NumPy reads rows at once if their lists are as long as those of the first row. A block
+        # has up to twice as many rows as the block before, so that few are read in vain.
+        most = min(count, 2 * len(blocks[-1]) if blocks else 1)
+        try:
             row = _first_row(body, offset, properties, order)
-            end = offset + count * row.itemsize
-            rows = np.frombuffer(body, row, count if end <= len(body) else 1, offset)
-            lengths = [rows[name] for name in row.names or () if name.startswith("length")]
-            if end <= len(body) and all((column == column[0]).all() for column in lengths):
-                return [
-                    _Lists(rows[f"length {i}"], rows[str(i)].ravel())
-                    if item.length_type
-                    else rows[str(i)]
-                    for i, item in enumerate(properties)
-                ], end
-        return _different_rows(body, offset, count, properties, order)
-    # NumPy refuses a list of negative length, or longer than the file.
-    except (ValueError, struct.error) as error:
-        raise ValueError(_TRUNCATED) from error
+            most = min(most, (len(body) - offset) // row.itemsize)
+            rows = np.frombuffer(body, row, max(1, most), offset)
+        # NumPy refuses a list of negative length, or longer than the file.
+        except ValueError as error:
+            raise ValueError(_TRUNCATED) from error
+        lengths = [rows[name] for name in row.names or () if name.startswith(_LENGTH)]
+        is_other = np.any([column != column[0] for column in lengths], axis=0)
+        blocks.append(rows[: is_other.argmax()] if is_other.any() else rows)
+        count -= len(blocks[-1])
+        offset += blocks[-1].nbytes
+
+    def column(name: str, number_type: str) -> np.ndarray:
+        """Join a column of all blocks."""
+        return np.concatenate([np.zeros(0, number_type), *(rows[name].ravel() for rows in blocks)])
+
+    values: _Values = {}
+    for name, number_type, length_type in properties:
+        numbers = column(name, number_type)
+        is_list = bool(length_type)
+        values[name] = _Lists(column(_LENGTH + name, length_type), numbers) if is_list else numbers
+    return values, offset
 
 
 def _first_row(body: bytes, offset: int, properties: list[_Property], order: str) -> np.dtype:
-    """Return the type of the first row, with the field "length 1" for a list in the field "1"."""
+    """Return the type of the first row, in which the length of a list is a field of its own."""
     fields: list[tuple[str, str, tuple[int, ...]]] = []
-    for index, item in enumerate(properties):
+    for name, number_type, length_type in properties:
         shape: tuple[int, ...] = ()
-        if item.length_type:
+        if length_type:
             start = offset + np.dtype(fields).itemsize
-            length_type = order + item.length_type
-            fields.append((f"length {index}", length_type, ()))
-            shape = (int(np.frombuffer(body, length_type, 1, start)[0]),)
-        fields.append((str(index), order + item.type, shape))
+            fields.append((_LENGTH + name, order + length_type, ()))
+            shape = (int(np.frombuffer(body, order + length_type, 1, start)[0]),)
+        fields.append((name, order + number_type, shape))
     return np.dtype(fields)
-
-
-def _different_rows(
-    body: bytes, offset: int, count: int, properties: list[_Property], order: str
-) -> tuple[list[np.ndarray | _Lists], int]:
-    """Read rows whose lists have different lengths."""
-    numbers: list[list[float]] = [[] for _ in properties]
-    lengths: list[list[int]] = [[] for _ in properties]
-    types = [np.dtype(item.type) for item in properties]
-    length_types = [item.length_type and np.dtype(item.length_type) for item in properties]
-    for _ in range(count):
-        for index, (number_type, length_type) in enumerate(zip(types, length_types, strict=True)):
-            length = 1
-            if length_type:
-                length = int(struct.unpack_from(order + length_type.char, body, offset)[0])
-                lengths[index].append(length)
-                offset += length_type.itemsize
-            numbers[index] += struct.unpack_from(f"{order}{length}{number_type.char}", body, offset)
-            offset += length * number_type.itemsize
-    columns = [np.array(values, types[i]) for i, values in enumerate(numbers)]
-    return [
-        _Lists(np.array(lengths[i], np.int64), column) if properties[i].length_type else column
-        for i, column in enumerate(columns)
-    ], offset
 
 
 def _cast(values: Any, item: _Property) -> Any:
@@ -330,15 +315,11 @@ def read_off(file: MeshFile) -> list[Part]:
     table = _numbers(vertex_lines).reshape(-1, width)
     vertices = table[:, :3]
     vertex_colors = _colors([line[color_start:color_end] for line in vertex_lines], file)
-    given_sizes = _numbers([line[:1] for line in face_lines])
-    sizes = given_sizes.astype(np.int64)
+    sizes = _numbers([line[:1] for line in face_lines], np.int64)
     corner_words = [line[1 : 1 + size] for line, size in zip(face_lines, sizes, strict=True)]
     color_words = [line[1 + size :] for line, size in zip(face_lines, sizes, strict=True)]
-    numbers = _numbers(corner_words)
-    indices = numbers.astype(np.int64)
-    is_complete = len(indices) == sizes.sum() and (sizes == given_sizes).all()
-    is_plain = is_complete and (indices == numbers).all()
-    if not is_plain or any(len(words) not in (0, 3, 4) for words in color_words):
+    indices = _numbers(corner_words, np.int64)
+    if len(indices) != sizes.sum() or any(len(words) not in (0, 3, 4) for words in color_words):
         raise ValueError("a face is not a number of vertices, the vertices, and maybe a color")
     face_colors = _colors(color_words, file)
     corners, polygons = mesh_file.triangles_of(file, vertices, indices, sizes)
@@ -350,9 +331,9 @@ def read_off(file: MeshFile) -> list[Part]:
     return [Part(mesh_file.colored_mesh(vertices, faces, colors), normals)]
 
 
-def _numbers(lines: list[list[bytes]]) -> np.ndarray:
+def _numbers(lines: list[list[bytes]], dtype: type = np.float64) -> np.ndarray:
     """Parse the words of all lines, shape (N,)."""
-    return mesh_file.parse_numbers(b" ".join(word for line in lines for word in line), np.float64)
+    return mesh_file.parse_numbers(b" ".join(word for line in lines for word in line), dtype)
 
 
 def _colors(lines: list[list[bytes]], file: MeshFile) -> np.ndarray:
@@ -365,10 +346,7 @@ def _colors(lines: list[list[bytes]], file: MeshFile) -> np.ndarray:
     has_point = any(b"." in word for line in lines for word in line)
     # As bytes, colors of only 0 and 1 are almost black, and an opacity of 1 is almost transparent.
     if is_whole and highest == 1 and (widths == 3).any() and not has_point:
-        raise ValueError(
-            "the colors are only 0 and 1, and 1 may be white or almost black: "
-            "write colors from 0 to 255, or with a point such as 1.0"
-        )
+        raise ValueError("the color 1 may be white or almost black: write 255 or 1.0 for white")
     colors = np.ones((len(lines), 4))
     values = given.astype(np.uint8) if is_whole and highest > 1 else given
     colors[np.arange(4) < widths[:, None]] = mesh_file.unit_colors(values, file)

@@ -190,10 +190,7 @@ def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
     array = read_numbers(path)
     names = _CHANNEL_NAMES_BY_COUNT.get(array.shape[-1]) if array.ndim == 3 else None
     if names is None:
-        raise InputError(
-            f"the array has the shape {array.shape}, but (height, width, channels) with 1, 3 or 4 "
-            "channels is needed"
-        )
+        raise InputError(f"the array has the shape {array.shape}: save (height, width, 3)")
     return array, names
 
 
@@ -209,9 +206,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]
     texels = image.get_pixels("float")
     spec = image.spec()
     if image.file_format_name not in ("hdr", "openexr"):
-        raise InputError(
-            f"the file is a {image.file_format_name} image, but an .hdr or .exr file is needed"
-        )
+        raise InputError(f"the file is a {image.file_format_name} image: save it as .exr")
     # The orientation 1 of EXIF means that the top row is stored first.
     if spec.roi != spec.roi_full or image.orientation != 1:
         raise InputError("the image is stored cropped or rotated: save the whole, upright image")
@@ -296,9 +291,7 @@ def _color_channels(names: Sequence[str]) -> list[int]:
     gray_channels = [i for i, parts in enumerate(words) if _OTHER_NAMES.isdisjoint(parts)]
     if len(gray_channels) == 1:
         return gray_channels * 3
-    raise InputError(
-        f"the channels are {', '.join(names)}, but R, G and B, or one gray channel, are needed"
-    )
+    raise InputError(f"the channels are {', '.join(names)}: save R, G and B, or one gray channel")
 
 
 def _openimageio() -> ModuleType:

@@ -257,10 +257,7 @@ class Lamps(LocalBasis):
             ) from error
         # NaN is out of range, too, because both comparisons with NaN are False.
         if not ((start >= 0) & (start <= settings.power)).all():
-            raise InputError(
-                f"start={settings.start} is out of range: give coefficients from 0 to "
-                f"power={settings.power:g}"
-            )
+            raise InputError(f"start={settings.start} must be from 0 to power={settings.power:g}")
         return lamps, lamps.project_nonnegative(start)
 
     def __str__(self) -> str:

@@ -136,20 +136,19 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
     # One row for each channel of each light, shape (lights · C, K).
     rows = coefficients.detach().mT.flatten(0, -2).clone()
     for index in np.unique(light_of_minimum):
-        projected = _project_channel(unique_channels[index].tobytes())
+        projected = torch.tensor(_project_channel(unique_channels[index].tobytes()))
         is_same_channel = torch.from_numpy(unique_index.reshape(-1) == index)
         rows[is_same_channel] = projected.to(rows)
     return rows.view(coefficients.mT.shape).mT
 
 
 @lru_cache(maxsize=_MAX_CACHED_CHANNELS)
-def _project_channel(channel: bytes) -> Float[Tensor, " K"]:
-    """Project one color channel, in bytes that can be hashed, and cache the result."""
-    return torch.from_numpy(_project_with_mean(np.frombuffer(channel).copy()))
+def _project_channel(channel: bytes) -> Array:
+    """Find the non-negative light with the same mean as a light and the closest irradiance.
 
-
-def _project_with_mean(light: Array) -> Array:
-    """Find the non-negative light with the same mean as a light and the closest irradiance."""
+    The light is one color channel, in bytes that can be hashed.
+    """
+    light = np.frombuffer(channel)
     mean = light[0]
     rounding_radiance = _rounding_radiance(light[None])
     uniform = np.concatenate([[max(mean, 0.0)], 0 * light[1:]])
@@ -206,7 +205,20 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
     taken over all channels of a light together. The radiance of a channel is at least
     -`TOLERANCE` times its largest one.
     """
-    programs = _create_programs(coefficients, within)
+    original = _split_channels(coefficients)
+    if within is None:
+        programs = [_QuadraticProgram(channel) for channel in original]
+    elif within.norm == "linf":
+        bounds = map(_split_channels, within.ends)
+        programs = [_QuadraticProgram(*arrays) for arrays in zip(original, *bounds, strict=True)]
+    else:
+        # An L2 ball couples the channels of a light, which become one block (C, K).
+        shape = coefficients.mT.shape
+        centers = _split_channels(within.center).reshape(shape)
+        programs = [
+            _QuadraticProgram(light, center=center, radius=within.radius)
+            for light, center in zip(original.reshape(shape), centers, strict=True)
+        ]
     # Few starts find most minima, and many find the rest.
     for starts in (_LOWEST_STARTS, _MANY_STARTS):
         _exchange(programs, starts)
@@ -233,25 +245,6 @@ def _exchange(programs: "list[_QuadraticProgram]", starts: float) -> None:
         programs = [programs[index] for index in still_negative]
         if not programs:
             break
-
-
-def _create_programs(
-    coefficients: Float[Tensor, "... K C"], within: Ball | None
-) -> "list[_QuadraticProgram]":
-    """Create the quadratic program of each light, or of each channel if no L2 ball couples them."""
-    original = _split_channels(coefficients)
-    if within is None:
-        return [_QuadraticProgram(channel) for channel in original]
-    if within.norm == "linf":
-        bounds = map(_split_channels, within.ends)
-        return [_QuadraticProgram(*arrays) for arrays in zip(original, *bounds, strict=True)]
-    # One row for each channel of each light becomes one block (C, K) for each light.
-    shape = coefficients.mT.shape
-    centers = _split_channels(within.center).reshape(shape)
-    return [
-        _QuadraticProgram(light, center=center, radius=within.radius)
-        for light, center in zip(original.reshape(shape), centers, strict=True)
-    ]
 
 
 def _rounding_radiance(channels: Array) -> Array:
@@ -321,7 +314,10 @@ class _QuadraticProgram:
         constraints = [np.concatenate(pair) for pair in pairs]
         for _ in range(_MAX_RADIUS_STEPS):
             target = self._unconstrained_point()
-            nearest, self._active_constraints = self._project(target, constraints)
+            channels = zip(target, constraints, self._low, self._high, strict=True)
+            solutions = [_least_distance(*channel) for channel in channels]
+            nearest = np.stack([solution for solution, _ in solutions])
+            self._active_constraints = [active for _, active in solutions]
             displacement = nearest - self._center
             distance = float(np.linalg.norm(displacement))
             missing = self._radius - distance
@@ -329,10 +325,10 @@ class _QuadraticProgram:
             is_on_sphere = abs(missing) <= _RADIUS_TOLERANCE * self._radius
             if is_inside or is_on_sphere:
                 break
-            channels = zip(self._offset, nearest - target, self._active_constraints, strict=True)
-            parts = [_differentiate(*channel) for channel in channels]
-            derivatives, multipliers, rates = zip(*parts, strict=True)
-            velocity = np.stack(derivatives)
+            arrays = zip(self._offset, nearest - target, self._active_constraints, strict=True)
+            derivatives = [_differentiate(*channel) for channel in arrays]
+            velocities, multipliers, rates = zip(*derivatives, strict=True)
+            velocity = np.stack(velocities)
             # r² - |x - c|² = (r - |x - c|) (r + |x - c|).
             missing_squared = missing * (self._radius + distance)
             step = self._step_to_sphere(velocity, displacement, missing_squared)
@@ -346,12 +342,6 @@ class _QuadraticProgram:
         # Rounding may leave the solution slightly outside of the ball.
         scale = min(1, self._radius / max(float(np.linalg.norm(displacement)), _TINY))
         self.nearest = self._center + displacement * scale
-
-    def _project(self, target: Array, constraints: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Find the nearest light in all constraints but the ball, and the active constraints."""
-        channels = zip(target, constraints, self._low, self._high, strict=True)
-        nearest, active = zip(*(_least_distance(*channel) for channel in channels), strict=True)
-        return np.stack(nearest), list(active)
 
     def _step_to_sphere(
         self, velocity: Array, displacement: Array, missing_squared: float

@@ -27,7 +27,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, as_tensor, is_number, require_finite
+from renderer.errors import InputError, as_tensor, require_finite
 from renderer.light.basis import HARMONICS
 from renderer.settings import TURBIDITY
 
@@ -155,38 +155,33 @@ def _as_parameters(
     The dtype and the device are those of the first floating-point tensor among turbidity, zenith
     and azimuth, or else float64.
     """
-    value_by_name = {"turbidity": turbidity, "zenith": zenith, "azimuth": azimuth}
-    floating = []
-    for name, value in value_by_name.items():
-        if not is_number(value):
-            # `as_tensor` raises InputError if the value is no tensor.
-            as_tensor(name, value)
-        if isinstance(value, Tensor) and value.is_floating_point():
-            floating.append(value)
+    given = {"turbidity": turbidity, "zenith": zenith, "azimuth": azimuth}
+    floating = [v for v in given.values() if isinstance(v, Tensor) and v.is_floating_point()]
     # Tensor that gives the dtype and the device of the results.
     like = floating[0] if floating else torch.zeros((), dtype=torch.float64)
-    turbidity_tensor = torch.as_tensor(turbidity, dtype=like.dtype, device=like.device)
-    degrees = []
-    for angle in (zenith, azimuth):
-        is_given = any(angle is tensor for tensor in floating)
-        dtype = None if is_given else torch.float64
-        degrees.append(torch.as_tensor(angle, dtype=dtype, device=like.device))
-    require_finite(azimuth=degrees[1])
-    expected = "0 to 90 degrees, with the sun above the horizon"
-    _require_in_range("zenith", degrees[0].to(like.dtype), ZENITH, expected)
-    _require_in_range("turbidity", turbidity_tensor, TURBIDITY, "2 to 10")
-    return [*(torch.deg2rad(angle).to(like.dtype) for angle in degrees), turbidity_tensor]
-
-
-def _require_in_range(name: str, value: Tensor, limits: tuple[float, float], expected: str) -> None:
-    """Check that all values of a parameter of the sky are within limits, up to rounding."""
-    low, high = limits
-    rounding = 4 * torch.finfo(value.dtype).eps
-    # Both comparisons are False for NaN, so NaN counts as outside.
-    is_outside = ~((value >= low * (1 - rounding)) & (value <= high * (1 + rounding)))
-    if is_outside.any():
-        first = value[is_outside][0].item()
-        raise InputError(f"{name}={first:.9g} is outside of the sky model's range: give {expected}")
+    tensors = {}
+    for name, value in given.items():
+        # `as_tensor` raises InputError if the value is no tensor, but rounds Python numbers.
+        as_tensor(name, value)
+        is_floating = any(value is tensor for tensor in floating)
+        dtype = None if is_floating else torch.float64
+        tensors[name] = torch.as_tensor(value, dtype=dtype, device=like.device)
+    require_finite(azimuth=tensors["azimuth"])
+    tensors["turbidity"] = tensors["turbidity"].to(like.dtype)
+    ranges = {
+        "zenith": (*ZENITH, "0 to 90 degrees, with the sun above the horizon"),
+        "turbidity": (*TURBIDITY, "2 to 10"),
+    }
+    rounding = 4 * torch.finfo(like.dtype).eps
+    for name, (low, high, expected) in ranges.items():
+        value = tensors[name].to(like.dtype)
+        # Both comparisons are False for NaN, so NaN counts as outside.
+        is_outside = ~((value >= low * (1 - rounding)) & (value <= high * (1 + rounding)))
+        if is_outside.any():
+            first = value[is_outside][0].item()
+            raise InputError(f"{name}={first:.9g} is out of the sky model's range: give {expected}")
+    angles = (torch.deg2rad(tensors[name]).to(like.dtype) for name in ("zenith", "azimuth"))
+    return [*angles, tensors["turbidity"]]
 
 
 def _chebyshev(

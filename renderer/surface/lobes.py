@@ -295,16 +295,14 @@ def coat_irradiance_factors(degree: int) -> Tensor:
     B_l = 2π ∫ E(μ) μ P_l(μ) dμ over 0 ≤ μ ≤ 1, with Legendre polynomials P_l.
     B_l depends on the roughness and is given as a sum of polynomials.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(degree + 64)
-    # The nodes of the quadrature in [-1, 1] are mapped to cosines in [0, 1].
-    cosine = (torch.from_numpy(nodes) + 1) / 2
+    cosine, weights = _gauss_legendre(degree + 64)
     coefficients = _coat_coefficients()
     # The integrand E(μ) μ: one row for each polynomial of the roughness, one column for
     # each cosine μ.
     reflected = coefficients @ _cosine_polynomials(cosine, coefficients.shape[1]) * cosine
     # Legendre polynomials: one row for each cosine, one column for each degree.
     legendre = torch.from_numpy(np.polynomial.legendre.legvander(cosine.numpy(), degree))
-    return math.pi * (legendre.T * torch.from_numpy(weights)) @ reflected.T
+    return 2 * math.pi * (legendre.T * weights) @ reflected.T
 
 
 def coat_mean(roughness: Tensor) -> Tensor:
