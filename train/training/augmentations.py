@@ -53,9 +53,9 @@ class Augmentation:
     absent: Sequence[int] = ()
 
     def apply(
-        self, images: UInt8[Tensor, "B 3 H W"], labels: Int[Tensor, " B"], step: int
+        self, images: UInt8[Tensor, "B 3 H W"], labels: Tensor, step: int
     ) -> UInt8[Tensor, "B 3 H W"]:
-        """Augment the images of a batch.
+        """Augment the images of a batch. Only "pgd" needs `labels`, which are of classes then.
 
         The random numbers for an image depend on the seed, the step and the index of the image in
         the batch.
