@@ -160,17 +160,13 @@ def _caveats(
     if settings.meshes and not (settings.hard_negatives or settings.laboratory):
         caveats.append(NO_HARD_NEGATIVES)
     for network in networks.values():
-
-        def shown(network: Classifier = network) -> Tensor:
-            if plan is None:
-                return torch.empty(0, device=device_of(network))
+        render: Callable[[], Tensor] = partial(torch.empty, 0, device=device_of(network))
+        if plan is not None:
             # Only an image with an object tells whether a detector has gradients.
-            scene = plan.attacked_views.scene(network.size)
-            return lights.render_in(scene, scene.lights[0])[:, 0]
-
-        if plan is None and not isinstance(network, Classifier):
+            render = partial(lights.plain_images, plan.attacked_views, network.size)
+        elif not isinstance(network, Classifier):
             continue
-        if not network.is_differentiable(shown):
+        if not network.is_differentiable(render):
             attack = "only random search attacks it"
             if plan is not None:
                 queries = f"{lights.QUERIES} queries for each radius"

@@ -229,6 +229,12 @@ def render_in(scene: Scene, light: Float[Tensor, "C K"]) -> Float[Tensor, "E 1 3
     return scene.render(Conditions(light.expand(len(scene), -1, -1)), examples)
 
 
+def plain_images(views: Views, size: Size, kind: str = "lighting") -> Float[Tensor, "E 3 H W"]:
+    """Render all views before an attack by a kind of lighting."""
+    scene = views.scene(size, kind)
+    return render_in(scene, scene.lights[0])[:, 0]
+
+
 def criterion_of(network: TaskNetwork, scene: Scene) -> Criterion:
     """Return the criterion of an attack on the class of a scene, the same in all E examples."""
     label = network.label(scene.labels[0])
@@ -268,7 +274,7 @@ def adversaries(
     else:
         settings |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
     scene = views.scene(classifier.size, kind)
-    if not classifier.is_differentiable(lambda: render_in(scene, scene.lights[0])[:, 0]):
+    if not classifier.is_differentiable(partial(plain_images, views, classifier.size, kind)):
         settings |= {"optimizer": RANDOM_SEARCH, "max_queries": QUERIES}
     return attack(
         classifier,
