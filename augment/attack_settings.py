@@ -172,9 +172,7 @@ class RelightingSettings(Settings):
     gradient attack takes half as many steps.
     """
 
-    gain: float = setting(
-        3.0, "Largest factor of a channel. The smallest is its inverse.", within=(1, 100)
-    )
+    gain: float = setting(3.0, "Largest factor of a channel, and largest divisor.", within=(1, 100))
     cells: int = setting(6, "Cells per side with factors of their own.", within=(1, 64))
     passes: int = setting(21, "Forward and backward passes of each search.", within=(1, 10**6))
     slides: int = setting(1, "Number of random slides for each photograph.", within=(1, 10**4))

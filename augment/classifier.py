@@ -315,10 +315,8 @@ class Classifier(TaskNetwork):
         """Check the arguments, which the docstring of the class explains. Freeze the network."""
         super().__init__(network, size, classes, name, normalize_light)
         if len(self.classes) < 2:
-            raise InputError(
-                f"classifier {name} has classes={self.classes}: give at least two, with one logit "
-                "each (for a network with a single output z, return the logits 0 and z)"
-            )
+            advice = "give at least two, with one logit each (for one output z, the logits 0 and z)"
+            raise InputError(f"classifier {name} has classes={self.classes}: {advice}")
 
     def detect(
         self, images: Float[Tensor, "N 3 height width"], label: str | None = None
@@ -504,9 +502,7 @@ def require_evaluation_mode(network: object, argument: str) -> None:
 
 
 def _preprocessed(
-    network: Callable[[Tensor], Tensor],
-    normalization: Normalization,
-    value_range: tuple[float, float],
+    network: Callable[..., Any], normalization: Normalization, value_range: tuple[float, float]
 ) -> nn.Module:
     """Return a network that takes images in [0, 1], scales and normalizes them."""
     module = network if isinstance(network, nn.Module) else wrappers.Function(network)

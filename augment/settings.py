@@ -136,9 +136,7 @@ class SceneSettings(Settings):
     """Cameras, backgrounds and lighting of a scene."""
 
     backgrounds: list[Any] = setting([0.5], "Gray values in [0, 1] or image files.")
-    views: int | None = setting(
-        1, "Cameras per mesh at equal azimuths.", within=(1, base.MAX_VIEWS)
-    )
+    views: int | None = setting(1, "Cameras per mesh at even azimuths.", within=(1, base.MAX_VIEWS))
     polar: float = setting(60.0, "Polar angle of the cameras from +z.", "degrees", within=(0, 180))
     azimuth: float = setting(0.0, "First azimuth from +x toward +y.", "degrees", within=(-360, 360))
     width: float = setting(2.0, "Width of the image at the mesh, which spans [-1, 1].")

@@ -153,11 +153,9 @@ def _with_weights(
         # The last layer has one row of weights for each class.
         count = len(state[last_weight])
         if facts.classes is not None and len(facts.classes) != count:
-            raise InputError(
-                f"classes has {len(facts.classes)} names, and weights={source} has {count} "
-                "classes: name each class of the weights, in the order of the outputs",
-                "classes",
-            )
+            reason = f"classes has {len(facts.classes)} names, and weights={source} has {count}"
+            advice = "name each class of the weights, in the order of the outputs"
+            raise InputError(f"{reason} classes: {advice}", "classes")
         if facts.size is None:
             own_height, _ = height_and_width(classifier.size)
             told = replace(told, size=_size_for_positions(own_height, own_state, state))

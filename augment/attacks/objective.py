@@ -359,9 +359,7 @@ def as_jpeg(images: Float[Tensor, "... 3 H W"], quality: int) -> Float[Tensor, "
     return to_unit(torch.stack(decompressed)).view(images.shape)
 
 
-def _moved(
-    images: Float[Tensor, "N 3 H W"], movements: Float[Tensor, "N 4"]
-) -> Float[Tensor, "N 3 H W"]:
+def _moved(images: Tensor, movements: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 H W"]:
     """Shift, rotate and scale images. The pixels at the border are repeated beyond the border.
 
     Each new pixel takes its value from a position in the given image. The movement is that of these

@@ -343,12 +343,10 @@ class Smoothest(NamedTuple):
         """Warn that the degree of the lighting is too low for the highlights of the surface."""
         error = ringing.highlight_error(degree, self.roughness)
         least_error = ringing.highlight_error(self.degree, self.roughness)
-        warnings.warn(
-            f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}, which takes light "
-            f"of degree {self.degree}: {subject} shows the highlight of a point of light off by "
-            f"{error:.0%} (rms) instead of {least_error:.0%}",
-            stacklevel=4,
-        )
+        surface = f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}"
+        needed = f"which takes light of degree {self.degree}"
+        shown = f"{subject} shows the highlight of a point of light off by {error:.0%} (rms)"
+        warnings.warn(f"{surface}, {needed}: {shown} instead of {least_error:.0%}", stacklevel=4)
 
 
 def reached_gloss(
@@ -431,9 +429,7 @@ def _warn_of_wrong_irradiance(name: str, light: Tensor, degree: int) -> None:
 
 
 def with_needed_degree(
-    scene: Scene,
-    material: MaterialSettings | None = None,
-    layer: SpecularLayerSettings | None = None,
+    scene: Scene, material: MaterialSettings | None, layer: SpecularLayerSettings | None = None
 ) -> Scene:
     """Raise the degree of a scene's lighting if an attack or a variation needs it.
 

@@ -250,11 +250,7 @@ class FrozenTransport:
         self.views[camera] = all_pixels.to(albedo), _sum_by_pixel(fragments, albedo)
 
     def radiance(
-        self,
-        camera: Camera,
-        fragments: Fragments,
-        albedo: Float[Tensor, "S 3"],
-        light: Float[Tensor, "K 3"],
+        self, camera: Camera, fragments: Fragments, albedo: Float[Tensor, "S 3"], light: Tensor
     ) -> Float[Tensor, "3 P"]:
         """Compute the radiance that shadows and bounces add to a view of a shape.
 

@@ -479,10 +479,7 @@ class Scene:
         return self._operator_renderer.layers(light, images)
 
     def _render_with_moved_lamps(
-        self,
-        light: Float[Tensor, "A K 3"],
-        positions: Float[Tensor, "A L 3"],
-        examples: Int[Tensor, " A"],
+        self, light: Tensor, positions: Float[Tensor, "A L 3"], examples: Int[Tensor, " A"]
     ) -> Iterator[Layer]:
         """Render views with transfer operators, and add the light of moved lamps to each view."""
         assert self.basis.movable_light is not None
@@ -524,9 +521,8 @@ class Scene:
             camera = self.cameras_under(conditions, row, example_index)[view]
             background = self.backgrounds[example.background].flatten(1)
             changed = conditions.row(row, self.mesh(example_index))
-            pixels, coverage, radiance = self._direct_renderer.radiance(
-                example_index, example.object, camera, light[row], changed, background
-            )
+            shown = example_index, example.object, camera, light[row], changed, background
+            pixels, coverage, radiance = self._direct_renderer.radiance(*shown)
             background_pixels = background.index_select(1, pixels)
             term = background_term(coverage[None], background_pixels, self.settings.encoding)
             yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])

@@ -61,9 +61,8 @@ def spline(
     """Return the matrix that interpolates nodes to pixels, or to slopes at a spacing of pixels."""
     identity = torch.eye(nodes).view(1, nodes, nodes, 1)
     # A spline has its outer nodes at the border, and linear interpolation at centers of cells.
-    values = F.interpolate(
-        identity, (pixels, 1), mode=mode, align_corners=True if mode == "bicubic" else None
-    )
+    corners = True if mode == "bicubic" else None
+    values = F.interpolate(identity, (pixels, 1), mode=mode, align_corners=corners)
     matrix = values[0, :, :, 0].T
     if spacing and pixels == 1:
         matrix = torch.zeros_like(matrix)

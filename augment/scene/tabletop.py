@@ -165,9 +165,8 @@ def irradiance(
     directions = _directions(normals)
     radiance = harmonics.radiance(directions.flatten(0, 1)) @ sky * (math.pi / DIRECTIONS)
     blocked = _blocked_sky(room, coarse_points, directions, radiance.unflatten(0, (2, -1)))
-    blocked_image = F.interpolate(
-        blocked.T.unflatten(1, coarse.shape)[None], image.shape, mode="bilinear"
-    )[0]
+    coarse_image = blocked.T.unflatten(1, coarse.shape)[None]
+    blocked_image = F.interpolate(coarse_image, image.shape, mode="bilinear")[0]
     return (lit.T.unflatten(1, image.shape) - blocked_image).clamp(min=0)
 
 
@@ -185,9 +184,8 @@ def _from_lamp(room: Room, seen: _SeenPoints, lamp: Float[Tensor, " 3"]) -> Floa
     """
     lit = (seen.normals @ lamp).clamp(min=0)
     # Indices of the samples, and of the pixels, of the points that may be shaded.
-    candidates = torch.nonzero(
-        (lit > 0) & _passes_near_origin(seen.points, lamp, room.radius), as_tuple=True
-    )
+    may_be_shaded = (lit > 0) & _passes_near_origin(seen.points, lamp, room.radius)
+    candidates = torch.nonzero(may_be_shaded, as_tuple=True)
     # Rays start slightly above the surface, so that rounding cannot move their starts below it.
     starts = seen.points[candidates] + room.rays.offset * seen.normals[candidates]
     lit[candidates] *= room.rays.first_hit(starts, lamp.expand(len(starts), 3)) == NO_FACE
@@ -217,10 +215,7 @@ def _from_local_lights(
 
 
 def _blocked_sky(
-    room: Room,
-    seen: _SeenPoints,
-    directions: Float[Tensor, "2 D 3"],
-    radiance: Float[Tensor, "2 D 3"],
+    room: Room, seen: _SeenPoints, directions: Float[Tensor, "2 D 3"], radiance: Tensor
 ) -> Float[Tensor, "P 3"]:
     """Compute how much irradiance an object takes from a table and a wall by blocking the sky.
 
@@ -281,9 +276,7 @@ def project_along_light(
     return coordinates.T.unflatten(1, image.shape)
 
 
-def _passes_near_origin(
-    points: Float[Tensor, "... 3"], directions: Tensor, radius: float
-) -> Bool[Tensor, " ..."]:
+def _passes_near_origin(points: Tensor, directions: Tensor, radius: float) -> Bool[Tensor, " ..."]:
     """Find the rays that pass through a sphere around the origin.
 
     Starts are outside of the sphere. Directions are one for all rays, shape (3,), or D for each
@@ -308,15 +301,13 @@ def _directions(normals: Float[Tensor, "2 3"]) -> Float[Tensor, "2 D 3"]:
     squared_radius = (index + 0.5) / DIRECTIONS
     angle = math.pi * (3 - math.sqrt(5)) * index
     radius = squared_radius.sqrt()
-    on_hemisphere = torch.stack(
-        [radius * angle.cos(), radius * angle.sin(), (1 - squared_radius).sqrt()], dim=1
-    )
+    on_disk = radius * angle.cos(), radius * angle.sin()
+    on_hemisphere = torch.stack([*on_disk, (1 - squared_radius).sqrt()], dim=1)
     # Axes of both hemispheres, whose third axis is the normal, in world axes.
     up, forward = normals
     right = torch.linalg.cross(up, forward)
-    return on_hemisphere @ torch.stack(
-        [torch.stack([forward, right, up]), torch.stack([right, up, forward])]
-    )
+    axes = torch.stack([forward, right, up]), torch.stack([right, up, forward])
+    return on_hemisphere @ torch.stack(axes)
 
 
 def _find_seen_points(

@@ -309,12 +309,7 @@ def _turn(camera: Camera, polar: float, azimuth: float) -> Camera:
 
 
 def _move(
-    camera: Camera,
-    shift: Sequence[float],
-    scale: float,
-    turn: Sequence[float],
-    fov: float,
-    is_above_table: bool,
+    camera: Camera, shift: list[float], scale: float, turn: list[float], fov: float, has_table: bool
 ) -> Camera:
     """Return a copy of a camera that is zoomed, shifted and turned around the object.
 
@@ -327,7 +322,7 @@ def _move(
     right = camera.right + shift[0] * width
     up = camera.up + shift[1] * width
     moved = replace(_turn(camera, *turn), width=width, right=right, up=up)
-    if is_above_table:
+    if has_table:
         # The polar angle is measured from the vertical, so its cosine is the sine of the elevation.
         elevation = abs(math.degrees(math.asin(math.cos(math.radians(moved.polar)))))
         moved = replace(moved, polar=90 - min(max(elevation, MIN_ELEVATION), MAX_ELEVATION))

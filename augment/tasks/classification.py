@@ -211,10 +211,8 @@ def label_loss(
     other_logits[:, list(absent)] = -torch.inf
     # The other classes have the probability Σ exp(other_logits) / Σ exp(logits) = 1 - p.
     complementary = logits.logsumexp(1) - other_logits.logsumexp(1)
-    cross_entropy = F.cross_entropy(
-        logits, classes, reduction="none", label_smoothing=label_smoothing
-    )
-    return torch.where(labels < 0, complementary, cross_entropy)
+    entropy = F.cross_entropy(logits, classes, reduction="none", label_smoothing=label_smoothing)
+    return torch.where(labels < 0, complementary, entropy)
 
 
 def is_correct(

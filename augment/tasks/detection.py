@@ -448,9 +448,8 @@ def log_odds_of(scores: Tensor) -> Tensor:
 
 def _is_transformer(outputs: Any) -> bool:
     """Return whether outputs are those of an object detector of transformers."""
-    return hasattr(outputs, "pred_boxes") or (
-        isinstance(outputs, Mapping) and {"logits", "pred_boxes"} <= outputs.keys()
-    )
+    keys = {*outputs} if isinstance(outputs, Mapping) else set()
+    return hasattr(outputs, "pred_boxes") or {"logits", "pred_boxes"} <= keys
 
 
 def _of_transformer(

@@ -214,11 +214,7 @@ class Task(ABC):
         """Return how surely each class is found, from 0 to 1."""
 
     def found(
-        self,
-        evidence: Float[Tensor, "... K"],
-        predicted: Int[Tensor, " ..."],
-        classes: Sequence[str],
-        when: str = "",
+        self, evidence: Tensor, predicted: Tensor, classes: Sequence[str], when: str = ""
     ) -> dict[str, Any]:
         """Return names and confidences of what is predicted, for a JSON file.
 
