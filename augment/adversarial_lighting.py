@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map_only
 
 from augment.classifier import CheckedNetwork, TaskNetwork
 from augment.lighting import Light, RandomLighting
@@ -16,10 +17,13 @@ from augment.network import frozen_eval_mode
 from augment.scene.lights import LightModel
 from augment.tasks.classification import Classification
 from augment.tasks.detection import Detection
+from augment.tasks.segmentation import BACKGROUND, Segmentation
 from augment.tasks.task import Criterion, Task
 from renderer import errors
 from renderer.errors import InputError
 
+# Label of pixels without a class, as in VOC.
+IGNORED = 255
 # A step changes each number in [0, 1] by this, divided by the number of steps.
 STEP = 0.5
 
@@ -90,18 +94,28 @@ class AdversarialLighting:
         Args:
             images: Images, bytes or in [0, 1].
             targets: What they show: labels (N,), or a list of dictionaries with
-                "boxes" and "labels", or label maps (N, H, W). None for what the
-                network finds in the images as they are.
+                "boxes" and "labels", or label maps (N, H, W), in which 255 and
+                negative numbers stand for no class. None for what the network
+                finds in the images as they are.
 
         Returns:
             Images of the same dtype and size.
+
+        Raises:
+            InputError: If images or targets have another shape, or if a label is
+                not that of a class.
         """
         shape = tuple(images.shape) if isinstance(images, Tensor) else ()
         if len(shape) != 4 or shape[1] != 3:
             raise InputError(f"images has shape {shape}: give a tensor (N, 3, H, W)")
-        params = self.lighting.make_params([images])
-        found = self._search(images, targets, params["lights"])
-        return self.lighting.apply(images, {"lights": found})
+        is_inference = torch.is_inference_mode_enabled()
+        with torch.inference_mode(False):
+            if is_inference:
+                # Autograd cannot save a tensor that inference mode made.
+                images, targets = tree_map_only(Tensor, Tensor.clone, (images, targets))
+            params = self.lighting.make_params([images])
+            found = self._search(images, targets, params["lights"])
+            return self.lighting.apply(images, {"lights": found})
 
     def _search(
         self, images: Tensor, targets: Any, lights: list[Light | None]
@@ -135,6 +149,7 @@ class AdversarialLighting:
         self, network: CheckedNetwork, unit: Float[Tensor, "N 3 H W"], targets: Any
     ) -> tuple[Int[Tensor, " E"], Criterion]:
         """Return what the cost is about, with one row for each object, and the image of each."""
+        classes = self.classes
         if targets is None:
             with torch.no_grad():
                 outputs = network(unit)
@@ -146,11 +161,26 @@ class AdversarialLighting:
             outputs = [_as_found(item["boxes"], item["labels"], unit.device) for item in given]
         else:
             targets = errors.as_integers("targets", targets)
-            count = len(self.classes) or max(targets.flatten().tolist(), default=0) + 1
+            is_map = isinstance(self.task, Segmentation)
+            errors.require_shape(
+                "targets", targets, len(targets), *unit.shape[2 if is_map else 4 :]
+            )
+            count = len(classes) or max(targets.flatten().tolist(), default=0) + 1
+            has_none = torch.zeros_like(targets, dtype=torch.bool)
+            if is_map:
+                has_none = (targets < 0) | ((targets == IGNORED) & (count <= IGNORED))
+            is_other = ~has_none & ((targets < 0) | (targets >= count))
+            if is_other.any():
+                label = int(targets[is_other][0])
+                raise InputError(f"targets has the label {label}: give those of {count} classes")
+            if is_map:
+                # A further class, which is no object, has the pixels without a class.
+                targets, classes = targets.where(~has_none, count), [*classes, BACKGROUND]
+                count += 1
             outputs = F.one_hot(targets, count).movedim(-1, 1).float()
         if len(outputs) != len(unit):
             raise InputError(f"{len(outputs)} targets are given for {len(unit)} images: give each")
-        image_of_row, criterion = self.task.as_found(outputs, self.classes)
+        image_of_row, criterion = self.task.as_found(outputs, classes)
         return image_of_row.to(unit.device), criterion.map(lambda rows: rows[:, 0].to(unit.device))
 
     def _cost(

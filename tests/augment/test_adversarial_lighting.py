@@ -132,3 +132,48 @@ def test_targets_of_a_detector_without_boxes_or_labels_are_refused(images, targe
     lighting = nb.AdversarialLighting(detector, nb.Detection(), classes=["background", "lamp"])
     with pytest.raises(InputError, match="targets"):
         lighting(images, targets)
+
+
+class Pixels(nn.Module):
+    """Segmenter whose logits of two classes are the mean of a pixel and .3."""
+
+    def forward(self, images):
+        mean = 10 * images.mean(1)
+        return torch.stack([torch.full_like(mean, 3.0), mean], dim=1)
+
+
+def segment(images, targets):
+    torch.manual_seed(0)
+    lighting = nb.AdversarialLighting(
+        Pixels(), nb.Segmentation(), lights="low_light", classes=["background", "lamp"]
+    )
+    return lighting(images, targets)
+
+
+@pytest.mark.parametrize("label", [255, -1, -100])
+def test_pixels_without_a_class_count_as_background(images, label):
+    targets = torch.ones(8, 16, 16, dtype=torch.int64)
+    targets[:, :4] = 0
+    expected = segment(images, targets)
+    assert torch.equal(segment(images, targets.where(targets == 1, label)), expected)
+
+
+@pytest.mark.parametrize("label", [2, 254])
+def test_label_maps_of_other_classes_are_refused(images, label):
+    with pytest.raises(InputError, match="classes"):
+        segment(images, torch.full((8, 16, 16), label))
+
+
+def test_negative_labels_of_images_are_refused(images):
+    with pytest.raises(InputError, match="-1"):
+        nb.AdversarialLighting(Mean())(images, torch.full((8,), -1))
+
+
+def test_under_inference_mode_the_light_is_the_same(images):
+    found = []
+    lighting = nb.AdversarialLighting(Mean(), lights="point")
+    for mode in (False, True):
+        torch.manual_seed(0)
+        with torch.inference_mode(mode):
+            found.append(lighting(images / 255, torch.zeros(8, dtype=torch.int64)))
+    assert torch.equal(*found)
