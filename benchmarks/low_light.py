@@ -27,7 +27,7 @@ from benchmarks.common import machine
 from benchmarks.detectors import SIZE, FastestDet, decode
 from renderer.io.images import crop_center, read_rgb
 from train.data.sets import Split
-from train.results.detection_scores import DetectionScores
+from train.results.annotated_scores import DetectionScores
 from train.results.tables import format_interval
 from train.training.detection import validate
 

@@ -13,7 +13,7 @@ the subfolders are CLASSIFIER and HARDENED.
 import json
 import math
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -37,7 +37,13 @@ from train import console
 from train.auditing import found, lights, page, relit
 from train.auditing.network import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
 from train.checkpoints import load_chosen, load_network
-from train.class_names import class_of_meshes, require_others, with_class_name
+from train.class_names import (
+    class_of_meshes,
+    class_of_name,
+    name_of_mesh,
+    require_others,
+    with_class_name,
+)
 from train.command_settings import AuditSettings, LabSettings
 from train.data.annotations import read_annotations
 from train.data.photographs import find_photographs, find_unlabeled
@@ -48,15 +54,7 @@ from train.results.page import PAGE
 from train.results.scoring import Predictor, evaluate_photographs
 from train.run_config import CONFIG, read_config, require_same, write_config
 from train.run_folder import read_json, sole_writer, writable_folder
-from train.settings import (
-    LABORATORY,
-    OTHER_PREFIX,
-    PHOTOGRAPHS,
-    published_folder,
-    read_objects,
-    simplified,
-    solid_name,
-)
+from train.settings import LABORATORY, OTHER_PREFIX, PHOTOGRAPHS, published_folder, read_objects
 from train.system import command_line
 
 # Number of views of the meshes that are rendered in environment lighting.
@@ -89,22 +87,33 @@ def run_audit(
 ) -> page.Audited:
     """Test networks in unusual lighting, and write a report to the folder `settings.out`.
 
-    Results that an earlier, stopped audit wrote to this folder are not measured
-    again.
+    Results that an earlier, stopped audit wrote to this folder are not measured again. The keys
+    of `networks` are CLASSIFIER and HARDENED. None loads those that the settings name.
     """
     is_named = networks is None
-    networks = load_networks(settings) if networks is None else networks
+    if networks is None:
+        networks = {CLASSIFIER: load_chosen(settings)}
+        if settings.hardened:
+            with keyed(name="hardened"):
+                networks[HARDENED] = load_network(settings.hardened, trust_code=settings.trust)
     device = choose_device(settings.device)
     networks = {key: network.to(device) for key, network in networks.items()}
     plan, given = None, settings
     if settings.meshes:
-        settings = complete(settings, networks[CLASSIFIER])
+        settings = complete(settings, networks[CLASSIFIER].classes)
         plan = _Plan(settings, networks, device)
-    else:
-        find_unlabeled(published_folder(Path(str(settings.unlabeled))))
+    # A path below pretrained/ is found from any working folder.
+    photographs = published_folder(Path(str(settings.unlabeled)))
+    if plan is None:
+        find_unlabeled(photographs)
     caveats = _caveats(given, networks, plan)
     out = writable_folder(settings.out, "out")
-    _require_continuable(out, settings.overwrite, is_named)
+    # config.yaml does not name networks that the caller passes as objects, so the results there may
+    # be about others. A folder without config.yaml raises an InputError.
+    is_continued = False
+    with suppress(InputError):
+        is_continued = is_named and "hard_negatives" in read_config(out / CONFIG)
+    require_replaceable(out, "out", settings.overwrite or is_continued)
     renders = out / "renders"
     has_renders = renders.exists() and not settings.overwrite
     if plan is not None and plan.has_classes and LABORATORY not in plan.image_folders:
@@ -129,8 +138,6 @@ def run_audit(
                 _write_folder(renders, partial(_write_renders, settings, plan, size))
             plan.measure(networks, out)
         if settings.unlabeled:
-            # A path below pretrained/ is found from any working folder.
-            photographs = published_folder(Path(str(settings.unlabeled)))
             attack = RelightingSettings(passes=relit.PASSES)
             count = settings.scale(relit.PHOTOGRAPH_COUNT)
             options: dict[str, Any] = {"seed": settings.seed, "limit": count}
@@ -196,8 +203,7 @@ class _Plan:
         meshes = [*read_objects(settings.meshes, self.label, "meshes").values()]
         hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
         for item in hard_negatives:
-            own_name = solid_name(item.mesh) or Path(item.mesh).stem
-            item.label = item.label or OTHER_PREFIX + own_name
+            item.label = item.label or OTHER_PREFIX + name_of_mesh(item.mesh)
         for item in meshes:
             if item.label != self.label:
                 raise InputError(
@@ -264,13 +270,12 @@ class _Plan:
             recognize = lights.recognize_in_environments
             _write_json(results / lights.RECOGNIZED, recognize, network, *environments)
             for kind in lights.KINDS:
-                path = results / f"{kind}.json"
-                attack = lights.success_by_light
-                _write_json(path, attack, network, attacked_views, kind, results)
+                arguments = (network, attacked_views, kind, results)
+                _write_json(results / f"{kind}.json", lights.success_by_light, *arguments)
             for other in networks.values():
                 if other is not network:
-                    arguments = (network, other, attacked_views, results)
-                    _write_json(results / lights.TRANSFER, lights.transfer_success, *arguments)
+                    shown = (network, other, attacked_views, results)
+                    _write_json(results / lights.TRANSFER, lights.transfer_success, *shown)
             if not self.has_classes:
                 negatives = replace(views, objects=self.negatives)
                 lit = (network, views, attacked_views, negatives, *environments[1:], results)
@@ -286,38 +291,24 @@ class _Plan:
                 _write_folder(out / key / found.BOXED, write_scores)
 
 
-def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
-    """Fill in the class and the hard negatives if the settings leave them out.
+def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:
+    """Name all classes, and fill in the class and the hard negatives if they are left out.
 
     The class is that of the meshes. Hard negatives are only filled in if test images must be
     rendered.
     """
-    label = class_of_meshes(settings.meshes, classifier.classes, "meshes", settings.label)
-    negatives = [
-        with_class_name(item, classifier.classes, "hard_negatives")
-        for item in settings.hard_negatives
-    ]
+    label = class_of_meshes(settings.meshes, classes, "meshes", settings.label)
+    negatives = settings.hard_negatives
     if not (negatives or settings.laboratory):
         negatives = [
-            f"solid:{name}" for name in NEGATIVE_SOLIDS if simplified(name) != simplified(label)
+            f"solid:{name}" for name in NEGATIVE_SOLIDS if class_of_name(name, [label]) is None
         ]
-    named = read_objects(negatives, "", "hard_negatives")
-    require_others(named, [label], classifier.classes)
-    meshes = [with_class_name(item, classifier.classes, "meshes") for item in settings.meshes]
-    return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
-
-
-def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
-    """Load the network to audit and, if the settings name one, the hardened network.
-
-    The keys CLASSIFIER and HARDENED also name the subfolders of their results.
-    """
-    classifier = load_chosen(settings)
-    networks = {CLASSIFIER: classifier}
-    if settings.hardened:
-        with keyed(name="hardened"):
-            networks[HARDENED] = load_network(settings.hardened, trust_code=settings.trust)
-    return networks
+    items: dict[str, Any] = {
+        key: [with_class_name(item, classes, key) for item in given]
+        for key, given in (("meshes", settings.meshes), ("hard_negatives", negatives))
+    }
+    require_others(read_objects(items["hard_negatives"], "", "hard_negatives"), [label], classes)
+    return replace(settings, label=label, **items)
 
 
 def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
@@ -333,7 +324,7 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
             # A folder that exists counts as complete, so it loses its name first.
             removed = out / f"{name}.part"
             shutil.rmtree(removed, ignore_errors=True)
-            if (out / name).exists():
+            with suppress(FileNotFoundError):
                 (out / name).rename(removed)
             shutil.rmtree(removed, ignore_errors=True)
     elif (out / CONFIG).exists():
@@ -351,32 +342,18 @@ def _write_renders(settings: AuditSettings, plan: _Plan, size: Size, out: Path) 
     and in each environment map of the audit.
     """
     lighting_count = len(PATTERNS) + len(settings.environments)
-    write_laboratory(
-        LabSettings(
-            out=str(out),
-            label=settings.label,
-            meshes=[asdict(item) for item in plan.items],
-            setups=settings.scale(SETUPS) * lighting_count,
-            patterns=[*PATTERNS],
-            environments=settings.environments,
-            size=size,
-            spp=SPP,
-            seed=settings.seed,
-        )
+    lab_settings = LabSettings(
+        out=str(out),
+        label=settings.label,
+        meshes=[asdict(item) for item in plan.items],
+        setups=settings.scale(SETUPS) * lighting_count,
+        patterns=[*PATTERNS],
+        environments=settings.environments,
+        size=size,
+        spp=SPP,
+        seed=settings.seed,
     )
-
-
-def _require_continuable(out: Path, overwrite: bool, is_named: bool) -> None:
-    """Check that an audit may write to a folder, because it is new or can be continued.
-
-    An audit of networks that the caller passes as objects is never continued. config.yaml does not
-    have their names, so the results may be about other networks.
-    """
-    # A folder without config.yaml raises an InputError.
-    with suppress(InputError):
-        if is_named and "hard_negatives" in read_config(out / CONFIG):
-            return
-    require_replaceable(out, "out", overwrite)
+    write_laboratory(lab_settings)
 
 
 def _write_json(path: Path, measure: Callable[..., Mapping[str, Any]], *arguments: Any) -> None:

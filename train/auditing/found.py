@@ -24,10 +24,9 @@ from renderer.light.files import load_light
 from train.auditing import lights
 from train.auditing.lights import BATCH, KINDS, RANDOM, Views
 from train.data.annotations import LETTERBOX, Annotations
-from train.results import detection_scores, detections
-from train.results.detection_scores import evaluate_detector
+from train.results import annotated_scores, detections
 from train.results.detections import Found, Marked, Matches
-from train.results.pictures import plot_curves
+from train.results.pictures import evenly_spaced, plot_curves
 from train.results.predictions import SUMMARY
 from train.results.tables import Estimate, Table, format_interval
 from train.run_folder import read_json
@@ -89,11 +88,11 @@ def find_in_lights(
 ) -> dict[str, Any]:
     """Score a network in all lights of an audit, after its attacks have been written to `out`."""
     label = network.label(views.objects[0].label)
+    # Pairs of what is found and the truth, with the number of their view, by the title of a group.
     groups: dict[str, list[tuple[int, tuple[Any, Any]]]] = {}
 
     def add(title: str, first_view: int, pairs: list[tuple[Any, Any]]) -> None:
-        numbered = enumerate(pairs, first_view)
-        groups.setdefault(title, []).extend(numbered)
+        groups.setdefault(title, []).extend(enumerate(pairs, first_view))
 
     plain = load_light(views.light).to(views.device) * views.exposure
     unusual = lights.environment_lights(views, environments, random_light_count)
@@ -111,27 +110,21 @@ def find_in_lights(
         with np.load(out / f"{kind}.npz") as saved:
             images = to_unit(torch.from_numpy(saved["images"])).to(views.device)
         add(f"attacked: {light_kind.title}", 0, _find(network, label, images, truth))
-    task: Any = network.task
-    metrics = {}
+    task = network.task
+    metrics: dict[str, Any] = {}
     for title, numbered in groups.items():
-        units = np.array([unit for unit, _ in numbered])
-        if not isinstance(task, Detection):
-            miou, _ = detections.mean_iou((pair for _, pair in numbered), 2, units, VIEWS)
-            metrics[title] = {"n": len(numbered), "miou": asdict(miou)}
-            continue
-        at_iou, at_half = (
-            [_match([pair for _, pair in numbered], label, iou)] for iou in (task.iou, 0.5)
-        )
-        metrics[title] = asdict(
-            detections.score(at_iou, task.threshold, at_half, units, over=VIEWS)
-        )
+        units, pairs = np.array([unit for unit, _ in numbered]), [pair for _, pair in numbered]
+        if isinstance(task, Detection):
+            at_iou, at_half = ([_match(pairs, label, iou)] for iou in (task.iou, 0.5))
+            scores = detections.score(at_iou, task.threshold, at_half, units, over=VIEWS)
+            metrics[title] = asdict(scores)
+        else:
+            miou, _ = detections.mean_iou(pairs, 2, units, VIEWS)
+            metrics[title] = {"n": len(pairs), "miou": asdict(miou)}
     if not isinstance(task, Detection):
         return {"metrics": metrics, "curve": []}
-    every = [
-        pair
-        for title in ("plain light", "environments", "random light")
-        for _, pair in groups.get(title, [])
-    ]
+    not_attacked = ("plain light", "environments", "random light")
+    every = [pair for title in not_attacked for _, pair in groups.get(title, [])]
     return {"metrics": metrics, "curve": _curve(_match(every, label, task.iou))}
 
 
@@ -141,26 +134,23 @@ def _match(pairs: Sequence[tuple[Found, Marked]], label: int, iou: float) -> Mat
     return detections.match_images(found, marked, [label], iou)[label]
 
 
-def _curve(matches: Matches) -> list[tuple[float, float]]:
+def _curve(matches: Matches) -> list[tuple[float, ...]]:
     """Return false detections per image and recall at descending thresholds."""
     every = np.ones((1, matches.image_count))
     finite = matches.object_score[np.isfinite(matches.object_score)]
     thresholds = np.unique([*finite, *matches.score])[::-1]
-    chosen = np.linspace(0, len(thresholds) - 1, min(CURVE_POINTS, len(thresholds)))
+    measures = (matches.false_per_image, matches.recall)
     return [
-        (
-            float(matches.false_per_image(threshold, every)[0]),
-            float(matches.recall(threshold, every)[0]),
-        )
-        for threshold in thresholds[chosen.round().astype(int)]
+        tuple(float(measure(threshold, every)[0]) for measure in measures)
+        for threshold in evenly_spaced(thresholds.tolist(), CURVE_POINTS)
     ]
 
 
 def score_photographs(network: TaskNetwork, annotations: Annotations, out: Path) -> None:
     """Score a detector on photographs with boxes. Unreadable ones are left out."""
     device = device_of(network)
-    scores = evaluate_detector(network, annotations, None, LETTERBOX, True, device)
-    detection_scores.write(scores, out)
+    scores = annotated_scores.evaluate_detector(network, annotations, None, LETTERBOX, True, device)
+    annotated_scores.write(scores, out)
 
 
 def sections(networks: Mapping[str, Path], label: str) -> list[dict[str, Any]]:

@@ -20,13 +20,8 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
-from augment.attack_settings import (
-    NOISE_MARGIN,
-    RANDOM_SEARCH,
-    AttackSettings,
-    SkylightSettings,
-    StepSettings,
-)
+from augment import attack_settings
+from augment.attack_settings import AttackSettings
 from augment.attacks.attack import EXPOSURES, attack
 from augment.attacks.checks import success_by_radius
 from augment.attacks.objective import Objective
@@ -127,26 +122,22 @@ class LightKind(NamedTuple):
 # of the attack and of the file with its results.
 KINDS = {
     "lighting": LightKind(
-        title="light from all around",
-        unit="change of each coefficient",
-        radii=(0.02, 0.05, 0.1, 0.3),
+        "light from all around", "change of each coefficient", (0.02, 0.05, 0.1, 0.3)
     ),
     "skylight": LightKind(
-        title="a daylight sky",
-        unit="1 is 57.3° of the sun, or 4 of turbidity",
-        radii=(0.1, 0.3, 1.0, 3.0),
+        "a daylight sky", "1 is 57.3° of the sun, or 4 of turbidity", (0.1, 0.3, 1.0, 3.0)
     ),
     "projector": LightKind(
-        title="a projector",
-        unit="fraction of its power, in each pixel",
-        radii=(0.03, 0.1, 0.3, 1.0),
-        local=(ProjectorSettings(),),
+        "a projector",
+        "fraction of its power, in each pixel",
+        (0.03, 0.1, 0.3, 1.0),
+        (ProjectorSettings(),),
     ),
     "lamps": LightKind(
-        title="four lamps",
-        unit="change of the power in each channel",
-        radii=(0.3, 1.0, 3.0, 10.0),
-        local=(LampsSettings(),),
+        "four lamps",
+        "change of the power in each channel",
+        (0.3, 1.0, 3.0, 10.0),
+        (LampsSettings(),),
     ),
 }
 
@@ -252,6 +243,14 @@ def is_found(
     return of_images.predicted(of_images.evidence(outputs)) == of_images.source
 
 
+def norm_ball(kind: str) -> dict[str, Any]:
+    """Return the setting of an attack by a kind of lighting, within the largest radius."""
+    of_sky = kind == "skylight"
+    settings = attack_settings.SkylightSettings if of_sky else attack_settings.StepSettings
+    radius = KINDS[kind].radii[-1]
+    return {kind: settings("linf", radius, "sign", radius / STEPS_PER_RADIUS)}
+
+
 def adversaries(
     classifier: TaskNetwork, views: Views, kind: str, additional: bool = False
 ) -> AttackResult:
@@ -262,27 +261,16 @@ def adversaries(
     forward passes. `additional` always takes ADDITIONAL_STEPS steps. Otherwise the attack stops
     when the prediction is wrong even with the noise of a camera.
     """
-    radius = KINDS[kind].radii[-1]
-    settings_class = SkylightSettings if kind == "skylight" else StepSettings
-    step_size = radius / STEPS_PER_RADIUS
-    # `AttackSettings` has an attribute for each kind of lighting, with the norm-ball.
-    settings: dict[str, Any] = {kind: settings_class("linf", radius, "sign", step_size)}
-    if additional:
-        # An attack stops when the wrong class leads by the margin in every view. With this
-        # margin, which no attack can reach, it takes all steps.
-        settings |= {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
-    else:
-        settings |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
+    # An attack stops when the wrong class leads by the margin in every view. With this margin,
+    # which no attack can reach, it takes all steps.
+    further = {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
+    first = {"max_steps": STEPS, "margin": 0.0, "noise_margin": attack_settings.NOISE_MARGIN}
+    options: dict[str, Any] = further if additional else first
     scene = views.scene(classifier.size, kind)
     if not classifier.is_differentiable(partial(plain_images, views, classifier.size, kind)):
-        settings |= {"optimizer": RANDOM_SEARCH, "max_queries": QUERIES}
-    return attack(
-        classifier,
-        scene,
-        settings=AttackSettings(**settings, batch_size=BATCH),
-        seed=views.seed,
-        force=True,
-    )
+        options |= {"optimizer": attack_settings.RANDOM_SEARCH, "max_queries": QUERIES}
+    settings = AttackSettings(**norm_ball(kind), **options, batch_size=BATCH)
+    return attack(classifier, scene, settings=settings, seed=views.seed, force=True)
 
 
 def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path) -> dict[str, Any]:
@@ -300,8 +288,7 @@ def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path
     by_radius = success_by_radius(result, [radius / radii[-1] for radius in radii])
     counts: dict[str, Any] = {"n": views.count, "correct": int(clean.sum())}
     for suffix, success in (("", result.success), ("_without_noise", result.success_without_noise)):
-        adversarial = f"adversarial{suffix}"
-        random = f"random{suffix}"
+        adversarial, random = f"adversarial{suffix}", f"random{suffix}"
         # There are two attacks for the largest radius. The attack in `by_radius` starts
         # where the attack within the next smaller radius ended. The attack in `result`
         # starts at the natural light. Either may succeed.
@@ -315,16 +302,15 @@ def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path
     atomic_write(out / f"{kind}.npz", content.getbuffer())
     if is_wrong.any():
         example = int(is_wrong.nonzero()[0])
-        both_evidence = torch.cat(
-            [part[example] for part in (result.evidence_in_views_before, result.evidence_in_views)]
-        )
+        evidence = (result.evidence_in_views_before, result.evidence_in_views)
+        both_evidence = torch.cat([part[example] for part in evidence])
         criterion = result.criterion.map(lambda rows: rows[[example, example], 0])
         predicted = criterion.predicted(both_evidence)
         counts |= classifier.task.found(both_evidence, predicted, classifier.classes)
         counts["slider"] = frames_of(result, example)
         shown = (result.images_before[example], result.images[example])
         both = torch.cat([*map(result.drawn, shown)], dim=2)
-        pair = Image.fromarray(to_bytes(both.cpu()).permute(1, 2, 0).numpy())
+        pair = _as_picture(both)
         # A small render is enlarged without smoothing, so that its pixels are visible.
         is_enlarged = pair.height < SIDE
         method = Image.Resampling.NEAREST if is_enlarged else Image.Resampling.LANCZOS
@@ -374,8 +360,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     CLASS_COUNT - 1 most probable others. Each of "frames" has "image", "ball" (a white ball in the
     same light), both JPEG in base64, and "probabilities" of these classes.
     """
-    start = result.problem.start[example]
-    end = result.minimum.values[example]
+    start, end = result.problem.start[example], result.minimum.values[example]
     weights = torch.linspace(0, 1, FRAME_COUNT).to(start)[:, None]
     values = start + weights * (end - start)
     examples = torch.full((FRAME_COUNT,), example, device=start.device)
@@ -391,25 +376,26 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     for index in range(FRAME_COUNT):
         basis = result.problem.scene.basis_under(conditions, index)
         ball = light_sphere(conditions.light[index], BALL_SIDE, basis=basis)
-        shown_probabilities = probabilities[index, shown_classes].tolist()
-        frames.append(
-            {
-                "image": _encode_jpeg(result.drawn(images[index, 0]), SIDE),
-                "ball": _encode_jpeg(ball, BALL_SIDE),
-                "probabilities": [round(value, 4) for value in shown_probabilities],
-            }
-        )
+        shown = [round(value, 4) for value in probabilities[index, shown_classes].tolist()]
+        image = _encode_jpeg(result.drawn(images[index, 0]), SIDE)
+        ball_image = _encode_jpeg(ball, BALL_SIDE)
+        frames.append({"image": image, "ball": ball_image, "probabilities": shown})
     names = [result.classifier.classes[index] for index in shown_classes]
     return {"classes": names, "label": names[0], "frames": frames}
 
 
 def _encode_jpeg(image: Float[Tensor, "3 H W"], height: int) -> str:
     """Resize an image in [0, 1] to a height, and encode it as a JPEG file in base64."""
-    pixels = Image.fromarray(to_bytes(image.cpu().clamp(0, 1)).permute(1, 2, 0).numpy())
     file = io.BytesIO()
-    width = round(height * pixels.width / pixels.height)
-    pixels.resize((width, height)).save(file, "JPEG", quality=85)
+    picture = _as_picture(image.clamp(0, 1))
+    width = round(height * picture.width / picture.height)
+    picture.resize((width, height)).save(file, "JPEG", quality=85)
     return base64.b64encode(file.getvalue()).decode()
+
+
+def _as_picture(image: Float[Tensor, "3 H W"]) -> Image.Image:
+    """Quantize an image in [0, 1] to 8 bits."""
+    return Image.fromarray(to_bytes(image.cpu()).permute(1, 2, 0).numpy())
 
 
 @dataclass(frozen=True)
@@ -445,8 +431,8 @@ def find_plain_views(classifier: TaskNetwork, views: Views) -> PlainViews:
         scene = replace(views, size=size).scene(classifier.size)
         criterion = criterion_of(classifier, scene)
         for exposure, name in product(EXPOSURES, PLAIN_LIGHTS):
-            light = load_light(name).to(scene.lights) * exposure
-            recognized = int(is_found(classifier, criterion, render_in(scene, light)).sum())
+            images = render_in(scene, load_light(name).to(scene.lights) * exposure)
+            recognized = int(is_found(classifier, criterion, images).sum())
             as_given = tried[0].recognized if tried else recognized
             tried.append(PlainViews(name, exposure, size, recognized, views.count, as_given))
             if recognized >= ENOUGH * views.count:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from renderer.errors import ShortRepr, as_path
 from renderer.io.files import atomic_write
 from train.auditing.lights import KINDS, PLAIN, RANDOM, RECOGNIZED, TRANSFER, PlainViews
 from train.results import tables
-from train.results.compare import ALL, Difference, Evaluations, difference, mean_metric
+from train.results.compare import ALL, Difference, Evaluation, Evaluations, difference, mean_metric
 from train.results.first_screen import EQUAL_RATE, gain_sentence
 from train.results.intervals import Units, leave_out, weighted_means
 from train.results.metrics import METRICS, metric_title
@@ -153,23 +153,31 @@ class AuditReport(ShortRepr):
 
     def __str__(self) -> str:
         """Return one line about each network, and the recommendation."""
-        networks = [self.network] if self.hardened is None else [self.network, self.hardened]
-        lines = [network.answer for network in networks]
-        if self.recommendation:
-            lines.append(self.recommendation)
-        return "\n".join(lines)
+        lines = [item.answer for item in (self.network, self.hardened) if item is not None]
+        return "\n".join([*lines, *filter(None, [self.recommendation])])
 
 
-# Clause for the report, such as "it recognizes 60% of orange", the fraction of images that a
-# network classifies correctly, and the low end of the 95% interval of this fraction.
-_Finding = tuple[str, float, float]
+class _Finding(NamedTuple):
+    """Clause for the report, such as "it recognizes 60% of orange", about correct predictions.
+
+    Attributes:
+        text: The clause.
+        right: Fraction of images that a network classifies correctly.
+        least: Low end of the 95% interval of this fraction.
+    """
+
+    text: str
+    right: float
+    least: float
 
 
-def _findings(subject: str, recall: Estimate) -> list[_Finding]:
-    """Describe what fraction of the images of an object a network recognizes, if it is known."""
-    if recall.value is None or recall.low is None:
-        return []
-    return [(f"it recognizes {recall.value:.0%} of {subject}", recall.value, recall.low)]
+def _findings(recalls: Mapping[str, Estimate]) -> list[_Finding]:
+    """Describe what fraction of the images of each object a network recognizes, if it is known."""
+    return [
+        _Finding(f"it recognizes {recall.value:.0%} of {subject}", recall.value, recall.low)
+        for subject, recall in recalls.items()
+        if recall.value is not None and recall.low is not None
+    ]
 
 
 @dataclass(frozen=True)
@@ -213,9 +221,13 @@ class AuditedNetwork:
         """The plain light in which all networks of the audit are tested."""
         return PlainViews(**read_json(self.folder.parent / CLASSIFIER / PLAIN))
 
+    def evaluation(self, images: str) -> Evaluation:
+        """Predictions for a folder of test images in groups, for comparisons."""
+        return Evaluation(self.run, ScoredRun(self.run, images).pooled())
+
     def predictions(self, images: str) -> Predictions:
         """Predictions for a folder of test images, in the order of the images."""
-        return ScoredRun(self.run, images).pooled().predictions
+        return self.evaluation(images).pooled.predictions
 
     @cached_property
     def rates(self) -> dict[str, Estimate]:
@@ -230,11 +242,9 @@ class AuditedNetwork:
         }
         rates: dict[str, Estimate] = {}
         for title, names in names_of_title.items():
-            # `hits` has one row for each view and one column for each light.
-            hits = np.array([self.recognized[name] for name in sorted(names)], float).T
-            # Index of the view in each entry of `hits.ravel()`.
-            view_of_render = np.arange(len(hits)).repeat(hits.shape[1])
-            units = Units([view_of_render], "views")
+            # `hits` has one row for each light and one column for each view.
+            hits = np.array([self.recognized[name] for name in sorted(names)], float)
+            units = Units([np.tile(np.arange(hits.shape[1]), len(hits))], "views")
             (rate,) = leave_out(partial(weighted_means, hits.reshape(1, -1)), units)
             rates[title] = rate.estimate
         return rates
@@ -244,22 +254,20 @@ class AuditedNetwork:
         """Whether the network is safe, in words such as "No", and a sentence that says why."""
         if not any(any(views) for views in self.recognized.values()):
             return "Unknown", f"Unknown: it does not recognize {self.label} in plain light, either."
-        of_renders = [item for rate in self.rates.items() for item in _findings(*rate)]
         of_images = self._judge_images()
-        findings = [*of_renders, *of_images]
-        faults = [text for text, right, _ in findings if right < PASS_THRESHOLD]
+        findings = [*_findings(self.rates), *of_images]
+        faults = [item.text for item in findings if item.right < PASS_THRESHOLD]
         faults += self._attack_faults()
         view_count = max(counts["correct"] for counts in self.counts.values())
-        rests_on_images = any(right < PASS_THRESHOLD for _, right, _ in of_images)
+        rests_on_images = any(item.right < PASS_THRESHOLD for item in of_images)
         if faults and not rests_on_images and view_count < MIN_VIEWS:
             reasons = "; ".join(faults)
             return "Perhaps not", f"Perhaps not: {reasons}. Only {view_count} views were attacked."
         if faults:
             return "No", f"No: {'; '.join(faults)}."
-        if self.run.photographs and all(least >= PASS_THRESHOLD for _, _, least in findings):
+        answer = "No fault is shown, but so few images leave room for one."
+        if self.run.photographs and all(item.least >= PASS_THRESHOLD for item in findings):
             answer = "Yes, as far as this audit looks."
-        else:
-            answer = "No fault is shown, but so few images leave room for one."
         return answer, answer
 
     @property
@@ -272,11 +280,11 @@ class AuditedNetwork:
         findings = []
         for images, scores in self.run.photographs.items():
             place = f"{self.label} in the {IN_WORDS[images]}"
-            findings += _findings(place, scores.overall.recall)
+            findings += _findings({place: scores.overall.recall})
             error = scores.overall.false_positive_rate
             if error.value is not None and error.high is not None:
                 text = f"it takes {error.value:.0%} of other objects for {place}"
-                findings.append((text, 1 - error.value, 1 - error.high))
+                findings.append(_Finding(text, 1 - error.value, 1 - error.high))
         return findings
 
     def _attack_faults(self) -> list[str]:
@@ -301,14 +309,9 @@ class AuditedNetwork:
 
         Empty if attacks with each kind succeed, or if no view is recognized before them.
         """
-        titles = [
-            KINDS[kind].title
-            for kind, counts in self.counts.items()
-            if counts["correct"] and not counts["adversarial"][-1]
-        ]
-        if not titles:
-            return ""
-        return f"No attack on {self.name} succeeded with {tables.join_words(titles, 'or')}."
+        kinds = [kind for kind, part in self._lost.items() if not part]
+        titles = tables.join_words([KINDS[kind].title for kind in kinds], "or") if kinds else ""
+        return f"No attack on {self.name} succeeded with {titles}." if kinds else ""
 
     @property
     def strongest_kind(self) -> str | None:
@@ -316,12 +319,19 @@ class AuditedNetwork:
 
         None if no view is recognized before the attacks.
         """
-        lost = {
+        return max(self._lost, key=lambda kind: self._lost[kind], default=None)
+
+    @property
+    def _lost(self) -> dict[str, float]:
+        """Fraction of the views that attacks of the largest radius lose, by the kind of lighting.
+
+        A kind without a view that is recognized before the attack is left out.
+        """
+        return {
             kind: counts["adversarial"][-1] / counts["correct"]
             for kind, counts in self.counts.items()
             if counts["correct"]
         }
-        return max(lost, key=lambda kind: lost[kind]) if lost else None
 
     def remaining(self, kind: str, method: str) -> list[Proportion]:
         """Return the fraction of the views that stay correct, of those correct before, by radius.
@@ -337,12 +347,17 @@ class AuditedNetwork:
         for images, stored in self.run.photographs.items():
             metrics = {name: stored.overall.find(name) for name in METRICS}
             scores[images] = {name: item for name, item in metrics.items() if item is not None}
-        attacks = {}
-        for kind, counts in self.counts.items():
-            light = KINDS[kind]
-            adversarial, random = (tuple(counts[method]) for method in ("adversarial", "random"))
-            of_light = (light.unit, light.radii, counts["n"], counts["correct"])
-            attacks[kind] = AttackCounts(*of_light, adversarial, random)
+        attacks = {
+            kind: AttackCounts(
+                unit=KINDS[kind].unit,
+                radii=KINDS[kind].radii,
+                views=counts["n"],
+                correct=counts["correct"],
+                adversarial=tuple(counts["adversarial"]),
+                random=tuple(counts["random"]),
+            )
+            for kind, counts in self.counts.items()
+        }
         recognized = {light: sum(views) / len(views) for light, views in self.recognized.items()}
         results = (recognized, attacks, scores, self.transfers)
         return NetworkReport(self.name, self.answer, *results)
@@ -427,11 +442,10 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     else:
         reason = gain_sentence(f"With {chosen}, {title}", gain)
     rows = []
-    for name, evaluations_of_network in evaluations.items():
-        value = tables.format_interval(mean_metric(evaluations_of_network, ALL, metric))
+    for name, items in evaluations.items():
+        value = tables.format_interval(mean_metric(items, ALL, metric))
         rows.append([name, value, tables.format_interval(gains.get(name), "+")])
     intervals = tables.describe_intervals(gains.values())
     table = Table(intervals, ["network", title, "gain over the original network"], rows)
-    advice = ADVICE[chosen]
-    remedy = None if gain is None else chosen
+    remedy, advice = None if gain is None else chosen, ADVICE[chosen]
     return Recommendation(remedy, advice, f"{advice} {reason}", table)

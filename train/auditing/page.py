@@ -33,7 +33,6 @@ from train.results.metrics import Metrics
 from train.results.page import scores_section, write_page
 from train.results.pictures import Picture, encode_picture, plot_by_radius, read_pictures
 from train.results.predictions import SUMMARY
-from train.results.store import RunSummary, ScoredRun
 from train.results.tables import Estimate, Proportion, fraction
 from train.run_config import CONFIG, read_config
 from train.run_folder import read_json
@@ -102,8 +101,12 @@ def write_audit_page(
     screen = _first_screen(networks, images, folders, plain)
     recommendation = None
     if images is not None and len(remedies) > 1:
-        runs = {name: AuditedNetwork("", name, out / key).run for name, key in remedies.items()}
-        recommendation = recommend(_evaluate(runs, images))
+        recommendation = recommend(
+            {
+                name: [AuditedNetwork("", name, out / key).evaluation(images)]
+                for name, key in remedies.items()
+            }
+        )
     advice = []
     if recommendation is not None:
         # The top of the report shows the gain by hardening already.
@@ -119,9 +122,9 @@ def write_audit_page(
         if files:
             text = f"{len(files)} of the {IN_WORDS[name]} cannot be read, such as {files[0]}."
             unreadable.append(text)
+    results = {network.name: network.folder for network in networks}
     path = write_page(
         out,
-        "audit.html.jinja",
         title=f"Audit: {in_words(label)} under unusual lighting",
         about=" and ".join(names.values()),
         label=in_words(label),
@@ -135,33 +138,26 @@ def write_audit_page(
         script=SLIDER_SCRIPT if slider else "",
         photographs=_score_sections(by_key, remedies, out),
         recommendation=recommendation,
-        worst=_worst(networks, folders),
+        worst=_worst(networks, folders) if folders else {},
         screen=screen,
-        caveats=[*caveats, *unreadable],
+        lead=[*caveats, *unreadable],
         agreement=_agreement(networks) if PHOTOGRAPHS in folders else Proportion(),
-        detections=found.sections(
-            {network.name: network.folder for network in networks}, in_words(label)
-        ),
-        relit=relit_sections({network.name: network.folder for network in networks}),
-        config=read_config(out / CONFIG),
+        detections=found.sections(results, in_words(label)),
+        relit=relit_sections(results),
+        configs={"configuration": read_config(out / CONFIG)},
     )
     return Audited(path, screen, label, by_key, recommendation)
 
 
-def _evaluate(runs: Mapping[str, RunSummary], images: str) -> compare.Evaluations:
-    """Read the predictions of several networks for the same images."""
-    return compare.read_evaluations({name: [ScoredRun(run, images)] for name, run in runs.items()})
-
-
-def _slider(networks: Sequence[AuditedNetwork]) -> dict[str, Any] | None:
-    """Choose the first attack that succeeds for the slider of the report, with titles, or None."""
+def _slider(networks: Sequence[AuditedNetwork]) -> dict[str, Any]:
+    """Choose the first attack that succeeds for the slider, with titles. Empty if none does."""
     for network in networks:
         for kind, counts in network.counts.items():
             if "slider" in counts:
                 classes = [in_words(label) for label in counts["slider"]["classes"]]
                 named = {"network": network.name, "light": KINDS[kind].title, "classes": classes}
                 return counts["slider"] | named
-    return None
+    return {}
 
 
 def _first_screen(
@@ -170,23 +166,15 @@ def _first_screen(
     """Make the top of the report from two networks' scores, or else from the first network."""
     if images is None:
         return screen_of_one(networks[0], plain, Metrics())
-    evaluations = _evaluate({network.name: network.run for network in networks}, images)
+    evaluations = [network.evaluation(images) for network in networks]
     if len(networks) > 1:
-        original, hardened = evaluations.values()
-        label = networks[0].label
-        before, after = (item.pooled.predictions for (item,) in (original, hardened))
-        screen = first_screen.compare_networks(
-            in_words(label),
-            original,
-            hardened,
-            (f"before: {networks[0].name}", f"after: {networks[1].name}"),
-            first_screen.describe_place(folders[images], folders[images].name),
-            first_screen.choose_disagreements(before, after, folders[images], [label]),
-        )
+        folder = folders[images]
+        names = (f"before: {networks[0].name}", f"after: {networks[1].name}")
+        before, after = ([evaluation] for evaluation in evaluations)
+        screen = first_screen.compare_networks(before, after, names, folder, folder.name)
         if screen is not None:
             return screen
-    (evaluation,) = evaluations[networks[0].name]
-    return screen_of_one(networks[0], plain, evaluation.pooled.all.metrics)
+    return screen_of_one(networks[0], plain, evaluations[0].pooled.all.metrics)
 
 
 def _score_sections(
@@ -228,17 +216,19 @@ def screen_of_one(
     network: AuditedNetwork, plain: str, metrics: Metrics
 ) -> first_screen.FirstScreen:
     """Make the top of the report of an audit of one network, with its scores on test images."""
-    views = fraction(network.plain.recognized, network.plain.n)
-    higher = "higher is better"
-    numbers = [first_screen.ShownMetric("Views recognized in plain light", higher, None, views)]
+    numbers = []
     sentences = [plain]
+
+    def show(title: str, value: Estimate, note: str = "higher is better") -> None:
+        numbers.append(first_screen.ShownMetric(title, note, None, value))
+
+    views = fraction(network.plain.recognized, network.plain.n)
+    show("Views recognized in plain light", views)
     kind = network.strongest_kind
     if kind is not None:
         light = KINDS[kind]
         kept = network.remaining(kind, "adversarial")[-1]
-        numbers.append(
-            first_screen.ShownMetric(f"Of these, under attack by {light.title}", higher, None, kept)
-        )
+        show(f"Of these, under attack by {light.title}", kept)
         sentences.append(
             f"If an attacker controls {light.title} (radius {light.radii[-1]:g}), it "
             f"still recognizes {kept.hits} of the {kept.n} views that it recognizes "
@@ -247,13 +237,12 @@ def screen_of_one(
     recall, mistaken = metrics.recall, metrics.false_positive_rate
     name = in_words(network.label)
     if mistaken.value is not None:
-        title = f"Other objects called {name}"
-        numbers.append(first_screen.ShownMetric(title, "lower is better", None, mistaken))
-    if recall.value is not None and mistaken.value is not None:
-        sentences.append(
-            f"In the scored images, it recognizes {recall.value:.0%} of {name} and calls "
-            f"{mistaken.value:.0%} of other objects “{name}”."
-        )
+        show(f"Other objects called {name}", mistaken, "lower is better")
+        if recall.value is not None:
+            sentences.append(
+                f"In the scored images, it recognizes {recall.value:.0%} of {name} and calls "
+                f"{mistaken.value:.0%} of other objects “{name}”."
+            )
     short, _ = network.verdict
     return first_screen.FirstScreen(VERDICTS.get(short, short), sentences, numbers, [network.name])
 
@@ -275,10 +264,11 @@ def attack_pictures(network: AuditedNetwork) -> list[first_screen.ComparedImage]
         if "predicted" not in counts:
             continue
         light = KINDS[kind]
-        shown = zip(counts["predicted"], counts["confidence"], ("right", "wrong"), strict=True)
-        before, after = (
-            first_screen.ShownPrediction(f"{in_words(a)} {p:.0%}", b) for a, p, b in shown
-        )
+        texts = [
+            f"{in_words(label)} {probability:.0%}"
+            for label, probability in zip(counts["predicted"], counts["confidence"], strict=True)
+        ]
+        before, after = map(first_screen.ShownPrediction, texts, ("right", "wrong"))
         alt_text = f"{light.title}: {before.text}, after the attack {after.text}"
         lost = f"{counts['adversarial'][-1]} of {counts['correct']} views lost"
         caption = f"{light.title}: {lost} at radius {light.radii[-1]:g}"
@@ -295,11 +285,12 @@ def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:
     """
     pictures = []
     for kind, light in KINDS.items():
-        lines: dict[str, Sequence[Estimate]] = {}
-        for network in networks:
-            if network.counts[kind]["correct"]:
-                for end, method in (("", "adversarial"), (", random", "random")):
-                    lines[network.name + end] = network.remaining(kind, method)
+        lines = {
+            network.name + end: network.remaining(kind, method)
+            for network in networks
+            if network.counts[kind]["correct"]
+            for end, method in (("", "adversarial"), (", random", "random"))
+        }
         if lines:
             unit = f"radius ({light.unit})"
             pictures.append(plot_by_radius(lines, (0, *light.radii), light.title, unit))
@@ -312,16 +303,17 @@ def _worst(
     """Make galleries of each network's WORST misses and false alarms, with all predictions."""
 
     def draw(images: str, row: int) -> Picture:
-        texts = []
-        for network in networks:
-            prediction = first_screen.describe_prediction(network.predictions(images), row)
-            texts.append(f"{network.name}: {prediction.text}")
-        photograph = networks[0].predictions(images).photograph[row]
+        predictions = [network.predictions(images) for network in networks]
+        texts = [
+            f"{network.name}: {first_screen.describe_prediction(of_network, row).text}"
+            for network, of_network in zip(networks, predictions, strict=True)
+        ]
+        photograph = predictions[0].photograph[row]
         caption = f"{in_words(photograph.label)}, {photograph.source}: {'; '.join(texts)}"
         image = Image.fromarray(read_center(folders[images] / photograph.path, SIDE))
         return encode_picture(image, caption, caption)
 
-    galleries: dict[str, list[Picture]] = {}
+    galleries = {}
     for network in networks:
         # Log-odds, whether the image is a positive, and its folder and row.
         items = []
@@ -333,9 +325,9 @@ def _worst(
         positives = [item[2:] for item in items if item[1]]
         negatives = [item[2:] for item in reversed(items) if not item[1]]
         label = in_words(network.label)
-        for title, chosen in (
-            (f"{label} that {network.name} doubts most", positives),
-            (f"what {network.name} most takes for {label}", negatives),
-        ):
-            galleries[title] = [draw(*item) for item in chosen[:WORST]]
+        misses, false_alarms = (
+            [draw(*item) for item in part[:WORST]] for part in (positives, negatives)
+        )
+        galleries[f"{label} that {network.name} doubts most"] = misses
+        galleries[f"what {network.name} most takes for {label}"] = false_alarms
     return galleries

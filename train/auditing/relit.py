@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -46,8 +46,6 @@ from train.run_folder import read_json
 
 # Pictures are written for this many photographs.
 PICTURE_COUNT = 8
-# Titles of the columns of tables, by the kind of light.
-TITLES = {SLIDE: "random slide", RANDOM: "random search", ADVERSARIAL: "gradient"}
 # Sentences of reports about what the simulation of the light leaves out.
 MODELED = (
     "A slide is the picture that a projector shows. "
@@ -67,18 +65,22 @@ MAX_PICTURE_WIDTH = 900
 # The report says that predictions depend on the light if less than this fraction of
 # the photographs keeps its class under random slides.
 PASS_THRESHOLD = 0.9
-# Titles of the numbers at the top of the report, by the kind of light.
-NUMBER_TITLES = {
-    SLIDE: "Kept under a random slide",
-    RANDOM: "… after random search",
-    ADVERSARIAL: "… after as many passes along the gradient",
-}
 
-# Descriptions of the kinds of light in a sentence.
-IN_LIGHT = {
-    SLIDE: "under a random slide",
-    RANDOM: "after random search",
-    ADVERSARIAL: "after the gradient attack",
+
+class _Words(NamedTuple):
+    """A kind of light in a table, above a number at the top of the report, and in a sentence."""
+
+    title: str
+    number_title: str
+    clause: str
+
+
+WORDS = {
+    SLIDE: _Words("random slide", "Kept under a random slide", "under a random slide"),
+    RANDOM: _Words("random search", "… after random search", "after random search"),
+    ADVERSARIAL: _Words(
+        "gradient", "… after as many passes along the gradient", "after the gradient attack"
+    ),
 }
 
 
@@ -170,19 +172,31 @@ class RelitScores(ShortRepr):
         A row has the number of photographs with the predicted class and, for each kind of light,
         the number that keep it. The classes that lose most photographs come first.
         """
-        kept = [[TITLES[light], format_fraction(self.kept(light))] for light in self.lights]
+        kept = [[WORDS[light].title, format_fraction(self.kept(light))] for light in self.lights]
+        groups: dict[str, list[RelitPhotograph]] = {}
+        for item in sorted(self.photographs, key=lambda item: item.predicted):
+            groups.setdefault(item.predicted, []).append(item)
         rows: list[Any] = []
-        for name in sorted({item.predicted for item in self.photographs}):
-            group = [item for item in self.photographs if item.predicted == name]
-            is_kept = [[item.kept[light] == self.slides for item in group] for light in self.lights]
-            rows.append([name, len(group), *map(sum, is_kept)])
+        for name, group in groups.items():
+            counts = [
+                sum(item.kept[light] == self.slides for item in group) for light in self.lights
+            ]
+            rows.append([name, len(group), *counts])
         rows.sort(key=lambda row: sum(row[2:]) / row[1])
-        titles = [f"kept: {TITLES[light]}" for light in self.lights]
+        titles = [f"kept: {WORDS[light].title}" for light in self.lights]
         subject, _ = self.finds
         return [
             Table(f"{subject} that keep their class", ["light", "kept"], kept),
             Table("by predicted class", ["class", subject, *titles], rows),
         ]
+
+    def sentence(self, name: str) -> str:
+        """Write how many photographs keep their class in each kind of light for a network."""
+        counts = [f"{self.kept(light).hits} {WORDS[light].clause}" for light in self.lights]
+        subject, keeps = self.finds
+        place = f" in {self.shown} photographs" if subject != "photographs" else ""
+        kept = join_words(counts, "and")
+        return f"Of {len(self.photographs)} {subject}{place}, {name} {keeps} {kept}."
 
 
 def attack_folder(
@@ -191,41 +205,31 @@ def attack_folder(
     settings: RelightingSettings,
     out: Path,
     *,
-    sensor_noise: float = 1.0,
-    batch_size: int = 32,
-    seed: int = 0,
     limit: int | None = None,
+    **options: Any,
 ) -> RelitScores:
     """Attack a network by the light of a projector on photographs, and write the results.
 
-    `sensor_noise` is a standard deviation in units of 1/255. `limit` photographs at equal distances
-    in the list are attacked, and as many objects in them, or all if it is None.
+    `limit` photographs at equal distances in the list are attacked, and as many objects in them, or
+    all if it is None. `options` are those of `attack_photographs`.
     """
     found = find_unlabeled(folder)
     chosen = evenly_spaced(found, limit or len(found))
     readable, images, unreadable = load_photographs(
         folder, chosen, classifier.size, skip_unreadable=True
     )
-    result = attack_photographs(
-        classifier,
-        images,
-        settings,
-        sensor_noise=sensor_noise,
-        batch_size=batch_size,
-        limit=limit,
-        seed=seed,
-    )
+    result = attack_photographs(classifier, images, settings, limit=limit, **options)
     out.mkdir(parents=True, exist_ok=True)
     classes = [*result.classifier.classes, NOTHING]
     photographs = []
-    for index, photograph in enumerate(readable[row] for row in result.index.tolist()):
+    for index, row in enumerate(result.index.tolist()):
         becomes = {
             light: [classes[label] for label in result.predicted[light][index].tolist()]
             for light in result.changed
         }
         kept = {light: int((~item[index]).sum()) for light, item in result.changed.items()}
         predicted = classes[int(result.source[index])]
-        photographs.append(RelitPhotograph(str(photograph.path), predicted, kept, becomes))
+        photographs.append(RelitPhotograph(str(readable[row].path), predicted, kept, becomes))
     scores = RelitScores(
         folder=str(folder),
         slides=settings.slides,
@@ -286,12 +290,6 @@ def _drawn(result: PhotographAttackResult, image: UInt8[Tensor, "3 H W"]) -> Flo
     return network.task.draw(shown, network(shown[None])[0], network.classes).cpu()
 
 
-def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
-    """Make a section about photographs in the light of a projector for each network."""
-    folders = {name: path / RELIT_FOLDER for name, path in results.items()}
-    return [_section(name, folder) for name, folder in folders.items() if folder.exists()]
-
-
 def write_photographs_page(
     results: Mapping[str, Path], out: Path, caveats: Sequence[str]
 ) -> tuple[Path, FirstScreen]:
@@ -301,58 +299,58 @@ def write_photographs_page(
     numbers = []
     for light in first.lights:
         if light in last.lights:
-            title = NUMBER_TITLES[light]
             before = first.kept(light) if len(scores) > 1 else None
-            numbers.append(ShownMetric(title, "higher is better", before, last.kept(light)))
+            number = (WORDS[light].number_title, "higher is better", before, last.kept(light))
+            numbers.append(ShownMetric(*number))
     answer = "Random slides seldom change its predictions."
     kept = last.kept(SLIDE).value
     if kept is not None and kept < PASS_THRESHOLD:
         answer = "Its predictions depend on the light."
-    sentences = [_sentence(name, item) for name, item in zip(results, scores, strict=True)]
+    sentences = [item.sentence(name) for name, item in zip(results, scores, strict=True)]
     place = f"{first.shown} photographs of {first.folder}"
     screen = FirstScreen(answer, [*sentences, MODELED], numbers, [*results], place)
     path = write_page(
         out,
-        "relit.html.jinja",
         title="Audit: photographs in the light of a projector",
         about=" and ".join(results),
         screen=screen,
         relit=relit_sections(results),
-        caveats=caveats,
-        config=read_config(out / CONFIG),
+        lead=caveats,
+        configs={"configuration": read_config(out / CONFIG)},
     )
     return path, screen
 
 
-def _sentence(name: str, scores: RelitScores) -> str:
-    """Write how many photographs keep their class in each kind of light."""
-    counts = [f"{scores.kept(light).hits} {IN_LIGHT[light]}" for light in scores.lights]
-    kept = join_words(counts, "and")
-    subject, keeps = scores.finds
-    place = f" in {scores.shown} photographs" if subject != "photographs" else ""
-    return f"Of {len(scores.photographs)} {subject}{place}, {name} {keeps} {kept}."
-
-
-def _section(name: str, folder: Path) -> dict[str, Any]:
-    """Make the section of a report about one network: its sentences, tables and pictures."""
-    scores = read_relit(folder)
-    sentences = [
-        _sentence(name, scores),
-        f"Each search multiplies each channel of the slide by smooth factors between "
-        f"1/{scores.gain:g} and {scores.gain:g}, in {scores.passes} passes through the network. "
-        "A change counts only if it remains in three draws of the noise of a sensor.",
-    ]
-    unreadable_count = len(scores.unreadable)
-    if scores.shown + unreadable_count < scores.found:
-        sentences.append(f"The folder holds {scores.found} photographs, of which these are some.")
-    if unreadable_count:
-        sentences.append(f"{unreadable_count} photographs cannot be read.")
-    pictures: list[Picture] = []
-    for index, file in scores.pictures.items():
-        photograph = scores.photographs[index]
-        # The predicted class in each light, from left to right.
-        predicted = [f"{TITLES[light]}: {names[0]}" for light, names in photograph.becomes.items()]
-        shown = [f"unchanged: {photograph.predicted}", *predicted]
-        caption = f"{photograph.path}. {'; '.join(shown)}"
-        pictures += read_pictures(folder / file, caption, MAX_PICTURE_WIDTH, caption)
-    return {"name": name, "sentences": sentences, "tables": scores.tables(), "pictures": pictures}
+def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
+    """Make a section about photographs in the light of a projector for each network."""
+    sections = []
+    for name, folder in ((name, path / RELIT_FOLDER) for name, path in results.items()):
+        if not folder.exists():
+            continue
+        scores = read_relit(folder)
+        sentences = [
+            scores.sentence(name),
+            f"Each search multiplies each channel of the slide by smooth factors between "
+            f"1/{scores.gain:g} and {scores.gain:g}, in {scores.passes} passes through the "
+            "network. A change counts only if it remains in three draws of the noise of a sensor.",
+        ]
+        unreadable_count = len(scores.unreadable)
+        if scores.shown + unreadable_count < scores.found:
+            sentences.append(
+                f"The folder holds {scores.found} photographs, of which these are some."
+            )
+        if unreadable_count:
+            sentences.append(f"{unreadable_count} photographs cannot be read.")
+        pictures: list[Picture] = []
+        for index, file in scores.pictures.items():
+            photograph = scores.photographs[index]
+            # The predicted class in each light, from left to right.
+            shown = [f"unchanged: {photograph.predicted}"]
+            shown += [
+                f"{WORDS[key].title}: {names[0]}" for key, names in photograph.becomes.items()
+            ]
+            caption = f"{photograph.path}. {'; '.join(shown)}"
+            pictures += read_pictures(folder / file, caption, MAX_PICTURE_WIDTH, caption)
+        content = {"sentences": sentences, "tables": scores.tables(), "pictures": pictures}
+        sections.append({"name": name, **content})
+    return sections

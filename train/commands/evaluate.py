@@ -22,11 +22,10 @@ from train.command_settings import EvaluateSettings, require_calibration
 from train.data.annotations import FITS, LETTERBOX, read_annotations
 from train.data.photographs import choose_labels, class_folders, require_outside
 from train.device import MixedPrecision, choose_device, choose_precision
-from train.results import detection_scores, scoring
-from train.results.detection_scores import DetectionScores, evaluate_detector
+from train.results import annotated_scores, scoring
+from train.results.annotated_scores import AnnotatedScores, evaluate_detector, evaluate_segmenter
 from train.results.overwrite import require_replaceable
 from train.results.scoring import Predictor, Scores, format_overall, format_scores
-from train.results.segmentation_scores import SegmentationScores, evaluate_segmenter
 from train.results.store import trained_labels
 from train.run_folder import sole_writer, writable_folder
 from train.settings import GROUPS, label_names, published_folder
@@ -86,7 +85,7 @@ def evaluate(
     device: torch.device | str | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
-) -> Scores | DetectionScores | SegmentationScores:
+) -> Scores | AnnotatedScores:
     """Score a network on the photographs of a folder.
 
     Nothing is written unless `out` is given. A detector is scored on photographs
@@ -185,7 +184,7 @@ def evaluate(
                 require_outside(target, folder)
         with sole_writer("out", target) if target else nullcontext():
             if not isinstance(made, Classifier):
-                found: DetectionScores | SegmentationScores
+                found: AnnotatedScores
                 how = fit, skip_unreadable, device
                 if isinstance(made.task, Detection):
                     chosen = None if label is None else label_names(label)
@@ -193,7 +192,7 @@ def evaluate(
                 else:
                     found = evaluate_segmenter(made, folder, *how)
                 if target:
-                    detection_scores.write(found, target)
+                    annotated_scores.write(found, target)
                 return found
             model = MixedPrecision(made, choose_precision(precision, device))
             predictor = Predictor(model, made.classes, made.size, device)

@@ -4,8 +4,6 @@ After a training, such a test set shows the same classes as the training, but ot
 lighting.
 """
 
-import csv
-import io
 import json
 import platform
 from collections.abc import Sequence
@@ -37,6 +35,7 @@ from renderer.solids import HARD_NEGATIVES, SOLIDS
 from train.command_settings import OTHER_PATTERNS, LabSettings
 from train.data.photo import DESCRIPTION, TABLE
 from train.laboratory.shots import FOV, Shot, draw_shots
+from train.results.tables import write_csv
 from train.run_folder import LOCK, read_json, sole_writer, writable_folder
 from train.settings import (
     OTHER_PREFIX,
@@ -226,9 +225,7 @@ def write_laboratory(settings: LabSettings) -> int:
                 path = _write_render(out, settings, subject, shot, number)
                 brightness = f"{shot.brightness:.4f}"
                 rows.append((path, shot.lighting, number, subject.mesh, brightness))
-        table = io.StringIO()
-        csv.writer(table).writerows([COLUMNS, *sorted(rows)])
-        atomic_write(out / TABLE, table.getvalue())
+        write_csv(out / TABLE, [COLUMNS, *sorted(rows)], line_end="\r\n")
         versions = {"python": platform.python_version()}
         versions |= {name: version(name) for name in PACKAGES}
         description = {**asdict(settings), "versions": versions}

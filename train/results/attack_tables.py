@@ -1,7 +1,5 @@
 """Text, tables and the figure of an attack."""
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -14,9 +12,9 @@ from torch import Tensor
 
 from augment.attacks.result import AttackResult, warnings
 from renderer.io.files import atomic_write
-from train.results.pictures import COLORS
+from train.results.pictures import COLORS, write_figure
 from train.results.predictions import SWEEP_FIGURE, SWEEP_TABLE
-from train.results.tables import Proportion, Table, format_fraction, fraction
+from train.results.tables import Proportion, Table, format_fraction, fraction, write_csv
 
 # Versions of the images of an adversary: the words say how they were made. attack.jsonl
 # has results for each version.
@@ -51,18 +49,15 @@ def format_attack(
     steps = result.steps[result.success & ~result.success_before].double()
     if len(steps):
         heading += f"; median of {steps.median():.0f} steps"
-    heading += f"; {int(result.queries.sum())} queries"
     backward_count = int(result.backward_passes.sum())
-    if backward_count:
-        heading += f", {backward_count} backward passes"
-    text = [f"{heading} ({result.seconds['attack']:.1f} s)"]
+    backward = f", {backward_count} backward passes" if backward_count else ""
+    queries = f"{int(result.queries.sum())} queries{backward}"
+    text = [f"{heading}; {queries} ({result.seconds['attack']:.1f} s)"]
     if checks is not None:
         text += _check_lines(checks, has_noise, result.settings.uses_gradients)
     adversaries = [line for line in lines if line["success"] and line["clean_correct"]]
-    if adversaries:
-        for version in adversaries[0]["versions"]:
-            text.append(_version_line(version, adversaries, has_noise))
-    return text
+    versions = adversaries[0]["versions"] if adversaries else ()
+    return text + [_version_line(version, adversaries, has_noise) for version in versions]
 
 
 def _success(result: AttackResult) -> str:
@@ -91,9 +86,7 @@ def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: boo
     def rate(name: str, steps: str | None = None) -> str:
         values = [checks[name + end] for end in ("", WITHOUT_NOISE)]
         with_noise, without = values if steps is None else [value[steps] for value in values]
-        return (
-            f"{with_noise:.0%} ({without:.0%} without noise)" if has_noise else f"{with_noise:.0%}"
-        )
+        return f"{with_noise:.0%}" + (f" ({without:.0%} without noise)" if has_noise else "")
 
     unit, units = ("step", "steps") if uses_gradients else ("query", "queries")
     attacks = [f"{rate('success_by_steps', n)} in {n}" for n in checks["success_by_steps"]]
@@ -155,8 +148,8 @@ def format_sweep(sweep: Sweep) -> str:
     for row in sweep:
         cells = [" + ".join(f"{name} {radius:g}" for name, radius in row["radii"].items())]
         for method in METHODS:
-            cells.append(format_fraction(_success_rate(row[method])))
-            cells.append(str(int(row[method + WITHOUT_NOISE].sum())))
+            without_noise = int(row[method + WITHOUT_NOISE].sum())
+            cells += [format_fraction(_success_rate(row[method])), str(without_noise)]
         rows.append(cells)
     titles = [title for method in METHODS.values() for title in (method, "without noise")]
     return str(Table("", ["radius", *titles], rows))
@@ -184,17 +177,14 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
             success = {method: torch.cat([row[method] for row in rows]) for method in methods}
             pooled.append({"radii": rows[0]["radii"], **success})
         sweeps = {**sweeps, "all": pooled}
-    records = []
-    for mesh, sweep in sweeps.items():
-        for method in methods:
-            for row in sweep:
-                rate = asdict(_success_rate(row[method]))
-                records.append({"mesh": mesh, "method": method, **row["radii"], **rate})
-    text = io.StringIO()
-    table = csv.DictWriter(text, list(records[0]))
-    table.writeheader()
-    table.writerows(records)
-    atomic_write(out / SWEEP_TABLE, text.getvalue())
+    records = [
+        {"mesh": mesh, "method": method, **row["radii"], **asdict(_success_rate(row[method]))}
+        for mesh, sweep in sweeps.items()
+        for method in methods
+        for row in sweep
+    ]
+    cells = [[*records[0]], *([*record.values()] for record in records)]
+    write_csv(out / SWEEP_TABLE, cells, line_end="\r\n")
     last_mesh = records[-1]["mesh"]
     shown = [record for record in records if record["mesh"] == last_mesh and record["n"]]
     _draw_sweep(shown, norms, out / SWEEP_FIGURE)
@@ -226,6 +216,4 @@ def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], 
         count = records[0]["n"]
         axes.set_title(f"{count} examples correct before, 95% intervals", fontsize=10)
         figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    image = io.BytesIO()
-    figure.savefig(image, dpi=150)
-    atomic_write(path, image.getbuffer())
+    write_figure(path, figure, dpi=150)

@@ -218,8 +218,16 @@ class Difference(Estimate):
         after: Mean of the metric over the seeds of the method.
     """
 
+    value: float = 0.0
+    low: float = 0.0
+    high: float = 0.0
     before: float = 0.0
     after: float = 0.0
+
+    @property
+    def direction(self) -> int:
+        """Sign of the difference, or 0 if its 95% interval contains 0."""
+        return int(self.low > 0) - int(self.high < 0)
 
 
 def difference(

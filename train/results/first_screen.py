@@ -3,7 +3,6 @@
 It says whether hardening helped, and shows metrics and pictures before and after it.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +16,10 @@ from train.data.photo import DESCRIPTION
 from train.results import compare
 from train.results.pictures import Picture, encode_picture
 from train.results.predictions import Predictions
+from train.results.store import RunSummary
 from train.results.tables import Estimate, Table, describe_intervals, join_words
-from train.settings import in_words
+from train.run_folder import read_json
+from train.settings import KEPT_ASIDE, PHOTOGRAPHS, in_words
 
 # Metric "recall at a false-positive rate of 10%". At an equal rate, the recall of two
 # networks can be compared.
@@ -121,79 +122,69 @@ class FirstScreen:
 
 def describe_place(folder: Path | None, name: str) -> str:
     """Write the start of a sentence that says where images are from."""
-    if folder is None or not is_laboratory(folder):
+    if folder is None or not (folder / DESCRIPTION).is_file():
         return f"In the images of “{name}”"
-    settings = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
+    settings = read_json(folder / DESCRIPTION)
     patterns = settings.get("patterns", [])
     if not patterns or settings.get("environments"):
         return "Under unusual lighting"
     return f"Under projected patterns ({join_words(patterns, 'and')})"
 
 
-def is_laboratory(folder: Path) -> bool:
-    """Return whether a folder has renders of pnb-lab, which has described them there."""
-    return (folder / DESCRIPTION).is_file()
-
-
 def compare_networks(
-    label: str,
     before: Sequence[compare.Evaluation],
     after: Sequence[compare.Evaluation],
     names: tuple[str, str],
-    place: str,
-    rows: dict[str, list[ComparedImage]],
+    folder: Path | None = None,
+    name: str = PHOTOGRAPHS,
     subjects: tuple[str, str] = NETWORKS,
     change: str = "hardening",
-    trained_objects: Sequence[str] = (),
 ) -> FirstScreen | None:
     """Make the first screen, which says whether hardening helped, and at what price.
 
-    `label` has the positive classes in words, and `change` what turned the first network into the
-    second. `names` of the networks stand in tables, and `subjects` in sentences. Images of the
-    classes `trained_objects` show the objects of the training. None if recall, false-positive rate
-    or AUC is unknown.
+    Both networks were scored on the images `name` in `folder`, which is None if it is unknown.
+    `names` of the networks stand in tables, and `subjects` in sentences. `change` turned the first
+    network into the second. None if recall, false-positive rate or AUC is unknown.
     """
     pool = after[0].pooled.all
-    labels = pool.positives.labels
+    labels = pool.predictions.labels
+    label = join_words([in_words(item) for item in labels], "or")
     metrics = {
         "recall": (f"Images of {label} recognized", "higher is better"),
         "false_positive_rate": (f"Other objects called {label}", "lower is better"),
         "auc": ("Ranking quality (AUC)", "higher is better; 0.5 is chance"),
     }
+    reasons = {EQUAL_RATE: "At an equal rate of 10% false positives, recall"}
     each = ""
     if len(labels) > 1:
         each = ", mean over these classes"
         metrics["class_top1"] = ("Top-1 among all classes, mean over classes", "higher is better")
+        reasons["class_top1"] = "Among all classes of the network, top-1 (the mean over classes)"
     gains = {
-        name: compare.difference(after, before, compare.ALL, name)
-        for name in (*metrics, EQUAL_RATE)
+        metric: compare.difference(after, before, compare.ALL, metric)
+        for metric in (*metrics, EQUAL_RATE)
     }
     recall, mistaken, auc = gains["recall"], gains["false_positive_rate"], gains["auc"]
     if recall is None or mistaken is None or auc is None:
         return None
     numbers = []
-    for name, (title, note) in metrics.items():
-        was, is_now = (compare.mean_metric(item, compare.ALL, name) for item in (before, after))
+    for metric, (title, note) in metrics.items():
+        was, is_now = (compare.mean_metric(item, compare.ALL, metric) for item in (before, after))
         if was is not None and is_now is not None:
             has_one_seed = len(before) == len(after) == 1
             interval = describe_intervals([is_now]) if has_one_seed else is_now.over
-            numbers.append(ShownMetric(title, note, was, is_now, name != "auc", interval))
+            numbers.append(ShownMetric(title, note, was, is_now, metric != "auc", interval))
 
     original, hardened = subjects
     sentences = [
-        f"{place}, {original} recognizes {recall.before:.0%} of the images of {label}; "
-        f"{hardened}, {recall.after:.0%}.",
-        f"{'The price: of' if _direction(mistaken) > 0 else 'Of'} the images of other objects, "
+        f"{describe_place(folder, name)}, {original} recognizes {recall.before:.0%} of the images "
+        f"of {label}; {hardened}, {recall.after:.0%}.",
+        f"{'The price: of' if mistaken.direction > 0 else 'Of'} the images of other objects, "
         f"{original} calls {mistaken.before:.0%} “{label}”; {hardened}, "
         f"{mistaken.after:.0%}{each}.",
     ]
-    reasons = {EQUAL_RATE: "At an equal rate of 10% false positives, recall"}
-    if len(labels) > 1:
-        reasons["class_top1"] = "Among all classes of the network, top-1 (the mean over classes)"
-    for name, text in reasons.items():
-        gain = gains[name]
-        if gain is not None:
-            sentences.append(gain_sentence(text, gain))
+    known = {text: gains[metric] for metric, text in reasons.items()}
+    sentences += [gain_sentence(text, gain) for text, gain in known.items() if gain is not None]
 
     shown = pool.negatives.photograph
     others = {item.path: item.mesh or item.path for item in shown if item.label not in labels}
@@ -205,21 +196,32 @@ def compare_networks(
     if len(labels) > 1:
         images += " For each class, the images of the other classes count as other objects, too."
     images += f" The gains have {describe_intervals([auc])}."
-    if trained_objects:
-        trained = join_words(trained_objects, "and")
-        images += f" The images of {trained} show the objects of the training in new light."
+    trained = _classes_with_trained_objects(after[0].run, labels, folder)
+    if trained:
+        trained_labels = join_words(trained, "and")
+        images += f" The images of {trained_labels} show the objects of the training in new light."
     note = (
         f"For other objects, any answer but {label} counts as right. Shown are the images on "
         "which the networks differ most: first one for each kind of object and light, then more."
     )
+    rows = {}
+    if folder is not None:
+        one, other = (item[0].pooled.predictions for item in (before, after))
+        rows = choose_disagreements(one, other, folder, labels, subjects)
     answer = _answer(change, recall, mistaken, auc)
     return FirstScreen(answer, sentences, numbers, names, images, rows, note)
 
 
-def _direction(change: compare.Difference) -> int:
-    """Return the sign of a difference, or 0 if its 95% interval contains 0."""
-    assert change.low is not None and change.high is not None
-    return int(change.low > 0) - int(change.high < 0)
+def _classes_with_trained_objects(
+    run: RunSummary, labels: Sequence[str], images: Path | None
+) -> list[str]:
+    """List the positive classes whose rendered test images show objects of the training."""
+    if images is None or images != run.folder / KEPT_ASIDE:
+        return []
+    trained = {item["mesh"] if isinstance(item, Mapping) else item for item in run.config.meshes}
+    shown = read_json(images / DESCRIPTION)["meshes"]
+    repeated = {item["label"] for item in shown if item["mesh"] in trained}
+    return [in_words(label) for label in labels if label in repeated]
 
 
 def _answer(
@@ -233,31 +235,27 @@ def _answer(
     A proven change of the AUC decides. Recall and false positives decide what the sentence says in
     addition. Differences are after minus before.
     """
-    assert auc.value is not None and auc.low is not None and auc.high is not None
     subject = change[0].upper() + change[1:]
-    gain = (
-        f"AUC {_rounded(auc.value, 2, '+')} [{_rounded(auc.low, 2)}, {_rounded(auc.high, 2)}] "
-        f"over {auc.over}"
-    )
-    if _direction(auc) > 0:
-        price = ", at a price" if _direction(false_positives) > 0 else ""
+    ends = f"{_rounded(auc.low, 2)}, {_rounded(auc.high, 2)}"
+    gain = f"AUC {_rounded(auc.value, 2, '+')} [{ends}] over {auc.over}"
+    if auc.direction > 0:
+        price = ", at a price" if false_positives.direction > 0 else ""
         return f"{subject} improved the ranking ({gain}){price}."
-    if _direction(auc) < 0:
+    if auc.direction < 0:
         return f"{subject} made the ranking worse ({gain})."
-    if _direction(recall) > 0 and _direction(false_positives) > 0:
+    if recall.direction > 0 and false_positives.direction > 0:
         return f"{subject} finds more, and mistakes more; a better ranking is not proven ({gain})."
     return f"It is not proven that {change} improved the ranking ({gain})."
 
 
 def gain_sentence(subject: str, change: compare.Difference) -> str:
     """Write a sentence that compares a metric of two networks."""
-    assert change.low is not None and change.high is not None
-    verdicts = {1: "a gain", -1: "a loss", 0: "a difference is not proven"}
+    verdict = {1: "a gain", -1: "a loss", 0: "a difference is not proven"}[change.direction]
     # Percentage points, such as "+3", "−0.4" or "0".
     low, high = (_rounded(100 * end, 0, "+") for end in (change.low, change.high))
     values = f"{change.after:.0%} instead of {change.before:.0%}"
     interval = f"95% interval over {change.over}: {low} to {high} points"
-    return f"{subject} is {values}; {verdicts[_direction(change)]} ({interval})."
+    return f"{subject} is {values}; {verdict} ({interval})."
 
 
 def _rounded(value: float, decimals: int, sign: str = "") -> str:

@@ -21,9 +21,9 @@ from train.data.photo import DESCRIPTION
 from train.results import compare, first_screen, store, tables
 from train.results.pictures import Picture, evenly_spaced, plot_curves, plot_roc, read_pictures
 from train.results.predictions import CONTACT_SHEET
-from train.results.store import Methods, RunSummary, Scored, ScoredRun
+from train.results.store import Methods, RunSummary, Scored
 from train.run_config import CONFIG, read_config
-from train.run_folder import RENDERS, attack_success, read_json
+from train.run_folder import RENDERS, attack_success
 from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, in_words, published_folder
 from train.system import user_message
 
@@ -48,6 +48,12 @@ FOLDER_NAME_LENGTH = 24
 GRID_WIDTH = 720
 # Largest width of a contact sheet and of an image of an attack, in pixels.
 SHEET_WIDTH = 1100
+# What a page shows, from its top to its end, if it is about this. The template has the same order.
+BLOCKS = (
+    *("screen", "networks", "recommendation", "lead", "attacks", "slider", "charts", "detections"),
+    *("photographs", "methods", "unfinished", "curves", "relit", "renders", "examples", "worst"),
+    *("seconds", "configs", "shown"),
+)
 # Titles of the plots of metrics by epoch.
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
@@ -67,9 +73,9 @@ def write_report(
     first = {method: runs[0] for method, runs in shown.items() if runs[0].epochs}
     groups = compare.group_by_images(shown)
     screen = _first_screen(groups)
+    configs = {f"configuration of {name}": runs[0].config for name, runs in methods.items()}
     path = write_page(
         out,
-        "runs.html.jinja",
         about=_about(found, folders),
         methods=methods,
         title=_title(found, methods),
@@ -88,6 +94,7 @@ def write_report(
         },
         attacks=found.attacks,
         shown=[_attack_section(attack) for attack in found.attacks[:MAX_ATTACKS]],
+        configs={title: config for title, config in configs.items() if config},
     )
     return path, screen
 
@@ -106,11 +113,9 @@ def _about(found: store.Findings, folders: Sequence[Path]) -> str:
         counts.append(f"{len(found.attacks)} attacks")
     about = f"{', '.join(counts)}; in {', '.join(map(str, folders))}"
     shown = [run.folder for run in found.runs] + [attack.folder for attack in found.attacks]
-    files = [file for folder in shown for file in folder.iterdir() if file.name != PAGE]
-    if files:
-        newest = max(file.stat().st_mtime for file in files)
-        about += f", {datetime.fromtimestamp(newest):%Y-%m-%d %H:%M}"
-    return about
+    files = [path for folder in shown for path in folder.iterdir()]
+    newest = max((file.stat().st_mtime for file in files if file.name != PAGE), default=None)
+    return about if newest is None else f"{about}, {datetime.fromtimestamp(newest):%Y-%m-%d %H:%M}"
 
 
 def _title(found: store.Findings, methods: Methods) -> str:
@@ -127,8 +132,8 @@ def _title(found: store.Findings, methods: Methods) -> str:
     return f"{subject}, trained with renders: {', '.join(trained)}"
 
 
-def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
-    """Render a template to HTML, and write it to report.html.
+def write_page(out: Path, script: str = "", **content: Any) -> Path:
+    """Write report.html with those of BLOCKS, in this order, that `content` has.
 
     `content` needs `title` and `about`, the line below the title. The browser runs no other script
     than `script`.
@@ -143,19 +148,16 @@ def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(as_text=tables.as_text, fraction=tables.fraction, sha256=_sha256)
+    environment.filters.update(as_text=tables.as_text, fraction=tables.fraction)
     environment.filters.update(hits=tables.format_fraction, interval=tables.format_interval)
     environment.filters.update(command=_shell_command, yaml=OmegaConf.to_yaml)
-    page = environment.get_template("page.html.jinja").render(body=body, script=script, **content)
+    # The base64 SHA-256 with which the content security policy allows the script.
+    allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    content = {name: {} for name in BLOCKS} | content | {"script": script, "allowed": allowed}
     out.mkdir(parents=True, exist_ok=True)
     path = out / PAGE
-    atomic_write(path, page)
+    atomic_write(path, environment.get_template("page.html.jinja").render(content))
     return path
-
-
-def _sha256(script: str) -> str:
-    """Return the base64 SHA-256 with which a content security policy allows a script."""
-    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
 def report_of(folders: Sequence[Path], out: Path) -> str:
@@ -222,11 +224,11 @@ def _attack_success_by_round(epochs: Sequence[Mapping[str, float]]) -> list[floa
 
 def _read_renders(run: RunSummary, kind: str, title: str) -> list[Picture]:
     """Read images of the training renders of the first, the middle and the last epoch of a run."""
-    path_of_epoch = {}
-    for path in (run.folder / RENDERS).glob(f"{kind}_*.png"):
-        number = path.stem.removeprefix(f"{kind}_")
-        if number.isdigit():
-            path_of_epoch[int(number)] = path
+    path_of_epoch = {
+        int(path.stem.rpartition("_")[2]): path
+        for path in (run.folder / RENDERS).glob(f"{kind}_[0-9]*.png")
+        if path.stem.rpartition("_")[2].isdigit()
+    }
     pictures = []
     for epoch in evenly_spaced(sorted(path_of_epoch), SHOWN_EPOCHS):
         alt = f"{title}, epoch {epoch}, {run.mode}"
@@ -242,10 +244,9 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
         return fmean(values) if values else None
 
     sentences = []
-    agreement = mean("test/agreement")
     known = [run.before.accuracy for run in runs if run.before]
     accuracies = [accuracy for accuracy in known if accuracy is not None]
-    if agreement is not None:
+    if (agreement := mean("test/agreement")) is not None:
         sentences.append(
             f"{method}: on photographs that training did not use, the network predicts the "
             f"same class as the original in {agreement:.1%} of the cases."
@@ -258,14 +259,13 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
         )
         is_rendered = OmegaConf.select(runs[0].config, "data.name") == "shapes"
         folders = [images_folder(run, name) for run in runs for name in run.photographs]
-        if is_rendered and all(folder and first_screen.is_laboratory(folder) for folder in folders):
+        if is_rendered and all(folder and (folder / DESCRIPTION).is_file() for folder in folders):
             sentence += (
                 " These are renders. No photographs were scored (setting photos), so the "
                 "price on photographs is unknown."
             )
         sentences.append(sentence)
-    after = mean("test/relit_agreement_after")
-    if after is not None:
+    if (after := mean("test/relit_agreement_after")) is not None:
         sentences.append(
             f"{method}: trained on photographs in the light of a projector. In this light, "
             f"{after:.1%} of the predictions are those for the unchanged photographs, "
@@ -275,63 +275,37 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
 
 
 def _first_screen(groups: Mapping[str, Scored]) -> first_screen.FirstScreen | None:
-    """Make the first screen from the first images on which two networks were scored."""
+    """Make the first screen from the first images on which two networks were scored.
+
+    It compares the last pair of a method and the network that it began with, or else the last pair.
+    """
     for group in groups.values():
         with suppress(InputError):
-            screen = _compare_on(group)
+            evaluations = compare.read_evaluations(group)
+            pairs = compare.choose_pairs(evaluations)
+            hardened = [pair for pair in pairs if group[pair[1]][0].run.mode == store.INITIAL]
+            if not pairs:
+                continue
+            method, base = (hardened or pairs)[-1]
+            words: tuple[Any, ...] = ("before hardening", "after hardening"), first_screen.NETWORKS
+            change = "hardening"
+            if not hardened:
+                words = (base, method), (f"the network “{base}”", f"the network “{method}”")
+                change = f"“{method}”"
+            # All runs of a method have the same images, so the first one stands for all.
+            run, name = group[method][0]
+            screen = first_screen.compare_networks(
+                evaluations[base],
+                evaluations[method],
+                names=words[0],
+                folder=images_folder(run, name),
+                name=name,
+                subjects=words[1],
+                change=change,
+            )
             if screen is not None:
                 return screen
     return None
-
-
-def _compare_on(group: Scored) -> first_screen.FirstScreen | None:
-    """Make the first screen, which compares two networks on the images that both were scored on.
-
-    They are the last pair of a method and the network that it began with, or else the last pair.
-    """
-    evaluations = compare.read_evaluations(group)
-    pairs = compare.choose_pairs(evaluations)
-    if not pairs:
-        return None
-    hardened = [pair for pair in pairs if group[pair[1]][0].run.mode == store.INITIAL]
-    method, base = (hardened or pairs)[-1]
-    names = ("before hardening", "after hardening")
-    subjects = first_screen.NETWORKS
-    change = "hardening"
-    if not hardened:
-        names = (base, method)
-        subjects = (f"the network “{base}”", f"the network “{method}”")
-        change = f"“{method}”"
-    # All runs of a method have the same labels and images, so the first one stands for all.
-    scored = group[method][0]
-    images = images_folder(scored.run, scored.name)
-    labels = scored.scores.labels
-    rows = {}
-    if images is not None:
-        before, after = (group[name][0].pooled().predictions for name in (base, method))
-        rows = first_screen.choose_disagreements(before, after, images, labels, subjects)
-    return first_screen.compare_networks(
-        tables.join_words([in_words(name) for name in labels], "or"),
-        evaluations[base],
-        evaluations[method],
-        names,
-        first_screen.describe_place(images, scored.name),
-        rows,
-        subjects,
-        change,
-        _classes_with_trained_objects(scored, images),
-    )
-
-
-def _classes_with_trained_objects(scored: ScoredRun, images: Path | None) -> list[str]:
-    """List the positive classes whose rendered test images show objects of the training."""
-    if images is None or images != scored.run.folder / KEPT_ASIDE:
-        return []
-    meshes = scored.run.config.meshes
-    trained = {item["mesh"] if isinstance(item, Mapping) else item for item in meshes}
-    shown = read_json(images / DESCRIPTION)["meshes"]
-    labels = {item["label"] for item in shown if item["mesh"] in trained}
-    return [in_words(label) for label in scored.scores.labels if label in labels]
 
 
 def images_folder(run: RunSummary, name: str) -> Path | None:
@@ -373,7 +347,16 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         if evaluations:
             first_evaluation = next(iter(evaluations.values()))[0]
             for subset in first_evaluation.rows():
-                rocs.append(_plot_roc(evaluations, subset, title.partition(":")[0]))
+                # Predictions for the images of the subset, of each seed of each method.
+                pools = {
+                    method: [pool for item in items if (pool := item.find(subset))]
+                    for method, items in evaluations.items()
+                }
+                scores = {
+                    method: [pool.scores for pool in found] for method, found in pools.items()
+                }
+                positive_classes = " or ".join(next(iter(pools.values()))[0].predictions.labels)
+                rocs.append(plot_roc(scores, f"{positive_classes}, {title.partition(':')[0]}"))
             shown.append(compare.overall_differences(evaluations))
             if len(first_evaluation.rows("source")) > 1:
                 shown.append(compare.group_table(evaluations))
@@ -387,18 +370,6 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         "tables": [table.without_unknown_columns for table in shown],
         "problem": problem,
     }
-
-
-def _plot_roc(methods: compare.Evaluations, subset: compare.Subset, images: str) -> Picture | None:
-    """Plot the ROC curves of all methods on all images, or for one positive class."""
-    # Predictions for the images of the subset, of each seed of each method.
-    pools = {
-        method: [pool for item in evaluations if (pool := item.find(subset))]
-        for method, evaluations in methods.items()
-    }
-    scores = {method: [pool.scores for pool in found] for method, found in pools.items()}
-    positive_classes = next(iter(pools.values()))[0].predictions.labels
-    return plot_roc(scores, f"{' or '.join(positive_classes)}, {images}")
 
 
 def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:

@@ -1,10 +1,10 @@
 """Pictures of results: plots as SVG for light and dark pages, contact sheets and ROC curves."""
 
 import base64
-import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -16,10 +16,11 @@ from renderer.io.files import atomic_write
 from renderer.io.images import PAPER, Tile, draw_grid, open_image
 from train.results.intervals import RATES, auc_and_recalls, roc_curve
 from train.results.predictions import ROC_FIGURE, ROC_TABLE, Predictions
-from train.results.tables import Estimate
+from train.results.tables import Estimate, write_csv
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Colors of the lines of a plot. The first two colors are those of the original and of the hardened
 # network. Their contrast to a white and to a dark page is above 3. The other colors are from Okabe
@@ -123,23 +124,20 @@ def plot_curves(
         method: [[(x, y) for x, y in points if y is not None] for points in seeds]
         for method, seeds in methods.items()
     }
-    every_line = [line for lines in lines_of_method.values() for line in lines]
+    every_line = chain(*lines_of_method.values())
     if all(len({y for _, y in line}) < 2 for line in every_line):
         return None
-    means = []
-    for method, lines in lines_of_method.items():
-        ends = [line[-1][1] for line in lines if line]
-        if ends:
-            means.append(f"{method} {np.mean(ends):.2f}")
+    ends = {
+        method: [line[-1][1] for line in lines if line] for method, lines in lines_of_method.items()
+    }
+    means = [f"{method} {np.mean(values):.2f}" for method, values in ends.items() if values]
 
     def draw(axes: "Axes") -> None:
         for index, (method, lines) in enumerate(lines_of_method.items()):
             for line in lines:
-                if len(line) < 2:
-                    continue
-                marker = MARKERS[index % len(MARKERS)] if len(line) < MARKED else None
-                x, y = zip(*line, strict=True)
-                axes.plot(x, y, marker=marker, ms=4, label=method, **style(index))
+                if len(line) > 1:
+                    marker = MARKERS[index % len(MARKERS)] if len(line) < MARKED else None
+                    axes.plot(*np.array(line).T, marker=marker, ms=4, label=method, **style(index))
         axes.set(xlabel=x_title)
         axes.locator_params(axis="x", integer=True, min_n_ticks=1)
 
@@ -161,11 +159,7 @@ def plot_roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | Non
     # A single network gets the second color, which is the color of a hardened network.
     first_color = 1 if len(methods) == 1 else 0
     styles = {method: style(index) for index, method in enumerate(methods, first_color)}
-    means = [
-        f"{method} {np.mean([auc_and_recalls(*pair)[0] for pair in pairs]):.3f}"
-        for method, pairs in known.items()
-        if pairs
-    ]
+    means = [f"{method} {_mean_auc(pairs):.3f}" for method, pairs in known.items() if pairs]
     alt = f"ROC of {label}; AUC: {', '.join(means)}"
     return _plot(lambda axes: draw_roc(axes, known, styles), f"ROC: {label}", alt)
 
@@ -270,19 +264,17 @@ def contact_sheet(predictions: Predictions, images: UInt8[np.ndarray, "N 3 H W"]
             ("false negatives", RED, is_positive & ~is_found, is_positive),
             ("false positives", YELLOW, ~is_positive & is_found, ~is_positive),
         ):
-            heading = f"{label}: {is_shown.sum()} {name} of {is_of_kind.sum()}"
-            if is_shown.sum() > MAX_IMAGES:
-                heading += f" ({MAX_IMAGES} shown, evenly by probability)"
+            count = is_shown.sum()
+            limit = f" ({MAX_IMAGES} shown, evenly by probability)" if count > MAX_IMAGES else ""
+            heading = f"{label}: {count} {name} of {is_of_kind.sum()}{limit}"
             chosen = evenly_spaced(order[is_shown].tolist(), MAX_IMAGES)
             tiles = [_tile(rows[row], images[row], color) for row in chosen]
             lines = [tiles[first : first + COLUMNS] for first in range(0, len(tiles), COLUMNS)]
             grids.append(draw_grid(lines, heading=heading))
-    width = max(grid.width for grid in grids)
-    sheet = Image.new("RGB", (width, sum(grid.height for grid in grids)), PAPER)
-    top = 0
-    for grid in grids:
+    tops = [0, *accumulate(grid.height for grid in grids)]
+    sheet = Image.new("RGB", (max(grid.width for grid in grids), tops.pop()), PAPER)
+    for grid, top in zip(grids, tops, strict=True):
         sheet.paste(grid, (0, top))
-        top += grid.height
     return sheet
 
 
@@ -325,13 +317,11 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
     known = {name: pair for name, pair in pairs.items() if all(map(len, pair))}
     # A source or a label can have the name "all", too.
     title = "all images" if "all" in known else "all"
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["source", "false_positive_rate", "recall", "threshold"])
+    rows: list[Sequence[object]] = [["source", "false_positive_rate", "recall", "threshold"]]
     for name, pair in known.items():
-        columns = [column.tolist() for column in roc_curve(*pair)]
-        writer.writerows([name, *point] for point in zip(*columns, strict=True))
-    atomic_write(folder / ROC_TABLE, table.getvalue())
+        columns = (column.tolist() for column in roc_curve(*pair))
+        rows += [[name, *point] for point in zip(*columns, strict=True)]
+    write_csv(folder / ROC_TABLE, rows)
 
     figure = Figure(figsize=(7, 7), layout="constrained")
     axes = figure.subplots()
@@ -341,9 +331,19 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
     axes.set_aspect("equal")
     if known:
         axes.legend(loc="lower right")
+    write_figure(folder / ROC_FIGURE, figure)
+
+
+def write_figure(path: Path, figure: "Figure", **options: Any) -> None:
+    """Write a figure of matplotlib to a PNG file."""
     image = io.BytesIO()
-    figure.savefig(image)
-    atomic_write(folder / ROC_FIGURE, image.getbuffer())
+    figure.savefig(image, **options)
+    atomic_write(path, image.getbuffer())
+
+
+def _mean_auc(pairs: Sequence[Pair]) -> float:
+    """Average the area under the ROC curves of several runs."""
+    return float(np.mean([auc_and_recalls(*pair)[0] for pair in pairs]))
 
 
 def draw_roc(
@@ -360,12 +360,10 @@ def draw_roc(
     for rate in map(float, RATES):
         axes.axvline(rate, color="0.6", linewidth=1, linestyle=":")
     for name, pairs in scores.items():
-        areas = [auc_and_recalls(*pair)[0] for pair in pairs]
-        legend: str | None = f"{name}: AUC {np.mean(areas):.3f}" if areas else None
-        for pair in pairs:
+        for number, pair in enumerate(pairs):
             rates, recalls, _ = roc_curve(*pair)
-            axes.plot(rates, recalls, label=legend, **styles.get(name, {}))
             # Further curves of the same name have no entry in the legend.
-            legend = None
+            legend = None if number else f"{name}: AUC {_mean_auc(pairs):.3f}"
+            axes.plot(rates, recalls, label=legend, **styles.get(name, {}))
     axes.set(xlabel="false positive rate", ylabel="recall")
     axes.set(xlim=(-0.01, 1), ylim=(0, 1.01))

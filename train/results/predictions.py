@@ -5,8 +5,8 @@ of a photograph and a label.
 """
 
 import csv
-import io
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from renderer.errors import InputError, ShortRepr, single_line
-from renderer.io.files import atomic_write
+from renderer.io.files import atomic_write, remove_unfinished
 from train.data.photo import SEPARATOR, Photograph, split_sources
+from train.results.tables import write_csv
 from train.settings import label_names
 
 # Files in a folder of scores: predictions, metrics and pictures.
@@ -132,7 +133,7 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
     first = next(iter(by_label.values()))
     photographs = first.photograph
     ranks = first.true_rank.tolist()
-    columns: dict[str, Any] = {
+    columns: dict[str, Iterable[object]] = {
         "path": [item.path for item in photographs],
         "label": first.shown,
         "source": first.source,
@@ -147,11 +148,20 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
         columns[f"{label}_probability"] = rows.label_probability.tolist()
         columns[f"{label}_rank"] = rows.label_rank.tolist()
         columns[f"{label}_log_odds"] = rows.log_odds.tolist()
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
-    atomic_write(path, table.getvalue())
+    write_csv(path, [columns, *zip(*columns.values(), strict=True)])
+
+
+def begin_scores(out: Path) -> None:
+    """Make a folder ready for scores. Without a summary, no folder counts as scored."""
+    out.mkdir(parents=True, exist_ok=True)
+    remove_unfinished(out)
+    (out / SUMMARY).unlink(missing_ok=True)
+
+
+def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
+    """Write summary.json, the last file of a folder of scores."""
+    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
+    atomic_write(out / SUMMARY, text + "\n")
 
 
 def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:

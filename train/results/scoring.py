@@ -8,7 +8,6 @@ threshold on its log-odds. An image above the threshold counts as detected.
 """
 
 import hashlib
-import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,7 +24,6 @@ from augment.classifier import CheckedNetwork, Label, OperatingPoint, log_odds
 from augment.network import compute_outputs
 from augment.tasks.classification import Classification
 from renderer.errors import InputError, ShortRepr, require_choice
-from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
 from renderer.settings import Size, as_size
 from train.data.photo import TABLE, Photograph
@@ -37,14 +35,15 @@ from train.data.photographs import (
 )
 from train.results import metrics, tables
 from train.results.intervals import thresholds
-from train.results.metrics import Metrics, Outcome, Pool, Pooled, metric_title
+from train.results.metrics import Metrics, Outcome, Pooled, metric_title
 from train.results.pictures import contact_sheet, write_roc
 from train.results.predictions import (
     CONTACT_SHEET,
     PREDICTIONS,
-    SUMMARY,
     Predictions,
+    begin_scores,
     write_predictions,
+    write_summary,
 )
 from train.results.tables import Estimate, Proportion, Table
 from train.settings import GROUPS, label_names
@@ -147,17 +146,13 @@ def compute_logits(
     not finite.
     """
     if classes < 2:
-        raise InputError(
-            "the model has a single class, so its log-odds are infinite: "
-            "evaluate a model with at least two classes"
-        )
+        fault = "the model has a single class, so its log-odds are infinite"
+        raise InputError(f"{fault}: evaluate a model with at least two classes")
     checked = CheckedNetwork(model, "model", Classification(), classes)
     logits = compute_outputs(checked, images, BATCH, device).cpu()
     if not logits.isfinite().all():
-        raise InputError(
-            "the model returned NaN or infinite logits: "
-            "evaluate a checkpoint of a run that converged"
-        )
+        fault = "the model returned NaN or infinite logits"
+        raise InputError(f"{fault}: evaluate a checkpoint of a run that converged")
     return logits
 
 
@@ -250,22 +245,26 @@ class Scores(ShortRepr):
     @cached_property
     def by_label(self) -> dict[str, Metrics]:
         """Metrics of each label. Empty with a single label."""
-        return _metrics_of(self.pooled.by_label) if len(self.predicted.labels) > 1 else {}
+        return self._metrics_by("label") if len(self.predicted.labels) > 1 else {}
 
     @cached_property
     def by_source(self) -> dict[str, Metrics]:
         """Metrics of the photographs of each source."""
-        return _metrics_of(self.pooled.by_source)
+        return self._metrics_by("source")
 
     @cached_property
     def by_mesh(self) -> dict[str, Metrics] | None:
         """Metrics of the photographs of each mesh. None without by="mesh"."""
-        return _metrics_of(self.pooled.by_mesh) if self.by == "mesh" else None
+        return self._metrics_by("mesh") if self.by == "mesh" else None
 
     @cached_property
     def class_metrics(self) -> dict[str, Metrics] | None:
         """Metrics of the photographs of each class. None without by="class"."""
-        return _metrics_of(self.pooled.by_class) if self.by == "class" else None
+        return self._metrics_by("class") if self.by == "class" else None
+
+    def _metrics_by(self, by: str) -> dict[str, Metrics]:
+        """Compute the metrics of groups of photographs."""
+        return {name: pool.metrics for name, pool in self.pooled.groups(by).items()}
 
     @cached_property
     def by_class(self) -> dict[str, ClassScores]:
@@ -287,10 +286,9 @@ class Scores(ShortRepr):
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""
         predicted = self.predicted
-        labels = predicted.labels
-        points = self.point_entries
+        has_labels = bool(self.by_label)
         summary: dict[str, Any] = {
-            "label": labels if self.by_label else labels[0],
+            "label": predicted.labels if has_labels else predicted.labels[0],
             "size": as_size("size", predicted.images.shape[-2:]),
             "images": predicted.images_hash,
             **self.overall.to_summary(),
@@ -302,27 +300,15 @@ class Scores(ShortRepr):
                 "left_out": len(predicted.left_out),
             },
         }
-        if points:
-            summary["operating_point"] = points if self.by_label else points[0]
-        if self.by_label:
-            summary["by_label"] = _to_entries(self.by_label)
-        summary["by_source"] = _to_entries(self.by_source)
-        if self.by_mesh is not None:
-            summary["by_mesh"] = _to_entries(self.by_mesh)
+        if self.points:
+            summary["operating_point"] = self.point_entries if has_labels else self.point_entries[0]
+        by_label = self.by_label if has_labels else None
+        groups = {"by_label": by_label, "by_source": self.by_source, "by_mesh": self.by_mesh}
+        for key, found in (groups | {"by_class": {}, "class_metrics": self.class_metrics}).items():
+            if found is not None:
+                summary[key] = {name: item.to_summary() for name, item in found.items()}
         summary["by_class"] = {name: asdict(scores) for name, scores in self.by_class.items()}
-        if self.class_metrics is not None:
-            summary["class_metrics"] = _to_entries(self.class_metrics)
         return summary | {"unreadable": predicted.unreadable, "left_out": predicted.left_out}
-
-
-def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
-    """Compute the metrics of several groups of predictions."""
-    return {name: pool.metrics for name, pool in pools.items()}
-
-
-def _to_entries(groups: Mapping[str, Metrics]) -> dict[str, Any]:
-    """Convert the metrics of several groups to an entry of summary.json."""
-    return {name: of_group.to_summary() for name, of_group in groups.items()}
 
 
 def evaluate_photographs(
@@ -381,18 +367,14 @@ def write(scores: Scores, out: Path) -> None:
       single label, of each source instead.
     """
     predicted = scores.predicted
-    out.mkdir(parents=True, exist_ok=True)
-    remove_unfinished(out)
-    # Without a summary, no folder counts as scored.
-    (out / SUMMARY).unlink(missing_ok=True)
+    begin_scores(out)
     write_predictions(out / PREDICTIONS, predicted.predictions)
     write_image(out / CONTACT_SHEET, contact_sheet(predicted.predictions, predicted.images.numpy()))
     pooled = scores.pooled
     groups = pooled.by_label if len(predicted.labels) > 1 else pooled.by_source
     curves = {name: pool.scores for name, pool in groups.items()}
     write_roc(out, pooled.all.scores, curves, scores.label)
-    text = json.dumps(scores.to_summary(), indent=2, ensure_ascii=False, allow_nan=False)
-    atomic_write(out / SUMMARY, text + "\n")
+    write_summary(out, scores.to_summary())
 
 
 def choose_operating_points(
@@ -419,29 +401,18 @@ def choose_operating_points(
                 "folder",
             )
         (threshold,) = thresholds(log_odds, np.ones(count, int), [str(rate)])
-        points.append(
-            OperatingPoint(
-                label=name,
-                threshold=float(threshold),
-                false_positive_rate=rate,
-                folder=folder.resolve().name,
-                images=predicted.images_hash,
-                negatives=count,
-            )
-        )
+        chosen_on = (folder.resolve().name, predicted.images_hash, count)
+        points.append(OperatingPoint(name, float(threshold), rate, *chosen_on))
     return points
 
 
 def format_scores(scores: Scores) -> str:
     """Format scores as Markdown tables, with a row for each label and each source or mesh."""
-    paragraphs = [
-        _count_images(scores),
-        str(_metric_table(scores, _fraction_metrics(scores))),
-        str(_metric_table(scores, RANKING_METRICS)),
-        str(_class_table(scores)),
-        *_notes(scores),
+    tables_of_metrics = [
+        _metric_table(scores, names) for names in (_fraction_metrics(scores), RANKING_METRICS)
     ]
-    return "\n\n".join(paragraphs)
+    shown = [_count_images(scores), *tables_of_metrics, _class_table(scores), *_notes(scores)]
+    return "\n\n".join(map(str, shown))
 
 
 def _count_images(scores: Scores) -> str:
@@ -495,11 +466,10 @@ def _class_table(scores: Scores) -> Table:
     """Make a table of recall and wrong predictions with a row for each class of photographs."""
     header = ["class", "recall", "top-5", f"predicted {scores.label}", "most common wrong classes"]
     rows = []
-    for name, of_class in scores.by_class.items():
-        proportions = (of_class.recall, of_class.top5, of_class.predicted_label)
-        wrong_counts = of_class.most_common_wrong.items()
-        wrong = ", ".join(f"{wrong_class} {count}" for wrong_class, count in wrong_counts)
-        rows.append([name, *map(tables.format_fraction, proportions), wrong])
+    for name, item in scores.by_class.items():
+        cells = map(tables.format_fraction, (item.recall, item.top5, item.predicted_label))
+        wrong = ", ".join(f"{wrong} {count}" for wrong, count in item.most_common_wrong.items())
+        rows.append([name, *cells, wrong])
     return Table("", header, rows)
 
 
@@ -509,9 +479,7 @@ def _notes(scores: Scores) -> Iterator[str]:
         label = f" of {point['label']}" if scores.by_label else ""
         threshold = f"threshold {point['threshold']:.3f} on the log-odds{label}"
         yield f"{threshold}, chosen for {metrics.describe_point(point)}"
-    unreadable = scores.predicted.unreadable
-    if unreadable:
+    if unreadable := scores.predicted.unreadable:
         yield f"{len(unreadable)} unreadable: {', '.join(unreadable)}"
-    files = scores.predicted.left_out
-    if files:
+    if files := scores.predicted.left_out:
         yield f"{len(files)} left out, of kinds that are not read, like {files[0]}"

@@ -72,14 +72,12 @@ class StoredScores:
         labels = label_names(summary.get("label", ""))
         points = summary.get("operating_point", [])
         points = points if isinstance(points, list) else [points]
-        by_label = {}
-        if len(labels) > 1:
-            by_label = {label: Metrics.read(summary["by_label"][label]) for label in labels}
+        several = labels if len(labels) > 1 else []
         return cls(
             images=str(summary.get("images") or summary),  # Unknown images: equal scores only.
             labels=labels,
             overall=Metrics.read(summary),
-            by_label=by_label,
+            by_label={label: Metrics.read(summary["by_label"][label]) for label in several},
             thresholds={point["label"]: float(point["threshold"]) for point in points},
             operating_point=" or ".join(dict.fromkeys(map(describe_point, points))),
         )
@@ -236,13 +234,11 @@ def _read(folder: Path) -> RunSummary | None:
         from train.checkpoints import load_selected
 
         stored = load_selected(folder)[1].get("scores", {})
-        # Scores on photographs are mappings. The test accuracy is a number.
-        scores = {
-            key: StoredScores.read(value)
-            for key, value in stored.items()
-            if isinstance(value, dict)
-        }
-        return RunSummary(folder, name, settings, scores, stored.get("test/accuracy"))
+        accuracy = stored.get("test/accuracy")
+        # Scores on photographs are mappings. Others are numbers.
+        found = {key: value for key, value in stored.items() if isinstance(value, dict)}
+        scores = {key: StoredScores.read(value) for key, value in found.items()}
+        return RunSummary(folder, name, settings, scores, accuracy)
     return None
 
 
@@ -279,29 +275,28 @@ def _read_run(folder: Path) -> RunSummary:
 
 def read_summaries(folder: Path) -> dict[str, StoredScores]:
     """Read the scores of a classifier on photographs in all sub-folders of a folder."""
-    contents = {path: read_json(path) for path in sorted(folder.glob(f"*/{SUMMARY}"))}
+    paths = sorted(folder.glob(f"*/{SUMMARY}"))
     # Scores of a detector tell their task.
     return {
         path.parent.name: StoredScores.read(content)
-        for path, content in contents.items()
-        if "task" not in content
+        for path in paths
+        if "task" not in (content := read_json(path))
     }
 
 
 def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
-    """Find the settings in which runs differ.
+    """Find the settings in which runs differ, with their names in words.
 
     The kind of renders and the seed are left out, because tables always show them.
     """
     keys = {key for run in runs for key in run.settings} - {"augment.mode", "seed"}
-    varied = {}
-    for key in sorted(keys):
-        values = [run.settings.get(key) for run in runs]
-        if any(value != values[0] for value in values):
-            # "train.learning_rate" becomes "learning rate".
-            words = re.sub(r"^(augment|train|scene|renderer|evaluate)\.|[._]", " ", key)
-            varied[key] = words.strip()
-    return varied
+    # "train.learning_rate" becomes "learning rate".
+    prefixes = r"^(augment|train|scene|renderer|evaluate)\.|[._]"
+    return {
+        key: re.sub(prefixes, " ", key).strip()
+        for key in sorted(keys)
+        if any(run.settings.get(key) != runs[0].settings.get(key) for run in runs)
+    }
 
 
 def group_by_method(runs: Sequence[RunSummary]) -> Methods:
@@ -314,15 +309,13 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     # the same images. Those of later runs are named by the absolute path of their folder.
     initial: dict[str, RunSummary] = {}
     for before in filter(None, (run.before for run in runs)):
-        key = repr(before.settings)
-        first = initial.setdefault(key, before)
+        first = initial.setdefault(repr(before.settings), before)
         known = {scores.images for scores in first.photographs.values()}
-        more = {
-            str(before.folder.absolute() / name): scores
-            for name, scores in before.photographs.items()
-            if scores.images not in known
-        }
-        initial[key] = replace(first, photographs={**first.photographs, **more})
+        photographs = dict(first.photographs)
+        for name, scores in before.photographs.items():
+            if scores.images not in known:
+                photographs[str(before.folder.absolute() / name)] = scores
+        initial[repr(before.settings)] = replace(first, photographs=photographs)
     # The key of a group is the text of the settings without the seed.
     groups: dict[str, list[RunSummary]] = {}
     for run in (*initial.values(), *runs):
@@ -363,6 +356,22 @@ class ExampleRow(NamedTuple):
     after: str
     outcome: str
 
+    @classmethod
+    def read(cls, line: Mapping[str, Any]) -> "ExampleRow":
+        """Make the row from a line of attack.jsonl."""
+        views = []
+        for end in ("_before", ""):
+            pairs = zip(line[f"predicted{end}"], line[f"confidence{end}"], strict=True)
+            views.append(", ".join(f"{probability:.1%} {name}" for name, probability in pairs))
+        outcome = "success only without noise" if line["success_without_noise"] else "no success"
+        outcome = f"{'success' if line['success'] else outcome} in {int(line['steps'])} steps"
+        if line["success_before"]:
+            outcome = "wrong before any step"
+        # The dictionary removes the class of a view if an earlier view has the same class.
+        label = ", ".join(dict.fromkeys(map(str, line["label"])))
+        before, after = views
+        return cls(int(line["example"]), label, before, after, outcome)
+
 
 @dataclass(frozen=True)
 class AttackSummary:
@@ -401,7 +410,7 @@ def read_attack(folder: Path) -> AttackSummary:
         correct = [line for line in examples if not line["success_before"]]
         return AttackSummary(
             folder=folder,
-            rows=[_example_row(line) for line in examples],
+            rows=[*map(ExampleRow.read, examples)],
             successes=sum(bool(line["success"]) for line in correct),
             without_noise=sum(bool(line["success_without_noise"]) for line in correct),
             correct=len(correct),
@@ -413,26 +422,6 @@ def read_attack(folder: Path) -> AttackSummary:
             f"{path} is damaged or was written by no attack ({single_line(error)}): "
             "use the folder of another attack"
         ) from error
-
-
-def _example_row(line: Mapping[str, Any]) -> ExampleRow:
-    """Make the row of a table about an example."""
-    views = []
-    for end in ("_before", ""):
-        pairs = zip(line[f"predicted{end}"], line[f"confidence{end}"], strict=True)
-        views.append(", ".join(f"{probability:.1%} {name}" for name, probability in pairs))
-    outcome = "no success"
-    if line["success"]:
-        outcome = "success"
-    elif line["success_without_noise"]:
-        outcome = "success only without noise"
-    outcome = f"{outcome} in {int(line['steps'])} steps"
-    if line["success_before"]:
-        outcome = "wrong before any step"
-    # The dictionary removes the class of a view if an earlier view has the same class.
-    label = ", ".join(dict.fromkeys(map(str, line["label"])))
-    before, after = views
-    return ExampleRow(int(line["example"]), label, before, after, outcome)
 
 
 class Unfinished(NamedTuple):
@@ -492,8 +481,8 @@ def find(folders: Sequence[Path]) -> Findings:
         except (InputError, OSError) as error:
             # OSError is raised if the folder belongs to another user.
             found.unfinished.append(Unfinished(path, f"cannot be read: {error}", []))
-    modes = [*MODES]
-    found.runs.sort(key=lambda run: modes.index(run.mode) if run.mode in modes else -1)
+    order = {mode: number for number, mode in enumerate(MODES)}
+    found.runs.sort(key=lambda run: order.get(run.mode, -1))
     return found
 
 
@@ -524,13 +513,11 @@ def _walk(folder: Path) -> Iterator[Path]:
         path = Path(root)
         names = set(file_names)
         subfolders.sort()
-        is_run = not names.isdisjoint(FILES_OF_RUN)
-        is_other_result = not names.isdisjoint({LINES, *FILES_OF_NETWORK})
-        # A run that has not finished an epoch has only these files.
-        is_started_run = {CONFIG, "train.log"} <= names
+        is_run = bool(names & FILES_OF_RUN)
         if is_run:
             scored = {name for name in subfolders if (path / name / SUMMARY).is_file()}
             # os.walk continues with the folders that stay in this list.
             subfolders[:] = [name for name in subfolders if name not in {BEFORE, *scored}]
-        if is_run or is_other_result or is_started_run:
+        # A run that has not finished an epoch has only a configuration and a log.
+        if is_run or names & {LINES, *FILES_OF_NETWORK} or {CONFIG, "train.log"} <= names:
             yield path

@@ -1,12 +1,18 @@
 """Metrics with their 95% intervals, and tables, as text for people."""
 
+import csv
+import io
 import shutil
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import compress
+from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
+
+from renderer.io.files import atomic_write
 
 # What a 95% interval is over. Images of few objects say nothing about other objects.
 OBJECTS = "objects"
@@ -66,14 +72,9 @@ class Table:
     @property
     def without_unknown_columns(self) -> "Table":
         """Copy of the table without the columns whose cells are all "-", for unknown."""
-        known = [
-            column
-            for column in range(len(self.header))
-            if any(row[column] != "-" for row in self.rows)
-        ]
-        header = [self.header[column] for column in known]
-        rows = [[row[column] for column in known] for row in self.rows]
-        return Table(self.title, header, rows)
+        is_known = [any(cell != "-" for cell in cells) for cells in zip(*self.rows, strict=True)]
+        rows = [[*compress(row, is_known)] for row in self.rows]
+        return Table(self.title, [*compress(self.header, is_known)], rows)
 
     def __str__(self) -> str:
         lines = [[as_text(cell) for cell in line] for line in (self.header, *self.rows)]
@@ -96,6 +97,13 @@ class Table:
             rows = zip(*part, strict=True)
             paragraphs.append("\n".join(f"| {' | '.join(cells)} |" for cells in rows))
         return "\n\n".join(paragraphs)
+
+
+def write_csv(path: Path, rows: Iterable[Iterable[object]], line_end: str = "\n") -> None:
+    """Write rows, of which the first is the header, to a CSV file."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator=line_end).writerows(rows)
+    atomic_write(path, text.getvalue())
 
 
 def as_text(value: object) -> str:

@@ -50,7 +50,7 @@ def screen_of(labels: tuple[str, ...]) -> FirstScreen:
         [Evaluation(run, Pooled(predictions_of(predicted, labels)))]
         for predicted in (BEFORE, AFTER)
     )
-    return compare_networks("banana or mug", before, after, ("before", "after"), "Here", {})
+    return compare_networks(before, after, ("before", "after"))
 
 
 @pytest.mark.parametrize("labels", [LABELS, LABELS[:1]])

@@ -1,0 +1,357 @@
+"""Scores of a detector or a segmenter on photographs with boxes or masks, as tables and files."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from augment.classifier import TaskNetwork
+from augment.network import compute_outputs
+from augment.tasks.detection import Detection
+from renderer.errors import InputError, ShortRepr
+from renderer.image import to_unit
+from renderer.io.files import atomic_write
+from renderer.io.images import draw_grid, tiles_of, write_image
+from renderer.settings import height_and_width
+from train import console
+from train.class_names import class_of_name
+from train.data.annotations import (
+    FITS,
+    UNSCORED,
+    Annotated,
+    Annotations,
+    Fitted,
+    fit_batches,
+    fit_mask,
+    read_masks,
+)
+from train.results import detections, tables
+from train.results.detections import DetectionMetrics, Found, Marked, mean_iou
+from train.results.pictures import evenly_spaced
+from train.results.predictions import CONTACT_SHEET, begin_scores, write_summary
+from train.results.tables import Estimate, Table
+
+# Number of photographs that a network sees at a time.
+BATCH = 16
+# Photographs with what is found on the contact sheet, and in each of its rows.
+SHOWN, COLUMNS = 24, 4
+# Name of the metrics of all classes.
+ALL = "all"
+# File of all detections, in the form of COCO's results.
+DETECTIONS = "detections.json"
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class AnnotatedScores(ShortRepr):
+    """Scores of a network on photographs with boxes or masks.
+
+    Attributes:
+        file: File or folder of the annotations.
+        size: Height and width of the images of the network.
+        fit: How photographs are brought to this size, "letterbox" or "stretch".
+        photograph_count: Number of scored photographs.
+        missing: Names of photographs whose file or mask is missing.
+        contents: What the photographs have and lack, in words.
+        pictures: Some photographs with what is found in them, by name.
+    """
+
+    file: Path
+    size: tuple[int, int]
+    fit: str
+    photograph_count: int
+    missing: Sequence[str]
+    contents: str
+    pictures: Mapping[str, Tensor]
+
+    @property
+    def about(self) -> str:
+        """Sentence that says what is scored, and how."""
+        height, width = self.size
+        size = FITS[self.fit].format(f"{width} × {height}")
+        return f"{self.photograph_count} photographs{self.contents}, {size}"
+
+    def table(self) -> Table:
+        """Make the table that pnb-evaluate prints."""
+        raise NotImplementedError
+
+    def to_summary(self) -> dict[str, Any]:
+        """Convert the scores to the content of summary.json."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        """Return the lines that pnb-evaluate prints."""
+        return f"{self.about}\n{self.table()}"
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class DetectionScores(AnnotatedScores):
+    """Scores of a detector on photographs with boxes.
+
+    Attributes:
+        task: Detection with its threshold and IoU.
+        labels: Names of the scored classes. All their objects are marked.
+        overall: Metrics of all classes.
+        by_label: Metrics of each class.
+        by_source: Metrics of each class, and of all as "all", in each folder of
+            photographs. Empty with one folder.
+        detections: Each detection with its photograph, class, box (x, y, width,
+            height, in pixels of the photograph) and score.
+    """
+
+    task: Detection
+    labels: Sequence[str]
+    overall: DetectionMetrics
+    by_label: Mapping[str, DetectionMetrics]
+    by_source: Mapping[str, Mapping[str, DetectionMetrics]]
+    detections: Sequence[Mapping[str, Any]]
+
+    def table(self) -> Table:
+        """Make a table with a row for all classes, and one for each class in each folder."""
+        groups = {"": {ALL: self.overall, **self.by_label}, **self.by_source}
+        cells: list[list[object]] = []
+        shown: list[tables.Estimate] = []
+        for source, of_group in groups.items():
+            for name, metrics in of_group.items():
+                if name != ALL or len(self.labels) > 1:
+                    estimates = (metrics.recall, metrics.ap50, metrics.false_per_image)
+                    shown += estimates
+                    title = f"{source}: {name}" if source else name
+                    cells.append([title, metrics.n, *map(tables.format_interval, estimates)])
+        threshold, iou = self.task.threshold, self.task.iou
+        recall, false_count = f"recall at {threshold:g}", f"false per image at {threshold:g}"
+        title = f"IoU {iou:g}; {tables.describe_intervals(shown)}"
+        return Table(title, ["", "objects", recall, "AP50", false_count], cells)
+
+    def to_summary(self) -> dict[str, Any]:
+        """Convert the scores to the content of summary.json."""
+        by_source = {
+            source: {name: asdict(metrics) for name, metrics in of_source.items()}
+            for source, of_source in self.by_source.items()
+        }
+        return {
+            "task": self.task.name,
+            "threshold": self.task.threshold,
+            "iou": self.task.iou,
+            "size": self.size,
+            "fit": self.fit,
+            "label": self.labels,
+            "n": {"photographs": self.photograph_count, "objects": self.overall.n},
+            **asdict(self.overall),
+            "by_label": {name: asdict(metrics) for name, metrics in self.by_label.items()},
+            "by_source": by_source,
+            "missing": self.missing,
+        }
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class SegmentationScores(AnnotatedScores):
+    """Scores of a segmenter on photographs with masks.
+
+    Attributes:
+        miou: Mean IoU of the classes that occur, with its interval over photographs.
+        by_class: IoU of each of these classes, from the pixels of all photographs, which count
+            at the size of the network.
+    """
+
+    miou: Estimate
+    by_class: Mapping[str, float]
+
+    def table(self) -> Table:
+        """Make a table of the mean IoU and that of each class."""
+        rows = [["mean", tables.format_interval(self.miou)]]
+        rows += [[name, f"{iou:.3f}"] for name, iou in self.by_class.items()]
+        return Table(tables.describe_intervals([self.miou]), ["class", "IoU"], rows)
+
+    def to_summary(self) -> dict[str, Any]:
+        """Convert the scores to the content of summary.json."""
+        return {
+            "task": "segmentation",
+            "size": self.size,
+            "fit": self.fit,
+            "n": {"photographs": self.photograph_count},
+            "miou": asdict(self.miou),
+            "by_class": self.by_class,
+            "missing": self.missing,
+        }
+
+
+def evaluate_detector(
+    network: TaskNetwork,
+    annotations: Annotations,
+    labels: Sequence[str] | None,
+    how: str,
+    skip_unreadable: bool,
+    device: torch.device,
+) -> DetectionScores:
+    """Detect objects in photographs, and score the detections of some classes, or of all."""
+    label_of_class = _choose_labels(annotations, network.classes, labels)
+    task = network.task
+    assert isinstance(task, Detection)
+    size = height_and_width(network.size)
+    shown = {id(item) for item in evenly_spaced(annotations.photographs, SHOWN)}
+    read: list[tuple[Annotated, Fitted]] = []
+
+    def batches() -> Iterator[Tensor]:
+        for batch in fit_batches(annotations.photographs, size, how, BATCH, skip_unreadable):
+            # Only the pixels of pictures are kept.
+            none = np.empty((3, 0, 0), np.uint8)
+            for item, fitted in batch:
+                kept = fitted if id(item) in shown else fitted._replace(pixels=none)
+                read.append((item, kept))
+            yield torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch]))
+
+    outputs: Any = compute_outputs(network, batches(), BATCH, device)
+    found: list[Found] = []
+    marked: list[Marked] = []
+    listed: list[dict[str, Any]] = []
+    pictures = {}
+    for (item, fitted), output in zip(read, outputs, strict=True):
+        if fitted.pixels.size:
+            image = to_unit(torch.from_numpy(fitted.pixels))
+            pictures[item.name] = task.draw(image, output, network.classes)
+        boxes, own, scores = (output[key].cpu().numpy() for key in ("boxes", "labels", "scores"))
+        boxes, scores = fitted.to_photograph(boxes.astype(float)), scores.astype(float)
+        found.append(Found(boxes, own, scores))
+        names = [annotations.classes[label] for label in item.labels[fitted.is_kept]]
+        # Classes that are not scored have a label that no detection has.
+        true = np.array([label_of_class.get(name, -1) for name in names], int)
+        marked.append(Marked(fitted.boxes, true, item.is_crowd[fitted.is_kept]))
+        for box, label, score in zip(boxes, own, scores, strict=True):
+            left, top, right, bottom = box.round(2).tolist()
+            sides = [left, top, round(right - left, 2), round(bottom - top, 2)]
+            entry = {"file_name": item.name, "category": network.classes[label], "bbox": sides}
+            listed.append(entry | {"score": round(float(score), 4)})
+        if not fitted.is_kept.all():
+            console.warning("%s: a box without an area in the photograph is left out", item.name)
+    sources = [item.source for item, _ in read]
+    overall, by_label, by_source = _score(found, marked, label_of_class, sources, task)
+    missing = f" ({len(annotations.missing)} files are missing)" if annotations.missing else ""
+    return DetectionScores(
+        file=annotations.file,
+        size=size,
+        fit=how,
+        photograph_count=len(read),
+        missing=annotations.missing,
+        contents=f"{missing} with {overall.n} objects",
+        pictures=pictures,
+        task=task,
+        labels=[*label_of_class],
+        overall=overall,
+        by_label=by_label,
+        by_source=by_source,
+        detections=listed,
+    )
+
+
+def _choose_labels(
+    annotations: Annotations, classes: Sequence[str], labels: Sequence[str] | None
+) -> dict[str, int]:
+    """Return the index in a network of each scored class of annotations, by its name there."""
+    known = {name: class_of_name(name, classes) for name in annotations.classes}
+    chosen = [*known] if labels is None else [*labels]
+    unmarked = [name for name in chosen if name not in known]
+    if unmarked:
+        names = ", ".join(annotations.classes[:10])
+        raise InputError(f"{annotations.file} marks no {unmarked[0]}, but {names}", "label")
+    lacking = [name for name in chosen if known[name] is None]
+    if len(lacking) == len(chosen) or (labels and lacking):
+        raise InputError(
+            f"{annotations.file} marks {', '.join(lacking[:10])}, which are no classes of the "
+            f"network (such as {', '.join(classes[:3])}): give classes"
+        )
+    if lacking:
+        console.warning("not scored, because the network lacks them: %s", ", ".join(lacking))
+    return {name: classes.index(own) for name in chosen if (own := known[name]) is not None}
+
+
+def _score(
+    found: Sequence[Found],
+    marked: Sequence[Marked],
+    labels: Mapping[str, int],
+    sources: Sequence[str],
+    task: Detection,
+) -> tuple[DetectionMetrics, dict[str, DetectionMetrics], dict[str, dict[str, DetectionMetrics]]]:
+    """Score all classes, each class, and both for the photographs of each source."""
+    matches = [
+        detections.match_images(found, marked, [*labels.values()], iou) for iou in (task.iou, 0.5)
+    ]
+    groups = {ALL: [*labels.values()], **{name: [label] for name, label in labels.items()}}
+
+    def score(is_chosen: Bool[np.ndarray, " N"]) -> dict[str, DetectionMetrics]:
+        scores = {}
+        for name, chosen in groups.items():
+            at_iou, at_half = (
+                [of_label[label].select(is_chosen) for label in chosen] for of_label in matches
+            )
+            scores[name] = detections.score(at_iou, task.threshold, at_half)
+        return scores
+
+    by_source = {}
+    names = sorted({*sources})
+    for source in names if len(names) > 1 else []:
+        by_source[source or "."] = score(np.array([item == source for item in sources]))
+    by_label = score(np.ones(len(found), bool))
+    overall = by_label.pop(ALL)
+    return overall, by_label, by_source
+
+
+def evaluate_segmenter(
+    network: TaskNetwork, folder: Path, how: str, skip_unreadable: bool, device: torch.device
+) -> SegmentationScores:
+    """Segment photographs, and compare the classes of the pixels with those of masks."""
+    if len(network.classes) > UNSCORED:
+        reason = f"{network.title} has {len(network.classes)} classes"
+        raise InputError(f"{reason}: masks can have at most {UNSCORED}, as {UNSCORED} is no class")
+    photographs, masks, missing = read_masks(folder)
+    size = height_and_width(network.size)
+    shown = {item.name for item in evenly_spaced(photographs, SHOWN)}
+    pictures: dict[str, Tensor] = {}
+    count = 0
+
+    def pairs() -> Iterator[tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]]:
+        nonlocal count
+        for batch in fit_batches(photographs, size, how, BATCH, skip_unreadable):
+            if not batch:
+                continue
+            images = torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch]))
+            outputs = compute_outputs(network, images.to(device), BATCH)
+            for (item, fitted), image, output in zip(batch, images, outputs, strict=True):
+                count += 1
+                if item.name in shown:
+                    drawn = network.task.draw(to_unit(image), output.cpu(), network.classes)
+                    pictures[item.name] = drawn
+                mask = fit_mask(masks[item.name], fitted, len(network.classes))
+                yield output.argmax(0).cpu().numpy(), mask
+
+    miou, by_class = mean_iou(pairs(), len(network.classes))
+    named = zip(network.classes, by_class, strict=True)
+    known = {name: iou for name, iou in named if np.isfinite(iou)}
+    return SegmentationScores(
+        file=folder,
+        size=size,
+        fit=how,
+        photograph_count=count,
+        missing=missing,
+        contents=f" ({len(missing)} others have no mask)" if missing else "",
+        pictures=pictures,
+        miou=miou,
+        by_class=known,
+    )
+
+
+def write(scores: AnnotatedScores, out: Path) -> None:
+    """Write scores, all detections, and photographs with what is found to a folder."""
+    begin_scores(out)
+    if isinstance(scores, DetectionScores):
+        lines = ",\n".join(json.dumps(entry, ensure_ascii=False) for entry in scores.detections)
+        atomic_write(out / DETECTIONS, f"[\n{lines}\n]\n")
+    tiles = tiles_of(scores.pictures.values(), [(name,) for name in scores.pictures])
+    rows = [tiles[start : start + COLUMNS] for start in range(0, len(tiles), COLUMNS)]
+    write_image(out / CONTACT_SHEET, draw_grid(rows, heading=scores.about.replace("×", "x")))
+    write_summary(out, scores.to_summary())
