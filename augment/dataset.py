@@ -35,6 +35,8 @@ from renderer.settings import Size, height_and_width
 # Renders with consecutive indices are drawn together. Larger blocks would render more than
 # is asked for, smaller ones would prepare scenes more often.
 BLOCK = 32
+# Labels of objects without a class.
+NAMELESS = ("", NO_OBJECT)
 
 
 @dataclass(frozen=True)
@@ -219,10 +221,12 @@ def _renders(
 ) -> Iterator[LabeledRender]:
     """Yield the renders of some examples of a problem, with indices from `start`."""
     scene = problem.scene
-    names = [*dict.fromkeys(of for item in scene.objects for of in item.labels if of != "")]
+    names = [
+        *dict.fromkeys(of for item in scene.objects for of in item.labels if of not in NAMELESS)
+    ]
 
     def index_of(label: str | int) -> int:
-        return NO_OBJECT if label == "" else names.index(label)
+        return NO_OBJECT if label in NAMELESS else names.index(label)
 
     # One after another, so that image, truth and maps are of the same rasterized view.
     for example in rows.tolist():

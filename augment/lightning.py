@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any
 
 from torch import nn
+from torch.utils._pytree import tree_leaves
 from torch.utils.data import Dataset
 
 from augment.renders import Renders
@@ -34,8 +35,8 @@ def lightning_callback(service: AugmentationService, network: nn.Module | None =
     """Create a callback of PyTorch Lightning that renders anew in each epoch.
 
     Its attribute `renders` is a data set with the renders of the present epoch.
-    It can be concatenated with the user's data. Without persistent workers, a
-    `DataLoader` reads the new renders in each epoch.
+    It can be concatenated with the user's data. The `DataLoader` may have
+    workers that are not persistent.
 
     Args:
         service: The source of renders, on the device of the network.
@@ -72,11 +73,22 @@ def lightning_callback(service: AugmentationService, network: nn.Module | None =
         def __init__(self) -> None:
             self.renders = CurrentRenders(len(service))
 
-        def on_train_epoch_start(self, trainer: Any, pl_module: Any) -> None:
-            """Attack the weights as they are now."""
+        def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
+            """Attack the weights as they are now, before workers get the first renders."""
             attacked = pl_module if network is None else network
-            self.renders.current = service.regenerate(attacked, trainer.current_epoch)
-            for name, value in self.renders.current.diagnostics.items():
+            self.epoch = trainer.current_epoch
+            made = service.regenerate(attacked, self.epoch)
+            self.renders.current, self.diagnostics = made, made.diagnostics
+
+        def on_train_epoch_start(self, trainer: Any, pl_module: Any) -> None:
+            """Attack the weights as they are now, and log numbers about it."""
+            loaders = tree_leaves(trainer.train_dataloader)
+            if any(getattr(loader, "persistent_workers", False) for loader in loaders):
+                reason = "the loader has persistent_workers=True, which keep the first renders"
+                raise InputError(f"{reason}: set it to False")
+            if self.epoch != trainer.current_epoch:
+                self.on_fit_start(trainer, pl_module)
+            for name, value in self.diagnostics.items():
                 pl_module.log(f"renders/{name}", value)
 
     return RendersOfEpoch()

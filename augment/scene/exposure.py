@@ -13,8 +13,9 @@ from augment.scene.scene import Scene
 from augment.scene.truth import unlabeled
 from renderer.image import clamp, encode
 
-# Mean value of an object's pixels at the exposure "auto".
-MEAN = 0.4
+# Mean value of an object's pixels at the exposure "auto", and the largest one of its values
+# that are not 0, as most are in a black or in a red object.
+MEAN, LIT_MEAN = 0.4, 0.8
 # Means beyond these limits are warned about.
 DARK, BRIGHT = 0.05, 0.95
 # Largest number of examples of an object from which its exposure is chosen.
@@ -29,16 +30,18 @@ def expose(scene: Scene) -> Scene:
     for index, item in enumerate(scene.objects):
         rows = [row for row, example in enumerate(scene.examples) if example.object == index]
         values = _linear_values(scene, rows[:: -(-len(rows) // PROBED)]) if rows else torch.empty(0)
+        lit = float((values > 0).float().mean()) if rows else 0.0
+        aim = min(MEAN, LIT_MEAN * lit)
         low, high = -float(STOPS), float(STOPS)
         # The mean grows with the exposure. 40 halvings leave 2^-35 stops.
         for _ in range(40):
             middle = (low + high) / 2
             mean = encode(clamp(values * 2**middle), scene.settings.encoding).mean()
-            low, high = (middle, high) if mean < MEAN else (low, middle)
+            low, high = (middle, high) if mean < aim else (low, middle)
         # Nothing brightens what is black.
-        factors.append(2**low if (values > 0).any() else 1.0)
+        factors.append(2**low if lit else 1.0)
         if rows:
-            say_once(f"{item.name}: exposure={factors[-1]:.3g}, at which its mean is {MEAN}")
+            say_once(f"{item.name}: exposure={factors[-1]:.3g}, at which its mean is {aim:.2g}")
     examples = [
         replace(example, exposure=example.exposure * factors[example.object])
         for example in scene.examples
@@ -79,4 +82,6 @@ def warn_of_exposure(scene: Scene) -> None:
         if not DARK <= mean <= BRIGHT:
             kind = "dark" if mean < DARK else "bright"
             name = scene.objects[index].name
-            say_once(f"{name} is too {kind}: its mean is {mean:.2f}; set exposure=auto")
+            say_once(
+                f"{name} is too {kind}: its mean is {mean:.2f}; set exposure=auto or another light"
+            )

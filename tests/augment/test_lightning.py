@@ -6,6 +6,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 import norm_balls as nb
+from renderer.errors import InputError
 
 lightning = pytest.importorskip("lightning")
 pytestmark = [pytest.mark.ecosystem, pytest.mark.filterwarnings("default")]
@@ -29,7 +30,23 @@ class Module(lightning.LightningModule):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-def test_each_epoch_trains_on_the_renders_of_the_service_for_its_weights(tmp_path):
+@pytest.mark.parametrize("workers", [0, 2])
+def test_each_epoch_trains_on_the_renders_of_the_service_for_its_weights(workers, tmp_path):
+    service, module = fit(tmp_path, num_workers=workers)
+    for epoch, images, labels in module.seen:
+        expected = service.regenerate(module, epoch)
+        assert torch.equal(images[2:], expected.images)
+        assert torch.equal(labels[2:], expected.labels)
+    assert len(module.seen) == 2
+
+
+def test_workers_that_would_keep_the_first_renders_are_refused(tmp_path):
+    with pytest.raises(InputError, match="persistent"):
+        fit(tmp_path, num_workers=1, persistent_workers=True)
+
+
+def fit(tmp_path, **of_loader):
+    """Train for two epochs, and return the service and the module."""
     settings = nb.AugmentationSettings(mode="random")
     meshes = [("solid:orange", 0), ("solid:cup", 1)]
     options = {"views": 2, "backgrounds": [0.5], "samples": 1}
@@ -47,10 +64,6 @@ def test_each_epoch_trains_on_the_renders_of_the_service_for_its_weights(tmp_pat
         accelerator="cpu",
         default_root_dir=tmp_path,
     )
-    loader = DataLoader(torch.utils.data.ConcatDataset([data, callback.renders]), batch_size=6)
-    trainer.fit(module, loader)
-    for epoch, images, labels in module.seen:
-        expected = service.regenerate(module, epoch)
-        assert torch.equal(images[2:], expected.images)
-        assert torch.equal(labels[2:], expected.labels)
-    assert len(module.seen) == 2
+    both = torch.utils.data.ConcatDataset([data, callback.renders])
+    trainer.fit(module, DataLoader(both, batch_size=6, **of_loader))
+    return service, module

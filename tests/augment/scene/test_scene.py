@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 import renderer
@@ -87,6 +88,24 @@ def test_the_automatic_exposure_makes_the_mean_of_an_object_two_fifths(light, en
         pixels = images[rows].movedim(1, 0)[:, masks[rows]]
         assert float(pixels.mean()) == pytest.approx(0.4, abs=1e-5)
     assert scene.examples[0].exposure != scene.examples[3].exposure
+
+
+@pytest.mark.parametrize(("red", "white"), [(0, 0), (0, 2), (12, 0)])
+def test_an_object_that_is_mostly_black_or_red_is_not_overexposed(red, white, tmp_path):
+    box = trimesh.creation.box()
+    box.visual.face_colors = [
+        [255 * (face < max(red, white)), *[255 * (face < white)] * 2, 255] for face in range(12)
+    ]
+    box.export(tmp_path / "box.ply")
+    options = {"light": "grace", "backgrounds": [0.0], "exposure": "auto"}
+    scene = build_scene([(str(tmp_path / "box.ply"), "box")], 24, 6, **options)
+    images = scene.render(scene.conditions(torch.arange(6)), torch.arange(6))[:, 0]
+    masks = scene.truth(lambda label: 0).masks[:, 0, 0]
+    values = images.movedim(1, 0)[:, masks]
+    if red or white:
+        assert float(values[values > 0].mean()) == pytest.approx(0.8, abs=0.01)
+    else:
+        assert scene.examples[0].exposure == 1
 
 
 @pytest.mark.parametrize(("exposure", "word"), [(1e-3, "dark"), (1e3, "bright"), (1.0, "")])

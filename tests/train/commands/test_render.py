@@ -280,6 +280,13 @@ def test_all_objects_of_an_entry_are_in_the_image(meshes, size):
         assert max(right.max() - left.min(), bottom.max() - top.min()) > 12
 
 
+@pytest.mark.parametrize("label", ["", -1])
+def test_an_object_without_a_class_is_not_labeled(meshes, label):
+    items = [[meshes[0]["mesh"], "box"], [meshes[1]["mesh"], label]]
+    [render] = render_dataset([[tuple(item) for item in items]], 24, 1)
+    assert render.labels == ["box"] and len(render.boxes) == len(render.masks) == 1
+
+
 def test_a_light_that_is_named_replaces_those_that_are_drawn():
     drawn = "augment.vary.environments="
     for name in ("light", "scene.light"):
