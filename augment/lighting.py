@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import accumulate
 from typing import Any, NamedTuple, cast
@@ -24,14 +24,14 @@ from torchvision import tv_tensors
 from torchvision.transforms import v2
 
 from augment.random_streams import generator, stream_seed
-from augment.scene.lights import MODELS, Illumination, LightModel
+from augment.scene import loops
+from augment.scene.lights import MODELS, Drawn, Illumination, LightModel, LowLight, normal_noise
+from augment.scene.loops import BINS
 from augment.scene.patterns import draw_projected_light, luminance, require_photographs
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import decode, encode, to_bytes, to_unit
 
-# Linear values are looked up in so many bins. Each has at most one limit between two bytes.
-BINS = 4096
 # Keys of a sample at which a plain tensor is an image, whatever stands before it.
 IMAGES = ("image", "images", "img", "pixel_values")
 # Modes of Pillow's images that are relit as they are, and those that are converted before.
@@ -395,10 +395,8 @@ def _relight(
     is_integer = not images.is_floating_point()
     largest = torch.iinfo(images.dtype).max if is_integer else 1
     if images.dtype == torch.uint8 and not values.requires_grad:
-        if model.has_noise:
-            radiance = _decoded(colors) * light.total()
-            radiance = model.camera(radiance, drawn, strength, radiance.new_tensor(1.0))
-            relit = relit_bytes(torch.full_like(colors, 255), Illumination(radiance))
+        if isinstance(model, LowLight):
+            relit = _noisy_bytes(colors, model, drawn, strength)
         else:
             relit = relit_bytes(colors, light)
     else:
@@ -442,76 +440,48 @@ def _tables(device: torch.device) -> Tables:
     return Tables(*(table.to(device) for table in (decoded.float(), lowest.byte(), limit)))
 
 
-def _decoded(colors: UInt8[Tensor, "N C H W"]) -> Float[Tensor, "N C H W"]:
-    """Look up the linear values of bytes."""
-    flat = colors.flatten().int()
-    return _tables(colors.device).decoded.index_select(0, flat).view(colors.shape)
+def _noisy_bytes(
+    colors: UInt8[Tensor, "N C H W"], model: LowLight, drawn: Drawn, strength: float
+) -> UInt8[Tensor, "N C H W"]:
+    """Return the nearest bytes of what a camera measures, from a table of its response to each."""
+    tables = _tables(colors.device)
+    decoded = tables.decoded.expand(len(colors), 1, 1, -1)
+    response = model.response(decoded, drawn, strength, decoded.new_ones(()))
+    z = normal_noise(tables.decoded.new_empty(colors.shape), drawn.seeds)
+    levels = torch.arange(model.levels + 1, device=colors.device).view(1, 1, 1, -1) / model.levels
+    encoded = relit_bytes(torch.full_like(levels, 255, dtype=torch.uint8), Illumination(levels))
+    if loop := loops.noisy_bytes(z):
+        parts = [part.flatten(1) for part in (colors, z, *response)]
+        loop(*parts, encoded.flatten(), (noisy := torch.empty_like(parts[0])))
+        return noisy.view(colors.shape)
+    first = 256 * torch.arange(len(colors), device=colors.device, dtype=torch.int32)
+    index = (colors.int() + first[:, None, None, None]).flatten()
+    middle, slope, curve = (
+        part.flatten().index_select(0, index).view(colors.shape) for part in response
+    )
+    signal = curve.mul_(z).add_(slope).mul_(z).add_(middle).clamp_(0, model.levels).round_()
+    return encoded.flatten().index_select(0, signal.int().flatten()).view(colors.shape)
 
 
 def relit_bytes(colors: UInt8[Tensor, "N C H W"], light: Illumination) -> UInt8[Tensor, "N C H W"]:
     """Multiply the linear colors of bytes by light, and return the nearest bytes."""
     tables = _tables(colors.device)
-    kernel = _kernel() if colors.device.type == "cpu" else None
-    if kernel is None:
-        linear = (_decoded(colors) * light.total()).clamp_(max=1)
+    loop = loops.relit_bytes(colors)
+    if loop is None:
+        decoded = tables.decoded.index_select(0, colors.flatten().int()).view(colors.shape)
+        linear = (decoded * light.total()).clamp_(max=1)
         bins = (linear * BINS).int()
         return tables.lowest[bins] + (linear >= tables.limit[bins])
-    relit = torch.empty(colors.shape, dtype=torch.uint8)
     count, channels = colors.shape[:2]
     gain, offset = (
         torch.as_tensor(part, dtype=torch.float32).expand(count, channels, 1, 1)[..., 0, 0]
         for part in light[1:]
     )
-    kernel(
-        colors.flatten(2).contiguous().numpy(),
-        light.field.detach().float().flatten(2).contiguous().numpy(),
-        gain.contiguous().numpy(),
-        offset.contiguous().numpy(),
-        *(table.numpy() for table in tables),
-        relit.flatten(2).numpy(),
+    flat = colors.flatten(2).contiguous()
+    loop(
+        flat, light.field.float().flatten(2), gain, offset, *tables, relit := torch.empty_like(flat)
     )
-    return relit
-
-
-@cache
-def _kernel() -> Callable[..., None] | None:
-    """Compile `relit_bytes` as one loop, or return None without numba."""
-    try:
-        import numba
-    except ImportError:
-        return None
-    image, rows, table = "uint8[:,:,::1]", "float32[:,::1]", "float32[::1]"
-    kinds = f"void({image},float32[:,:,::1],{rows},{rows},{table},uint8[::1],{table},{image})"
-    compiled: Callable[..., None] = numba.njit(kinds, cache=True, nogil=True)(_relit_bytes)
-    return compiled
-
-
-def _relit_bytes(
-    colors: np.ndarray,
-    field: np.ndarray,
-    gain: np.ndarray,
-    offset: np.ndarray,
-    decoded: np.ndarray,
-    lowest: np.ndarray,
-    limit: np.ndarray,
-    relit: np.ndarray,
-) -> None:
-    """Relight one byte after the other, with the arithmetic of the tables in `relit_bytes`."""
-    one, bins = np.float32(1), np.float32(BINS)
-    pixels = colors.shape[2]
-    for image in range(len(colors)):
-        for channel in range(colors.shape[1]):
-            given, shown = colors[image, channel], relit[image, channel]
-            # A field of one value or of one channel stands for all.
-            row = field[image, min(channel, field.shape[1] - 1)]
-            factor, added = gain[image, channel], offset[image, channel]
-            step = 1 if len(row) == pixels else 0
-            for pixel in range(pixels):
-                light = factor * row[pixel * step] + added
-                value = min(decoded[given[pixel]] * light, one)
-                # Unsigned indices need no check for negative ones.
-                index = np.uint32(np.int32(value * bins))
-                shown[pixel] = lowest[index] + (value >= limit[index])
+    return relit.view(colors.shape)
 
 
 def _albumentations(lighting: RandomLighting) -> Any:

@@ -15,7 +15,7 @@ The image is 2 units wide: x points to the right, y down, and heights towards th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, NamedTuple
@@ -24,11 +24,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from augment.scene import loops
+from augment.scene.black_body import planckian_rgb
 from augment.scene.patterns import (
     AMBIENT,
     DARKEST,
     STOPS,
+    by_kind,
     draw_slides,
+    fraction,
     luminance,
     random_colors,
     require_photographs,
@@ -39,8 +43,10 @@ from augment.scene.surfaces import (
     SURFACE_NODES,
     Surface,
     axes,
+    direction,
     lambert,
     smooth,
+    spline,
     surface_of_depth,
 )
 from renderer import errors
@@ -53,17 +59,14 @@ def between(numbers: Tensor, low: float, high: float) -> Tensor:
     return low + (high - low) * numbers
 
 
-def normal_numbers(uniform: Float[Tensor, "B E"], nodes: int) -> Float[Tensor, "B 1 nodes nodes"]:
-    """Convert the first uniform numbers to standard normal ones at a grid of nodes."""
-    inside = uniform[:, : nodes**2].clamp(1e-6, 1 - 1e-6)
-    return (2**0.5 * torch.erfinv(2 * inside - 1)).view(-1, 1, nodes, nodes)
+def normal_numbers(uniform: Float[Tensor, " *S"]) -> Float[Tensor, " *S"]:
+    """Convert uniform numbers to standard normal ones."""
+    return 2**0.5 * torch.erfinv(2 * uniform.clamp(1e-6, 1 - 1e-6) - 1)
 
 
-def blend(
-    uniform: Float[Tensor, "B E"], nodes: int, angle: Float[Tensor, "B 1 1 1"]
-) -> Float[Tensor, "B 1 nodes nodes"]:
-    """Blend two grids of normal numbers. The variance is the same at any angle."""
-    first, second = (normal_numbers(uniform[:, start:], nodes) for start in (0, nodes**2))
+def blend(uniform: Float[Tensor, "B E"], angle: Float[Tensor, "B 1 1 1"]) -> Tensor:
+    """Blend the halves of uniform numbers to normal ones, whose variance holds at any angle."""
+    first, second = normal_numbers(uniform)[..., None, None].chunk(2, 1)
     return angle.cos() * first + angle.sin() * second
 
 
@@ -99,12 +102,12 @@ LAMP = (Range(-1.5, 1.5), Range(-1.5, 1.5), Range(0.4, 2.0, True))
 class Drawn(NamedTuple):
     """Numbers of the lights of B images, and what the lights depend on.
 
-    `numbers` are what light depends on smoothly, in their ranges, shape (B, 1, 1, 1) each. The
-    `constants` are uniform in [0, 1], shape (B, E). `seeds` are for the noise and for slides.
+    `numbers` are what light depends on smoothly, in their ranges. The `constants` are uniform in
+    [0, 1]. `seeds` are for the noise and for slides.
     """
 
-    numbers: Sequence[Tensor]
-    constants: Tensor
+    numbers: Float[Tensor, "D B 1 1 1"]
+    constants: Float[Tensor, "B E"]
     size: Size
     depth: Tensor | None
     seeds: Sequence[int]
@@ -113,8 +116,8 @@ class Drawn(NamedTuple):
         """Return the surface of the depth of the images, or a random smooth one."""
         if self.depth is not None:
             return surface_of_depth(self.depth)
-        heights = normal_numbers(self.constants[:, start:], SURFACE_NODES)
-        nodes = steepness * heights
+        heights = normal_numbers(self.constants[:, start : start + SURFACE_NODES**2])
+        nodes = steepness * heights.view(-1, 1, SURFACE_NODES, SURFACE_NODES)
         down, right = (smooth(nodes, self.size, slope) for slope in "yx")
         return Surface(down, right, (*axes(self.size, nodes), smooth(nodes, self.size)))
 
@@ -143,8 +146,7 @@ class LightModel:
     constants: ClassVar[int] = 0
     # Whether a meter sets the exposure, of which the last number has the stops.
     has_meter: ClassVar[bool] = False
-    # Whether the camera adds noise, and whether it clips values above the white of HDR images.
-    has_noise: ClassVar[bool] = False
+    # Whether the camera clips values above the white of HDR images.
     has_limit: ClassVar[bool] = False
 
     @property
@@ -167,8 +169,9 @@ class LightModel:
         low, span, is_geometric = _ranges(self.ranges, values.device, values.dtype)
         numbers = torch.addcmul(low, span, values[:, : self.dimensions])
         numbers = torch.where(is_geometric, numbers.exp(), numbers)
-        columns = numbers.T[..., None, None, None].unbind()
-        return Drawn(columns, values[:, self.dimensions :], size, depth, seeds)
+        return Drawn(
+            numbers.T[..., None, None, None], values[:, self.dimensions :], size, depth, seeds
+        )
 
     def illumination(self, drawn: Drawn, strength: float = 1.0) -> Illumination:
         """Mix the light with the unchanged light, and expose it."""
@@ -210,17 +213,16 @@ class ProjectedSlide(LightModel):
         """Project a picture of its own on each image."""
         draws = [torch.Generator().manual_seed(seed) for seed in drawn.seeds]
         pictures = torch.cat([draw_slides(1, drawn.size, draw, self.slides) for draw in draws])
-        log_gain = torch.cat(list(drawn.numbers[4:-1]), 1).view(-1, 3, self.cells, self.cells)
+        log_gain = drawn.numbers[4:-1, :, 0, 0, 0].T.reshape(-1, 3, self.cells, self.cells)
         gain = smooth(log_gain, drawn.size, mode="bilinear").exp()
-        return Illumination(pictures.to(gain) * gain * shading(drawn), offset=drawn.numbers[3])
+        return Illumination(gain * pictures.to(gain) * shading(drawn), offset=drawn.numbers[3])
 
 
 def shading(drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
     """Compute the shading of a surface from its steepness and the direction of the light."""
     steepness, azimuth, polar, *_ = drawn.numbers
     surface = drawn.surface(steepness)
-    to_light = polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()
-    return lambert(surface.slope_down, surface.slope_right, *to_light)
+    return lambert(surface.slope_down, surface.slope_right, *direction(azimuth, polar))
 
 
 @dataclass(frozen=True)
@@ -240,15 +242,25 @@ class DirectionalLight(LightModel):
 
 
 def lamp_light(
-    surface: Surface, right: Tensor, down: Tensor, above: Tensor
-) -> Float[Tensor, "B 1 H W"]:
-    """Compute the irradiance of a small lamp, cos / distance², in units of that right below it."""
+    surface: Surface,
+    right: Float[Tensor, "B L 1 1"],
+    down: Float[Tensor, "B L 1 1"],
+    above: Float[Tensor, "B L 1 1"],
+) -> Float[Tensor, "B L H W"]:
+    """Compute the irradiance of small lamps, cos / distance², in units of that right below them."""
     x, y, height = surface.position
+    # With a depth, x and y differ from pixel to pixel.
+    if len(x.flatten()) == x.shape[3] and (loop := loops.lamps(right + height)):
+        slopes = surface.slope_down[:, 0], surface.slope_right[:, 0]
+        places = torch.cat([right, down, above], 3)[:, :, 0]
+        field = height.new_empty(*right.shape[:2], *height.shape[2:])
+        loop(*slopes, height[:, 0], x.flatten(), y.flatten(), places, field)
+        return field
     # No surface is nearer to the lamp than a tenth of its distance.
-    offsets = right - x, down - y, (above - height).clamp(min=0.1 * above)
-    squares = offsets[0] ** 2 + offsets[1] ** 2 + offsets[2] ** 2
+    offsets = right - x, down - y, torch.maximum(above - height, 0.1 * above)
+    squares = torch.addcmul(offsets[0] ** 2 + offsets[1] ** 2, offsets[2], offsets[2])
     cosine = lambert(surface.slope_down, surface.slope_right, *offsets)
-    return cosine * (above**2 / (squares * squares.sqrt()))
+    return cosine * (squares * squares.sqrt()).reciprocal() * above**2
 
 
 @dataclass(frozen=True)
@@ -279,18 +291,19 @@ class ColoredLamps(LightModel):
 
     def light(self, drawn: Drawn) -> Illumination:
         """Add the light of the lamps, of which some are off, to weak ambient light."""
-        steepness, *lamps, ambient, _ = drawn.numbers
-        surface = drawn.surface(steepness, start=1)
+        surface = drawn.surface(drawn.numbers[0], start=1)
         # Index of the last lamp of each image that is on.
         last = (3 * drawn.constants[:, :1]).floor().clamp(max=2)
-        colors, fields = [], []
-        for lamp in range(int(last.max()) + 1):
-            *place, hue, saturation = lamps[5 * lamp : 5 * lamp + 5]
-            color = random_colors(torch.cat([hue, saturation], 1)[:, :, 0, 0])[..., 0]
-            colors.append(color * (last >= lamp)[..., None])
-            fields.append(lamp_light(surface, *place))
-        mixed = torch.cat(colors, 2) @ torch.cat(fields, 1).flatten(2)
-        return Illumination(mixed.unflatten(2, fields[0].shape[2:]), offset=ambient)
+        count = int(last.max()) + 1
+        # Numbers of each lamp, shape (5, B, count).
+        lamps = drawn.numbers[1 : 1 + 5 * count, :, 0, 0, 0].unflatten(0, (count, 5))
+        *place, hue, saturation = lamps.permute(1, 2, 0)
+        colors = random_colors(torch.stack([hue, saturation], 2).flatten(0, 1))
+        is_on = torch.arange(count, device=last.device) <= last
+        colors = colors.view(-1, count, 3) * is_on[..., None]
+        fields = lamp_light(surface, *(numbers[..., None, None] for numbers in place))
+        mixed = colors.mT @ fields.flatten(2)
+        return Illumination(mixed.unflatten(2, fields.shape[2:]), offset=drawn.numbers[-2])
 
 
 @dataclass(frozen=True)
@@ -328,13 +341,20 @@ class FractalLight(LightModel):
     def light(self, drawn: Drawn) -> Illumination:
         """Blend two random fields of the same variance, and take the exponential."""
         contrast, angle, _ = drawn.numbers
-        nodes = torch.zeros_like(contrast)
-        start = 0
-        for octave, count in enumerate(self.octaves):
-            blended = blend(drawn.constants[:, start:], count, angle)
-            nodes = nodes + 0.5**octave * smooth(blended, self.octaves[-1])
-            start += 2 * count**2
-        return Illumination(smooth(contrast * nodes, drawn.size).exp())
+        blended = blend(drawn.constants, angle)[..., 0, 0]
+        nodes = blended @ _sum_of_octaves(self.octaves, angle.device, angle.dtype)
+        nodes = contrast * nodes.view(-1, 1, self.octaves[-1], self.octaves[-1])
+        return Illumination(smooth(nodes, drawn.size).exp())
+
+
+@lru_cache(maxsize=8)
+@torch.inference_mode(False)
+def _sum_of_octaves(
+    octaves: Sequence[int], device: torch.device, dtype: torch.dtype
+) -> Float[Tensor, "E nodes"]:
+    """Return the matrix that adds the nodes of all octaves at the nodes of the last one."""
+    parts = [spline(count, octaves[-1], 0.0, "bicubic", device, dtype) for count in octaves]
+    return torch.cat([0.5**i * torch.kron(part, part).T for i, part in enumerate(parts)])
 
 
 def circle_segment(distance: Tensor) -> Tensor:
@@ -345,9 +365,6 @@ def circle_segment(distance: Tensor) -> Tensor:
     """
     t = distance.clamp(-1 + 1e-6, 1 - 1e-6)
     return torch.addcmul(torch.asin(t), t, torch.addcmul(t.new_ones(()), t, t, value=-1).sqrt())
-
-
-Along = Callable[[Tensor | float, Tensor | float, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -383,100 +400,66 @@ class CastShadow(LightModel):
     def light(self, drawn: Drawn) -> Illumination:
         """Compute the light of the sun and of the sky."""
         kinds = (drawn.constants[:, 0] * len(self.kinds)).long().clamp(max=len(self.kinds) - 1)
-        if len(kinds) == 1:
-            part = drawn._replace(constants=drawn.constants[:, 1:])
-            return self._light(self.kinds[int(kinds)], part)
-        of_kind = [torch.nonzero(kinds == kind)[:, 0] for kind in range(len(self.kinds))]
-        parts = []
-        for kind, rows in zip(self.kinds, of_kind, strict=True):
-            numbers = [column[rows] for column in drawn.numbers]
-            part = drawn._replace(numbers=numbers, constants=drawn.constants[rows, 1:])
-            parts.append(self._light(kind, part))
-        order = torch.cat(of_kind).argsort()
-        return Illumination(*(torch.cat(part)[order] for part in zip(*parts, strict=True)))
 
-    def _light(self, kind: str, drawn: Drawn) -> Illumination:
-        """Compute the light of shadows of one kind."""
-        right, down, angle, scale, softness, ambient, blue = drawn.numbers
+        def segment(kind: int, rows: list[int] | slice) -> Tensor:
+            numbers, constants = drawn.numbers[:, rows], drawn.constants[rows, 1:]
+            part = drawn._replace(numbers=numbers, constants=constants)
+            return self._segment(self.kinds[kind], part)
+
+        *_, ambient, blue = drawn.numbers
+        # Light of the sky in the shadow, relative to that of sun and sky.
+        sky = ambient - ambient * torch.cat([0.5 * blue, 0.2 * blue, 0 * blue], 1)
+        return Illumination(by_kind(kinds.tolist(), segment), (1 - sky) / math.pi, (1 + sky) / 2)
+
+    def _segment(self, kind: str, drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
+        """Compute the segment of the sun, which depends on the distance to the edge of a shadow.
+
+        Distances are positive in the light, and in units of the penumbra's radius.
+        """
+        right, down, angle, scale, softness, *_ = drawn.numbers
         if kind == "leaves":
-            nodes = blend(drawn.constants, self.nodes, angle)
+            nodes = blend(drawn.constants, angle).view(-1, 1, self.nodes, self.nodes)
             # The heights are 0 at the edges between leaves and gaps.
             height = smooth(nodes, drawn.size) - right
             slopes = [smooth(nodes, drawn.size, slope) for slope in "xy"]
             # Distance to the edge, to first order.
             squares = torch.addcmul(slopes[0] * slopes[0], slopes[1], slopes[1])
-            distance = height * (squares + 1e-6).rsqrt() / softness
+            return circle_segment(height * (squares + 1e-6).rsqrt() / softness)
+        x, y = axes(drawn.size, right)
+        x, y, scale = (x - right) / softness, (y - down) / softness, scale / softness
+        constants = drawn.constants[..., None, None]
+        period, back = scale / scale, 0 * scale
+        limits = [back] * 3
+        index = torch.arange(self.corners, device=scale.device)[:, None, None]
+        if kind == "polygon":
+            turns, far = constants[:, : 2 * self.corners].chunk(2, 1)
+            normal = angle + 2 * math.pi / self.corners * (index + 0.8 * turns)
+            back = scale * between(far, 0.4, 1.0)
+        elif kind == "blinds":
+            normal, period = angle + math.pi / 2, scale / 2.5
+            limits[:2] = between(constants[:, :1], 0.15, 0.35), period
         else:
-            x, y = axes(drawn.size, right)
-            x, y = x - right, y - down
-            # Distances are in units of the penumbra's radius.
-            cosine, sine, scale = angle.cos() / softness, angle.sin() / softness, scale / softness
-
-            def along(first: Tensor | float, second: Tensor | float, back: Tensor) -> Tensor:
-                """Return first · p + second · q − back, where p and q turn with the shape."""
-                right, down = first * cosine - second * sine, first * sine + second * cosine
-                return right * x + (down * y - back)
-
-            constants = drawn.constants[..., None, None]
-            distance = getattr(self, f"_{kind}")(along, scale, constants)
-        segment = circle_segment(distance)
-        # Light of the sky in the shadow, relative to that of sun and sky.
-        tint = torch.cat([0.5 * blue, 0.2 * blue, 0 * blue], 1)
-        sky = ambient - ambient * tint
-        return Illumination(segment, (1 - sky) / math.pi, (1 + sky) / 2)
-
-    def _polygon(self, along: Along, scale: Tensor, constants: Tensor) -> Tensor:
-        """Return the distance outside a convex polygon, which is exact except near corners."""
-        turns, far = constants[:, : self.corners], constants[:, self.corners : 2 * self.corners]
-        index = torch.arange(self.corners, device=far.device).view(1, -1, 1, 1)
-        angle = 2 * math.pi / self.corners * (index + 0.8 * turns)
-        cosine, sine, far = angle.cos(), angle.sin(), scale * between(far, 0.4, 1.0)
-        distance = along(cosine[:, :1], sine[:, :1], far[:, :1])
-        for corner in range(1, self.corners):
-            one = slice(corner, corner + 1)
-            edge = along(cosine[:, one], sine[:, one], far[:, one])
-            distance = torch.maximum(distance, edge)
-        return distance
-
-    def _blinds(self, along: Along, scale: Tensor, constants: Tensor) -> Tensor:
-        """Return the distance inside the gaps between parallel slats, of which a period is 0.4."""
-        across = along(0.0, 2.5 / scale, 0 * scale)
-        gap = between(constants[:, :1], 0.15, 0.35)
-        return (gap - (across - across.floor() - 0.5).abs()) * (scale / 2.5)
-
-    def _window(self, along: Along, scale: Tensor, constants: Tensor) -> Tensor:
-        """Return the distance inside the panes of a window with a cross bar."""
-        high = scale * between(constants[:, :1], 0.6, 1.6)
-        bar = scale * between(constants[:, 1:2], 0.03, 0.12)
-        p, q = along(1.0, 0.0, 0 * scale).abs(), along(0.0, 1.0, 0 * scale).abs()
-        return torch.minimum(torch.minimum(scale - p, high - q), torch.minimum(p - bar, q - bar))
-
-
-def planckian_locus(kelvin: Tensor) -> tuple[Tensor, Tensor]:
-    """Return CIE 1960 u and v of a black body at 1,000 to 15,000 K, within 1e-4 (Krystek 1985)."""
-    u = (0.860117757 + 1.54118254e-4 * kelvin + 1.28641212e-7 * kelvin**2) / (
-        1 + 8.42420235e-4 * kelvin + 7.08145163e-7 * kelvin**2
-    )
-    v = (0.317398726 + 4.22806245e-5 * kelvin + 4.20481691e-8 * kelvin**2) / (
-        1 - 2.89741816e-5 * kelvin + 1.61456053e-7 * kelvin**2
-    )
-    return u, v
-
-
-def planckian_rgb(kelvin: Tensor, offset: Tensor | float = 0.0) -> Float[Tensor, "... 3 1 1"]:
-    """Return the linear RGB, with Y = 1, of a color at a distance (Duv) above a black body."""
-    u, v = planckian_locus(kelvin)
-    hotter_u, hotter_v = planckian_locus(1.01 * kelvin)
-    # A hotter body has less u and v. The normal of the locus points to green.
-    along_u, along_v = hotter_u - u, hotter_v - v
-    length = (along_u**2 + along_v**2).sqrt()
-    u, v = u + offset * along_v / length, v - offset * along_u / length
-    # CIE 1960 (u, v) to X and Z at Y = 1: X / Y = 3u / 2v and Z / Y = (4 − u − 10v) / 2v.
-    x, z = 3 * u / (2 * v), (4 - u - 10 * v) / (2 * v)
-    red = 3.2404542 * x - 1.5371385 - 0.4985314 * z
-    green = -0.9692660 * x + 1.8760108 + 0.0415560 * z
-    blue = 0.0556434 * x - 0.2040259 + 1.0572252 * z
-    return torch.cat([red, green, blue], -3).clamp(min=1e-3)
+            normal = angle + math.pi / 2 * index[:2]
+            high, bar = between(constants[:, :1], 0.6, 1.6), between(constants[:, 1:2], 0.03, 0.12)
+            limits = [scale, scale * high, scale * bar]
+        # Distances of each column, and of each row, along the normals of the shape.
+        columns, rows = normal.cos() * x / period, (normal.sin() * y - back) / period
+        if loop := loops.penumbra(columns):
+            segment = columns.new_empty(len(columns), *height_and_width(drawn.size))
+            of_kind = ("polygon", "blinds", "window").index(kind)
+            loop(of_kind, columns[:, :, 0], rows[..., 0], torch.cat(limits, 1)[..., 0, 0], segment)
+            return segment[:, None]
+        edges = columns + rows
+        if kind == "polygon":
+            # Outside a convex polygon. The distance is exact except near corners.
+            return circle_segment(edges.amax(1, keepdim=True))
+        if kind == "blinds":
+            # Inside the gaps between parallel slats, with a period of 0.4 in units of the scale.
+            return circle_segment((limits[0] - (fraction(edges) - 0.5).abs()) * period)
+        # Inside the panes of a window with a cross bar.
+        p, q = edges.abs().split(1, 1)
+        inside = torch.minimum(limits[0] - p, limits[1] - q)
+        return circle_segment(torch.minimum(inside, torch.minimum(p, q) - limits[2]))
 
 
 @dataclass(frozen=True)
@@ -517,7 +500,6 @@ class LowLight(LightModel):
     levels: ClassVar[int] = 2**12 - 1
     # Fraction of the stops, read noise in electrons, and fraction that the gain recovers.
     ranges = (Range(0, 1), Range(1, 5), Range(0, 1))
-    has_noise = True
 
     def __post_init__(self) -> None:
         errors.require_number("exposure", self.exposure, 1e-6, 1)
@@ -530,17 +512,23 @@ class LowLight(LightModel):
         self, radiance: Float[Tensor, "B C H W"], drawn: Drawn, strength: float, white: Tensor
     ) -> Float[Tensor, "B C H W"]:
         """Count electrons, add noise, amplify and round. Gradients pass through the rounding."""
+        z = normal_noise(radiance, drawn.seeds)
+        middle, slope, curve = self.response(radiance, drawn, strength, white)
+        signal = torch.addcmul(middle, z, torch.addcmul(slope, z, curve)).clamp(0, self.levels)
+        return _rounded(signal) * (white / self.levels)
+
+    def response(
+        self, radiance: Float[Tensor, "B C H W"], drawn: Drawn, strength: float, white: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return a, b and c, where a + b z + c z² is the signal of the amplifier."""
         darkness, read, recovered = drawn.numbers
         stops = strength * math.log2(1 / self.exposure) * darkness
         mean = radiance.clamp(min=0) * (self.full_well * torch.exp2(-stops) / white)
         variance = mean + read**2
-        z, ratio = normal_noise(radiance, drawn.seeds), mean / variance
-        slope = torch.addcmul(variance.sqrt(), z, ratio, value=1 / 6)
-        electrons = torch.addcmul(mean, z, slope).sub(ratio, alpha=1 / 6)
-        # The gain of the amplifier, after which a full pixel has the largest number.
+        # After the gain of the amplifier, a full pixel has the largest number.
         gain = torch.exp2(stops * recovered) * (self.levels / self.full_well)
-        signal = (electrons * gain).clamp(0, self.levels)
-        return _rounded(signal) * (white / self.levels)
+        curve = gain / 6 * mean / variance
+        return gain * mean - curve, gain * variance.sqrt(), curve
 
 
 def normal_noise(like: Float[Tensor, "B C H W"], seeds: Sequence[int]) -> Tensor:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Generator, Tensor
 
-from augment.scene.surfaces import draw_shading, interpolate_smoothly
+from augment.scene.surfaces import draw_shading, smooth
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import LUMINANCE, clamp, decode, encode, to_unit
@@ -38,6 +39,11 @@ MAX_ZOOM = 2.0
 MAX_SATURATION = 3.0
 
 
+def fraction(values: Float[Tensor, " *S"]) -> Float[Tensor, " *S"]:
+    """Return values modulo 1, to the bit and several times as fast as torch does."""
+    return values - values.floor()
+
+
 def stripes(
     points: Float[Tensor, " ..."], shift: Tensor | float, bright: float = 0.5
 ) -> Bool[Tensor, " ..."]:
@@ -46,20 +52,20 @@ def stripes(
     Row 0 of the points is x, row 1 is y. `bright` is the bright fraction of a period.
     """
     # Vertical stripes depend on x only, which is row 0.
-    return ((points + shift) % 1 < bright)[0]
+    return fraction((points + shift)[0]) < bright
 
 
 def checkers(points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]) -> Bool[Tensor, " ..."]:
     """Find the points on the bright squares of a chessboard with period 1."""
     # A square is bright if exactly one of x and y is in the first half of its period.
-    is_in_first_half = (points + shift) % 1 < 0.5
+    is_in_first_half = fraction(points + shift) < 0.5
     return is_in_first_half.sum(0) == 1
 
 
 def spots(points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]) -> Bool[Tensor, " ..."]:
     """Find the points in the discs of a square grid with period 1."""
     # Vector from the center of the disc in the same cell to each point, shape (2, ...).
-    from_center = (points + shift) % 1 - 0.5
+    from_center = fraction(points + shift) - 0.5
     return from_center.square().sum(0) < DISC_RADIUS**2
 
 
@@ -84,13 +90,20 @@ def pixel_centers(size: Size) -> Float[Tensor, "2 1 height width"]:
     Row 0 is x to the right, row 1 is y down, in the same unit. The second axis is for several
     images.
     """
+    return torch.stack(torch.broadcast_tensors(*_centers(size)))
+
+
+def _centers(size: Size) -> tuple[Float[Tensor, "1 1 W"], Float[Tensor, "1 H 1"]]:
+    """Return x of the columns and y of the rows of `pixel_centers`."""
     height, width = height_and_width(size)
     x, y = ((torch.arange(count) + 0.5) / width * 2 - count / width for count in (width, height))
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"))[:, None]
+    return x.view(1, 1, -1), y.view(1, -1, 1)
 
 
 def turned(
-    points: Float[Tensor, "2 ..."], cosine: Tensor | float, sine: Tensor | float
+    points: Float[Tensor, "2 ..."] | tuple[Tensor, Tensor],
+    cosine: Tensor | float,
+    sine: Tensor | float,
 ) -> Float[Tensor, "2 ..."]:
     """Rotate points about the center of the image.
 
@@ -124,8 +137,8 @@ def draw_patterns(
     and y of the point of the pattern that each pixel shows. By default, the pattern fills the
     image, which spans [-1, 1].
     """
-    if points is None:
-        points = pixel_centers(size)
+    # Without points, the coordinates of columns and rows are enough.
+    x, y = _centers(size) if points is None else points
     drawn = [
         (
             torch.rand(4, generator=draws),
@@ -142,17 +155,30 @@ def draw_patterns(
     period = MIN_PERIOD + (MAX_PERIOD - MIN_PERIOD) * relative_period
     angle = 2 * math.pi * turn
     # Points of the pattern in units of its period, shape (2, count, height, width).
-    rotated = turned(points / period, angle.cos(), angle.sin())
+    rotated = turned((x / period, y / period), angle.cos(), angle.sin())
     shift = torch.stack(shifts)
     # Weight of the first color at each pixel, shape (count, 1, height, width).
-    weight = torch.empty(count, 1, *points.shape[2:])
-    for index, family in enumerate(FAMILIES):
-        rows = torch.nonzero(family_of_pattern == index).squeeze(1)
-        weight[rows, 0] = family(rotated[:, rows], shift[:, rows]).float()
+    weight = by_kind(
+        family_of_pattern.tolist(),
+        lambda kind, rows: FAMILIES[kind](rotated[:, rows], shift[:, rows]).float()[:, None],
+    )
     # Hue and saturation of both colors, and the brightness of the second one.
-    first = random_colors(colors[:, :2])
-    second = random_colors(colors[:, 2:4]) * colors[:, 4:, None, None]
-    return second + weight * (first - second)
+    first, second = random_colors(colors[:, :4].reshape(-1, 2)).unflatten(0, (count, 2)).unbind(1)
+    second = second * colors[:, 4:, None, None]
+    return (weight * (first - second)).add_(second)
+
+
+def by_kind(
+    kind_of_row: Sequence[int], compute: Callable[[int, list[int] | slice], Tensor]
+) -> Tensor:
+    """Compute the rows of a tensor from a function of a kind and of the rows of this kind."""
+    kinds = sorted(set(kind_of_row))
+    if len(kinds) == 1:
+        return compute(kinds[0], slice(None))
+    rows = [[row for row, of_row in enumerate(kind_of_row) if of_row == kind] for kind in kinds]
+    parts = [compute(kind, of_kind) for kind, of_kind in zip(kinds, rows, strict=True)]
+    order = torch.tensor([*chain(*rows)]).argsort().to(parts[0].device)
+    return torch.cat(parts)[order]
 
 
 def draw_photograph_patterns(
@@ -197,9 +223,9 @@ MAX_NODES = 6
 FIELD_CONTRAST = 2.0
 # Probabilities of a slide with a two-color pattern, Voronoi cells, a smooth field or a photograph.
 PROBABILITIES = (0.4, 0.15, 0.15, 0.3)
-# Coordinate of the centers of Voronoi cells that a slide does not use. They are so far away that no
-# pixel belongs to their cells.
-FAR = 100.0
+# Power of 2 above `MAX_CELLS`. A distance to the center of a cell is a multiple of it, to which the
+# index of the cell is added.
+CELL_CODE = 32
 
 
 def draw_slides(
@@ -216,14 +242,9 @@ def draw_slides(
         families.append(partial(draw_projected, photographs))
     # `multinomial` divides by the sum, so the probabilities fit without photographs, too.
     weights = torch.tensor(PROBABILITIES[: len(families)])
-    # Kind of each slide as an index of `families`, shape (count,).
-    slide_to_family = torch.multinomial(weights, count, replacement=True, generator=draws)
-    slides = torch.empty(count, 3, *height_and_width(size))
-    for index, draw in enumerate(families):
-        rows = torch.nonzero(slide_to_family == index).squeeze(1)
-        if len(rows):
-            slides[rows] = draw(len(rows), size, draws)
-    return slides
+    # Kind of each slide as an index of `families`.
+    kinds = torch.multinomial(weights, count, replacement=True, generator=draws).tolist()
+    return by_kind(kinds, lambda kind, _: families[kind](kinds.count(kind), size, draws))
 
 
 def draw_cells(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 3 height width"]:
@@ -233,23 +254,26 @@ def draw_cells(count: int, size: Size, draws: Generator) -> Float[Tensor, "count
     Pictures are linear light.
     """
     cell_counts = torch.randint(MIN_CELLS, MAX_CELLS + 1, (count,), generator=draws)
-    # Draw `MAX_CELLS` centers for each picture, and move those that are not needed far away.
+    # `MAX_CELLS` centers and colors are drawn for each picture, of which it uses the first ones.
     height, width = height_and_width(size)
     centers = 2 * torch.rand(count, MAX_CELLS, 2, generator=draws) - 1
     centers[..., 1] *= height / width
-    is_unused = torch.arange(MAX_CELLS) >= cell_counts[:, None]
-    centers[is_unused] = FAR
-    # Coordinates x and y of the pixel centers, shape (height · width, 2).
-    pixels = pixel_centers(size).flatten(1).T
-    # Index of the cell of each pixel, which has the nearest center, shape (count, height · width).
-    pixel_to_cell = torch.cdist(pixels.expand(count, -1, -1), centers).argmin(2)
-
     hue, saturation, brightness = torch.rand(3, count * MAX_CELLS, generator=draws)
     colors = random_colors(torch.stack([hue, saturation], dim=1))[:, :, 0, 0] * brightness[:, None]
-    colors = colors.view(count, MAX_CELLS, 3)
-    # Color of each pixel, shape (count, height · width, 3).
-    shown = colors.gather(1, pixel_to_cell[:, :, None].expand(-1, -1, 3))
-    return shown.transpose(1, 2).unflatten(2, (height, width))
+    colors = colors.view(count, MAX_CELLS, 3).transpose(1, 2)
+    x, y = _centers(size)
+    # Squared distances are whole numbers of 25 bits, before the index of the cell is added.
+    unit = 4 * (1 + (height / width) ** 2) / 2**25
+    pictures = []
+    for used, places, palette in zip(cell_counts.tolist(), centers, colors, strict=True):
+        columns, rows = (
+            ((axis - place) ** 2 / unit).round().int() * CELL_CODE
+            for axis, place in zip((x, y), places[:used].T[..., None, None], strict=True)
+        )
+        nearest = (columns + torch.arange(used, dtype=torch.int32)[:, None, None] + rows).amin(0)
+        shown = palette.index_select(1, (nearest & (CELL_CODE - 1)).flatten())
+        pictures.append(shown.unflatten(1, (height, width)))
+    return torch.stack(pictures)
 
 
 def draw_fields(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 3 height width"]:
@@ -261,7 +285,7 @@ def draw_fields(count: int, size: Size, draws: Generator) -> Float[Tensor, "coun
     for _ in range(count):
         node_count = int(torch.randint(MIN_NODES, MAX_NODES + 1, (), generator=draws))
         node_values = FIELD_CONTRAST * torch.randn(1, 3, node_count, node_count, generator=draws)
-        fields.append(interpolate_smoothly(node_values, size).sigmoid())
+        fields.append(smooth(node_values, size).sigmoid())
     return torch.cat(fields)
 
 

@@ -27,14 +27,6 @@ MAX_POLAR = 60.0
 FIELD_OF_VIEW = 60.0
 
 
-def interpolate_smoothly(values: Float[Tensor, "N C n n"], size: Size) -> Float[Tensor, "N C H W"]:
-    """Interpolate the values of a coarse grid to the pixels of an image, by bicubic splines.
-
-    Interpolated values may be outside of the range of the given values.
-    """
-    return F.interpolate(values, height_and_width(size), mode="bicubic", align_corners=True)
-
-
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _axes(
@@ -76,7 +68,8 @@ def smooth(
 ) -> Float[Tensor, "B C H W"]:
     """Interpolate nodes at the pixels of an image by bicubic splines, or return a slope of them.
 
-    The slope is along "x" or "y". Two products of matrices are faster than `F.interpolate`.
+    The slope is along "x" or "y". Interpolated values may be outside of the range of the nodes. Two
+    products of matrices are faster than `F.interpolate`.
     """
     height, width = height_and_width(size)
     count = nodes.shape[-1]
@@ -128,19 +121,16 @@ def draw_shading(count: int, size: Size, draws: Generator) -> Float[Tensor, "cou
     It is the cosine between normal and light, or 0 if the surface faces away.
     """
     # Steepness, azimuth and polar angle of the light, as fractions of their ranges.
-    steepness, turn, tilt = torch.rand(3, count, 1, 1, generator=draws)
+    steepness, turn, tilt = torch.rand(3, count, 1, 1, 1, generator=draws)
     node_heights = torch.randn(count, 1, SURFACE_NODES, SURFACE_NODES, generator=draws)
-    # Height of each pixel, shape (count, 1, height, width).
-    height = MAX_STEEPNESS * steepness[:, None] * interpolate_smoothly(node_heights, size)
-    # Slope of the surface. The image is 2 units wide, so a pixel has the width 2 / width.
-    spacing = 2 / height.shape[-1]
-    slope_down, slope_right = torch.gradient(height[:, 0], spacing=spacing, dim=(1, 2))
-    polar = math.radians(MAX_POLAR) * tilt
-    azimuth = 2 * math.pi * turn
-    # Components of the unit vector towards the light. The one along the view is polar.cos().
-    to_right = polar.sin() * azimuth.cos()
-    to_bottom = polar.sin() * azimuth.sin()
-    return lambert(slope_down, slope_right, to_right, to_bottom, polar.cos())[:, None]
+    heights = MAX_STEEPNESS * steepness * node_heights
+    down, right = (smooth(heights, size, slope) for slope in "yx")
+    return lambert(down, right, *direction(2 * math.pi * turn, math.radians(MAX_POLAR) * tilt))
+
+
+def direction(azimuth: Tensor, polar: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the unit vector towards a light: its components to the right, to the bottom and up."""
+    return polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()
 
 
 def lambert(down: Tensor, right: Tensor, to_right: Tensor, to_bottom: Tensor, up: Tensor) -> Tensor:
@@ -148,6 +138,7 @@ def lambert(down: Tensor, right: Tensor, to_right: Tensor, to_bottom: Tensor, up
 
     The vector towards the light has the components to the right, to the bottom and up.
     """
-    length = (1 + right**2 + down**2).sqrt()
+    squares = torch.addcmul(torch.addcmul(down.new_ones(()), down, down), right, right)
     # Product of the light's vector with the normal (-right, -down, 1) / length.
-    return ((up - to_right * right - to_bottom * down) / length).clamp(min=0)
+    dot = torch.addcmul(torch.addcmul(up, to_right, right, value=-1), to_bottom, down, value=-1)
+    return (dot * squares.rsqrt()).clamp(min=0)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scipy import integrate, stats
+from scipy import integrate, spatial, stats
 from torch.utils.data import DataLoader
 from torchvision import tv_tensors
 
 import norm_balls as nb
 from augment import lighting
-from augment.scene import lights, patterns, surfaces
+from augment.scene import lights, loops, patterns, surfaces
 from augment.scene.lights import MODELS, Illumination, circle_segment
 from renderer.errors import InputError
 from renderer.image import decode, encode
@@ -271,8 +271,53 @@ def test_the_loop_of_numba_equals_the_operations_of_torch(monkeypatch):
         2 * torch.rand(2, 1, 33, 65), torch.rand(2, 3, 1, 1), torch.rand(2, 3, 1, 1)
     )
     expected = lighting.relit_bytes(colors, light)
-    monkeypatch.setattr(lighting, "_kernel", lambda: None)
+    monkeypatch.setattr(loops, "relit_bytes", lambda _: None)
     assert torch.equal(lighting.relit_bytes(colors, light), expected)
+
+
+LOOPS = ("relit_bytes", "noisy_bytes", "penumbra", "lamps")
+
+
+@pytest.mark.parametrize("name", [*lights.CastShadow().kinds, "point", "lamps"])
+def test_the_light_of_the_loops_equals_that_of_torch(name, monkeypatch):
+    pytest.importorskip("numba")
+    model = MODELS[name]() if name in MODELS else lights.CastShadow((name,))
+    drawn = model.draw(draw_values(model, 3), (33, 65))
+    light = model.illumination(drawn).total()
+    for loop in LOOPS:
+        monkeypatch.setattr(loops, loop, lambda _: None)
+    torch.testing.assert_close(light, model.illumination(drawn).total(), atol=1e-4, rtol=1e-4)
+
+
+def test_noisy_bytes_of_the_loop_equal_those_of_torch(monkeypatch):
+    pytest.importorskip("numba")
+    image = picture(2, 3, 33, 65)
+    params = (transform := nb.RandomLighting("low_light")).make_params([image])
+    relit = transform.apply(image, params)
+    for loop in LOOPS:
+        monkeypatch.setattr(loops, loop, lambda _: None)
+    assert (relit == transform.apply(image, params)).float().mean() > 0.999
+
+
+def test_noisy_bytes_equal_what_the_camera_measures():
+    model, image = lights.LowLight(), picture(1, 3, 33, 65)
+    light = lighting.Light(model, draw_values(model)[0], 3, 1.0)
+    relit = nb.RandomLighting().apply(image, {"lights": [light]})
+    exact = nb.RandomLighting().apply(image / 255, {"lights": [light]})
+    assert (relit / 255 - exact).abs().max() < 0.51 / 255
+
+
+def test_a_pixel_of_a_slide_belongs_to_the_cell_whose_center_is_nearest():
+    [shown] = patterns.draw_cells(1, (30, 50), torch.Generator().manual_seed(3))
+    draws = torch.Generator().manual_seed(3)
+    count = int(torch.randint(patterns.MIN_CELLS, patterns.MAX_CELLS + 1, (1,), generator=draws))
+    centers = 2 * torch.rand(patterns.MAX_CELLS, 2, generator=draws)[:count] - 1
+    centers[:, 1] *= 30 / 50
+    points = patterns.pixel_centers((30, 50)).flatten(1).T
+    _, nearest = spatial.cKDTree(centers.numpy()).query(points.numpy())
+    colors = shown.flatten(1).T.numpy()
+    for cell in range(count):
+        assert len(np.unique(colors[nearest == cell], axis=0)) <= 1
 
 
 @pytest.mark.parametrize("distance", [-1.5, -1.0, -0.6, -0.1, 0.0, 0.3, 0.99, 1.0, 2.0])
