@@ -198,13 +198,20 @@ def _attack(
         minimum = minimize(problem, objective, restarts=restarts)
         images = final_images(problem, minimum.values, problem.all_examples, minimum.images)
 
-    if minimum.zero_gradient.any():
-        warnings.warn(ZERO_GRADIENT, stacklevel=3)
-
     # The attack may have moved the objects.
     objective = objective.moved(problem, minimum.values, problem.all_examples)
     criterion = objective.criterion
     evidence, success_in_views, _ = objective.judge(images, problem.all_examples)
+    is_constant = torch.equal(evidence, evidence_before) and all(
+        torch.equal(objective.evidence(torch.full_like(images, shade)), evidence)
+        for shade in (0.0, 1.0)
+    )
+    if is_constant:
+        advice = "an attack finds no direction in constant scores"
+        reason = "scores black and white images exactly like the renders"
+        warnings.warn(f"{classifier.title} {reason}: {advice}", stacklevel=3)
+    elif minimum.zero_gradient.any():
+        warnings.warn(ZERO_GRADIENT, stacklevel=3)
     # Images that the search or `final_images` showed to the classifier.
     queries = minimum.queries + scene.views * (images is not minimum.images)
     if settings.sensor_noise:
