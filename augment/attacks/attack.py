@@ -202,10 +202,11 @@ def _attack(
     objective = objective.moved(problem, minimum.values, problem.all_examples)
     criterion = objective.criterion
     evidence, success_in_views, _ = objective.judge(images, problem.all_examples)
-    is_constant = torch.equal(evidence, evidence_before) and all(
-        torch.equal(objective.evidence(torch.full_like(images, shade)), evidence)
-        for shade in (0.0, 1.0)
-    )
+    # A detector that finds nothing may have constant scores, but a cost with a gradient.
+    is_constant = not settings.uses_gradients or bool(minimum.zero_gradient.all())
+    is_constant = is_constant and torch.equal(evidence, evidence_before)
+    for shade in (0.0, 1.0) if is_constant else ():
+        is_constant &= torch.equal(objective.evidence(torch.full_like(images, shade)), evidence)
     if is_constant:
         advice = "an attack finds no direction in constant scores"
         reason = "scores black and white images exactly like the renders"
