@@ -91,14 +91,8 @@ def nearby_fit(brightness: float) -> tuple[FittedScene, float]:
     return found, irradiance_error(found, mesh, FAR, light)
 
 
-@pytest.mark.parametrize(
-    ("brightness", "bound"),
-    [
-        (9.0, 0.055),
-        pytest.param(1.0, 0.05, marks=pytest.mark.slow),
-        pytest.param(13.0, 0.17, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("brightness", "bound"), [(9.0, 0.055), (1.0, 0.05), (13.0, 0.17)])
 def test_camera_and_light_are_found_also_if_parts_are_overexposed(brightness, bound):
     """A sixth and a third of the object's values are 1, and tell no more than that it is bright."""
     found, error = nearby_fit(brightness)

@@ -43,6 +43,7 @@ def no_report(monkeypatch) -> None:
     monkeypatch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
 
 
+@pytest.mark.slow
 def test_a_training_of_two_methods_ends_with_their_table_and_records_its_command(
     call, capsys, tmp_path, two_methods, photos
 ):

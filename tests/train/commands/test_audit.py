@@ -50,6 +50,7 @@ def options(monkeypatch, laboratory) -> dict:
     return {"classes": CLASSES, "size": SIZE, "laboratory": laboratory, "environments": ["grace"]}
 
 
+@pytest.mark.slow
 def test_the_report_has_the_numbers_of_the_files(options, tmp_path):
     network = Brightness().eval()
     out = tmp_path / "audit"

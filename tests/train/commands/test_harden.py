@@ -137,6 +137,7 @@ def test_each_mesh_trains_the_class_that_it_or_its_file_names(network, photograp
     assert not torch.equal(hardened[4].weight, swapped[4].weight)
 
 
+@pytest.mark.slow
 def test_a_copy_trained_in_normalized_light_has_the_weights_without_it(network, photographs):
     plain = harden(network, photographs, normalize_light=True)
     classifier = nb.Classifier(deepcopy(network), SIZE, CLASSES, normalize_light=True)

@@ -142,6 +142,7 @@ def test_names_and_weights_of_different_numbers_of_classes_are_counted_in_the_er
         augment.load_classifier(f"torchvision:{NAME}", here / "mine.pth", CLASSES[:9])
 
 
+@pytest.mark.slow
 def test_an_attack_and_an_evaluation_find_the_class_by_its_index(call, here):
     label = f"label={CLASSES.index('Orange')}"
     words = ["attack.max_steps=1", "attack.checks=false", "attack.verify=null"]

@@ -125,6 +125,7 @@ def read_files(folders: list[Path]) -> dict[Path, tuple[bytes, int]]:
     return files
 
 
+@pytest.mark.slow
 def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(
     run_sweep, folder_of, swept, capsys
 ):

@@ -121,6 +121,7 @@ def test_normalized_light_is_remembered_by_the_network_and_by_that_of_the_next_r
         torch.testing.assert_close(load_run(run)(images), expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_network_that_hardly_moves_keeps_its_predictions_at_no_loss(almost_fixed):
     folder, scores = almost_fixed
     assert read_metrics(folder)[0]["train/loss"] < 1e-6
@@ -129,6 +130,7 @@ def test_a_network_that_hardly_moves_keeps_its_predictions_at_no_loss(almost_fix
     assert scores["test/accuracy_before"] == 1
 
 
+@pytest.mark.slow
 def test_batch_statistics_change_the_predictions_outside_of_eval_mode(tuned):
     folder, _ = tuned("unlabeled", ALMOST_FIXED, "train.eval_mode=false")
     assert read_metrics(folder)[0]["train/loss"] > 0.01

@@ -60,6 +60,7 @@ def finished(settings_of, tmp_path_factory):
     return folder, completed_run(settings_of(folder), folder)
 
 
+@pytest.mark.slow
 def test_the_weights_lie_on_the_line_between_original_and_trained_ones(finished, weights):
     folder, scores = finished
     best = load(folder / BEST)
