@@ -211,6 +211,7 @@ def test_detectors_of_torchvision_learn_from_one_object_several_and_none(photogr
     if "rcnn" in name:
         options |= {"rpn_post_nms_top_n_test": 20, "rpn_post_nms_top_n_train": 50}
         options |= {"box_detections_per_img": 5}
+    torch.manual_seed(0)
     network = get_model(name, **options).eval()
     bottle, cup = (nb.ObjectSettings(f"solid:{name}", label=name) for name in ("bottle", "cup"))
     meshes = [bottle, [cup, replace(bottle, at=(2.0, 0.0))]]
