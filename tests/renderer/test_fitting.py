@@ -121,6 +121,7 @@ def path_traced(folder: Path, mesh: renderer.Mesh, camera: Camera, light: Tensor
     return image.double().clamp(0, 1)
 
 
+@pytest.mark.filterwarnings("ignore:ignored in .glb")
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "camera", "light_name", "bound"),
