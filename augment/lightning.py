@@ -73,21 +73,25 @@ def lightning_callback(service: AugmentationService, network: nn.Module | None =
         def __init__(self) -> None:
             self.renders = CurrentRenders(len(service))
 
-        def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
-            """Attack the weights as they are now, before workers get the first renders."""
+        def regenerate(self, trainer: Any, pl_module: Any) -> None:
+            """Attack the weights as they are now."""
             attacked = pl_module if network is None else network
             self.epoch = trainer.current_epoch
             made = service.regenerate(attacked, self.epoch)
             self.renders.current, self.diagnostics = made, made.diagnostics
 
+        def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
+            """Make the first renders before workers copy them."""
+            self.regenerate(trainer, pl_module)
+
         def on_train_epoch_start(self, trainer: Any, pl_module: Any) -> None:
-            """Attack the weights as they are now, and log numbers about it."""
+            """Render anew if the epoch has no renders yet, and log numbers about them."""
             loaders = tree_leaves(trainer.train_dataloader)
             if any(getattr(loader, "persistent_workers", False) for loader in loaders):
                 reason = "the loader has persistent_workers=True, which keep the first renders"
                 raise InputError(f"{reason}: set it to False")
             if self.epoch != trainer.current_epoch:
-                self.on_fit_start(trainer, pl_module)
+                self.regenerate(trainer, pl_module)
             for name, value in self.diagnostics.items():
                 pl_module.log(f"renders/{name}", value)
 

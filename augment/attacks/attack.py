@@ -203,11 +203,12 @@ def _attack(
     criterion = objective.criterion
     evidence, success_in_views, _ = objective.judge(images, problem.all_examples)
     # A detector that finds nothing may have constant scores, but a cost with a gradient.
-    is_constant = not settings.uses_gradients or bool(minimum.zero_gradient.all())
-    is_constant = is_constant and torch.equal(evidence, evidence_before)
-    for shade in (0.0, 1.0) if is_constant else ():
-        is_constant &= torch.equal(objective.evidence(torch.full_like(images, shade)), evidence)
-    if is_constant:
+    has_gradient = settings.uses_gradients and not minimum.zero_gradient.all()
+    may_be_constant = not has_gradient and torch.equal(evidence, evidence_before)
+    black_and_white = (torch.full_like(images, shade) for shade in (0.0, 1.0))
+    if may_be_constant and all(
+        torch.equal(objective.evidence(shown), evidence) for shown in black_and_white
+    ):
         advice = "an attack finds no direction in constant scores"
         reason = "scores black and white images exactly like the renders"
         warnings.warn(f"{classifier.title} {reason}: {advice}", stacklevel=3)
@@ -245,7 +246,8 @@ def require_clean_correct(
     The error says what it finds in the first other image.
     """
     wrong = (criterion.predicted(evidence) != criterion.source).nonzero().tolist()
-    for example, view in wrong[:1]:
+    if wrong:
+        example, view = wrong[0]
         item = scene.objects[scene.examples[example].object]
         found = network.task.describe(evidence[example, view], network.classes)
         count = f"in {len(wrong)} of {criterion.source.numel()} images the class is not found"

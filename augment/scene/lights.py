@@ -65,7 +65,7 @@ def normal_numbers(uniform: Float[Tensor, " *S"]) -> Float[Tensor, " *S"]:
 
 
 def blend(uniform: Float[Tensor, "B E"], angle: Float[Tensor, "B 1 1 1"]) -> Tensor:
-    """Blend the halves of uniform numbers to normal ones, whose variance holds at any angle."""
+    """Blend both halves of uniform numbers to normal ones, of equal variance at any angle."""
     first, second = normal_numbers(uniform)[..., None, None].chunk(2, 1)
     return angle.cos() * first + angle.sin() * second
 

@@ -96,8 +96,7 @@ class DataSet:
             "light": render.light.tolist(),
         }
         if render.depth is not None:
-            # Depth, in world units, of one step of the depth image.
-            details["depth_scale"] = float(render.depth.max()) / MAX_DEPTH
+            details["depth_scale"] = _depth_scale(render.depth)
         files: dict[str, bytes | str] = {image: png(render.image)}
         for name in self.maps:
             files[f"{DETAILS}/{number}_{name}.png"] = png(_map(render, name))
@@ -229,6 +228,11 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
     return counts if counts[-1] else counts[:-1]
 
 
+def _depth_scale(depth: Tensor) -> float:
+    """Return the depth, in world units, of one step of a depth image."""
+    return float(depth.max()) / MAX_DEPTH
+
+
 def _map(render: LabeledRender, name: str) -> np.ndarray:
     """Return a map of a render as an array of 8 or 16 bits.
 
@@ -241,7 +245,7 @@ def _map(render: LabeledRender, name: str) -> np.ndarray:
         return (render.masks.numpy() * numbers).max(0, initial=0).reshape(shape).astype(np.uint8)
     assert render.depth is not None and render.normals is not None
     if name == "depth":
-        scale = float(render.depth.max()) / MAX_DEPTH or 1.0
+        scale = _depth_scale(render.depth) or 1.0
         return np.rint(render.depth.numpy() / scale).astype(np.uint16)
     normals = render.normals.permute(1, 2, 0).numpy()
     return np.rint((normals + 1) / 2 * 255).astype(np.uint8)
