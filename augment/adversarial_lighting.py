@@ -160,28 +160,35 @@ class AdversarialLighting:
                 raise InputError(f"targets has no boxes or no labels: give {expected}")
             outputs = [_as_found(item["boxes"], item["labels"], unit.device) for item in given]
         else:
-            targets = errors.as_integers("targets", targets)
-            is_map = isinstance(self.task, Segmentation)
-            errors.require_shape(
-                "targets", targets, len(targets), *unit.shape[2 if is_map else 4 :]
-            )
-            count = len(classes) or max(targets.flatten().tolist(), default=0) + 1
-            has_none = torch.zeros_like(targets, dtype=torch.bool)
-            if is_map:
-                has_none = (targets < 0) | ((targets == IGNORED) & (count <= IGNORED))
-            is_other = ~has_none & ((targets < 0) | (targets >= count))
-            if is_other.any():
-                label = int(targets[is_other][0])
-                raise InputError(f"targets has the label {label}: give those of {count} classes")
-            if is_map:
-                # A further class, which is no object, has the pixels without a class.
-                targets, classes = targets.where(~has_none, count), [*classes, BACKGROUND]
-                count += 1
-            outputs = F.one_hot(targets, count).movedim(-1, 1).float()
+            outputs, classes = self._as_outputs(targets, unit)
         if len(outputs) != len(unit):
             raise InputError(f"{len(outputs)} targets are given for {len(unit)} images: give each")
         image_of_row, criterion = self.task.as_found(outputs, classes)
         return image_of_row.to(unit.device), criterion.map(lambda rows: rows[:, 0].to(unit.device))
+
+    def _as_outputs(
+        self, targets: Any, unit: Float[Tensor, "N 3 H W"]
+    ) -> tuple[Float[Tensor, "M ..."], list[str]]:
+        """Return the outputs of a network that is sure of labels or of label maps, and its classes.
+
+        Pixels without a class get a further class, which is no object.
+        """
+        targets = errors.as_integers("targets", targets)
+        is_map = isinstance(self.task, Segmentation)
+        size = unit.shape[2:] if is_map else ()
+        errors.require_shape("targets", targets, len(targets), *size)
+        count = len(self.classes) or max(targets.flatten().tolist(), default=0) + 1
+        has_class = (targets >= 0) & (targets < count)
+        is_wrong = ~has_class
+        if is_map:
+            is_wrong &= (targets >= 0) & (targets != IGNORED)
+        if is_wrong.any():
+            label = int(targets[is_wrong][0])
+            raise InputError(f"targets has the label {label}: give those of {count} classes")
+        if not is_map:
+            return F.one_hot(targets, count).float(), self.classes
+        outputs = F.one_hot(targets.where(has_class, count), count + 1).movedim(-1, 1)
+        return outputs.float(), [*self.classes, BACKGROUND]
 
     def _cost(
         self,
