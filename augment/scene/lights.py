@@ -195,8 +195,9 @@ class LightModel:
 class ProjectedSlide(LightModel):
     """A projector shows a picture on the surface of a flat print.
 
-    The light is slide · gain · shading + ambient, as in `nb.attack_photographs`. The picture has
-    stripes, checkers, spots, cells or smooth colors, or shows one of the slides (M, 3, H, W).
+    The light is slide · gain · shading + ambient (Grossberg et al. 2004), as in
+    `nb.attack_photographs`. The picture has stripes, checkers, spots, cells or smooth colors, or
+    shows one of the slides (M, 3, H, W).
     """
 
     slides: Tensor | None = None
@@ -283,7 +284,10 @@ class PointLight(LightModel):
 
 @dataclass(frozen=True)
 class ColoredLamps(LightModel):
-    """One to three small lamps, each of its own color, light a matte surface (see `PointLight`)."""
+    """One to three small lamps, each of its own color, light a matte surface (see `PointLight`).
+
+    The light of several lamps is the sum of theirs (Grassmann 1853).
+    """
 
     ranges = (STEEPNESS, *[*LAMP, Range(0, 1), Range(0, 1)] * 3, WEAK, METER)
     constants = 1 + SURFACE_NODES**2
@@ -310,7 +314,8 @@ class ColoredLamps(LightModel):
 class LinearLight(LightModel):
     """Light that rises evenly from one side of the image to the other.
 
-    It is the first-order expansion of any smooth light, such as that of a window at one side.
+    It is the first-order expansion of any smooth light, such as that of a window at one side (Land
+    & McCann 1971).
     """
 
     ranges = (TURN, Range(0, 0.95), METER)
@@ -371,9 +376,9 @@ def circle_segment(distance: Tensor) -> Tensor:
 class CastShadow(LightModel):
     """An object between the sun and the scene casts a shadow, whose penumbra has a uniform width.
 
-    A pixel of the penumbra sees a part of the disc of the sun (`circle_segment`). Edges count as
-    straight. The shadow is lit by the sky, which is bluish. Kinds are "polygon", "leaves", "blinds"
-    and "window".
+    A pixel of the penumbra sees a part of the disc of the sun (`circle_segment`, Hasenfratz et al.
+    2003). Edges count as straight. The shadow is lit by the sky, which is bluish. Kinds are
+    "polygon", "leaves", "blinds" and "window".
     """
 
     kinds: tuple[str, ...] = ("polygon", "leaves", "blinds", "window")
@@ -466,9 +471,10 @@ class CastShadow(LightModel):
 class ColorTemperature(LightModel):
     """A black body of 2,000 to 15,000 K lights the scene, and the camera's white balance is off.
 
-    The camera divides its channels by the color of the lamp that it assumes (von Kries 1902 in the
-    channels of the camera). Its temperature is between that of the lamp and of D65. A tint is up to
-    0.02 (Duv) to green or magenta. That of daylight is 0.003.
+    The light is that of Planck (1901), approximated as by Krystek (1985). The camera divides its
+    channels by the color of the lamp that it assumes (von Kries 1902 in the channels of the
+    camera). Its temperature is between that of the lamp and of D65. A tint is up to 0.02 (Duv) to
+    green or magenta. That of daylight is 0.003.
     """
 
     # Temperature in 1/K, how much of it the camera corrects, and the tint.
@@ -548,7 +554,10 @@ def _rounded(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class ClippedHighlights(LightModel):
-    """The exposure is too long by 0.5 to 3 stops, and full pixels of the sensor are white."""
+    """The exposure is too long by 0.5 to 3 stops, and full pixels of the sensor are white.
+
+    The sensor is linear up to its saturation (EMVA 1288).
+    """
 
     ranges = (Range(0.5, 3.0),)
     has_limit = True
