@@ -1,4 +1,4 @@
-"""Binary .ply files, polygons and triangle strips."""
+"""Binary .ply files and polygons."""
 
 import struct
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import corners_of
 
 from renderer.errors import InputError
 from renderer.io.meshes import load_mesh
@@ -30,13 +29,12 @@ def write_ply(
     length: str = "uchar",
     index: str = "int",
     line_break: str = "\n",
-    element: str = "face",
 ) -> Path:
     """Write the vertices and faces as ASCII or with struct, without a library for .ply files."""
     lines = ["ply", f"format {form} 1.0", "comment end_header", f"element vertex {len(VERTICES)}"]
     lines += [f"property {position} {axis}" for axis in "xyz"] + ["property short quality"]
     lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    lines += [f"element {element} {len(faces)}", f"property list {length} {index} vertex_index"]
+    lines += [f"element face {len(faces)}", f"property list {length} {index} vertex_index"]
     lines += ["property int flag", "end_header", ""]
     rows = [
         *(
@@ -130,19 +128,3 @@ def test_more_rows_than_the_file_has_are_refused_before_memory_is_allocated(tmp_
         path.write_bytes(content.replace(element, element + b"9" * 12))
         with pytest.raises(InputError, match="truncated"):
             load_mesh(path)
-
-
-@pytest.mark.filterwarnings("ignore:.*quality")
-@pytest.mark.parametrize("form", FORMS)
-def test_triangle_strips_are_unrolled_with_alternating_orientation(tmp_path, form):
-    strips = [[0, 1, 4, 2, -1, 0, 5, 1], [5, 6, 7]]
-    path = write_ply(tmp_path / "mesh.ply", form, strips, element="tristrips")
-    expected = [[0, 1, 4], [4, 1, 2], [0, 5, 1], [5, 6, 7]]
-    found = [
-        {tuple(np.roll(face, turn, axis=0).ravel()) for turn in range(3)}
-        for face in corners_of(load_mesh(path))
-    ]
-    assert found == [
-        {tuple(np.roll(VERTICES[face], turn, axis=0).ravel()) for turn in range(3)}
-        for face in expected
-    ]
