@@ -198,7 +198,8 @@ class RendererSettings(Settings):
 
     rasterizer: str = setting(
         "auto",
-        "Rasterizer: auto (numba if it is installed, otherwise numpy), opengl, numba or numpy.",
+        "Rasterizer: auto (torch on a GPU, otherwise numba if it is installed, or numpy), opengl, "
+        "numba, numpy or torch.",
         checks_type=False,  # A `Rasterizer` is valid, too.
     )
     samples: int | None = setting(

@@ -6,7 +6,7 @@ World axes are right-handed, and z points up.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import torch
@@ -18,6 +18,8 @@ from renderer import errors
 from renderer.errors import InputError
 from renderer.settings import MAX_VIEWS
 
+# An array of points, or a tensor on any device.
+Points = TypeVar("Points", np.ndarray, Tensor)
 # Default of a camera's `clip_range` in world units. A camera then shows all of a normalized mesh,
 # whose vertices are at most √3 from the origin.
 CLIP_RANGE = 2.0
@@ -199,9 +201,9 @@ class Camera(ABC):
         columns = np.column_stack([axes.T, position - self._from_pivot(np.zeros(3))])
         return np.vstack([columns, [0, 0, 0, 1]])
 
-    def _from_pivot(self, points: Float[np.ndarray, "... 3"]) -> np.ndarray:
+    def _from_pivot(self, points: Points) -> Points:
         """Subtract the point about which attacks turn the camera from other points."""
-        return points - np.array([self.center_x, self.center_y, self.center_z])
+        return points - _like(np.array([self.center_x, self.center_y, self.center_z]), points)
 
     def eye(self) -> np.ndarray:
         """Return the position of the camera in homogeneous world coordinates.
@@ -232,17 +234,19 @@ class Camera(ABC):
         return F.pad((position - origin) @ axes, (0, 1), value=1.0)
 
     @abstractmethod
-    def project(self, points: np.ndarray) -> np.ndarray:
+    def project(self, points: Points) -> Points:
         """Project points to normalized device coordinates.
 
         The image goes from -1 to 1 in x, and y has the same unit. The depth is -1 at the
         near plane and 1 at the far plane. Planes in the world stay planes.
 
         Args:
-            points: Points in world coordinates, shape (V, 3).
+            points: Points in world coordinates, an array or a tensor on any device,
+                shape (V, 3).
 
         Returns:
-            Coordinates (x, y, depth), with x to the right and y up, shape (V, 3).
+            Coordinates (x, y, depth) of the same type, with x to the right and y up,
+            shape (V, 3).
 
         Raises:
             InputError: If a perspective camera lies in or behind the points.
@@ -290,7 +294,7 @@ class Camera(ABC):
         cosine, sine = roll.cos(), roll.sin()
         return torch.stack([cosine * right + sine * up, cosine * up - sine * right, back])
 
-    def depths(self, points: np.ndarray) -> np.ndarray | None:
+    def depths(self, points: Points) -> Points | None:
         """Compute the depths of points, which a perspective projection divides by.
 
         Args:
@@ -325,12 +329,12 @@ class OrthographicCamera(Camera):
         """Distance that files of cameras store. Images do not depend on it."""
         return 2 * self.clip_range
 
-    def project(self, points: np.ndarray) -> np.ndarray:
+    def project(self, points: Points) -> Points:
         """Project points without perspective, with depths from -1 at `near` to 1 at `far`."""
         scale = np.array([2 / self.width, 2 / self.width, -1 / self.clip_range])
         shift = np.array([self.right, self.up, 0.0])
-        coordinates = (self.axes() * scale[:, None]) @ points.T
-        coordinates += (shift * scale)[:, None]
+        coordinates = _like(self.axes() * scale[:, None], points) @ points.T
+        coordinates += _like((shift * scale)[:, None], points)
         return coordinates.T
 
 
@@ -358,10 +362,10 @@ class PerspectiveCamera(Camera):
         """Field of view, the angle between the left and the right side of the image."""
         return math.degrees(2 * math.atan(self.width / 2 / self.distance))
 
-    def project(self, points: np.ndarray) -> np.ndarray:
+    def project(self, points: Points) -> Points:
         """Project points with perspective, with depths from -1 (near plane) to 1 (far plane)."""
         depths = self.depths(points)
-        right, up, back = self.axes() @ self._from_pivot(points).T
+        right, up, back = _like(self.axes(), points) @ self._from_pivot(points).T
         scale = 2 / self.width * (self.distance / depths)
         x = (right + self.right) * scale + self.principal_right
         y = (up + self.up) * scale * self.pixel_aspect + self.principal_up
@@ -369,11 +373,12 @@ class PerspectiveCamera(Camera):
         # The near plane is measured along the axis from the pivot to the camera.
         depth_scale = 2 * far / (far - near)
         normalized_depth = depth_scale * ((self.distance - near - back) / depths) - 1
-        return np.stack([x, y, normalized_depth]).T
+        stack: Any = torch.stack if isinstance(points, Tensor) else np.stack
+        return stack([x, y, normalized_depth]).T
 
-    def depths(self, points: np.ndarray) -> np.ndarray:
+    def depths(self, points: Points) -> Points:
         """Compute the depths of points, which must lie in front of the camera."""
-        depths = self.distance - self._from_pivot(points) @ self.axes()[2]
+        depths = self.distance - self._from_pivot(points) @ _like(self.axes()[2], points)
         if not (depths >= self._limits(depths)[0]).all():
             raise InputError(
                 f"the mesh reaches the camera at {self.pose()[:3, 3].round(3).tolist()} or lies "
@@ -382,7 +387,7 @@ class PerspectiveCamera(Camera):
             )
         return depths
 
-    def _limits(self, depths: np.ndarray) -> tuple[float, float, float]:
+    def _limits(self, depths: Any) -> tuple[float, float, float]:
         """Return the smallest allowed depth, and the depths of the near and of the far plane."""
         return MIN_NEAR_RATIO * self.distance, self.near, self.far
 
@@ -396,6 +401,11 @@ def _as_scalar(name: str, value: Any) -> Any:
     if not errors.is_number(value):
         raise InputError(f"{name} is {errors.describe(value)}: give one number")
     return value.item() if isinstance(value, np.generic | np.ndarray) else value
+
+
+def _like(array: np.ndarray, points: Points) -> Points:
+    """Convert an array to a tensor on the device of the points, if they are one."""
+    return points.new_tensor(array) if isinstance(points, Tensor) else array
 
 
 def tensor_like(value: float | Tensor, like: Tensor) -> Tensor:

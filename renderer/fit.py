@@ -152,7 +152,7 @@ def fit_scene(
         bounces: Number of light bounces, with shadows, with which the returned
             light is fitted. With 0, the light for a concave mesh is too bright
             or too dim. The search for the camera ignores shadows and bounces.
-        rasterizer: "auto", "opengl", "numba" or "numpy".
+        rasterizer: "auto", "opengl", "numba", "numpy" or "torch".
         start: Camera that is refined. None searches for a camera.
 
     Returns:

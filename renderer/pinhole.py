@@ -188,7 +188,7 @@ class PinholeCamera(PerspectiveCamera):
         moved = super().normalized(center, scale)
         return replace(moved, center_x=0.0, center_y=0.0, center_z=0.0)
 
-    def _limits(self, depths: np.ndarray) -> tuple[float, float, float]:
+    def _limits(self, depths: Any) -> tuple[float, float, float]:
         """Return the smallest allowed depth, and depths just around those of the points."""
         near, far = depths.min(), depths.max()
         smallest = MIN_DEPTH_RATIO * max(-near, far)

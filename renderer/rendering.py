@@ -117,8 +117,8 @@ def render(
         silhouettes: True includes visibility changes at moving silhouettes in
             gradients with respect to the vertices, and with respect to fields of
             the cameras that are tensors.
-        rasterizer: Program that finds the visible faces: "auto", "opengl", "numba"
-            or "numpy".
+        rasterizer: Program that finds the visible faces: "auto", "opengl", "numba",
+            "numpy" or "torch".
 
     Returns:
         Images in [0, 1], shape (V, 3, height, width). For one camera that is not in a
@@ -163,7 +163,7 @@ def render(
     # numbers instead of tensors.
     moved_mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
     views = build_fragments(
-        moved_mesh.vertices,
+        vertices,
         mesh.faces,
         [camera.fixed() for camera in all_cameras],
         settings,
@@ -185,7 +185,7 @@ def render(
         fragments = view.to(like.device)
         indirect = None
         if transport:
-            surface = Surface(moved_mesh, view, settings, given_gloss=gloss)
+            surface = Surface(moved_mesh, view.to("cpu"), settings, given_gloss=gloss)
             # Function of the albedo and the environment light. It returns the radiance that shadows
             # and bounces add to the pixels.
             indirect = partial(transport.radiance, surface)
@@ -283,8 +283,8 @@ def precompute_transfer(
         shadows: True if the mesh casts shadows of environment light on itself.
         bounces: Number of bounces of light between the surfaces of the mesh. One
             or more includes shadows.
-        rasterizer: Program that finds the visible faces: "auto", "opengl", "numba"
-            or "numpy".
+        rasterizer: Program that finds the visible faces: "auto", "opengl", "numba",
+            "numpy" or "torch".
 
     Returns:
         The operator for one camera, or the sequence of operators for a list of

@@ -45,7 +45,7 @@ REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 # Allowed kinds of normals.
 NORMALS = ("flat", "smooth")
 # Allowed names of rasterizers.
-RASTERIZERS = ("auto", "opengl", "numba", "numpy")
+RASTERIZERS = ("auto", "opengl", "numba", "numpy", "torch")
 # Largest number of bounces of light between surfaces.
 MAX_BOUNCES = 100
 # Largest width and height of images in

@@ -324,7 +324,8 @@ class DirectRenderer:
         if key not in self._views:
             if not self.cached:
                 self._views.clear()
-            vertices = self.objects[object_index].mesh.vertices
+            mesh = self.objects[object_index].mesh
+            vertices = torch.as_tensor(mesh.vertices, device=self.like.device)
             self._views[key] = self._rasterize(object_index, camera, vertices)
         return self._views[key]
 
@@ -411,8 +412,8 @@ class DirectRenderer:
         mesh = self.objects[object_index].mesh
         if vertices is None:
             return mesh, self.view(object_index, camera)[0].to("cpu")
-        mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
-        return mesh, self._rasterize(object_index, camera, mesh.vertices)[0].to("cpu")
+        fragments, _ = self._rasterize(object_index, camera, vertices)
+        return _moved(mesh, vertices), fragments.to("cpu")
 
     def radiance(
         self,
@@ -431,14 +432,11 @@ class DirectRenderer:
         """
         item = self.objects[object_index]
         fixed_camera = camera.fixed()
-        # `moved` is a tensor, which may have a gradient. `positions` is the same as an array.
         moved = changed.vertices
         if moved is None:
-            positions = item.mesh.vertices
             fragments, albedo = self.view(object_index, fixed_camera)
         else:
-            positions = moved.detach().cpu().double().numpy()
-            fragments, albedo = self._rasterize(object_index, fixed_camera, positions)
+            fragments, albedo = self._rasterize(object_index, fixed_camera, moved)
         if changed.albedo is not None:
             of_view = (item.mesh, fragments, self.settings.encoding, item.albedo_scale)
             albedo = paint_faces(*of_view, changed.albedo, changed.hue)
@@ -452,15 +450,16 @@ class DirectRenderer:
         if split.local_lights and moved is None and gloss is None:
             lamp_view = self.local_view(object_index, fixed_camera)
         elif split.local_lights:
-            moved_mesh = replace(item.mesh, vertices=positions)
-            rays = self._rays_among(object_index) if moved is None else Rays(moved_mesh)
+            rays = (
+                self._rays_among(object_index) if moved is None else Rays(_moved(item.mesh, moved))
+            )
             lamp_view = LocalLightView(rays, item.mesh, fragments, self.settings, moved, gloss)
 
         def indirect(albedo: Float[Tensor, "S 3"], light: Float[Tensor, "K 3"]) -> Tensor:
             """Compute the radiance that shadows and bounces of environment light add."""
-            frozen = self._transport(example, object_index, positions)
+            frozen = self._transport(example, object_index, _moved(item.mesh, moved).vertices)
             if fixed_camera not in frozen.views:
-                vertices = frozen.mesh.vertices
+                vertices = torch.as_tensor(frozen.mesh.vertices, device=self.like.device)
                 frozen.add(fixed_camera, *self._rasterize(object_index, fixed_camera, vertices))
             added = frozen.radiance(fixed_camera, fragments, albedo, light)
             # A camera whose fields are tensors is attacked, so it differs in each call. Its views
@@ -516,7 +515,7 @@ class DirectRenderer:
         return frozen
 
     def _rasterize(
-        self, object_index: int, camera: Camera, vertices: Float[np.ndarray, "V 3"]
+        self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"]
     ) -> tuple[Fragments, Tensor]:
         """Find the samples that show an object with given vertices, and their albedo (S, 3)."""
         item = self.objects[object_index]
@@ -525,3 +524,10 @@ class DirectRenderer:
         fragments = fragments.to(self.like.device)
         albedo = surface_albedo(item.mesh, fragments, self.settings.encoding)
         return fragments, (albedo * item.albedo_scale).to(self.like)
+
+
+def _moved(mesh: Mesh, vertices: Float[Tensor, "V 3"] | None) -> Mesh:
+    """Return a mesh with other vertices, if they are given."""
+    if vertices is None:
+        return mesh
+    return replace(mesh, vertices=vertices.detach().cpu().double().numpy())

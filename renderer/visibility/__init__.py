@@ -1,6 +1,6 @@
 """Rasterizers, which find the nearest face at each sample of an image.
 
-There are three: opengl, numpy and numba.
+There are four: opengl, numpy, numba and torch, which takes and returns tensors.
 
 Each module of this package has a function
 
@@ -27,7 +27,7 @@ none, int32, shape (N, R, C). Row 0 is at the top. If two faces have the same
 depth, the face with the lower index is returned.
 
 All rasterizers round vertices to 1/256 of a sample. A sample at the common edge
-of two faces is therefore covered by exactly one of them. NumPy and numba give
+of two faces is therefore covered by exactly one of them. NumPy, numba and torch give
 the same results. OpenGL rounds depths differently.
 """
 
@@ -35,9 +35,12 @@ from dataclasses import dataclass
 from importlib import import_module
 
 import numpy as np
-import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
+# The module `torch` of this package would hide a name `torch`.
+from torch import Tensor, as_tensor, from_numpy
+
+from renderer.camera import Points
 from renderer.errors import InputError, require_choice, require_memory
 from renderer.settings import RASTERIZERS, Size, height_and_width
 from renderer.visibility import opengl
@@ -57,53 +60,55 @@ class Rasterizer:
     Attributes:
         name: Name of its module in this package.
         description: Name with the version or the device, for log lines.
+        is_automatic: Whether points on a GPU are rasterized there by torch instead.
     """
 
     name: str
     description: str
+    is_automatic: bool = False
 
     def rasterize(
-        self,
-        points: Float[np.ndarray, "N V 3"],
-        faces: Int[np.ndarray, "F 3"],
-        resolution: Size,
-        closed: bool = False,
-    ) -> Int[np.ndarray, "N R C"]:
-        """Find the nearest face at each sample of N images, or -1.
+        self, points: Points, faces: Int[np.ndarray, "F 3"], resolution: Size, closed: bool = False
+    ) -> Points:
+        """Find the nearest face at each sample of N images, or -1, int32, shape (N, R, C).
 
-        `resolution` is the number of samples per side, or of rows and columns. x of the points is
-        in [-1, 1] in the image, and the third coordinate is the depth. `closed` leaves out faces
-        that are seen from behind.
+        `points` have the shape (N, V, 3) and may be on any device, on which a tensor of results
+        is. x is in [-1, 1] in the image, and the third coordinate is the depth. `resolution` is the
+        number of samples per side, or of rows and columns. `closed` leaves out faces that are seen
+        from behind.
         """
-        rows, columns = height_and_width(resolution)
+        shape = rows, columns = height_and_width(resolution)
         # Larger coordinates would not fit into the integers of the rasterizers.
-        limit = SPAN / columns
-        if np.abs(points).max(initial=0) > limit:
-            points = np.clip(points, -limit, limit)
+        given = as_tensor(points).clamp(-SPAN / columns, SPAN / columns)
         needed = (4 * len(points) + SHADED_BYTES) * rows * columns
-        name = f"{len(points)} views of {rows} × {columns} samples"
-        require_memory(name, needed, torch.device("cpu"))
-        module = import_module(f"renderer.visibility.{self.name}")
-        return module.rasterize(points, faces, (rows, columns), closed)
+        require_memory(f"{len(points)} views of {rows} × {columns} samples", needed, given.device)
+        name = "torch" if self.is_automatic and given.is_cuda else self.name
+        rasterize = import_module(f"renderer.visibility.{name}").rasterize
+        if name == "torch":
+            ids = rasterize(given, as_tensor(faces, device=given.device), shape, closed)
+        else:
+            ids = from_numpy(rasterize(given.cpu().numpy(), faces, shape, closed))
+        return ids.to(given.device) if isinstance(points, Tensor) else ids.numpy()
 
 
 def choose(rasterizer: str = "auto") -> Rasterizer:
     """Choose a rasterizer that works on this machine.
 
-    "auto" chooses numba if it is installed, and numpy otherwise, so that images are the
-    same on every machine.
+    "auto" chooses torch for points on a GPU. Otherwise, it chooses numba if it is installed, and
+    numpy if not, so that images are the same on every machine.
     """
     require_choice("rasterizer", rasterizer, RASTERIZERS)
     if rasterizer == "opengl":
         return Rasterizer("opengl", f"opengl ({opengl.device()})")
-    if rasterizer == "numpy":
-        return Rasterizer("numpy", "numpy")
+    if rasterizer in ("numpy", "torch"):
+        return Rasterizer(rasterizer, rasterizer)
+    is_automatic = rasterizer == "auto"
     try:
         # Only imported when it is needed, because it also imports numba, which takes 0.5 s.
         from renderer.visibility import numba
 
-        return Rasterizer("numba", f"numba ({numba.VERSION})")
+        return Rasterizer("numba", f"numba ({numba.VERSION})", is_automatic)
     except InputError:
-        if rasterizer == "numba":
+        if not is_automatic:
             raise
-    return Rasterizer("numpy", "numpy (numba is faster: pip install numba)")
+    return Rasterizer("numpy", "numpy (numba is faster: pip install numba)", is_automatic)

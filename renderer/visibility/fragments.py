@@ -12,7 +12,7 @@ show G of the F faces of the mesh.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -342,7 +342,7 @@ def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
 
 
 def build_fragments(
-    vertices: Float[np.ndarray, "V 3"],
+    vertices: Float[np.ndarray, "V 3"] | Float[Tensor, "V 3"],
     faces: Int[np.ndarray, "F 3"],
     cameras: Sequence[Camera],
     settings: ImageSettings,
@@ -351,82 +351,83 @@ def build_fragments(
 ) -> list[Fragments]:
     """Rasterize a mesh once for each camera to find the samples that show the mesh.
 
-    Vertices are in world axes. With `closed` (see `Mesh.closed`), faces that are seen from
-    behind are not drawn, except if the near plane cuts the mesh open. A mesh that reaches a
-    perspective camera raises `InputError`.
+    Vertices are in world axes. Those on a GPU give fragments there, and all others on the CPU. With
+    `closed` (see `Mesh.closed`), faces that are seen from behind are not drawn, except if the near
+    plane cuts the mesh open. A mesh that reaches a perspective camera raises `InputError`.
     """
-    require_finite(vertices=torch.from_numpy(vertices))
+    require_finite(vertices=torch.as_tensor(vertices))
+    points: Any = vertices
+    if isinstance(vertices, Tensor):
+        points = vertices.detach()
+        points = points.double() if points.is_cuda else points.cpu().double().numpy()
     # Axes: camera, coordinate, vertex. In this order, each coordinate is contiguous in
     # memory.
-    coordinates = np.stack([camera.project(vertices).T for camera in cameras])
-    projected = coordinates.swapaxes(1, 2)
+    coordinates = torch.stack([torch.as_tensor(c.project(points)).T for c in cameras])
+    projected = coordinates.mT
     # The third coordinate is the depth. It is less than -1 in front of the near plane,
     # which would cut the mesh open.
     is_uncut = bool((projected[..., 2] >= -1).all())
     shape = tuple(side * settings.samples for side in settings.shape)
     face_ids = rasterizer.rasterize(projected, faces, shape, closed and is_uncut)
+    all_faces = torch.as_tensor(faces, device=projected.device)
     views = []
-    for camera, points, ids_of_view in zip(cameras, projected, face_ids, strict=True):
-        depths = camera.depths(vertices)
-        views.append(_fragments_of_view(camera, points, depths, ids_of_view, faces, settings))
+    for camera, view_points, view_ids in zip(cameras, projected, face_ids, strict=True):
+        depths = camera.depths(points)
+        depths = None if depths is None else torch.as_tensor(depths)
+        views.append(_fragments_of_view(camera, view_points, depths, view_ids, all_faces, settings))
     return views
 
 
 def _fragments_of_view(
     camera: Camera,
-    projected: Float[np.ndarray, "V 3"],
-    depths: Float[np.ndarray, " V"] | None,
-    face_ids: Int[np.ndarray, "_ _"],
-    faces: Int[np.ndarray, "F 3"],
+    projected: Float[Tensor, "V 3"],
+    depths: Float[Tensor, " V"] | None,
+    face_ids: Int[Tensor, "_ _"],
+    faces: Int[Tensor, "F 3"],
     settings: ImageSettings,
 ) -> Fragments:
     """Create fragments from face indices (-1: no face) and depths (None: no perspective)."""
-    height, width = settings.shape
-    samples = settings.samples
-    numbers = np.arange(face_ids.size, dtype=np.int32).reshape(face_ids.shape)
-    # Values of all samples of the first pixel, then of all samples of the second pixel, and so on.
-    ids_by_pixel, numbers_by_pixel = (
-        values.reshape(height, samples, width, samples).swapaxes(1, 2).ravel()
-        for values in (face_ids, numbers)
-    )
-    covered_samples = np.flatnonzero(ids_by_pixel >= 0)
-    seen_faces, sample_to_seen_face = _compact(ids_by_pixel[covered_samples], len(faces))
-    counts_of_all_pixels = np.bincount(covered_samples // samples**2, minlength=height * width)
-    pixels = np.flatnonzero(counts_of_all_pixels)
-    sample_count = counts_of_all_pixels[pixels]
+    order = _samples_by_pixel(settings.shape, settings.samples, face_ids.device)
+    ids_by_pixel = face_ids.flatten().index_select(0, order)
+    is_covered = ids_by_pixel >= 0
+    covered = is_covered.nonzero().squeeze(1)
+    counts_of_all_pixels = is_covered.view(-1, settings.samples**2).sum(1)
+    pixels = counts_of_all_pixels.nonzero().squeeze(1)
+    sample_count = counts_of_all_pixels.index_select(0, pixels)
+    shown = ids_by_pixel.index_select(0, covered).long()
+    is_seen = torch.zeros(len(faces), dtype=torch.bool, device=faces.device)
+    is_seen.index_fill_(0, shown, True)
     # One row for each corner, one column for each seen face. Rows are contiguous in
     # memory, because later code reads all first corners together.
-    corners = np.ascontiguousarray(faces.take(seen_faces, axis=0).T)
+    seen_faces = is_seen.nonzero().squeeze(1)
+    corners = faces.index_select(0, seen_faces).T.contiguous()
     # Axes: coordinates x and y, corner, seen face.
-    outlines = projected[:, :2].T.take(corners, axis=1)
+    outlines = projected.T[:2].index_select(1, corners.flatten()).unflatten(1, (3, -1))
     (ax, bx, cx), (ay, by, cy) = outlines
     # A face is seen from behind if its corners are clockwise in the image.
     is_seen_from_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
     return Fragments(
         shape=settings.shape,
-        samples=samples,
-        pixels=torch.from_numpy(pixels),
-        coverage=torch.from_numpy(sample_count / samples**2),
-        faces=torch.from_numpy(seen_faces),
-        corners=torch.from_numpy(corners).T,
-        facing=torch.from_numpy(np.where(is_seen_from_behind, -1.0, 1.0))[:, None],
-        outlines=torch.from_numpy(outlines.T),
-        sample_to_pixel=torch.from_numpy(np.repeat(np.arange(len(pixels)), sample_count)),
-        sample_to_seen_face=torch.from_numpy(sample_to_seen_face),
-        sample_numbers=torch.from_numpy(numbers_by_pixel[covered_samples]).long(),
-        depths=None if depths is None else torch.from_numpy(depths.take(corners)).T,
+        samples=settings.samples,
+        pixels=pixels,
+        coverage=sample_count.double() / settings.samples**2,
+        faces=seen_faces,
+        corners=corners.T,
+        facing=torch.where(is_seen_from_behind, -1.0, 1.0).double()[:, None],
+        outlines=outlines.permute(2, 1, 0),
+        sample_to_pixel=torch.repeat_interleave(sample_count, output_size=len(covered)),
+        sample_to_seen_face=(is_seen.cumsum(0) - 1).index_select(0, shown),
+        sample_numbers=order.index_select(0, covered),
+        depths=None if depths is None else depths[corners].T,
         camera=camera,
     )
 
 
-def _compact(values: Int[np.ndarray, " S"], limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """Do what np.unique with inverse does, for numbers in [0, limit) and faster without sorting."""
-    # Convert the indices once here. Otherwise, each of the two lookups would convert them.
-    values = values.astype(np.intp)
-    is_present = np.zeros(limit, dtype=bool)
-    is_present[values] = True
-    distinct_values = np.flatnonzero(is_present)
-    # Index of each value among the distinct values. Other entries stay undefined.
-    value_to_index = np.empty(limit, dtype=np.intp)
-    value_to_index[distinct_values] = np.arange(len(distinct_values))
-    return distinct_values, value_to_index.take(values)
+@lru_cache(maxsize=2)
+def _samples_by_pixel(
+    shape: tuple[int, int], samples: int, device: torch.device
+) -> Int[Tensor, " N"]:
+    """List the numbers of all samples: those of the first pixel, of the second pixel, and so on."""
+    height, width = shape
+    numbers = torch.arange(height * width * samples**2, device=device)
+    return numbers.view(height, samples, width, samples).transpose(1, 2).flatten()

@@ -90,6 +90,8 @@ def test_orthographic_depth_grows_with_distance_and_positions_do_not_depend_on_i
 def test_points_are_projected_as_by_hand(camera, points, expected):
     projected = camera.project(np.array(points, dtype=float))
     np.testing.assert_allclose(projected[:, :2], expected, atol=2 * EPS)
+    of_tensor = camera.project(torch.tensor(points, dtype=torch.float64))
+    np.testing.assert_allclose(of_tensor, projected, rtol=0, atol=4 * EPS)
 
 
 @pytest.mark.parametrize("camera", [*ORTHOGRAPHIC[:2], *PERSPECTIVE])

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import moderngl
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,7 +20,7 @@ from renderer.visibility import SPAN, Rasterizer, choose, opengl
 HAS_NUMBA = find_spec("numba") is not None
 needs_numba = pytest.mark.skipif(not HAS_NUMBA, reason="numba is not installed")
 needs_egl = pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library on this machine")
-ON_THE_CPU = ("numpy", "numba") if HAS_NUMBA else ("numpy",)
+ON_THE_CPU = ("numpy", "torch", "numba") if HAS_NUMBA else ("numpy", "torch")
 
 # Corners are rounded to this number of parts of a sample.
 PARTS = 256
@@ -32,6 +33,7 @@ NO_FACE = -1
     scope="module",
     params=[
         "numpy",
+        "torch",
         pytest.param("numba", marks=needs_numba),
         pytest.param("opengl", marks=needs_egl),
     ],
@@ -260,7 +262,7 @@ def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides():
     order=st.sampled_from("CF"),
     closed=st.booleans(),
 )
-def test_numba_equals_numpy_to_the_bit(
+def test_numba_and_torch_equal_numpy_to_the_bit(
     seed, view_count, vertex_count, face_count, resolution, lattice, scales, order, closed
 ):
     """Triangles are huge, thin, without area, at samples, out of range, and at equal depths."""
@@ -270,10 +272,19 @@ def test_numba_equals_numpy_to_the_bit(
         points = np.round(points * lattice) / lattice
     points = points * scales
     faces = np.asarray(rng.integers(0, vertex_count, (face_count, 3)), order=order)
-    compiled = choose("numba").rasterize(points, faces, resolution, closed)
     plain = choose("numpy").rasterize(points, faces, resolution, closed)
-    assert compiled.dtype == plain.dtype
-    np.testing.assert_array_equal(compiled, plain)
+    for name in ("numba", "torch"):
+        other = choose(name).rasterize(points, faces, resolution, closed)
+        assert other.dtype == plain.dtype
+        np.testing.assert_array_equal(other, plain)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_auto_draws_on_a_gpu_what_numpy_draws():
+    points, faces = random_triangles(seed=11, count=500)
+    ids = choose("auto").rasterize(torch.from_numpy(points).cuda(), faces, (90, 70))
+    assert ids.is_cuda
+    np.testing.assert_array_equal(ids.cpu(), choose("numpy").rasterize(points, faces, (90, 70)))
 
 
 @needs_egl

@@ -1,0 +1,106 @@
+"""Rasterizer of torch operations, which draws all faces of many views at once, on any device.
+
+Each face is expanded to the samples of its bounding box. A sample is covered if the three edge
+functions of the face are not negative there. They are exact integers of the fixed-point corners,
+less 1 for an edge that leaves its samples to the other face (the top-left rule). Depths, keys and
+therefore faces are those of `renderer.visibility.numpy`.
+"""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from renderer.visibility.numpy import EMPTY_KEY, FACE_BITS, FAR, SUBSAMPLE_BITS, SUBSAMPLES
+
+# Faces of all views that are prepared at once, and pairs of a face and a sample that are tested at
+# once. A face takes about 300 bytes, and a pair 200.
+FACES_PER_TILE = 2**20
+PAIRS_PER_TILE = 2**20
+
+
+def rasterize(
+    points: Float[Tensor, "N V 3"], faces: Int[Tensor, "F 3"], shape: tuple[int, int], closed: bool
+) -> Int[Tensor, "N R C"]:
+    """Find the nearest face at each sample of all views, on the device of the points.
+
+    The docstring of the package `renderer.visibility` defines the coordinates and the rounding.
+    Samples without a face get -1. The program waits for a GPU once for FACES_PER_TILE faces.
+    """
+    keys = torch.full((len(points), *shape), EMPTY_KEY, device=points.device)
+    step = max(1, FACES_PER_TILE // max(1, len(faces)))
+    for some_keys, some_points in zip(keys.split(step), points.split(step), strict=True):
+        _draw(some_keys, some_points, faces, closed)
+    # The conversion keeps the low 32 bits of each key, the face index.
+    return keys.int()
+
+
+def _draw(
+    keys: Int[Tensor, "N R C"],
+    points: Float[Tensor, "N V 3"],
+    faces: Int[Tensor, "F 3"],
+    closed: bool,
+) -> None:
+    """Lower the key of each sample to that of the nearest face."""
+    rows, columns = keys.shape[1:]
+    # As on GPUs, positions in samples are computed with one multiplication and one addition, and
+    # rounded to float32. x points to the right and y down.
+    halves = points.new_tensor([columns / 2, rows / 2])
+    window = points[..., :2].float() * points.new_tensor([columns / 2, -columns / 2]) + halves
+    positions = (window.float() * SUBSAMPLES).round().long() - SUBSAMPLES // 2
+    depths = (points[..., 2] + 1) / 2 * FAR
+    # Counter-clockwise triangles have negative areas, since y points down.
+    areas = _doubled_areas(positions[:, faces])
+    is_drawn = (areas < 0 if closed else areas != 0).flatten()
+    # Corners are sorted, so that two faces with the same corners get exactly the same depth. Axes
+    # of the tensors below: corner, or edge to the next corner; M = N · F triangles.
+    corners = faces.sort(dim=1).values
+    triangles = positions[:, corners].flatten(0, 1)
+    x, y = triangles.permute(2, 1, 0)
+    depth = depths[:, corners].flatten(0, 1).T
+    first_column, widths = _covered_range(x, columns)
+    first_row, heights = _covered_range(y, rows)
+    counts = widths * heights * is_drawn
+    ends = counts.cumsum(0)
+    # The edge function is by_column · column + by_row · row + constant.
+    areas = _doubled_areas(triangles)
+    to_x, to_y = x.roll(-1, 0) - x, y.roll(-1, 0) - y
+    by_column, by_row = -SUBSAMPLES * to_y * areas.sign(), SUBSAMPLES * to_x * areas.sign()
+    is_owner = (by_column > 0) | ((by_column == 0) & (by_row > 0))
+    constant = (x * to_y - y * to_x) * areas.sign() - (~is_owner).long()
+    edges = torch.stack([by_column, by_row, constant])
+    boxes = torch.stack([first_column, first_row, widths, ends - counts])
+    # The depth is a plane through the first corner.
+    depth_b, depth_c = depth[1:] - depth[0]
+    scale = SUBSAMPLES / areas.double()
+    slope_x = (depth_b * (y[2] - y[0]) - depth_c * (y[1] - y[0])) * scale
+    slope_y = (depth_c * (x[1] - x[0]) - depth_b * (x[2] - x[0])) * scale
+    origins = triangles[:, 0].T.double() / SUBSAMPLES
+    planes = torch.stack([*origins, depth[0], slope_x, slope_y])
+    pair_count = int(ends[-1:].sum())  # The only wait for a GPU.
+    for begin in range(0, pair_count, PAIRS_PER_TILE):
+        pair = torch.arange(begin, min(begin + PAIRS_PER_TILE, pair_count), device=points.device)
+        triangle = torch.searchsorted(ends, pair, right=True)
+        column, row, width, first_pair = boxes[:, triangle]
+        step = pair - first_pair
+        column, row = column + step % width, row + step // width
+        by_column, by_row, constant = edges[..., triangle]
+        is_inside = (by_column * column + by_row * row + constant >= 0).all(0)
+        x_a, y_a, depth_a, slope_x, slope_y = planes[:, triangle]
+        rounded = (depth_a + (row - y_a) * slope_y + slope_x * (column - x_a)).round()
+        is_seen = is_inside & (rounded >= 0) & (rounded < FAR)
+        view, face = triangle // len(faces), triangle % len(faces)
+        key = torch.where(is_seen, (rounded.long() << FACE_BITS) | face, EMPTY_KEY)
+        keys.view(-1).scatter_reduce_(0, (view * rows + row) * columns + column, key, "amin")
+
+
+def _doubled_areas(triangles: Int[Tensor, "... 3 2"]) -> Int[Tensor, "..."]:
+    """Compute twice the signed areas of triangles, negative if counter-clockwise in the image."""
+    to_b, to_c = (triangles[..., 1:, :] - triangles[..., :1, :]).unbind(-2)
+    return to_b[..., 0] * to_c[..., 1] - to_c[..., 0] * to_b[..., 1]
+
+
+def _covered_range(positions: Int[Tensor, "3 M"], count: int) -> tuple[Tensor, Tensor]:
+    """Find the first row, or column, that each triangle can cover, and the number of them."""
+    low, high = (-(-ends >> SUBSAMPLE_BITS) for ends in positions.aminmax(dim=0))
+    first = low.clamp(min=0)
+    return first, (high.clamp(max=count) - first).clamp(min=0)
