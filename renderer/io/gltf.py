@@ -38,9 +38,7 @@ ATTRIBUTES |= dict.fromkeys(SKINNING, (4,))
 DRACO = "KHR_draco_mesh_compression"
 # Bytes that a face and a vertex take while the parts are read and joined.
 FACE_BYTES = 2000
-VERTEX_BYTES = 400
-# The same for a vertex that joints move.
-SKINNED_VERTEX_BYTES = 1000
+VERTEX_BYTES = 1000
 # The weights of the joints of a vertex should add up to 1. Their sum may
 # differ from 1 by at most this much, because weights with 8 bits are rounded.
 MAX_WEIGHT_ERROR = 0.01
@@ -86,10 +84,10 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     for feature in ignored_features(file.tree):
         mesh_file.ignore(feature)
     nodes = [node for node in file.scene_nodes() if "mesh" in file.tree["nodes"][node]]
-    _require_memory(file, nodes)
     material = cache(lambda index: read_material(file, index, gloss))
     part = cache(lambda *key: _read_part(file, material, *key))
     placed_parts = []
+    needed = 0
     for index in nodes:
         node = file.tree["nodes"][index]
         mesh = file.entry("meshes", node["mesh"])
@@ -99,27 +97,15 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
                 mesh_file.ignore("points and lines")
             else:
                 read = part(node["mesh"], number, weights)
+                # A small file can show one mesh very often.
+                needed += FACE_BYTES * len(read.surface.faces)
+                needed += VERTEX_BYTES * len(read.surface.values)
+                require_memory("its faces", needed, CPU)
                 placed_parts += _place(file, index, read)
     modes = {material.get("alphaMode") for material in file.tree.get("materials", ())}
     if not placed_parts and "MASK" in modes:
         raise ValueError("its alpha cuts out all faces (alphaMode MASK): use OPAQUE")
     return placed_parts
-
-
-def _require_memory(file: GltfFile, nodes: list[int]) -> None:
-    """Check that the faces fit into memory, since a small file can show one mesh very often."""
-    needed = 0
-    for index in nodes:
-        node = file.tree["nodes"][index]
-        copies = len(file.instances(index))
-        vertex_bytes = SKINNED_VERTEX_BYTES if "skin" in node else VERTEX_BYTES
-        for primitive in file.entry("meshes", node["mesh"])["primitives"]:
-            position = primitive["attributes"]["POSITION"]
-            vertices = file.entry("accessors", position)["count"]
-            corners = file.entry("accessors", primitive.get("indices", position))["count"]
-            faces = corners / 3 if primitive.get("mode", TRIANGLES) == TRIANGLES else corners
-            needed += copies * int(FACE_BYTES * faces + vertex_bytes * vertices)
-    require_memory("its faces", needed, CPU)
 
 
 def _read_part(
@@ -216,17 +202,14 @@ def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.n
 
 
 def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
-    """Place a part in the scene, once for each copy that a node shows, and cut out its holes."""
-    poses = file.instances(index)
+    """Cut holes out of a part of a node, and place it in the scene: none if no face is left."""
+    pose = file.poses[index]
     surface = part.surface
     node = file.tree["nodes"][index]
     if "skin" in node:
-        if len(poses) > 1:
-            raise ValueError("it shows several copies of a mesh that joints move")
         positions, pose = _posed(file, file.entry("skins", node["skin"]), part)
         values = np.column_stack([positions, surface.values[:, 3:]])
         surface = surface._replace(values=values)
-        poses = pose[None]
     values, faces = _visible(part.material, surface)
     if not len(faces):
         return []
@@ -246,9 +229,9 @@ def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
         mesh = replace(mesh, gloss=gloss, gloss_textures=() if texture is None else (texture,))
     normals = corners[..., NORMAL] if corners[..., NORMAL].any() else None
     if "skin" not in node:
-        return [Part(mesh, normals, pose) for pose in poses]
+        return [Part(mesh, normals, pose)]
     # The values of the normals are only compared, so they need not follow the joints.
-    posed, normals = Part(mesh, normals, poses[0]).placed()
+    posed, normals = Part(mesh, normals, pose).placed()
     return [Part(replace(posed, vertices=vertices), normals)]
 
 

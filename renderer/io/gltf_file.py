@@ -199,19 +199,6 @@ class GltfFile:
                 waiting += reversed(entry.get("children", []))
         return list(listed)
 
-    def instances(self, index: int) -> np.ndarray:
-        """Return the matrices (N, 4, 4) of the N copies of its mesh that a node shows."""
-        extensions = self.tree["nodes"][index].get("extensions", {})
-        # Files may have more attributes, such as a number of each copy.
-        arrays = {
-            name.lower(): self.array(accessor)
-            for name, accessor in extensions.get(INSTANCING, {}).get("attributes", {}).items()
-            if name in ("TRANSLATION", "ROTATION", "SCALE")
-        }
-        if len(set(map(len, arrays.values()))) > 1:
-            raise ValueError(f"the arrays of {INSTANCING} have different lengths")
-        return (self.poses[index] @ _local_matrix(arrays)).reshape(-1, 4, 4)
-
 
 def _chunks(content: bytes) -> dict[int, bytes]:
     """Divide a .glb file into its chunks, by their types (4.4)."""
@@ -230,16 +217,13 @@ def _chunks(content: bytes) -> dict[int, bytes]:
 
 
 def _local_matrix(node: dict[str, Any]) -> np.ndarray:
-    """Return the matrix (4, 4) of a node relative to its parent (3.5.2), or those of N copies."""
+    """Return the matrix (4, 4) of a node relative to its parent (3.5.2)."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
     rotation = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix()
-    linear = rotation * np.expand_dims(node.get("scale", (1, 1, 1)), -2)
-    translation = np.expand_dims(node.get("translation", (0, 0, 0)), -1)
-    copies = np.broadcast_shapes(linear.shape[:-2], translation.shape[:-2])
-    matrix = np.broadcast_to(np.eye(4), (*copies, 4, 4)).copy()
-    matrix[..., :3, :3] = linear
-    matrix[..., :3, 3:] = translation
+    matrix[:3, :3] = rotation * node.get("scale", (1, 1, 1))
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
     return matrix
 
 
@@ -250,7 +234,7 @@ SPECULAR = "KHR_materials_specular"
 IOR = "KHR_materials_ior"
 # Extensions that are read. SPECULAR and IOR are read only for the gloss.
 READ = {TRANSFORM, QUANTIZATION, SPECULAR_GLOSSINESS, SPECULAR, IOR}
-READ |= {WEBP, INSTANCING, VISIBILITY}
+READ |= {WEBP, VISIBILITY}
 # Beginnings of the names of extensions that may be required by a
 # file but ignored, because they change neither shape nor color.
 HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation_")
@@ -387,10 +371,11 @@ def ignored_features(tree: dict[str, Any]) -> list[str]:
         features.add("animations")
     if len(tree.get("scenes", ())) > 1:
         features.add("all scenes but the first" if "scene" not in tree else "other scenes")
-    for name in tree.get("extensionsRequired", []):
-        if name not in READ and not name.startswith(HARMLESS):
+    used = set(tree.get("extensionsUsed", ())) - READ
+    for name in {*tree.get("extensionsRequired", ()), *({INSTANCING} & used)} - READ:
+        if not name.startswith(HARMLESS):
             raise ValueError(f"it needs the extension {name}: export the mesh without it")
-    return sorted(features | set(tree.get("extensionsUsed", ())) - READ)
+    return sorted(features | used)
 
 
 def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:

@@ -20,14 +20,8 @@ _LINE = re.compile(rb"^[ \t]*(\S+)[ \t]*(.*)", re.MULTILINE)
 # Comment of ZBrush with the colors of vertices. Each is a
 # mask, red, green and blue in two hexadecimal digits each.
 _POLYPAINT = re.compile(rb"^#MRGB[ \t]+((?:[0-9a-fA-F]{8})+)", re.MULTILINE)
-# Option of a texture, with its values.
-_OPTION = re.compile(
-    r"(-[a-z]+)\s+((?:on|off|[rgbmlz])\s+|(?:[-+]?[\d.]+(?:e[-+]?\d+)?\s+){1,3})(.*)", re.IGNORECASE
-)
-# Options of textures that leave the colors as they are.
-_HARMLESS_OPTIONS = {"-blendu", "-blendv", "-texres", "-bm", "-boost"}
-# Options of textures that leave the colors as they are if they have these values.
-_NEUTRAL_VALUES = {"-o": [0, 0, 0], "-s": [1, 1, 1], "-t": [0, 0, 0], "-mm": [0, 1]}
+# Options of a texture that leave it as it is: a scale of 1 and a shift of 0.
+_NEUTRAL_OPTIONS = re.compile(r"(-(s(\s+1(\.0*)?)+|[ot](\s+0(\.0*)?)+)\s+)*", re.IGNORECASE)
 # End of the text of a corner that leaves out an index.
 _LEFT_OUT = -(10**18)
 
@@ -60,12 +54,10 @@ class _Material(NamedTuple):
         color: sRGB-encoded color.
         texture: Name of the image file, and the folder in which it is sought first,
             with a final /. None without a texture.
-        is_clamped: True if the texture does not repeat.
     """
 
     color: tuple[float, ...] = (1.0, 1.0, 1.0)
     texture: tuple[str, str] | None = None
-    is_clamped: bool = False
 
 
 def read_obj(file: MeshFile) -> list[Part]:
@@ -99,9 +91,6 @@ def read_obj(file: MeshFile) -> list[Part]:
     ids = [textures.index(item.texture) if item.texture else NO_TEXTURE for item in materials]
     # The row at the end is for corners without texture coordinates, whose index is -1.
     corner_uvs = np.append(uvs[:, :2], [[np.nan] * 2], axis=0)[uv_ids]
-    is_clamped = np.array([material.is_clamped for material in materials])[material_of_face]
-    if (np.abs(corner_uvs[is_clamped] - 0.5) > 0.5).any():
-        raise ValueError("textures with the option -clamp are not supported beyond their edges")
     texture_ids = np.array(ids)[material_of_face]
     texels = [file.texture(*texture) for texture in textures]
     mesh = mesh_file.colored_mesh(vertices, faces, colors, corner_uvs, texture_ids, texels)
@@ -253,8 +242,12 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
                 color = tuple(min(value, 1.0) for value in values * (3 // len(values)))
                 material = material._replace(color=color)
             case "map_kd":
-                texture, is_clamped = _texture(text)
-                material = material._replace(texture=(texture, folder), is_clamped=is_clamped)
+                texture = _NEUTRAL_OPTIONS.sub("", text, count=1)
+                if not texture or texture.startswith("-"):
+                    raise ValueError(
+                        f'"map_Kd {text}" is not an image alone: leave its options out'
+                    )
+                material = material._replace(texture=(texture, folder))
             case "d" | "tr" as key:
                 # A number may follow the option "-halo".
                 opacities[key] = float("".join(text.partition(" #")[0].split()[-1:]))
@@ -265,23 +258,3 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
     if not opacities.get("d", 1 - opacities.get("tr", 0)) >= mesh_file.OPAQUE:
         raise ValueError(f"the material {name} is transparent, which is not supported")
     return material
-
-
-def _texture(text: str) -> tuple[str, bool]:
-    """Parse the name of a texture, and whether it is clamped, from a value with options."""
-    is_clamped = False
-    while option := _OPTION.fullmatch(text):
-        name, values, text = option.groups()
-        name = name.lower()
-        words = values.lower().split()
-        if name in _NEUTRAL_VALUES:
-            neutral = _NEUTRAL_VALUES[name]
-            is_neutral = [float(word) for word in words] == neutral[: len(words)]
-        else:
-            is_neutral = name in _HARMLESS_OPTIONS or words == ["off"] or name == "-clamp"
-        if not is_neutral:
-            raise ValueError(f"the option {name} {values.strip()} of a texture is not supported")
-        is_clamped |= name == "-clamp" and words == ["on"]
-    if not text:
-        raise ValueError("a map_Kd names no image")
-    return text, is_clamped

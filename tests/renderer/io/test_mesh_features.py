@@ -169,14 +169,11 @@ ROWS = [
     ),
     *(
         (option, obj(mtl=f"map_Kd {option} red.png", face=TEXTURED), RED)
-        for option in each(
-            "-s 1 1 1|-s 1|-o 0 0 0 -s 1 1|-t 0 0 0|-mm 0 1|-cc off|-clamp on|-clamp off|-bm 1.0|"
-            "-blendu on -blendv off|-texres 256|-boost 2"
-        )
+        for option in each("-s 1 1 1|-s 1|-o 0 0 0 -s 1 1|-t 0 0.000 0")
     ),
     *(
         (option, obj(mtl=f"map_Kd {option} red.png", face=TEXTURED), REFUSED)
-        for option in ("-s 2 2 1", "-o 0.5", "-t 1", "-mm 0 2", "-cc on", "-imfchan r")
+        for option in each("-s 2 2 1|-s 1.5|-o 0.5|-t 1|-mm 0 2|-cc on|-imfchan r|-clamp on")
     ),
     ("triangle", ply(), WHITE),
     ("uchar red", ply(RGB, at="255 0 0"), RED),

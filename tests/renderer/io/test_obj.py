@@ -216,18 +216,6 @@ def test_a_texture_that_does_not_fit_into_memory_is_refused(tmp_path, monkeypatc
         load(tmp_path, text, m="newmtl m\nmap_Kd red.png\n")
 
 
-@pytest.mark.parametrize("option", ["-clamp on", ""])
-def test_a_clamped_texture_is_refused_where_it_would_not_repeat(tmp_path, option):
-    (tmp_path / "red.png").write_bytes(png_of(255, 0, 0))
-    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 2 0\nmtllib m.mtl\nusemtl m\nf 1/1 2/2 3/1\n"
-    library = f"newmtl m\nmap_Kd {option} red.png"
-    if option:
-        with pytest.raises(InputError, match="-clamp"):
-            load(tmp_path, text, m=library)
-    else:
-        assert load(tmp_path, text, m=library).corner_uvs.max() == 2
-
-
 def test_concave_faces_keep_their_shape_and_their_texture_coordinates(tmp_path):
     (tmp_path / "red.png").write_bytes(png_of(255, 0, 0))
     points = [(2, 1), (1, 1), (1, 2), (0, 2), (0, 0), (2, 0)]
