@@ -1,12 +1,14 @@
 """Fixtures of tests of several packages."""
 
 import logging
+import re
 import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from ipaddress import ip_address
+from pathlib import Path
 
 import pytest
 import torch
@@ -26,6 +28,17 @@ shapes.install()
 def pytest_configure(config: pytest.Config) -> None:
     """Choose how property tests draw their examples."""
     settings.load_profile("search" if config.option.markexpr == "slow" else "same")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files whose tests are all deselected, since they import large libraries."""
+    if collection_path.suffix == ".py":
+        marks = re.search(
+            r"^pytestmark = \[?\s*pytest\.mark\.(\w+)", collection_path.read_text(), re.M
+        )
+        if marks and f"not {marks[1]}" in config.option.markexpr:
+            return True
+    return None
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -67,6 +80,14 @@ def cache_home(tmp_path_factory) -> Iterator[None]:
     """Keep caches apart from the user's, also in commands that tests start."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("caches")))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def small_maps() -> Iterator[None]:
+    """Write small environment maps beside adversaries, since those of users take half a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("augment.attacks.adversary.MAP_HEIGHT", 64)
         yield
 
 

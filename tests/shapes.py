@@ -18,7 +18,7 @@ from torch import Tensor
 
 PACKAGES = ("renderer", "augment", "train")
 # Calls of a function that each test process checks. Loops call it thousands of times alike.
-CHECKED_CALLS = 100
+CHECKED_CALLS = 20
 
 
 def install() -> None:

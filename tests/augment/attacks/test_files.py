@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import augment
-from augment.attacks.adversary import MAP_HEIGHT
+from augment.attacks import adversary
 from augment.attacks.files import LINES, SIDE, figure
 from augment.attacks.result import AttackResult, warnings
 from renderer.io.images import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
@@ -110,9 +110,9 @@ def test_the_light_is_read_back_to_the_bit(saved_light):
 def test_negative_light_is_told_clipped_for_mitsuba_and_not_written_as_a_map(saved_light):
     name, folder, light, line = saved_light
     is_negative = name == "grace"
-    assert bool(to_map(light, MAP_HEIGHT).min() < 0) == is_negative
+    assert bool(to_map(light, adversary.MAP_HEIGHT).min() < 0) == is_negative
     assert (line["negative_light"] > 1e-6) == is_negative
-    expected = mitsuba_map(light, MAP_HEIGHT).float().clamp(min=0)
+    expected = mitsuba_map(light, adversary.MAP_HEIGHT).float().clamp(min=0)
     assert torch.equal(read_map(folder / "mitsuba" / "light.exr"), expected)
     if is_negative:
         assert not list(folder.glob("light.hdr")) + list(folder.glob("light.exr"))
