@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import pytest
@@ -16,13 +17,18 @@ from renderer.camera import Camera
 from tests.helpers import bright_or_dark
 from tests.tetrahedron import CAMERA, IMAGES, LAMP, LIGHT, MESH, SIZE, render
 
-OPERATOR = renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)
-COVERED = len(OPERATOR.pixels)
-SCENE = augment.build_scene([(MESH, "orange")], SIZE, views=2, light="uniform", samples=1)
 LABELS = torch.tensor([1, 0])
-
-
 CLASSIFIER = augment.Classifier(bright_or_dark, SIZE, ["orange", "other"])
+
+
+@cache
+def operator() -> renderer.TransferOperator:
+    return renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)
+
+
+@cache
+def small_scene() -> augment.Scene:
+    return augment.build_scene([(MESH, "orange")], SIZE, views=2, light="uniform", samples=1)
 
 
 def render_scene(scene: augment.Scene) -> Tensor:
@@ -53,10 +59,11 @@ CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
     "specular_factor": (torch.tensor(0.5), lambda x: render(gloss=renderer.Gloss(0.3, 0.0, x))),
     "camera": (torch.tensor([57.0, 28.5, 4.0, 0.25, 8.0]), lambda x: perspective(*x)),
     "orbit": (torch.tensor([2.0, 57.0, 28.5]), lambda x: render(cameras=orbit_of(x))),
-    "operator's lights": (torch.stack([LIGHT, 2 * LIGHT]), OPERATOR.image),
-    "operator's radiance": (LIGHT, OPERATOR.radiance),
-    "operator's background": (IMAGES[0], lambda x: OPERATOR.image(LIGHT, x)),
-    "radiance_gradient": (torch.rand(3, COVERED), OPERATOR.light_gradient),
+    "operator's lights": (torch.stack([LIGHT, 2 * LIGHT]), lambda x: operator().image(x)),
+    "operator's radiance": (LIGHT, lambda x: operator().radiance(x)),
+    "operator's background": (IMAGES[0], lambda x: operator().image(LIGHT, x)),
+    # The tetrahedron covers 13 pixels.
+    "radiance_gradient": (torch.rand(3, 13), lambda x: operator().light_gradient(x)),
     "vertices of a mesh": (torch.from_numpy(MESH.vertices) / 2, lambda x: mesh_with(vertices=x)),
     "faces of a mesh": (torch.from_numpy(MESH.faces), lambda x: mesh_with(faces=x)),
     "colors of a mesh": (torch.rand(4, 3, 3), lambda x: mesh_with(corner_colors=x)),
@@ -77,15 +84,21 @@ CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
         LIGHT,
         lambda x: render_scene(augment.build_scene([(MESH, "a")], SIZE, light=x, samples=1)),
     ),
-    "lights of a scene": (LIGHT, lambda x: render_scene(SCENE.changed(lights=x))),
-    "backgrounds of a scene": (IMAGES[:1], lambda x: render_scene(SCENE.changed(backgrounds=x))),
-    "examples": (torch.tensor([1, 0]), lambda x: SCENE.render(SCENE.conditions(LABELS), x)),
+    "lights of a scene": (LIGHT, lambda x: render_scene(small_scene().changed(lights=x))),
+    "backgrounds of a scene": (
+        IMAGES[:1],
+        lambda x: render_scene(small_scene().changed(backgrounds=x)),
+    ),
+    "examples": (
+        torch.tensor([1, 0]),
+        lambda x: small_scene().render(small_scene().conditions(LABELS), x),
+    ),
     "images": (IMAGES, CLASSIFIER),
     "labels": (
         torch.tensor([3, 1]),
         lambda x: (
             augment.AugmentationService(
-                augment.AugmentationSettings(), SCENE, x, 0, Phases()
+                augment.AugmentationSettings(), small_scene(), x, 0, Phases()
             ).labels
         ),
     ),

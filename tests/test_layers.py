@@ -26,13 +26,17 @@ def modules() -> dict[str, Path]:
 
 
 @cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text())))
+
+
+@cache
 def imported_modules() -> dict[str, set[str]]:
     """Map each module to what it imports of the packages, also in functions and for types."""
     known = modules()
     imported = {}
     for name, path in known.items():
-        tree = ast.parse(path.read_text())
-        nodes = list(ast.walk(tree))
+        nodes = nodes_of(path)
         plain = {
             alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names
         }
@@ -119,7 +123,7 @@ def test_only_commands_and_what_gets_all_their_settings_name_keys():
 
 def texts(path: Path) -> list[str]:
     """List the strings of a module, except for docstrings."""
-    nodes = list(ast.walk(ast.parse(path.read_text())))
+    nodes = nodes_of(path)
     docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
     constants = [node for node in nodes if isinstance(node, ast.Constant)]
     others = [node.value for node in constants if id(node) not in docstrings]

@@ -62,20 +62,22 @@ def test_missing_inputs_are_refused_before_anything_runs(tmp_path, arguments, en
 
 
 @pytest.mark.parametrize(
-    ("command", "trainings"),
+    ("command", "trainings", "tables"),
     [
-        ("cpu", ["cpu"]),
-        ("gpu", ["paper", "fast"]),
-        ("harden", ["harden"] * 2),
-        ("best", ["best"] * 5),
+        ("cpu", ["cpu"], [("cpu", "photographs")]),
+        ("gpu", ["paper", "fast"], [("paper", "photographs"), ("fast", "photographs")]),
+        ("harden", ["harden"] * 2, [("harden", "laboratory"), ("harden", "photographs")]),
+        ("best", ["best"] * 5, [("best", "laboratory"), ("best", "photographs")]),
     ],
 )
-def test_every_training_has_valid_settings(tmp_path, command, trainings):
+def test_every_training_has_valid_settings_and_tables_compare_all_runs_of_an_experiment(
+    tmp_path, command, trainings, tables
+):
     status, calls, errors = reproduce(tmp_path, command, "train.checkpoint_every=5", **INPUTS)
     assert (status, errors) == (0, "")
-    calls = [call for call in calls if call[:3] == ["-m", "train", "--multirun"]]
-    assert [call[3] for call in calls] == [f"experiment={name}" for name in trainings]
-    for call in calls:
+    started = [call for call in calls if call[:3] == ["-m", "train", "--multirun"]]
+    assert [call[3] for call in started] == [f"experiment={name}" for name in trainings]
+    for call in started:
         settings = train_command.read([first_of_sweep(word) for word in call[3:]])
         assert settings.data.path == "cifar100.npz"
         assert settings.train.checkpoint_every == 5
@@ -83,27 +85,14 @@ def test_every_training_has_valid_settings(tmp_path, command, trainings):
         is_from_network = command in ("harden", "best")
         folders = ["photographs", "laboratory"] if is_from_network else ["photographs"]
         assert [*settings.scored_folders] == folders
+    compared = [call for call in calls if call[:2] == ["-m", "scripts.compare"]]
+    for call, (experiment, images) in zip(compared, tables, strict=True):
+        runs = [f"runs/{experiment}/augment-none+seed-{seed}" for seed in (0, 1)]
+        assert call[2] == f"runs=[{','.join(runs)}]"
+        assert call[3] == f"photos={images}"
 
 
 def first_of_sweep(word: str) -> str:
     """Return a setting with the first of the values that a sweep gives it."""
     swept = ("seed=", "augment=", "train.augmentation=")
     return word.split(",")[0] if word.startswith(swept) else word
-
-
-@pytest.mark.parametrize(
-    ("command", "tables"),
-    [
-        ("cpu", [("cpu", "photographs")]),
-        ("gpu", [("paper", "photographs"), ("fast", "photographs")]),
-        ("harden", [("harden", "laboratory"), ("harden", "photographs")]),
-        ("best", [("best", "laboratory"), ("best", "photographs")]),
-    ],
-)
-def test_the_tables_compare_all_runs_of_an_experiment(tmp_path, command, tables):
-    _, calls, _ = reproduce(tmp_path, command, **INPUTS)
-    calls = [call for call in calls if call[:2] == ["-m", "scripts.compare"]]
-    for call, (experiment, images) in zip(calls, tables, strict=True):
-        runs = [f"runs/{experiment}/augment-none+seed-{seed}" for seed in (0, 1)]
-        assert call[2] == f"runs=[{','.join(runs)}]"
-        assert call[3] == f"photos={images}"

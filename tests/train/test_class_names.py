@@ -1,5 +1,6 @@
 import re
 from dataclasses import replace
+from functools import cache
 
 import pytest
 
@@ -11,10 +12,13 @@ from train.settings import ExperimentSettings
 CLASSES = ["banana", "coffee mug", "lemon", "orange"]
 
 
+@cache
+def composed() -> ExperimentSettings:
+    return train_command.read(["experiment=classifier", "network=a", "unlabeled=b", "out=c"])
+
+
 def settings(meshes: list, hard_negatives: list | None = None) -> ExperimentSettings:
-    overrides = ["experiment=classifier", "network=a", "unlabeled=b", "out=c"]
-    composed = train_command.read(overrides)
-    return replace(composed, meshes=meshes, hard_negatives=hard_negatives or [])
+    return replace(composed(), meshes=meshes, hard_negatives=hard_negatives or [])
 
 
 def test_label_lists_the_classes_of_labels_files_and_solids_once():

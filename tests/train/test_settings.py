@@ -27,7 +27,7 @@ def test_every_experiment_takes_other_data(experiment):
     assert settings.network == "b"
 
 
-@pytest.mark.parametrize("experiment", ["harden", "best", "classifier", "photographs"])
+@pytest.mark.parametrize("experiment", ["harden", "photographs"])
 def test_an_experiment_that_fine_tunes_asks_for_the_initial_network(experiment):
     with pytest.raises(InputError, match=r"^network is not set"):
         train_command.read([f"experiment={experiment}", *OTHER_DATA])
@@ -65,10 +65,7 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["attack@augment.attack=[lightning]"], "attack=lightning is not a choice"),
         (["~seed"], "~seed: a setting cannot be removed"),
         (["out="], "out is empty"),
-        (["data=npz"], "data.path is not set"),
-        (["train.epochs=abc"], "train.epochs: Value 'abc'"),
         (["scene.ground=[a]"], "scene.ground[0]"),
-        (["scene.meshes=[a]"], "scene.meshes is not a setting: did you mean meshes?"),
         (["augment.attack.geometry.radius=1"], "augment.attack.geometry is null"),
         (
             ["attack@augment.attack=[geometry]", "augment.attack.geometry.radius=-1"],
@@ -77,7 +74,6 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["attack@augment.attack=[pose]"], "renderer.silhouettes=false"),
         (["scene.projector.pixels=abc"], "scene.projector.pixels is 'abc'"),
         (["photos={renders: /x}"], "photos has the name 'renders'"),
-        (["augment=folder"], "augment.folder=None is not set"),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",
 )
@@ -115,11 +111,9 @@ TWO_CLASSES += ["scene.views=1", "augment.examples=null"]
             ["hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
             "hard_negatives[0] is solid:orange, which is of the positive class orange",
         ),
-        (["hard_negatives=[a/Orange.glb]", "augment.examples=6"], "hard_negatives[0]"),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["label=null"], "label is not set: set it to the class of the meshes, one of the 3 class"),
         (["label=ornage"], "'ornage' is not a class of the model"),
-        ([*TWO_CLASSES, "label=[orange,pear,lemon]"], "label: 'lemon' is not a class of the model"),
         ([*TWO_CLASSES, "label=[orange,pear,orange]"], "a list of several, each once"),
         (["label=[orange,apple]"], "label=['orange', 'apple'] has no mesh of apple"),
         ([*TWO_CLASSES, "meshes=[a.glb,'solid:pear']"], "meshes[0] has no class"),

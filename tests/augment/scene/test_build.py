@@ -60,8 +60,9 @@ def lowest_roughness(scene: Scene, settings: MaterialSettings) -> float:
     return float(roughness.expand(is_own.shape)[torch.from_numpy(is_own)].min())
 
 
-@pytest.mark.parametrize("radius", [0.3, 0.64, 1.5, None])
-@pytest.mark.parametrize("smoothest", [0.6, 0.5])
+@pytest.mark.parametrize(
+    ("smoothest", "radius"), [(0.6, 0.3), (0.5, 0.64), (0.6, 1.5), (0.5, None)]
+)
 def test_the_degree_shows_the_least_roughness_that_an_attack_on_the_material_reaches(
     smoothest, radius
 ):

@@ -174,7 +174,7 @@ PARTS = {"colored": (1.0, (1, 0)), "white": (1.0, (0, 1)), "varnish": (0.0, (Non
 @pytest.mark.parametrize(
     ("degree", "roughnesses"),
     [
-        (10, [0.2, 0.6]),
+        (10, [0.2]),
         pytest.param(39, [0.2, 0.27], marks=pytest.mark.slow),
         pytest.param(5, [0.2, 0.22, 0.3, 0.6, 0.85, 1.0], marks=pytest.mark.slow),
         pytest.param(20, [0.2, 0.22, 0.3, 0.6, 0.85, 1.0], marks=pytest.mark.slow),

@@ -92,9 +92,7 @@ def test_published_networks_record_what_they_were_trained_for(name, labels):
 
 
 MISTAKES = [
-    ([*EVALUATE, "skip_unreadable=maybe"], "skip_unreadable: "),
     ([*EVALUATE, "label=pear"], "label: classifier run:1.10: 'pear'"),
-    ([*EVALUATE, "label=[]"], "label=[]"),
     (
         [*EVALUATE, "network=torchvision:resnet18"],
         "run=1.10 and network=torchvision:resnet18 do not",
@@ -102,9 +100,7 @@ MISTAKES = [
     ([*EVALUATE_CLASSIFIER, "network=python:nowhere:build"], "network=python:nowhere:build"),
     ([*EVALUATE, "weights=b"], "weights=b"),
     ([*EVALUATE, "out=file"], "out=file"),
-    (["compare"], "runs is not set"),
     (["compare", "runs=[2024]"], "runs: 2024 holds no run"),
-    (["compare", "--multirun"], "--multirun"),
     (["lab", "out=file/out"], "out=file/out"),
     ([*ATTACK, "transfer.networks=[resnet18]"], "transfer.networks=resnet18"),
     ([*ATTACK, "transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "'paer' is not a class"),

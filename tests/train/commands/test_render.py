@@ -3,6 +3,7 @@
 import gc
 import json
 import tarfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +27,11 @@ COUNT = 11
 MAPS = ["mask", "depth", "normals"]
 
 
-@pytest.fixture(autouse=True)
-def small_blocks(monkeypatch):
-    monkeypatch.setattr(dataset, "BLOCK", 4)
+@pytest.fixture(autouse=True, scope="module")
+def small_blocks() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "BLOCK", 4)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +48,12 @@ def write(meshes, out: Path, **options) -> Path:
     return out
 
 
+@pytest.fixture(scope="module")
+def written(meshes, tmp_path_factory) -> Path:
+    """Write a folder with all maps."""
+    return write(meshes, tmp_path_factory.mktemp("written") / "out", maps=MAPS)
+
+
 def pictures(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.rglob("[0-9]*.png"))}
 
@@ -58,13 +67,12 @@ def decoded(counts: list[int], size: list[int]) -> np.ndarray:
     return values.reshape(size[::-1]).T.astype(bool)
 
 
-def test_torchvision_reads_the_classes_of_folders(meshes, tmp_path):
-    folder = write(meshes, tmp_path / "out")
+def test_torchvision_reads_the_classes_of_folders(written):
     for part, count in {"train": 7, "val": 4}.items():
-        found = ImageFolder(str(folder / part))
+        found = ImageFolder(str(written / part))
         assert len(found) == count and found.classes == ["ball", "box"]
         for path, label in found.samples:
-            of_render = details(folder, int(Path(path).stem))
+            of_render = details(written, int(Path(path).stem))
             assert of_render["objects"][0]["class"] == found.classes[label]
             assert of_render["split"] == part
 
@@ -99,12 +107,11 @@ def test_lines_of_yolo_are_centers_and_sizes_as_fractions(meshes, tmp_path):
         assert found == pytest.approx([left, top, right - left, bottom - top], abs=1e-4)
 
 
-@pytest.mark.parametrize("maps", [[], ["mask"]])
-def test_without_maps_of_depth_the_pictures_are_the_same(meshes, tmp_path, maps):
-    every, some = (write(meshes, tmp_path / str(i), maps=of) for i, of in enumerate((MAPS, maps)))
-    assert pictures(every).items() >= pictures(some).items()
-    assert len(pictures(some)) == COUNT * (1 + len(maps))
-    assert "depth_scale" not in details(some, 0)
+def test_without_maps_the_pictures_are_the_same(meshes, written, tmp_path):
+    folder = write(meshes, tmp_path / "out", maps=[])
+    assert pictures(written).items() >= pictures(folder).items()
+    assert len(pictures(folder)) == COUNT
+    assert "depth_scale" not in details(folder, 0)
 
 
 def test_views_of_one_light_each_are_shaded_as_operators_shade_them(meshes):
@@ -117,37 +124,39 @@ def test_views_of_one_light_each_are_shaded_as_operators_shade_them(meshes):
     assert torch.equal(direct.masks, operator.masks)
 
 
-def test_a_tar_file_has_the_same_pictures_as_a_folder(meshes, tmp_path):
-    expected = pictures(write(meshes, tmp_path / "folder", maps=["mask"]))
-    folder = write(meshes, tmp_path / "tar", format="webdataset", maps=["mask"])
+def test_a_tar_file_has_the_same_pictures_as_a_folder(meshes, written, tmp_path):
+    expected = pictures(written)
+    folder = write(meshes, tmp_path / "tar", format="webdataset", maps=MAPS)
     found = {}
     for path in folder.glob("*.tar"):
         with tarfile.open(path) as tar:
             for member in tar:
-                found[member.name.replace(".mask", "_mask")] = tar.extractfile(member).read()
+                stem, *parts = member.name.split(".")
+                found["_".join([stem, *parts[:-1]]) + "." + parts[-1]] = tar.extractfile(
+                    member
+                ).read()
     assert {name: found[name] for name in expected} == expected
     assert {found[name] for name in found if name.endswith(".cls")} == {b"0", b"1"}
 
 
-def test_shards_and_stopped_commands_give_the_same_pictures(meshes, tmp_path):
-    expected = pictures(write(meshes, tmp_path / "one"))
+def test_shards_and_stopped_commands_give_the_same_pictures(meshes, written, tmp_path):
+    expected = pictures(written)
     folder = tmp_path / "shards"
     for shard in (1, 0):
-        write(meshes, folder, shards=2, shard=shard)
+        write(meshes, folder, maps=MAPS, shards=2, shard=shard)
     assert pictures(folder) == expected
     kept = folder / "details/000000.json"
     before = kept.stat().st_mtime_ns
     for index in (4, COUNT - 1):
         (folder / f"details/{index:06d}.json").unlink()
-    write(meshes, folder)
+    write(meshes, folder, maps=MAPS)
     assert pictures(folder) == expected and kept.stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize("changed", [{"seed": 1}, {"size": 8}, {"format": "coco"}])
-def test_a_data_set_of_other_settings_is_not_continued(meshes, tmp_path, changed):
-    folder = write(meshes, tmp_path / "out", count=2)
+@pytest.mark.parametrize("changed", [{"seed": 1}, {"format": "coco"}])
+def test_a_data_set_of_other_settings_is_not_continued(meshes, written, changed):
     with pytest.raises(InputError, match=next(iter(changed))):
-        write(meshes, folder, **{"count": 2} | changed)
+        write(meshes, written, maps=MAPS, **changed)
 
 
 def test_a_folder_of_other_files_is_refused(meshes, tmp_path):

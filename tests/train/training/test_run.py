@@ -275,14 +275,10 @@ def test_a_full_disk_is_one_error_for_every_writer_and_the_run_can_be_resumed(
     assert len(read_metrics(tmp_path)) == 2
 
 
-def test_arms_with_and_without_renders_differ_in_their_renders_alone(tiny, tmp_path):
-    """Renders draw nothing from the random streams of training."""
+def test_arms_with_and_without_renders_draw_the_same_in_training(tiny, tmp_path):
     completed_run(tiny(*WITHOUT_RENDERS), tmp_path / "none")
     completed_run(tiny("train.epochs=1", "augment.examples=0"), tmp_path / "empty")
-    completed_run(tiny("train.epochs=1"), tmp_path / "renders")
-    without_renders = weight_hashes(tmp_path / "none")
-    assert weight_hashes(tmp_path / "empty") == without_renders
-    assert weight_hashes(tmp_path / "renders") != without_renders
+    assert weight_hashes(tmp_path / "empty") == weight_hashes(tmp_path / "none")
     assert not (tmp_path / "none" / "renders").exists()
 
 
