@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from bisect import bisect
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from functools import cache
 from itertools import accumulate
 from typing import Any, NamedTuple, cast
@@ -340,6 +341,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         limit = f"{errors.MAX_MAGNITUDE:g}"
         raise InputError(f"the image has values that are NaN or beyond ±{limit}: replace them")
     depths = None if depth is None else _as_depth(depth, frames, count)
+    is_mixed = torch.is_autocast_enabled(plain.device.type)
     groups: dict[Any, list[int]] = {}
     for row, light in enumerate(lights):
         groups.setdefault((id(light and light.model), light and light.strength), []).append(row)
@@ -348,7 +350,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         chosen = [light for light in (lights[row] for row in rows) if light is not None]
         part = frames if len(rows) == len(frames) else frames[rows]
         depth_of_rows = None if depths is None else depths[rows]
-        with torch.autocast(plain.device.type, enabled=False):
+        with torch.autocast(plain.device.type, enabled=False) if is_mixed else nullcontext():
             parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
     if len(parts) == 1:
         return parts[0].reshape(plain.shape)
@@ -466,22 +468,18 @@ def _noisy_bytes(
 def relit_bytes(colors: UInt8[Tensor, "N C H W"], light: Illumination) -> UInt8[Tensor, "N C H W"]:
     """Multiply the linear colors of bytes by light, and return the nearest bytes."""
     tables = _tables(colors.device)
-    loop = loops.relit_bytes(colors)
+    loop = loops.relit_bytes(colors, light.field)
     if loop is None:
         decoded = tables.decoded.index_select(0, colors.flatten().int()).view(colors.shape)
         linear = (decoded * light.total()).clamp_(max=1)
         bins = (linear * BINS).int()
         return tables.lowest[bins] + (linear >= tables.limit[bins])
-    count, channels = colors.shape[:2]
-    gain, offset = (
-        torch.as_tensor(part, dtype=torch.float32).expand(count, channels, 1, 1)[..., 0, 0]
-        for part in light[1:]
-    )
-    flat = colors.flatten(2).contiguous()
-    loop(
-        flat, light.field.float().flatten(2), gain, offset, *tables, relit := torch.empty_like(flat)
-    )
-    return relit.view(colors.shape)
+    parts = [part.numpy()[..., 0, 0] if isinstance(part, Tensor) else part for part in light[1:]]
+    gain, offset = (np.full(colors.shape[:2], part, np.float32) for part in parts)
+    relit = colors.new_empty(colors.shape)
+    field = light.field.float().flatten(2)
+    loop(colors.flatten(2), field, gain, offset, *tables, relit.flatten(2))
+    return relit
 
 
 def _albumentations(lighting: RandomLighting) -> Any:

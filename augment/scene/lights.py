@@ -215,15 +215,23 @@ class ProjectedSlide(LightModel):
         draws = [torch.Generator().manual_seed(seed) for seed in drawn.seeds]
         pictures = torch.cat([draw_slides(1, drawn.size, draw, self.slides) for draw in draws])
         log_gain = drawn.numbers[4:-1, :, 0, 0, 0].T.reshape(-1, 3, self.cells, self.cells)
-        gain = smooth(log_gain, drawn.size, mode="bilinear").exp()
-        return Illumination(gain * pictures.to(gain) * shading(drawn), offset=drawn.numbers[3])
+        light = smooth(log_gain, drawn.size, mode="bilinear").exp_()
+        for factor in (pictures.to(light), shading(drawn)):
+            light = light * factor if light.requires_grad else light.mul_(factor)
+        return Illumination(light, offset=drawn.numbers[3])
 
 
 def shading(drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
     """Compute the shading of a surface from its steepness and the direction of the light."""
     steepness, azimuth, polar, *_ = drawn.numbers
     surface = drawn.surface(steepness)
-    return lambert(surface.slope_down, surface.slope_right, *direction(azimuth, polar))
+    slopes, towards = (surface.slope_down, surface.slope_right), direction(azimuth, polar)
+    if loop := loops.cosines(drawn.numbers, *slopes):
+        cosine = drawn.numbers.new_empty(slopes[0].shape)
+        flat = (slope.flatten(1) for slope in slopes)
+        loop(*flat, torch.cat(towards, 1)[..., 0, 0], cosine.flatten(1))
+        return cosine
+    return lambert(*slopes, *towards)
 
 
 @dataclass(frozen=True)
@@ -243,25 +251,23 @@ class DirectionalLight(LightModel):
 
 
 def lamp_light(
-    surface: Surface,
-    right: Float[Tensor, "B L 1 1"],
-    down: Float[Tensor, "B L 1 1"],
-    above: Float[Tensor, "B L 1 1"],
-) -> Float[Tensor, "B L H W"]:
-    """Compute the irradiance of small lamps, cos / distance², in units of that right below them."""
+    surface: Surface, places: Float[Tensor, "B L 3"], colors: Float[Tensor, "B L C"]
+) -> Float[Tensor, "B C H W"]:
+    """Add up the irradiance of small lamps, cos / distance², in units of that right below each."""
     x, y, height = surface.position
     # With a depth, x and y differ from pixel to pixel.
-    if len(x.flatten()) == x.shape[3] and (loop := loops.lamps(right + height)):
+    if len(x.flatten()) == x.shape[3] and (loop := loops.lamps(places, height)):
         slopes = surface.slope_down[:, 0], surface.slope_right[:, 0]
-        places = torch.cat([right, down, above], 3)[:, :, 0]
-        field = height.new_empty(*right.shape[:2], *height.shape[2:])
-        loop(*slopes, height[:, 0], x.flatten(), y.flatten(), places, field)
-        return field
+        light = height.new_empty(len(places), colors.shape[2], *height.shape[2:])
+        loop(*slopes, height[:, 0], x.flatten(), y.flatten(), places, colors, light)
+        return light
+    right, down, above = places[..., None, None].unbind(2)
     # No surface is nearer to the lamp than a tenth of its distance.
     offsets = right - x, down - y, torch.maximum(above - height, 0.1 * above)
     squares = torch.addcmul(offsets[0] ** 2 + offsets[1] ** 2, offsets[2], offsets[2])
     cosine = lambert(surface.slope_down, surface.slope_right, *offsets)
-    return cosine * (squares * squares.sqrt()).reciprocal() * above**2
+    fields = cosine * (squares * squares.sqrt()).reciprocal() * above**2
+    return (colors.mT @ fields.flatten(2)).unflatten(2, fields.shape[2:])
 
 
 @dataclass(frozen=True)
@@ -278,8 +284,9 @@ class PointLight(LightModel):
 
     def light(self, drawn: Drawn) -> Illumination:
         """Add weak ambient light to the light of the lamp."""
-        steepness, *lamp, ambient, _ = drawn.numbers
-        return Illumination(lamp_light(drawn.surface(steepness), *lamp), offset=ambient)
+        place = drawn.numbers[1:4, :, :, 0, 0].permute(1, 2, 0)
+        light = lamp_light(drawn.surface(drawn.numbers[0]), place, torch.ones_like(place[..., :1]))
+        return Illumination(light, offset=drawn.numbers[4])
 
 
 @dataclass(frozen=True)
@@ -299,15 +306,12 @@ class ColoredLamps(LightModel):
         # Index of the last lamp of each image that is on.
         last = (3 * drawn.constants[:, :1]).floor().clamp(max=2)
         count = int(last.max()) + 1
-        # Numbers of each lamp, shape (5, B, count).
-        lamps = drawn.numbers[1 : 1 + 5 * count, :, 0, 0, 0].unflatten(0, (count, 5))
-        *place, hue, saturation = lamps.permute(1, 2, 0)
-        colors = random_colors(torch.stack([hue, saturation], 2).flatten(0, 1))
+        # Numbers of each lamp, shape (B, count, 5).
+        lamps = drawn.numbers[1 : 1 + 5 * count, :, 0, 0, 0].T.unflatten(1, (count, 5))
+        colors = random_colors(lamps[..., 3:].flatten(0, 1)).view(-1, count, 3)
         is_on = torch.arange(count, device=last.device) <= last
-        colors = colors.view(-1, count, 3) * is_on[..., None]
-        fields = lamp_light(surface, *(numbers[..., None, None] for numbers in place))
-        mixed = colors.mT @ fields.flatten(2)
-        return Illumination(mixed.unflatten(2, fields.shape[2:]), offset=drawn.numbers[-2])
+        light = lamp_light(surface, lamps[..., :3], colors * is_on[..., None])
+        return Illumination(light, offset=drawn.numbers[-2])
 
 
 @dataclass(frozen=True)
@@ -368,6 +372,10 @@ def circle_segment(distance: Tensor) -> Tensor:
     A straight edge at a distance, in units of the radius, leaves the fraction 1/2 + segment / π of
     a uniform disc visible. The distance is positive if the center is visible.
     """
+    if loop := loops.segment(distance):
+        segment = distance.new_empty(distance.shape)
+        loop(distance.flatten(), segment.flatten())
+        return segment
     t = distance.clamp(-1 + 1e-6, 1 - 1e-6)
     return torch.addcmul(torch.asin(t), t, torch.addcmul(t.new_ones(()), t, t, value=-1).sqrt())
 
@@ -404,7 +412,9 @@ class CastShadow(LightModel):
 
     def light(self, drawn: Drawn) -> Illumination:
         """Compute the light of the sun and of the sky."""
-        kinds = (drawn.constants[:, 0] * len(self.kinds)).long().clamp(max=len(self.kinds) - 1)
+        # Uniform numbers are less than 1, but their product with the count is rounded.
+        last = len(self.kinds) - 1
+        kinds = [min(int(each * (last + 1)), last) for each in drawn.constants[:, 0].tolist()]
 
         def segment(kind: int, rows: list[int] | slice) -> Tensor:
             numbers, constants = drawn.numbers[:, rows], drawn.constants[rows, 1:]
@@ -413,8 +423,8 @@ class CastShadow(LightModel):
 
         *_, ambient, blue = drawn.numbers
         # Light of the sky in the shadow, relative to that of sun and sky.
-        sky = ambient - ambient * torch.cat([0.5 * blue, 0.2 * blue, 0 * blue], 1)
-        return Illumination(by_kind(kinds.tolist(), segment), (1 - sky) / math.pi, (1 + sky) / 2)
+        sky = ambient - ambient * blue * blue.new_tensor([0.5, 0.2, 0.0])[:, None, None]
+        return Illumination(by_kind(kinds, segment), (1 - sky) / math.pi, (1 + sky) / 2)
 
     def _segment(self, kind: str, drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
         """Compute the segment of the sun, which depends on the distance to the edge of a shadow.
@@ -433,8 +443,7 @@ class CastShadow(LightModel):
         x, y = axes(drawn.size, right)
         x, y, scale = (x - right) / softness, (y - down) / softness, scale / softness
         constants = drawn.constants[..., None, None]
-        period, back = scale / scale, 0 * scale
-        limits = [back] * 3
+        period, back, limits = 1.0, 0.0, [scale] * 3
         index = torch.arange(self.corners, device=scale.device)[:, None, None]
         if kind == "polygon":
             turns, far = constants[:, : 2 * self.corners].chunk(2, 1)
@@ -449,11 +458,11 @@ class CastShadow(LightModel):
             limits = [scale, scale * high, scale * bar]
         # Distances of each column, and of each row, along the normals of the shape.
         columns, rows = normal.cos() * x / period, (normal.sin() * y - back) / period
-        if loop := loops.penumbra(columns):
-            segment = columns.new_empty(len(columns), *height_and_width(drawn.size))
+        if loop := loops.edges(columns):
+            distance = columns.new_empty(len(columns), *height_and_width(drawn.size))
             of_kind = ("polygon", "blinds", "window").index(kind)
-            loop(of_kind, columns[:, :, 0], rows[..., 0], torch.cat(limits, 1)[..., 0, 0], segment)
-            return segment[:, None]
+            loop(of_kind, columns[:, :, 0], rows[..., 0], torch.cat(limits, 1)[..., 0, 0], distance)
+            return circle_segment(distance[:, None])
         edges = columns + rows
         if kind == "polygon":
             # Outside a convex polygon. The distance is exact except near corners.

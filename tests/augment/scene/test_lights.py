@@ -95,9 +95,11 @@ def test_lamps_add_up():
     model = lights.ColoredLamps()
     drawn = drawn_of(model, {model.dimensions: 0.99})
     surface, total = drawn.surface(drawn.numbers[0], start=1), 0.0
-    for lamp in drawn.numbers[1:16].split(5):
-        color = patterns.random_colors(lamp[3:, 0, :, 0, 0].T)
-        total = total + color * lights.lamp_light(surface, *lamp[:3])
+    for lamp in drawn.numbers[1:16, 0, 0, 0, 0].split(5):
+        color = patterns.random_colors(lamp[None, 3:])
+        total = total + color * lights.lamp_light(
+            surface, lamp[None, None, :3], torch.ones(1, 1, 1)
+        )
     torch.testing.assert_close(model.light(drawn).field, total)
 
 
