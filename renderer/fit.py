@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares, nnls
@@ -305,32 +305,9 @@ class _Target(NamedTuple):
         coverage = no_coverage.index_copy(0, pixels, operator.coverage.double())
         background = self.gray * (1 - coverage)
         image = self.image[:, pixels]
-        is_covered = torch.minimum(coverage, self.mask)[pixels] >= min_coverage
-        light, rendered, penalties = self._fit_pixels(
-            transfer, background[pixels], image, is_covered.expand(CHANNELS, -1), grid
-        )
-        rendered_image = background.repeat(CHANNELS, 1).index_copy(1, pixels, rendered)
-        differences = rendered_image.clamp(max=1) - self.image
-        residuals = torch.cat([differences.flatten(), penalties.flatten()])
-        return residuals, light, coverage
-
-    def _fit_pixels(
-        self,
-        transfer: Float[Tensor, "3 49 P"],
-        background: Float[Tensor, " P"],
-        image: Float[Tensor, "3 P"],
-        is_covered: Bool[Tensor, "3 P"],
-        grid: int,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Fit a light to P pixels of the photograph by least squares.
-
-        A pixel that is clipped in the photograph may have been brighter. The fit is repeated
-        without the clipped pixels that the render makes brighter than 1. `transfer` is the radiance
-        under 49 lights with one coefficient of 1 each. The result is the light (49, 3), the values
-        (3, P) of its render, and the weighted differences (3, 49) from the expected light.
-        """
-        object_radiance = image - background
-        is_clipped = image >= CLIPPED_VALUE
+        covered_share = torch.minimum(coverage, self.mask)[pixels]
+        is_covered = (covered_share >= min_coverage).expand(CHANNELS, -1)
+        object_radiance = image - background[pixels]
         is_used = is_covered
         for _ in range(CLIPPING_ROUNDS):
             # Matrix and right side of the normal equations of each channel, shape (3, 49, 49) and
@@ -340,12 +317,18 @@ class _Target(NamedTuple):
             right_side = (used_transfer @ object_radiance[..., None])[..., 0]
             penalty = self.penalty(normal_matrix)
             light, expected_light = _fit_channels(normal_matrix, right_side, penalty, grid)
-            rendered = (light.T[:, None] @ transfer)[:, 0] + background
-            is_trusted = is_covered & ~(is_clipped & (rendered > 1))
+            rendered = (light.T[:, None] @ transfer)[:, 0] + background[pixels]
+            # A pixel that is clipped in the photograph may have been brighter. The fit is repeated
+            # without the clipped pixels that the render makes brighter than 1.
+            is_trusted = is_covered & ~((image >= CLIPPED_VALUE) & (rendered > 1))
             if torch.equal(is_trusted, is_used):
                 break
             is_used = is_trusted
-        return light, rendered, penalty.sqrt() * (light - expected_light).T
+        rendered_image = background.repeat(CHANNELS, 1).index_copy(1, pixels, rendered)
+        differences = rendered_image.clamp(max=1) - self.image
+        penalties = penalty.sqrt() * (light - expected_light).T
+        residuals = torch.cat([differences.flatten(), penalties.flatten()])
+        return residuals, light, coverage
 
     def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
         """Sort cameras by the squared error of a render with their best light, smallest first."""

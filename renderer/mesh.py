@@ -289,25 +289,15 @@ def _closed_parts(face_bytes: bytes) -> Int[np.ndarray, " F"] | None:
     from trimesh.graph import connected_component_labels
 
     faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
-    # First and last vertex of each edge of each face, shape (3 F, 2).
-    # The edges in rows 3 f, 3 f + 1 and 3 f + 2 belong to face f.
-    edge_ends = faces[:, EDGES].reshape(-1, 2)
-    vertex_count = faces.max(initial=0) + 1
-    # An edge from vertex a to vertex b gets the key a · V + b, for V vertices.
-    keys = edge_ends @ [vertex_count, 1]
-    # Key of the same edge in the opposite direction: b · V + a.
-    reversed_keys = edge_ends @ [1, vertex_count]
-    order = np.argsort(keys)
-    reversed_order = np.argsort(reversed_keys)
-    is_repeated = (np.diff(keys[order]) == 0).any()
-    # Each edge of a closed surface occurs once in each direction,
-    # so the set of keys equals the set of reversed keys.
-    if is_repeated or not np.array_equal(keys[order], reversed_keys[reversed_order]):
+    _, edge_of_side = shared_edges(faces)
+    edges = edge_of_side.ravel()
+    starts, ends = faces[:, EDGES].reshape(-1, 2).T
+    # Each edge of a closed surface has one side in each direction.
+    directions = np.bincount(edges, np.sign(ends - starts))
+    if (np.bincount(edges) != 2).any() or directions.any():
         return None
-    # Both orders list the edges by the same keys, so entry i of the
-    # first order and entry i of the second one are the same edge in
-    # two neighboring faces. The edge in row r belongs to face r // 3.
-    neighboring_faces = np.stack([order, reversed_order], axis=1) // 3
+    # Side s of face f has the number 3 f + s.
+    neighboring_faces = np.argsort(edges, kind="stable").reshape(-1, 2) // 3
     return connected_component_labels(neighboring_faces, node_count=len(faces))
 
 

@@ -191,7 +191,8 @@ def render(
             indirect = partial(transport.radiance, surface)
         lamp_view = None
         if local_lights:
-            lamp_view = LocalLightView(rays, mesh, fragments, settings, vertices, gloss)
+            on_cpu = fragments.to("cpu")
+            lamp_view = LocalLightView(rays, Surface(mesh, on_cpu, settings, vertices, gloss))
         shaded_view = ShadedView(
             mesh=mesh,
             fragments=fragments,

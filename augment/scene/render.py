@@ -338,8 +338,8 @@ class DirectRenderer:
         if key not in self._local_views:
             fragments, _ = self.view(object_index, camera)
             mesh = self.objects[object_index].mesh
-            rays = self._rays_among(object_index)
-            self._local_views[key] = LocalLightView(rays, mesh, fragments, self.settings)
+            surface = Surface(mesh, fragments.to("cpu"), self.settings)
+            self._local_views[key] = LocalLightView(self._rays_among(object_index), surface)
         return self._local_views[key]
 
     def masks(
@@ -453,7 +453,8 @@ class DirectRenderer:
             rays = (
                 self._rays_among(object_index) if moved is None else Rays(_moved(item.mesh, moved))
             )
-            lamp_view = LocalLightView(rays, item.mesh, fragments, self.settings, moved, gloss)
+            surface = Surface(item.mesh, fragments.to("cpu"), self.settings, moved, gloss)
+            lamp_view = LocalLightView(rays, surface)
 
         def indirect(albedo: Float[Tensor, "S 3"], light: Float[Tensor, "K 3"]) -> Tensor:
             """Compute the radiance that shadows and bounces of environment light add."""

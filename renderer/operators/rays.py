@@ -18,7 +18,7 @@ covered samples in P pixels, and these samples show G of the F faces.
 import math
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -90,7 +90,7 @@ class Surface:
         """Positions of the V vertices in world axes, float64, shape (V, 3)."""
         if self.moved is None:
             return torch.from_numpy(self.mesh.vertices)
-        return self.moved.double()
+        return self.moved.cpu().double()
 
     @cached_property
     def planes(self) -> Tensor:
@@ -403,6 +403,7 @@ def unoccluded(
     return LightPaths(*(field[is_unblocked] for field in paths))
 
 
+@dataclass(frozen=True, eq=False)
 class LocalLightView:
     """A view of one mesh that is rendered many times under lamps and projectors.
 
@@ -412,32 +413,16 @@ class LocalLightView:
     hold fixed which lamps, and which pixels of a projected pattern, light a
     sample.
 
-    Args:
+    Attributes:
         rays: Rays among the faces of the mesh.
-        mesh: Mesh that the view shows, with V vertices.
-        fragments: Samples of the view that show the mesh.
-        settings: Settings of the image.
-        vertices: Vertex positions to use instead of `mesh.vertices`,
-            shape (V, 3). None uses `mesh.vertices`.
-        gloss: Gloss to use instead of the gloss of the mesh. None uses the gloss
-            of the mesh.
+        surface: Points, normals and gloss of the samples.
+        fixed_paths: For each light that stays in place, its paths to samples that no
+            face blocks.
     """
 
-    def __init__(
-        self,
-        rays: Rays,
-        mesh: Mesh,
-        fragments: Fragments,
-        settings: ImageSettings,
-        vertices: Tensor | None = None,
-        gloss: Gloss | None = None,
-    ):
-        """Prepare the view. Rays are cast in the first render."""
-        vertices = None if vertices is None else vertices.cpu()
-        self._rays = rays
-        self._surface = Surface(mesh, fragments.to("cpu"), settings, vertices, gloss)
-        # For each light that stays in place, its paths to samples that no face blocks.
-        self._fixed_paths: dict[LocalBasis, LightPaths] = {}
+    rays: Rays
+    surface: Surface
+    fixed_paths: dict[LocalBasis, LightPaths] = field(default_factory=dict)
 
     def radiance(
         self,
@@ -453,14 +438,14 @@ class LocalLightView:
         It is multiplied by the fraction of each pixel that the mesh covers. Lamps may have moved
         to `positions`, and `fragments` may assign the samples to other pixels.
         """
-        surface = self._surface
+        surface = self.surface
         moved = positions.cpu().double() if basis.is_movable and positions is not None else None
-        paths = self._fixed_paths.get(basis) if moved is None else None
+        paths = self.fixed_paths.get(basis) if moved is None else None
         if paths is None:
             samples = surface.points, surface.normals, surface.planes
-            paths = unoccluded(self._rays, basis, *samples, moved)
+            paths = unoccluded(self.rays, basis, *samples, moved)
         if moved is None:
-            self._fixed_paths[basis] = paths
+            self.fixed_paths[basis] = paths
         shown = (fragments or surface.fragments).to("cpu")
         # Irradiance at the end of each path: one row for each path, one column for each color.
         irradiance = paths.irradiance[:, None] * light.cpu().double()[paths.function]

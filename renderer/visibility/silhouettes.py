@@ -44,7 +44,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.camera import Camera
-from renderer.mesh import EDGES
+from renderer.mesh import EDGES, shared_edges
 from renderer.visibility.fragments import Fragments
 from renderer.visibility.numpy import SUBSAMPLES, to_fixed_point
 
@@ -501,14 +501,5 @@ def _edges(face_bytes: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     argument holds int64 vertex indices as bytes, because a key of the cache is hashed.
     """
     faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
-    # Vertices at both ends of the sides: one row for each side, one column for each face.
-    start, end = faces.T.take(EDGES, axis=0).swapaxes(0, 1)
-    low = np.minimum(start, end).ravel()
-    high = np.maximum(start, end).ravel()
-    vertex_count = int(high.max()) + 1
-    # The two vertices of a side are combined to one number, because `np.unique` sorts
-    # numbers faster than pairs.
-    keys, edge_of_side, face_count = np.unique(
-        low * vertex_count + high, return_inverse=True, return_counts=True
-    )
-    return np.stack(np.divmod(keys, vertex_count)), edge_of_side.ravel(), face_count
+    ends, edge_of_side = shared_edges(faces)
+    return ends.T, edge_of_side.T.ravel(), np.bincount(edge_of_side.ravel())

@@ -20,7 +20,7 @@ from renderer.mesh import Mesh, concatenate
 from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
-from renderer.operators.rays import LocalLightView, Rays
+from renderer.operators.rays import LocalLightView, Rays, Surface
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo
 from renderer.visibility import choose
@@ -150,12 +150,13 @@ class LitView:
 
     def moved_lamps(self, positions: Tensor, powers: Tensor) -> Tensor:
         """Return the radiance (3, P) under lamps at positions (L, 3) with powers (L, 3)."""
-        lit = LocalLightView(Rays(self.mesh), self.mesh, self.view, self.settings)
+        lit = LocalLightView(Rays(self.mesh), Surface(self.mesh, self.view, self.settings))
         return lit.radiance(self.basis, self.albedo, powers, positions)
 
     def changed_surface(self, vertices: Tensor, albedo: Tensor) -> Tensor:
         """Return the radiance (3, P) of other vertices (V, 3) and albedo (S, 3)."""
-        lit = LocalLightView(Rays(self.mesh), self.mesh, self.view, self.settings, vertices)
+        surface = Surface(self.mesh, self.view, self.settings, vertices)
+        lit = LocalLightView(Rays(self.mesh), surface)
         return lit.radiance(self.basis, albedo, draw_uniform(self.basis.size, 3))
 
 

@@ -31,7 +31,7 @@ from renderer.microfacets import reflectance
 from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
-from renderer.operators.rays import LocalLightView, Rays
+from renderer.operators.rays import LocalLightView, Rays, Surface
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shaded_view import ShadedView
@@ -659,7 +659,9 @@ class GlossyView:
             vertices,
             values["albedo"],
             SplitLight(values["environment"], [(self.LAMP, values["lamp"])]),
-            LocalLightView(self.rays, self.mesh, self.view, self.settings, vertices, gloss),
+            LocalLightView(
+                self.rays, Surface(self.mesh, self.view, self.settings, vertices, gloss)
+            ),
             gloss=gloss,
         )
         return (view.radiance() * self.upstream).sum()
