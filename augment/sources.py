@@ -11,7 +11,9 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
+from runpy import run_path
 from typing import Any
 
 import torch
@@ -47,9 +49,11 @@ def imagenet_classes() -> tuple[str, ...]:
     Each name occurs once, because torchvision renames duplicates. For example,
     the bird is "crane bird" and the machine is "crane".
     """
-    from torchvision.models import SqueezeNet1_0_Weights
-
-    return tuple(SqueezeNet1_0_Weights.DEFAULT.meta["categories"])
+    # Importing torchvision takes as long as importing torch, so only its file of names is read.
+    package = find_spec("torchvision")
+    assert package is not None and package.origin is not None
+    names = run_path(str(Path(package.origin).with_name("models") / "_meta.py"))
+    return tuple(names["_IMAGENET_CATEGORIES"])
 
 
 def _classifier(

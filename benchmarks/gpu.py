@@ -24,22 +24,26 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
+import numpy as np
 import torch
 
 import renderer
 from augment import AugmentationService, AugmentationSettings, StepSettings
 from augment.augmentation_settings import TrainingAttackSettings
+from augment.lighting import RandomLighting
+from augment.scene.lights import MODELS
 from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch, precompute
 from renderer.visibility import choose
 from train.checkpoints import load_run
 from train.device import MixedPrecision, choose_precision, set_deterministic
+from train.networks import WideResNet
 
 NETWORK = "pretrained/none"
 MESH_COUNT = 2
@@ -56,6 +60,13 @@ SAMPLES_PER_SIDE = (64, 512, 2048)
 # An attack ends when its margin is reached. No logit reaches this margin, so
 # that every attack takes all its steps.
 ENDLESS_MARGIN = 1e3
+# Pixels per side and number of views of the question `rates`, and lights for each view.
+IMAGES = {32: 1000, 128: 250, 224: 100}
+LIGHTS_PER_VIEW = 20
+# Floating-point operations of a training step of the WideResNet for an image, and epochs of the
+# paper's experiment.
+FLOP_PER_IMAGE = 2.5e9
+PAPER_EPOCHS = 150
 # Longest text of an error, or of the end of an output, in characters.
 MAX_TEXT = 2000
 ROOT = Path(__file__).parents[1]
@@ -334,13 +345,180 @@ def training(device: str) -> Iterator[Row]:
                 }
 
 
+def rates(device: str) -> Iterator[Row]:
+    """Ask how many images a second are rendered in new light, in new poses, and with a gradient.
+
+    Args:
+        device: Device of the light.
+
+    Yields:
+        A row for each size and way, with images per second and the peak of the GPU's memory.
+    """
+    mesh = renderer.solid("orange")
+    for size, count in IMAGES.items():
+        cameras = renderer.orbit_cameras(count if device != "cpu" else 4, 2.2)
+        light = renderer.load_light("grace").to(device)
+        lights = light.expand(LIGHTS_PER_VIEW if device != "cpu" else 4, -1, -1)
+        operators = renderer.precompute_transfer(mesh, cameras, size).to(device)
+
+        def new_pose(
+            needs_gradient: bool = False,
+            size: int = size,
+            cameras: Sequence[renderer.Camera] = cameras,
+            light: torch.Tensor = light,
+        ) -> None:
+            """Render moved vertices, which are rasterized anew."""
+            vertices = torch.from_numpy(mesh.vertices).to(light).requires_grad_(needs_gradient)
+            images = renderer.render(mesh, cameras, light, size, vertices=vertices)
+            if needs_gradient:
+                images.sum().backward()
+
+        ways: dict[str, tuple[int, Callable[[], object]]] = {
+            "new light": (len(lights) * len(cameras), partial(operators.image, lights)),
+            "new pose": (len(cameras), new_pose),
+            "new pose with gradient": (len(cameras), partial(new_pose, True)),
+            "operators": (len(cameras), partial(renderer.precompute_transfer, mesh, cameras, size)),
+        }
+        for way, (image_count, call) in ways.items():
+            yield rate(f"{size}²", way, image_count, call, device)
+
+
+def rate(question: str, way: str, count: int, call: Callable[[], object], device: str) -> Row:
+    """Time a call that makes `count` things, and read the peak of the GPU's memory.
+
+    Args:
+        question: Name of the question.
+        way: Name of the way.
+        count: Number of things.
+        call: The call.
+        device: Device that it uses.
+
+    Returns:
+        Row with things per second.
+    """
+    call()
+    if device != "cpu":
+        torch.cuda.reset_peak_memory_stats()
+    milliseconds = medians({way: call}, ROUNDS, device)[way]
+    peak = 0 if device == "cpu" else torch.cuda.max_memory_allocated()
+    row = {"question": question, "way": way, "per_second": 1e3 * count / milliseconds}
+    return row | {"count": count, "peak_bytes": peak}
+
+
+def regeneration(device: str) -> Iterator[Row]:
+    """Ask how long 100 attacked renders take, and whether two rounds have equal bits.
+
+    Args:
+        device: Device of the attacks.
+
+    Yields:
+        One row.
+    """
+    set_deterministic(True)
+    network = load_on(device)
+    steps = STEPS if device != "cpu" else 1
+    services = [make_service(device, steps) for _ in range(2)]
+    first, second = (service.regenerate(network, 0).images for service in services)
+    row = rate(
+        "regeneration", "renders", len(first), partial(services[0].regenerate, network, 0), device
+    )
+    set_deterministic(False)
+    yield row | {"equal_bits": torch.equal(first, second)}
+
+
+def light_on_images(device: str) -> Iterator[Row]:
+    """Ask how many images of 256² a second each light model of `nb.RandomLighting` transforms.
+
+    Args:
+        device: Device of the images.
+
+    Yields:
+        A row for each model.
+    """
+    count = 256 if device != "cpu" else 4
+    images = torch.randint(0, 256, (count, 3, 256, 256), dtype=torch.uint8, device=device)
+    for name in MODELS:
+        yield rate("transforms", name, count, partial(RandomLighting(name), images), device)
+
+
+def peak(device: str) -> Iterator[Row]:
+    """Ask which part of the rate of a large matrix product in bfloat16 a training step reaches.
+
+    Args:
+        device: Device of the training.
+
+    Yields:
+        A row with the rates in TFLOP/s. "value" is the step, and "reference" the product.
+    """
+    side, batch = (8192, 512) if device != "cpu" else (512, 8)
+    matrix = torch.randn(side, side, device=device, dtype=torch.bfloat16)
+    network = WideResNet(100).to(device, memory_format=torch.channels_last)
+    images = torch.randn(batch, 3, 32, 32, device=device)
+    images = images.contiguous(memory_format=torch.channels_last)
+    compiled = torch.compile(network) if device != "cpu" else network
+
+    def step() -> None:
+        """Compute the gradient of a loss, as a training step does."""
+        with torch.autocast(torch.device(device).type, torch.bfloat16):
+            loss = compiled(images).square().mean()
+        loss.backward()
+
+    step()
+    times = medians({"step": step, "product": lambda: matrix @ matrix}, ROUNDS, device)
+    reached = batch * FLOP_PER_IMAGE / times["step"] / 1e9
+    yield compare_values(
+        "peak", "training step", reached, "product", 2 * side**3 / times["product"] / 1e9
+    )
+
+
+def paper(device: str) -> Iterator[Row]:
+    """Ask for the seconds of an epoch of experiment=paper, alone and four runs at once.
+
+    The images are random, as many as those of CIFAR-100.
+
+    Args:
+        device: Device of the training.
+
+    Yields:
+        A row for one run, and one for four. "total" is the time of all epochs.
+    """
+    train_count, test_count = (50_000, 10_000) if device != "cpu" else (500, 100)
+    for count in (1, 4):
+        with TemporaryDirectory() as folder, ThreadPoolExecutor(count) as pool:
+            random = np.random.default_rng(0)
+            file = Path(folder, "random.npz")
+            np.savez(
+                file,
+                train_images=random.integers(0, 256, (train_count, 3, 32, 32), dtype=np.uint8),
+                train_labels=random.integers(0, 100, train_count),
+                test_images=random.integers(0, 256, (test_count, 3, 32, 32), dtype=np.uint8),
+                test_labels=random.integers(0, 100, test_count),
+                classes=np.array(load_run(NETWORK).classes),
+            )
+            overrides = ["data=npz", f"data.path={file}", f"train.device={device}"]
+            runs = [Path(folder, str(number)) for number in range(count)]
+            epochs = list(pool.map(last_epoch, runs, *([value] * count for value in overrides)))
+        seconds = max(epoch["seconds/training"] + epoch["seconds/attack"] for epoch in epochs)
+        yield {
+            "question": "paper",
+            "way": f"{count} at once",
+            "value": seconds,
+            "total": PAPER_EPOCHS * seconds,
+        }
+
+
 QUESTIONS: dict[str, Callable[[str], Iterator[Row]]] = {
     "tests": tests,
+    "rates": rates,
+    "regeneration": regeneration,
+    "transforms": light_on_images,
+    "peak": peak,
     "rasterizers": rasterizers,
     "attack": attack,
     "shrinking": shrinking,
     "synchronizations": synchronizations,
     "training": training,
+    "paper": paper,
 }
 NEED_CUDA = ("tests", "synchronizations")
 

@@ -294,8 +294,8 @@ def find_scene(
     build: Callable[[Settings], Scene],
     cameras: int,
     draws: torch.Generator,
-) -> Settings:
-    """Search for a scene whose images a classifier recognizes before the attack.
+) -> tuple[Settings, Scene]:
+    """Search for settings of a scene, and the scene, that a classifier recognizes before an attack.
 
     The search tries several cameras. Each is tried in the light of the scene, in the built-in
     environments and in uniform light, with several exposures, and also in front of a light gray
@@ -304,8 +304,9 @@ def find_scene(
     in all their images, or if no other scene is recognized.
     """
     # The confidence is 0 if an image is misclassified.
-    if _confidences(build(settings), attack_settings, classifier).any():
-        return settings
+    scene = build(settings)
+    if _confidences(scene, attack_settings, classifier).any():
+        return settings, scene
     highest, best_settings = 0.0, settings
     for candidate in progress(_candidates(settings, cameras, draws), "search for a scene"):
         confidence, lit = _best_light(build(candidate), candidate, attack_settings, classifier)
@@ -313,7 +314,7 @@ def find_scene(
             highest, best_settings = confidence, lit
         if highest >= CONFIDENCE_TO_STOP:
             break
-    return best_settings
+    return best_settings, build(best_settings)
 
 
 def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Iterator[Settings]:

@@ -202,8 +202,11 @@ def attacks(
         chosen = settings.scene
         if chosen.search and not settings.attack.force:
             draws = generator(settings.seed, mesh.mesh, "search")
-            chosen = find_scene(classifier, chosen, settings.attack, build, chosen.search, draws)
-        yield mesh.mesh, chosen, start(build(chosen), settings.attack.force)
+            found = classifier, chosen, settings.attack, build, chosen.search, draws
+            chosen, scene = find_scene(*found)
+        else:
+            scene = build(chosen)
+        yield mesh.mesh, chosen, start(scene, settings.attack.force)
 
 
 def build_attacked(

@@ -42,7 +42,7 @@ def found(
 ) -> SceneSettings:
     build = partial(built, shared=shared)
     classifier = classifier_of(score)
-    return find_scene(classifier, settings, LIGHTING, build, cameras, generator(0))
+    return find_scene(classifier, settings, LIGHTING, build, cameras, generator(0))[0]
 
 
 def test_a_scene_that_is_classified_correctly_stays_as_it_is():
