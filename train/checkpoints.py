@@ -1,7 +1,7 @@
 """Files of networks: checkpoints, the network that a run selected, published and exported ones.
 
-Checkpoints are written atomically with a hash of their content, and read without pickle. A
-checkpoint holds a dictionary of plain values and tensors. best.pt has `model` (the network's state
+Checkpoints are written atomically, and read without pickle. A checkpoint holds a dictionary of
+plain values and tensors. best.pt has `model` (the network's state
 dict), `architecture` (what rebuilds the network, see `train.networks.describe`) and `epoch`.
 last.pt has all of `train.training.loop.Trainer.state_dict`.
 """
@@ -14,6 +14,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import safetensors.torch
 import torch
@@ -28,13 +29,10 @@ from augment.sources import SOURCES, import_function, load_classifier
 from augment.tasks.detection import Detection
 from renderer.errors import InputError, as_path, keyed, require_file, require_kind, single_line
 from renderer.io.files import atomic_write
-from train.data.sets import content_hash
 from train.networks import DETECTOR, PYTHON, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
 from train.settings import NetworkSettings, TaskSettings, published_folder
 
-# Key in a checkpoint. Its value is the hash of the other entries.
-HASH = "sha256"
 # A name of a classifier that begins with this text names the folder of a training run.
 RUN = "run:"
 # Entries in the file of a published network, in addition to the weights.
@@ -52,37 +50,31 @@ LIGHT_PREFIX = "network."
 LONGEST_REASON = 300
 
 
-def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
-    """Write a checkpoint with the hash of its content. The file is never half written.
-
-    An existing file is moved to `previous`.
-    """
-    _write({**state, HASH: content_hash(state)}, path, previous)
-
-
 def export(path: Path, network: nn.Module) -> None:
     """Write the trained weights of a classifier of the user, so that the user can load them.
 
     The weights have the names of the user's own network, without wrappers of this library.
     """
-    _write({name: value.cpu() for name, value in unwrapped(network).state_dict().items()}, path)
+    save(path, {name: value.cpu() for name, value in unwrapped(network).state_dict().items()})
 
 
-def _write(state: dict[str, Any], path: Path, previous: Path | None = None) -> None:
-    """Write a dictionary atomically by `torch.save`."""
+def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
+    """Write a checkpoint, so that the file is never half written.
+
+    An existing file is moved to `previous`.
+    """
     content = io.BytesIO()
     torch.save(state, content)
     atomic_write(path, content.getbuffer(), durable=True, previous=previous)
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a checkpoint that `save` wrote, and check its hash."""
+    """Read a checkpoint that `save` wrote. It is a zip file, whose checksums are compared."""
     require_file(path, "give a run folder that holds a checkpoint")
-    with _refused_if_damaged(path):
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        if state.pop(HASH, None) != content_hash(state):
-            raise ValueError("its content does not match its hash")
-        return _checked(state)
+    with _refused_if_damaged(path), ZipFile(path) as archive:
+        if archive.testzip():
+            raise ValueError("its content does not match its checksums")
+        return _checked(torch.load(path, map_location="cpu", weights_only=True))
 
 
 def _refused_if_damaged(path: Path) -> AbstractContextManager[None]:

@@ -121,7 +121,7 @@ class Command:
 
     def __call__(self) -> None:
         """Start the command with the arguments of this process."""
-        with system.exits_on_sigterm(), self.handle_errors():
+        with self.handle_errors():
             system.set_up_process()
             words = system.take_flag(sys.argv[1:])
             if not HELP_FLAGS.isdisjoint(words):
@@ -281,13 +281,10 @@ def format_facts(kind: type, name: str) -> str:
 
 def _format_line(left: str, right: str) -> str:
     """Format two columns. A long text on the left gets a line of its own above the right text."""
-    key = f"  {left}"
     lines = textwrap.wrap(right, TEXT_WIDTH, break_long_words=False, break_on_hyphens=False)
-    if len(key) > KEY_WIDTH - 2:
-        lines.insert(0, key)
-    elif lines:
-        lines[0] = key.ljust(KEY_WIDTH) + lines[0]
-    return f"\n{' ' * KEY_WIDTH}".join(lines or [key])
+    above = "" if len(left) < KEY_WIDTH - 3 else f"  {left}\n"
+    beside = f"  {'' if above else left}".ljust(KEY_WIDTH)
+    return (above + beside + f"\n{' ' * KEY_WIDTH}".join(lines)).rstrip()
 
 
 def read_settings(kind: type[Kind], config: DictConfig) -> Kind:

@@ -18,8 +18,9 @@ from renderer import settings as base
 from renderer.errors import MAX_SCALE, MAX_SEED, InputError, is_number, require_choice
 from renderer.settings import REQUIRED, Settings, pair, setting, setting_like
 from train import settings as common
-from train.settings import LABEL, MESHES, NETWORKS, TIME_FOLDER, TaskSettings
+from train.settings import LABEL, MESHES, NETWORKS, PROBABILITY, TIME_FOLDER, TaskSettings
 
+SCALES = (1 / MAX_SCALE, MAX_SCALE)
 # Default environment maps of an audit.
 ENVIRONMENTS = ("grace", "eucalyptus", "st_peters")
 # Renderers that can verify written adversaries.
@@ -50,12 +51,8 @@ LAB_MESHES = [
 class AttackCommandSettings(AttackSettings):
     """Settings of an attack that only the command pnb-attack has."""
 
-    relighting: RelightingSettings | None = setting(
-        None, "Attack on the light of a projector on `unlabeled`, without a mesh."
-    )
-    shared: bool = setting(
-        False, "The views share one lighting, shape or color, and their costs are summed."
-    )
+    relighting: RelightingSettings | None = setting(None, "Projector light on `unlabeled` instead.")
+    shared: bool = setting(False, "One lighting, shape or color for all views.")
     force: bool = setting(False, "Also attack images that are misclassified before the attack.")
     checks: bool | None = setting(
         None,
@@ -64,12 +61,11 @@ class AttackCommandSettings(AttackSettings):
     )
     radius_scales: list[float] = setting(
         [],
-        "Measure success against radius at these factors of each radius, such as "
-        "[0.25, 0.5, 1, 2]. A radius of null counts as 1.",
-        within=(1 / MAX_SCALE, MAX_SCALE),
+        "Factors of each radius at which success is measured, such as [0.5, 1, 2]. null: 1.",
+        within=SCALES,
     )
     verify: str | None = setting(
-        "reload", "Render the written files again: reload (here), mitsuba, reload+mitsuba or null."
+        "reload", "Render the files again: reload, mitsuba, reload+mitsuba."
     )
 
     def __post_init__(self) -> None:
@@ -90,9 +86,7 @@ class AttackSceneSettings(SceneSettings):
 
     views: int = setting_like(SceneSettings, "views", 1)
     search: int = setting(
-        10,
-        "Cameras to try for a misclassified mesh, in several lightings.",
-        within=(0, base.MAX_VIEWS),
+        10, "Cameras to try for a misclassified mesh.", within=(0, base.MAX_VIEWS)
     )
 
     def __post_init__(self) -> None:
@@ -112,9 +106,7 @@ class TransferSettings(Settings):
     """
 
     networks: list[Any] = setting([], "Other networks: as `network`, or {network, weights}.")
-    azimuths: list[float] = setting(
-        [], "Rotations of the camera about the vertical.", "degrees", within=(-360, 360)
-    )
+    azimuths: list[float] = setting([], "Rotations of the camera.", "degrees", within=(-360, 360))
     meshes: list[Any] = setting([], "Other meshes, as `meshes`, in the same lighting.")
 
 
@@ -131,37 +123,27 @@ class AttackExperimentSettings(TaskSettings):
     label: Any = setting(None, LABEL, is_text=True)
     target: Any = setting(
         None,
-        "Class to reach: null (any other), least_likely, a class, or a list, one per view.",
+        "Class to reach: null (any other), least_likely, a class, or one per view.",
         is_text=True,
     )
     goal: str | None = setting(
         None,
-        "What an attack on a detector reaches: hide (no detection of the class) or mislabel (a "
-        "better one of another class). null: hide.",
+        "Goal for a detector: hide, or mislabel (a better box of another class). null: hide.",
         choices=("hide", "mislabel"),
     )
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
     meshes: list[Any] = setting(["solid:orange:0"], MESHES, is_filled=True)
-    unlabeled: str | None = setting(
-        None, "Folder of any photographs, which attack=relighting attacks instead of meshes."
-    )
+    unlabeled: str | None = setting(None, "Folder of photographs for attack=relighting.")
     reload: str | None = setting(
-        None,
-        "Folder of an adversary, to print its predictions or, with attack=..., attack it further.",
+        None, "Folder of an adversary to classify or, with attack=..., to attack further."
     )
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
-    attack: AttackCommandSettings = setting(
-        AttackCommandSettings, "What is attacked, and how. attack=NAME+NAME names it."
-    )
-    transfer: TransferSettings = setting(
-        TransferSettings, "Where else successful adversaries are shown."
-    )
+    attack: AttackCommandSettings = setting(AttackCommandSettings, "The attack: attack=NAME+NAME.")
+    transfer: TransferSettings = setting(TransferSettings, "Where else adversaries are shown.")
     scene: AttackSceneSettings = setting(AttackSceneSettings, "The scene.")
-    renderer: RendererSettings = setting(
-        lambda: RendererSettings(shadows=True), "How images are rendered."
-    )
+    renderer: RendererSettings = setting(lambda: RendererSettings(shadows=True), "The renderer.")
 
     def __post_init__(self) -> None:
         """Check all values, and add to the scene the lights that are attacked."""
@@ -203,54 +185,31 @@ class LabSettings(Settings):
     out: str = setting(REQUIRED, "A new folder, for photos= of pnb-evaluate.")
     label: Any = setting(
         None,
-        "Positive class, or several. An object of each and one other object stand in each setup. "
-        "null: orange, the class of the default meshes.",
+        "Positive class, or several, each beside one other object in a setup. null: orange.",
         is_text=True,
     )
     meshes: list[Any] = setting(LAB_MESHES, "The objects: by default, 6 oranges and 10 others.")
-    setups: int = setting(
-        180,
-        "Draws of lighting, camera and pose. With one label, each has two renders.",
-        within=(1, common.MAX_IMAGES),
-    )
+    setups: int = setting(180, "Draws of lighting, camera and pose.", within=(1, common.MAX_IMAGES))
     patterns: list[str] = setting(
-        list(TRAINED_PATTERNS),
-        f"Projected patterns, for as many setups each: {', '.join(PATTERNS)}. a+b projects two "
-        "from two projectors.",
+        list(TRAINED_PATTERNS), f"Projected patterns: {', '.join(PATTERNS)}. a+b: two projectors."
     )
     slides: list[str] = setting([], "Image files that the pattern `slides` projects.")
     environments: list[str] = setting(
-        [], "Environment maps (.npy, .hdr, .exr) instead of patterns, for as many setups each."
+        [], "Environment maps (.npy, .hdr, .exr) instead of patterns."
     )
-    brightness: list[float] = pair(
-        [0.2, 2.5], "radiance of white surfaces that face the light.", (1 / MAX_SCALE, MAX_SCALE)
-    )
-    azimuth: list[float] = pair(
-        [-70, 70], "azimuth of a projector, relative to the camera.", (-180, 180), "degrees"
-    )
-    elevation: list[float] = pair(
-        [25, 70], "elevation of a projector above the table.", (1, 89), "degrees"
-    )
-    ambient: list[float] = pair(
-        [0.01, 0.06], "radiance of the uniform environment besides the projectors.", (0, 1)
-    )
+    brightness: list[float] = pair([0.2, 2.5], "radiance of white surfaces in the light.", SCALES)
+    azimuth: list[float] = pair([-70, 70], "azimuth of a projector.", (-180, 180), "degrees")
+    elevation: list[float] = pair([25, 70], "elevation of a projector.", (1, 89), "degrees")
+    ambient: list[float] = pair([0.01, 0.06], "radiance of the uniform environment.", (0, 1))
     albedo: list[float] = pair([0.04, 0.16], "albedo of table and wall.", (0, 1))
-    walls: float = setting(
-        0.0, "Fraction of the setups with a wall behind the object.", within=(0, 1)
-    )
-    roughness: list[float] = pair(
-        [0.5, 0.5], "roughness of the object. 0.1 is glossy, 1 is matte.", (0.05, 1)
-    )
-    exposure: float = setting(
-        1.0, "Factor of the radiance, of which 1 is white.", within=(1 / MAX_SCALE, MAX_SCALE)
-    )
+    walls: float = setting(0.0, "Fraction of the setups with a wall.", within=(0, 1))
+    roughness: list[float] = pair([0.5, 0.5], "roughness of the object. 1 is matte.", (0.05, 1))
+    exposure: float = setting(1.0, "Factor of the radiance. 1 is white.", within=SCALES)
     size: Any = setting(64, "Pixels per side, or [height, width].", within=(1, base.MAX_SIZE))
     spp: int = setting(32, "Paths per pixel and light.", within=(1, 10**5))
     bounces: int = setting(4, "Largest number of bounces of light.", within=(1, 1000))
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
-    overwrite: bool = setting(
-        False, "Render into a folder that is not empty. The renders in it are replaced."
-    )
+    overwrite: bool = setting(False, "Replace the renders in the folder `out`.")
 
     def __post_init__(self) -> None:
         """Check all values, and that each pattern and each environment gets as many setups."""
@@ -282,36 +241,30 @@ class AuditSettings(TaskSettings):
     """
 
     network: str = setting(REQUIRED, f"The audited network: {NETWORKS}.")
-    hardened: str | None = setting(
-        None, "Another classifier to show beside it, such as run:runs/harden."
-    )
+    hardened: str | None = setting(None, "Another network beside it, such as run:runs/harden.")
     label: Any = setting(None, LABEL, is_text=True)
     meshes: list[Any] = setting([], "Meshes of the class. []: only `unlabeled` is audited.")
     unlabeled: str | None = setting(
         None,
-        "Folder of any photographs, without labels: which ones keep their predicted class in the "
-        "light of a projector? At most 100 times `budget` of them are attacked.",
+        "Folder of photographs: which keep their predicted class in the light of a projector? "
+        "At most 100 times `budget` of them are attacked.",
     )
     hard_negatives: list[Any] = setting(
-        [], "Meshes of other classes, in the same lighting. []: generated fruit and balls."
+        [], "Meshes of other classes. []: generated fruit and balls."
     )
     photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")
     laboratory: str | None = setting(
-        None, "Such a folder of renders. null: it is made of the meshes if Mitsuba is installed."
+        None, "Folder of renders. null: made of the meshes by Mitsuba."
     )
     environments: list[str] = setting([*ENVIRONMENTS], "Environment lightings, or maps (.hdr ...).")
     budget: float = setting(
-        1.0,
-        "Factor of views, lightings and renders. With 1, EfficientNet-Lite0 takes 18 minutes on "
-        "a core.",
-        within=(0.01, 100),
+        1.0, "Factor of views, lightings and renders, and thus of the time.", within=(0.01, 100)
     )
     overwrite: bool = setting(False, "Start anew in a folder that holds an audit or other results.")
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
     out: str = setting(
-        f"runs/audits/{TIME_FOLDER}",
-        "Folder of the audit. An audit that was stopped continues in its folder.",
+        f"runs/audits/{TIME_FOLDER}", "Folder of the audit. A stopped one continues in it."
     )
 
     def __post_init__(self) -> None:
@@ -343,7 +296,7 @@ class EvaluateSettings(TaskSettings):
     )
     fit: str = setting(
         "letterbox",
-        "How photographs get the size of a detector or segmenter: letterbox or stretch.",
+        "How photographs get the size of a detector or segmenter.",
         choices=("letterbox", "stretch"),
     )
     run: str | None = setting(
@@ -353,28 +306,18 @@ class EvaluateSettings(TaskSettings):
     )
     label: Any = setting(
         None,
-        "Positive class, whose recall and false positives count, or several. It is the class of a "
-        "folder without sub-folders. null: what the run was trained for, or else each class that "
-        "has a sub-folder.",
+        "Positive class, or several. null: that of the run, or each class with a sub-folder.",
         is_text=True,
     )
     out: str = setting(f"runs/photographs/{TIME_FOLDER}", "Folder of the scores.")
     false_positive_rate: float | None = setting(
-        None,
-        "Rate for which a threshold of `label` is chosen on calibrate.",
-        within=(1e-6, 1 - 1e-6),
+        None, "Rate for which thresholds are chosen on calibrate.", within=PROBABILITY
     )
-    calibrate: str | None = setting(
-        None, "A folder like photos. null: the threshold that a published network carries, if any."
-    )
-    by: str = setting(
-        "source", "Groups of the tables: a column of photos.csv, or class.", choices=common.GROUPS
-    )
+    calibrate: str | None = setting(None, "Folder like photos. null: the stored threshold, if any.")
+    by: str = setting("source", "Groups of the tables.", choices=common.GROUPS)
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
-    precision: str = setting(
-        "auto", "auto (bfloat16 if the hardware computes in it), bfloat16 or float32."
-    )
+    precision: str = setting("auto", "auto (bfloat16 where it is fast), bfloat16 or float32.")
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
 
     def __post_init__(self) -> None:
@@ -412,33 +355,19 @@ class FitSettings(Settings):
     photograph: str = setting(REQUIRED, "An image file.")
     mesh: str = setting(REQUIRED, "A mesh file or solid:NAME:SEED, upright as in the photograph.")
     mask: str | None = setting(None, "Image of the photograph's size, white where the object is.")
-    box: list[int] = setting(
-        [], "Instead of mask, [left, top, right, bottom] in pixels, for OpenCV's GrabCut."
-    )
+    box: list[int] = setting([], "Or [left, top, right, bottom] in pixels, for GrabCut.")
     fov: float | None = setting(
         None,
-        "Angle across a square 1.6 times as wide as the object. null: orthographic.",
+        "Angle across 1.6 widths of the object. null: orthographic.",
         "degrees",
         within=(0.1, 120),
     )
-    albedo_scale: float = setting(
-        1.0, "Factor of the albedo. Twice as much halves the lighting.", within=(1e-3, 1e3)
-    )
-    encoding: str = setting(
-        "srgb", "Encoding of the photograph and of the colors of the mesh.", choices=base.ENCODINGS
-    )
-    bounces: int = setting(
-        3,
-        "Bounces of light between the surfaces of the mesh. 0: also no shadows.",
-        within=(0, base.MAX_BOUNCES),
-    )
-    label: str | None = setting(
-        None, "Class of the printed attack. null: the class that the name of the mesh tells."
-    )
+    albedo_scale: float = setting(1.0, "Factor of the albedo.", within=(1e-3, 1e3))
+    encoding: str = setting("srgb", "Encoding of photograph and mesh.", choices=base.ENCODINGS)
+    bounces: int = setting(3, "Bounces of light. 0: also no shadows.", within=(0, base.MAX_BOUNCES))
+    label: str | None = setting(None, "Class of the printed attack. null: what the mesh is named.")
     size: int = setting(64, "Pixels per side that are compared.", within=(16, 512))
-    out: str = setting(
-        "runs/fit", "Folder of background.png, mask.png, light.json and comparison.png."
-    )
+    out: str = setting("runs/fit", "Folder of the background, the mask, the light and a picture.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
 
     def __post_init__(self) -> None:
@@ -456,28 +385,20 @@ class RenderSettings(TaskSettings):
     The renders show the meshes in turn, then the next background, then the next view.
     """
 
-    network: str | None = setting(
-        None, f"Network for whose mistakes each render is attacked: {NETWORKS}. null: none."
-    )
+    network: str | None = setting(None, f"Network that each render is to fool: {NETWORKS}.")
     size: Any = setting(
         None,
-        "Pixels per side, or [height, width]. null: those of the network, or 224.",
+        "Pixels per side, or [height, width]. null: the network's, or 224.",
         within=(1, base.MAX_SIZE),
     )
     meshes: list[Any] = setting(
         ["solid:orange", "solid:apple", "solid:cup"], MESHES, is_filled=True
     )
-    label: Any = setting(
-        None, "Class of the meshes. null: what the name of each file tells.", is_text=True
-    )
+    label: Any = setting(None, "Class of the meshes. null: the names of the files.", is_text=True)
     format: str = setting("imagefolder", "Layout of the data set.", choices=DATA_SET_FORMATS)
     count: int = setting(100, "Number of renders.", within=(1, MAX_SEED))
-    splits: Any = setting(
-        {"train": 0.8, "val": 0.1, "test": 0.1}, "Parts of the data set, and their fractions."
-    )
-    maps: list[str] = setting(
-        list(DATA_SET_MAPS), "Further images of each render.", choices=DATA_SET_MAPS
-    )
+    splits: Any = setting({"train": 0.8, "val": 0.1, "test": 0.1}, "Fractions of the parts.")
+    maps: list[str] = setting(list(DATA_SET_MAPS), "Further images.", choices=DATA_SET_MAPS)
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     shards: int = setting(1, "Parts of the work that --multirun shard=0,1,... shares.")
     shard: int = setting(0, "Index of the part that this process renders.", within=(0, None))
@@ -505,9 +426,7 @@ class RenderSettings(TaskSettings):
         ),
         "The scene. light=NAME is short for scene.light=NAME.",
     )
-    renderer: RendererSettings = setting(
-        lambda: RendererSettings(encoding="srgb"), "How images are rendered."
-    )
+    renderer: RendererSettings = setting(lambda: RendererSettings(encoding="srgb"), "The renderer.")
 
     def __post_init__(self) -> None:
         """Check all values, and compute the number of renders in each part."""
@@ -533,26 +452,16 @@ class RenderSettings(TaskSettings):
 class CompareSettings(Settings):
     """Settings of the command pnb-compare, which prints tables of the metrics of training runs."""
 
-    runs: list[str] = setting(
-        REQUIRED, "Folders of finished runs and sweeps, or folders above them.", is_filled=True
-    )
+    runs: list[str] = setting(REQUIRED, "Runs and sweeps, or folders above them.", is_filled=True)
     exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
     by: str = setting("source", "Groups of the tables.", choices=common.GROUPS)
-    photos: str = setting(
-        "photographs", "Sub-folder of the scores to compare: its name in `photos`."
-    )
+    photos: str = setting("photographs", "Name in `photos` of the scores to compare.")
 
 
 @dataclass
 class ReportSettings(Settings):
     """Settings of the command pnb-report, which writes an HTML page about runs and attacks."""
 
-    runs: list[str] = setting(
-        REQUIRED, "Folders of runs, sweeps and attacks, or folders above them.", is_filled=True
-    )
-    out: str | None = setting(
-        None,
-        "Folder of the page and its images. null: the common parent of the runs, whose page is "
-        "replaced.",
-    )
+    runs: list[str] = setting(REQUIRED, "Runs, sweeps, attacks, or folders above.", is_filled=True)
+    out: str | None = setting(None, "Folder of the page. null: the common parent of the runs.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")

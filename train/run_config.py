@@ -31,8 +31,6 @@ from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted, published_
 from train.system import program
 
 CONFIG = "config.yaml"
-# Packages whose versions config.yaml records, in addition to Python and torch.
-PACKAGES = ("torchvision", "numpy")
 # Arguments that are left out when the command line of a run is recorded. Whoever
 # resumes the run gives other values.
 NOT_RECORDED = ("out=", "train.resume=")
@@ -84,16 +82,11 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     if "command" in facts:
         facts["working_folder"] = os.getcwd()
-        with suppress(InputError):
-            recorded = read_config(folder / CONFIG)
-            # A command that begins with the recorded command continues the run.
-            if str(facts["command"]).startswith(str(recorded.get("command"))):
-                facts["working_folder"] = recorded.get("working_folder") or os.getcwd()
     # This import is here because results of runs are read without torch.
     from torch import __version__ as torch_version
 
-    versions = {"python": platform.python_version(), "torch": str(torch_version)}
-    versions |= {name: version(name) for name in PACKAGES}
+    versions = {name: version(name) for name in ("torchvision", "numpy")}
+    versions |= {"python": platform.python_version(), "torch": str(torch_version)}
     content = asdict(settings)
     content |= {name: fact for name, fact in facts.items() if "${" not in str(fact)}
     content |= {"inputs": fingerprints(settings), "versions": versions}

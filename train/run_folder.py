@@ -1,11 +1,9 @@
 """The folder of a run or of another command: its files' names, their text, and its lock."""
 
 import json
-import math
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -81,9 +79,6 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         lines = [_parse_object(line) for line in text.split("\n")[:-1]]
         if any(not isinstance(value, int | float) for line in lines for value in line.values()):
             raise ValueError("a value is not a number")
-        epochs = [line.get("epoch", math.inf) for line in lines]
-        if not all(first < second for first, second in pairwise(epochs)):
-            raise ValueError("epochs are repeated, or follow the final scores")
         return lines
 
 

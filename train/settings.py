@@ -47,6 +47,7 @@ GROUPS = ("source", "mesh", "class")
 # needs this size.
 MIN_SIZE = 5
 MAX_IMAGES = 10**6
+PROBABILITY = (1e-6, 1 - 1e-6)
 # Number of renders if neither this number nor that of the views is set.
 RENDERS = 100
 # Explanation of a list of meshes in settings.
@@ -82,22 +83,16 @@ class DataSettings(Settings):
 
     name: str = setting("shapes", "The data set.", choices=DATA_SETS)
     validation: float | None = setting(
-        None,
-        "Fraction of each class to validate on. null: what `network` left out, or 0.1.",
-        above=0,
-        below=1,
+        None, "Validation fraction. null: what `network` left out, or 0.1.", above=0, below=1
     )
     path: str = setting("", "File or folder of the data.", may_be_empty=True)
     test_fraction: float = setting(
         0.1,
-        "Fraction of the images to test on, if the folder has no sub-folder `test`: "
-        "of each class, or of photographs without labels 1,000 at most.",
+        "Test fraction, if there is no sub-folder `test`. Without labels, at most 1,000 images.",
         above=0,
         below=1,
     )
-    workers: int = setting(
-        2, "Processes that read images of more than 64 pixels per side.", within=(0, 1024)
-    )
+    workers: int = setting(2, "Processes that read images above 64 pixels.", within=(0, 1024))
     train_per_class: int = setting(300, "Training images of each shape.", within=(1, MAX_IMAGES))
     test_per_class: int = setting(60, "Test images of each shape.", within=(1, MAX_IMAGES))
     seed: int = setting(0, "Seed of the shapes.", within=(0, MAX_SEED))
@@ -116,9 +111,7 @@ class TrainingSceneSettings(SceneSettings):
 
     backgrounds: list[Any] = setting_like(SceneSettings, "backgrounds", [0.0, 0.25, 0.5, 0.75, 1.0])
     views: int | None = setting(
-        None,
-        "Cameras per mesh, at equal azimuths. null: as augment.examples needs.",
-        within=(1, MAX_VIEWS),
+        None, "Cameras per mesh. null: as augment.examples needs.", within=(1, MAX_VIEWS)
     )
 
 
@@ -132,8 +125,8 @@ class EvaluationSettings(Settings):
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     laboratory_setups: int = setting(
         0,
-        "If photos is null: number of path-traced setups (light and camera) of other objects "
-        "and patterns than in training, to score both networks on. A multiple of 5. 0: none.",
+        "Path-traced setups of other objects and patterns to score both networks on, if photos is "
+        "null. A multiple of 5. 0: none.",
         within=(0, MAX_IMAGES),
     )
 
@@ -152,30 +145,24 @@ class NetworkSettings(Settings):
     network: str | None = setting(None, f"The network: {NETWORKS}.")
     size: Any = setting(
         None,
-        "Pixels per side of the network's images, or [height, width]. null: those of its source, "
-        "or 224.",
+        "Pixels per side, or [height, width]. null: those of the network, or 224.",
         within=(1, MAX_SIZE),
     )
-    weights: str | None = setting(
-        None, "File of the network's weights (a state dict or a checkpoint). null: its own."
-    )
+    weights: str | None = setting(None, "File of the network's weights. null: its own.")
     classes: Any = setting(
         None,
-        "Names of the classifier's classes in the order of its outputs: a text file with a name "
-        "in each line, or [a,b]. null: the names that its source knows, otherwise 0, 1 and so on.",
+        "Names of the classes in the order of the outputs, [a,b], or a text file with a name in "
+        "each line. null: the names that the network knows, otherwise 0, 1 and so on.",
         is_text=True,
     )
     normalization: Any = setting(
         None,
-        "Normalization before the classifier: imagenet, or [MEAN,STD] of red, green and blue in "
-        "units of [0, 1], such as [[0,0,0],[1,1,1]] for none. null: that of its source, and none "
-        "before a file's network.",
+        "Normalization before the classifier: imagenet, or [MEAN,STD] in units of [0, 1], such as "
+        "[[0,0,0],[1,1,1]] for none. null: that of the network, and none before a file's.",
         is_text=True,
     )
     prompt: str | None = setting(
-        None,
-        "Text with {} for the name of a class, for a zero-shot network (hf:). "
-        "null: a photo of a {}.",
+        None, "Prompt of a zero-shot network, in which {} is the class. null: a photo of a {}."
     )
     normalize_light: Any = setting(
         None,
@@ -207,17 +194,14 @@ class TaskSettings(NetworkSettings):
 
     task: str | None = setting(
         None,
-        "What the outputs of the network mean: classification, detection or segmentation. null: "
-        "what their type tells.",
+        "What the outputs mean. null: what their type tells.",
         choices=("classification", "detection", "segmentation"),
     )
     threshold: float | None = setting(
-        None, "Detections with a lower score do not count. null: 0.4.", within=(1e-6, 1 - 1e-6)
+        None, "Lowest score of a detection. null: 0.4.", within=PROBABILITY
     )
     iou: float | None = setting(
-        None,
-        "Detections and masks with a lower intersection over union do not count. null: 0.5.",
-        within=(0.01, 1),
+        None, "Lowest intersection over union of a match. null: 0.5.", within=(0.01, 1)
     )
     decode: str | None = setting(
         None,
@@ -237,7 +221,7 @@ class ExperimentSettings(NetworkSettings):
         "python:package.module:function. null: random weights.",
     )
     size: int | None = setting(
-        None, "Pixels per side. null: those of `network`, or 32.", within=(MIN_SIZE, MAX_SIZE)
+        None, "Pixels per side. null: the network's, or 32.", within=(MIN_SIZE, MAX_SIZE)
     )
     meshes: list[Any] = setting(["solid:orange:0", "solid:orange:1"], MESHES)
     hard_negatives: list[Any] = setting(
@@ -248,48 +232,33 @@ class ExperimentSettings(NetworkSettings):
     # The type is str | dict[str, str] | None, which OmegaConf does not support.
     photos: Any = setting(
         None,
-        "Folder of photographs to score: a folder per class, or images of `label`. "
-        "Several folders: {photographs: A, lab: B}. null: none.",
+        "Folder of photographs to score, or several: {photographs: A, lab: B}. null: none.",
         is_text=True,
     )
-    unlabeled: str | None = setting(
-        None, "Folder of any photographs to train on, without labels, for data=unlabeled."
-    )
+    unlabeled: str | None = setting(None, "Folder of photographs to train on, for data=unlabeled.")
     out: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
-    sweep: str = setting(
-        "runs/sweep", "Folder of the runs of a --multirun, each named by its overrides."
-    )
+    sweep: str = setting("runs/sweep", "Folder of the runs of a --multirun.")
     overwrite: bool = setting(False, "Start anew in a folder that holds a run or other results.")
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
-    label: Any = setting(  # str | list[str], for which OmegaConf has no type
+    label: Any = setting(
         None,
-        "Positive class: the class of the meshes, whose recall and false positives are measured. "
-        "Or several: [orange, apple]. null: the classes that meshes name or, without meshes, "
-        "each class that has a sub-folder of photographs.",
+        "Positive class: the class of the meshes, or several, [orange, apple]. null: the classes "
+        "that meshes name or, without meshes, each class that has a sub-folder of photographs.",
         is_text=True,
     )
-    compare: list[str] = setting(
-        [], "Other kinds of renders to train first, in sub-folders, and to show in the same table."
-    )
+    compare: list[str] = setting([], "Other kinds of renders to train first, for the same table.")
     photographs_first: bool = setting(
         False, "First train with experiment=photographs in a sub-folder, and begin with its result."
     )
     data: DataSettings = setting(DataSettings, "The data set.")
-    augment: AugmentationSettings = setting(
-        AugmentationSettings, "The renders among the training images."
-    )
+    augment: AugmentationSettings = setting(AugmentationSettings, "The training renders.")
     scene: TrainingSceneSettings = setting(TrainingSceneSettings, "The scene of the renders.")
     renderer: RendererSettings = setting(
-        lambda: RendererSettings(samples=8, normals="flat"),
-        "How images are rendered. The defaults are the paper's.",
+        lambda: RendererSettings(samples=8, normals="flat"), "The renderer, by default the paper's."
     )
-    model: ModelSettings = setting(
-        ModelSettings, "The network. model=NAME is short for model.name=NAME."
-    )
+    model: ModelSettings = setting(ModelSettings, "The architecture. model=NAME: model.name=NAME.")
     train: TrainSettings = setting(TrainSettings, "How the network is trained.")
-    evaluate: EvaluationSettings = setting(
-        EvaluationSettings, "What the trained network is scored on."
-    )
+    evaluate: EvaluationSettings = setting(EvaluationSettings, "What the network is scored on.")
 
     def __post_init__(self) -> None:
         """Check all values, and compute the number of renders."""

@@ -10,10 +10,8 @@ import os
 import shlex
 import signal
 import sys
-import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, cast
@@ -23,8 +21,6 @@ from renderer.errors import InputError, is_out_of_memory
 INTERRUPTED = "ended by SIGINT"
 # The names of all installed commands begin with this text.
 PREFIX = "pnb-"
-# If an import takes more seconds than this, `import_function` prints a line about it.
-IMPORT_DELAY = 5.0
 # Options of the command line that ask for details.
 VERBOSE_FLAGS = frozenset({"--verbose", "-v"})
 # Environment variable that is set if commands print details.
@@ -74,10 +70,12 @@ def shortened(lines: Sequence[str], limit: int = MAX_LINES) -> list[str]:
 
 
 def set_up_process() -> None:
-    """Set environment variables, warnings and output streams as all commands need them.
+    """Set environment variables, warnings, output streams and signals as all commands need them.
 
     This must happen before torch is imported.
     """
+    # SIGTERM raises SystemExit, so that launchers end their child processes.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     # Hydra raises errors instead of printing them if this variable is set.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # Threads of torch sleep while they wait if this variable is set. Otherwise they
@@ -112,42 +110,21 @@ def reuse_freed_memory() -> None:
         mallopt(M_TRIM_THRESHOLD, LARGEST_REUSED)
 
 
-@contextmanager
-def exits_on_sigterm() -> Iterator[None]:
-    """Raise SystemExit if the signal SIGTERM comes during the block.
-
-    Python's cleanup then runs, in which launchers end their child processes.
-    """
-    previous_handler = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous_handler)
-
-
 def import_function(path: str) -> Callable[..., Any]:
     """Import a function by its path "module:function".
 
-    If this takes seconds, a line says so. Ctrl-C ends the process at once, since some modules catch
-    KeyboardInterrupt while they are imported, and would continue.
+    Ctrl-C ends the process at once, since some modules catch KeyboardInterrupt while they are
+    imported, and would continue.
     """
     is_torch_imported = "torch" in sys.modules
-    line = "loading PyTorch and other libraries ..."
-    timer = threading.Timer(IMPORT_DELAY, print, [line], {"file": sys.stderr, "flush": True})
-    timer.daemon = True
-    timer.start()
-    # Python lets only the main thread set a handler. A job in the background of a shell ignores
-    # SIGINT, and must still do so.
-    is_main = threading.current_thread() is threading.main_thread()
-    ends_at_once = is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if ends_at_once:
+    # A job in the background of a shell ignores SIGINT, and must still do so.
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end_at_once)
     try:
         function = resolve_name(path)
     finally:
-        timer.cancel()
-        if ends_at_once:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, handler)
     if not is_torch_imported:
         skip_last_collection()
     return cast(Callable[..., Any], function)

@@ -27,15 +27,15 @@ LOW_LIGHT, RELIGHT_AND_LOW_LIGHT = "low_light", "relight+low_light"
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT, LOW_LIGHT, RELIGHT_AND_LOW_LIGHT)
 # Choices of train.optimizer.
 OPTIMIZERS = ("sgd", "adamw")
+# Choices of train.schedule.
+SCHEDULES = ("step", "cosine", "one_cycle")
 
 
 @dataclass
 class ModelSettings(Settings):
     """Settings of the architecture of the network to train."""
 
-    name: str = setting(
-        WIDERESNET, "wideresnet, torchvision:NAME or python:package.module:function."
-    )
+    name: str = setting(WIDERESNET, "wideresnet, torchvision:NAME or python:module:function.")
     depth: int = setting(16, "Depth of the WideResNet.")
     width: int = setting(4, "Width of the WideResNet.")
     dropout: float = setting(0.3, "Dropout of the WideResNet.", minimum=0, below=1)
@@ -57,15 +57,12 @@ class TrainSettings(Settings):
         None, "Number of training images, drawn anew for each epoch. null: all.", within=(1, 10**9)
     )
     batch_size: int = setting(128, "Images per training step.", within=(1, 10**6))
-    accumulation_steps: int = setting(
-        1, "Number of parts into which each batch is divided to save memory.", within=(1, 10**6)
-    )
     optimizer: str = setting("sgd", "adamw decays no biases and norms.", choices=OPTIMIZERS)
     learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
     feature_norm: float | None = setting(
         None,
-        "Norm of the features for which learning_rate is meant. If only the last layer learns, the "
-        "rate is multiplied by it / the norm of the network's features. null: it is not.",
+        "Norm of the features for which learning_rate is meant, if only the last layer learns. "
+        "The rate is multiplied by it / the network's norm. null: it is not.",
         above=0,
         maximum=MAX_SCALE,
     )
@@ -80,13 +77,11 @@ class TrainSettings(Settings):
         "all_but_last: only the last layer learns. null: all layers learn.",
     )
     schedule: str = setting(
-        "step",
-        "Schedule of the learning rate. step: times 0.2 at 30%, 60% and 80%.",
-        choices=("step", "cosine", "one_cycle"),
+        "step", "Schedule of the rate. step: times 0.2 at 30%, 60%, 80%.", choices=SCHEDULES
     )
     flips: str = setting(
         "random",
-        "Horizontal flips: of random halves, or of each image in every other epoch.",
+        "Flips of random images, or in every other epoch.",
         choices=("random", "alternating"),
     )
     augmentation: str = setting(
@@ -96,28 +91,20 @@ class TrainSettings(Settings):
         choices=AUGMENTATIONS,
     )
     relight_gain: float = setting(
-        3.0,
-        "Largest factor of a channel for augmentation=relight. Its inverse is the smallest.",
-        within=(1, 100),
+        3.0, "Largest factor of a channel for relight, and 1 / the smallest.", within=(1, 100)
     )
     relight_steps: int = setting(
-        0, "Steps along the gradient that find these factors. 0: random factors.", within=(0, 1000)
+        0, "Gradient steps that find the factors. 0: random factors.", within=(0, 1000)
     )
     label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
     ranking_weight: float = setting(
-        0.0,
-        "Weight of the loss that ranks images of `label` above the others of a batch.",
-        within=(0, MAX_SCALE),
+        0.0, "Weight of the loss that ranks `label` above other classes.", within=(0, MAX_SCALE)
     )
     distillation_weight: float = setting(
-        0.0,
-        "Weight of the divergence from `network`, on renders for classes other than `label`.",
-        within=(0, MAX_SCALE),
+        0.0, "Weight of the divergence from the predictions of `network`.", within=(0, MAX_SCALE)
     )
     consistency_weight: float = setting(
-        0.0,
-        "Weight of the divergence on augmented images from `network` on the plain images.",
-        within=(0, MAX_SCALE),
+        0.0, "Weight of the same divergence on augmented images.", within=(0, MAX_SCALE)
     )
     interpolate: bool = setting(
         False,
@@ -125,18 +112,12 @@ class TrainSettings(Settings):
         "by the factor with the lowest loss on unchanged and relit validation images (WiSE-FT).",
     )
     ema_decay: float = setting(
-        0.0,
-        "Decay of the moving average of the weights, which is kept. 0: none.",
-        minimum=0,
-        below=1,
+        0.0, "Decay of the moving average of the weights. 0: none.", minimum=0, below=1
     )
-    soup: bool = setting(
-        False, "Start each epoch with `network`, and keep the mean of all epochs (a model soup)."
-    )
+    soup: bool = setting(False, "Keep the mean of all epochs, which all start with `network`.")
     eval_mode: bool | None = setting(
         None,
-        "Train in evaluation mode: with the running statistics of `network` and without "
-        "dropout. null: only a third-party classifier.",
+        "Train with the statistics of `network`, without dropout. null: a classifier of others.",
     )
     precision: str = setting(
         "auto",
@@ -145,27 +126,15 @@ class TrainSettings(Settings):
     )
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
     threads: int | None = setting(
-        None,
-        "CPU threads, on which the last bits depend. null: all cores, or one for small batches.",
-        within=(1, 1024),
+        None, "CPU threads. null: all cores, or one for small batches.", within=(1, 1024)
     )
     compile: str = setting(
-        "auto",
-        "Compile the training step. auto: CUDA graphs on one GPU.",
-        choices=("auto", "always", "never"),
+        "auto", "Compile the training step. auto: on one GPU.", choices=("auto", "always", "never")
     )
-    deterministic: bool = setting(
-        False, "Compute the same bits every time on a GPU, too, which is slower."
-    )
-    checkpoint_every: int = setting(
-        1, "Epochs between checkpoints. One process alone adds one a minute.", within=(1, 10**6)
-    )
-    resume: bool = setting(
-        False, "Resume from the last checkpoint in `out`. out=FOLDER train.resume=true is enough."
-    )
-    cache: str | None = setting(
-        "auto", "Folder of rendered data sets. auto: ~/.cache/parametric-norm-balls. null: none."
-    )
+    deterministic: bool = setting(False, "Compute the same bits every time on a GPU, too.")
+    checkpoint_every: int = setting(1, "Epochs between checkpoints.", within=(1, 10**6))
+    resume: bool = setting(False, "Resume from the last checkpoint in `out`.")
+    cache: str | None = setting("auto", "Folder of rendered data sets. null: none.")
 
     def __post_init__(self) -> None:
         """Check all values, and that attacked images have a loss."""

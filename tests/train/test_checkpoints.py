@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from renderer.errors import InputError
-from train.checkpoints import content_hash, load, load_newest, save
+from train.checkpoints import load, load_newest, save
+from train.data.sets import content_hash
 from train.run_folder import BEST, LAST, PREVIOUS
 
 STATE = {

@@ -8,7 +8,6 @@ the folder of the main training run.
 import logging
 import shlex
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
@@ -50,7 +49,6 @@ SHARED_IN_TRAIN = (
 
 def train(config: DictConfig, overrides: Sequence[str]) -> None:
     """Train a network and its baselines, in this process or in each process of torchrun."""
-    threading.excepthook = _report_thread_error
     command = format_command(overrides)
     with process_group():
         # The default name of the folder has the time, which differs between processes. All
@@ -67,15 +65,6 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
             settings = _train_on_photographs(settings, folder, command)
         again = (f"out={folder}", "train.resume=true")
         _train_in(folder, settings, command, [*program("train", as_called=True), *again])
-
-
-def _report_thread_error(error: threading.ExceptHookArgs) -> None:
-    """Print an error that a thread did not catch, unless it is an OSError.
-
-    If the disk is full, the thread of TensorBoard and the main thread raise the same OSError.
-    """
-    if error.exc_type is not OSError:
-        threading.__excepthook__(error)
 
 
 def _train_on_photographs(

@@ -163,58 +163,51 @@ def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height w
 
 def _levels(path: str) -> np.ndarray:
     """Read the coverage of each pixel by the object, uint8. Raises ValueError if it is unknown."""
+    pixels = _pixels(path)
+    is_colored = pixels.ndim == 3 and np.ptp(pixels, axis=-1).max() > TINT
+    if is_colored:
+        pixels = pixels @ np.array([2**16, 2**8, 1])  # One number for each color.
+    elif pixels.ndim == 3:
+        pixels = pixels[..., 0]
+    values = np.unique(pixels)
+    if len(values) == 1:
+        raise ValueError(f"all of its pixels have the value {values[0]}")
+    if len(values) == 2 and values[0] == 0 and values[1] > 0:
+        if values[1] not in (1, 255):
+            print(f"mask={path}: all that is not black is the object")
+        return np.where(pixels > 0, 255, 0).astype(np.uint8)
+    if is_colored:
+        raise ValueError(f"it has {len(values)} colors")
+    # NaN, which sorts last, is not white.
+    if not values[-1] >= WHITE or values[0] > 255 - WHITE:
+        raise ValueError(f"its values are from {values[0]} to {values[-1]} of 255")
+    # A pixel at the edge of the object has a neighbor of another value.
+    neighbors = sliding_window_view(pixels, (3, 3))
+    is_flat = neighbors.min(axis=(2, 3)) == neighbors.max(axis=(2, 3))
+    areas = np.unique(pixels[1:-1, 1:-1][is_flat])
+    gray = areas[(areas > 255 - WHITE) & (areas < WHITE)]
+    if len(gray):
+        raise ValueError(f"areas of it have the gray value {gray[0]}")
+    return pixels.astype(np.uint8)
+
+
+def _pixels(path: str) -> np.ndarray:
+    """Read what may tell the object: opacity, one channel (H, W) or colors (H, W, 3)."""
     with open_image(path) as image:
         ImageOps.exif_transpose(image, in_place=True)
         if image.has_transparency_data:
             rgba = np.asarray(eight_bits(image).convert("RGBA"))
             alpha = rgba[..., 3]
-            if alpha.min() < alpha.max():
-                opaque = rgba[..., :3][alpha >= WHITE]
-                if {*np.unique(opaque).tolist()} == {0, 255}:
-                    raise ValueError("it is black and white, and a part is transparent")
-                print(f"mask={path}: the opaque part is the object")
-                return _white_on_black(path, alpha)
-            return _of_colors(path, rgba[..., :3])
-        if image.mode in ("1", "L", "I", "F") or image.mode.startswith("I;16"):
-            values = np.asarray(image)
-            if len(np.unique(values)) > 2:
-                values = np.asarray(eight_bits(image))
-            return _white_on_black(path, values)
-        return _of_colors(path, np.asarray(image.convert("RGB")))
-
-
-def _of_colors(path: str, rgb: np.ndarray) -> np.ndarray:
-    """Convert a mask with colors, shape (H, W, 3), to coverage."""
-    if np.ptp(rgb, axis=-1).max() <= TINT:
-        return _white_on_black(path, rgb[..., 0])
-    colors = np.unique(rgb.reshape(-1, 3), axis=0)
-    # The colors are sorted, so black is the first.
-    if len(colors) != 2 or colors[0].any():
-        raise ValueError(f"it has {len(colors)} colors")
-    print(f"mask={path}: the color {tuple(colors[1].tolist())} is the object")
-    return np.where(rgb.any(axis=-1), 255, 0).astype(np.uint8)
-
-
-def _white_on_black(path: str, values: np.ndarray) -> np.ndarray:
-    """Convert a mask of one channel, shape (H, W), to coverage."""
-    levels = np.unique(values)
-    if len(levels) == 1:
-        raise ValueError(f"all of its pixels have the value {levels[0]}")
-    if len(levels) == 2 and levels[0] == 0 and levels[1] > 0:
-        if levels[1] not in (1, 255):
-            print(f"mask={path}: the value {levels[1]} is the object")
-        return np.where(values > 0, 255, 0).astype(np.uint8)
-    # NaN, which sorts last, is not white.
-    if not levels[-1] >= WHITE or levels[0] > 255 - WHITE:
-        raise ValueError(f"its values are from {levels[0]} to {levels[-1]} of 255")
-    # A pixel at the edge of the object has a neighbor of another value.
-    neighbors = sliding_window_view(values, (3, 3))
-    is_flat = neighbors.min(axis=(2, 3)) == neighbors.max(axis=(2, 3))
-    areas = np.unique(values[1:-1, 1:-1][is_flat])
-    gray = areas[(areas > 255 - WHITE) & (areas < WHITE)]
-    if len(gray):
-        raise ValueError(f"areas of it have the gray value {gray[0]}")
-    return values.astype(np.uint8)
+            if alpha.min() == alpha.max():
+                return rgba[..., :3]
+            if {*np.unique(rgba[..., :3][alpha >= WHITE]).tolist()} == {0, 255}:
+                raise ValueError("it is black and white, and a part is transparent")
+            print(f"mask={path}: the opaque part is the object")
+            return alpha
+        if image.mode not in ("1", "L", "I", "F") and not image.mode.startswith("I;16"):
+            return np.asarray(image.convert("RGB"))
+        values = np.asarray(image)
+        return values if len(np.unique(values)) <= 2 else np.asarray(eight_bits(image))
 
 
 def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndarray, "H W"]:

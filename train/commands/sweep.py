@@ -8,6 +8,7 @@ the runs in this process or in others. The results are read from the folders.
 
 import logging
 import os
+import re
 import shutil
 import sys
 import traceback
@@ -75,7 +76,8 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
             require_same_run(folder, settings, finished=True)
         else:
             require_new_run(folder, "sweep", overwrite, resume=True)
-            new_runs.setdefault(frozenset(filter(_is_text, overrides)), (folder, settings))
+            texts = [word for word in overrides if not re.search(r"=[-+.e\d]+$", word)]
+            new_runs.setdefault(frozenset(texts), (folder, settings))
     # Numbers are checked now. The files and networks that texts name are checked by loading them.
     # The nodes of a cluster have other devices, so their runs are not loaded here.
     for folder, settings in () if "launcher=slurm" in runs[0] else new_runs.values():
@@ -92,12 +94,6 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     print(report_of(existing, parent))
     if not all(map(is_finished, folders)):
         sys.exit(1)
-
-
-def _is_text(override: str) -> bool:
-    """Return whether the value of a setting is neither a number nor true, false or null."""
-    value = OverridesParser.create().parse_override(override).value()
-    return not (value is None or isinstance(value, int | float))
 
 
 def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:

@@ -215,14 +215,8 @@ def choose_validation(
         return asked or default, record
     # The records of the same images differ only in the fraction.
     if not isinstance(left_out, float) or record | {"fraction": left_out} != earlier:
-        name = settings.network
-        console.debug("validation: %s does not say whether it learned from these images, too", name)
         return asked or default, None
-    fraction = asked or left_out
-    if fraction > left_out:
-        fault = f"it left out only data.validation={left_out}"
-        console.debug("validation: %s learned from part of it: %s", settings.network, fault)
-    return fraction, record | {"fraction": min(fraction, left_out)}
+    return asked or left_out, record | {"fraction": min(asked or left_out, left_out)}
 
 
 def load_inputs(settings: ExperimentSettings) -> tuple[sets.DataSet, Initial | None]:

@@ -91,19 +91,14 @@ class TrainingStep:
             # The consistency term compares the images before and after the augmentation.
             tensors = [images, labels, rendered, augmented]
         self.optimizer.zero_grad(set_to_none=True)
-        sums = torch.zeros(2, device=self._device)
-        # The gradients of parts of the batch are added, which saves memory.
-        chunks = [tensor.chunk(settings.accumulation_steps) for tensor in tensors]
-        for part in zip(*chunks, strict=True):
-            loss, hits = self._loss(*part)
-            self.scaler.scale(loss / settings.accumulation_steps).backward()
-            sums += torch.stack([loss.detach() * len(part[0]), hits])
+        loss, hits = self._loss(*tensors)
+        self.scaler.scale(loss).backward()
         if settings.clip_gradient:
             self.scaler.unscale_(self.optimizer)
             nn.utils.clip_grad_norm_(self._model.parameters(), settings.clip_gradient)
         self.scaler.step(self.optimizer)
         self.scaler.update()
-        return sums
+        return torch.stack([loss.detach() * len(images), hits])
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of the optimizer and of the gradient scaler for a checkpoint."""
@@ -116,17 +111,12 @@ class TrainingStep:
 
 
 def require_equal_shares(settings: TrainSettings) -> None:
-    """Raise InputError if a batch cannot be divided equally.
-
-    Each process gets an equal part of the batch, and divides it into
-    `accumulation_steps` equal parts.
-    """
-    steps = settings.accumulation_steps
-    shares = distributed.world_size() * steps
-    if settings.batch_size % shares:
-        fault = f"batch_size={settings.batch_size} is no multiple of {shares // steps} processes"
-        advice = f"accumulation_steps={steps}: set it to a multiple of {shares}"
-        raise InputError(f"{fault} × {advice}", "batch_size")
+    """Raise InputError if a batch cannot be divided equally among the processes."""
+    if settings.batch_size % distributed.world_size():
+        fault = f"batch_size={settings.batch_size} is no multiple of the number of processes"
+        raise InputError(
+            f"{fault}: set it to a multiple of {distributed.world_size()}", "batch_size"
+        )
 
 
 def fitting_batch_size(
@@ -136,8 +126,7 @@ def fitting_batch_size(
 
     A larger batch would only hold copies of the images.
     """
-    # Each process divides its part of a batch into equal parts.
-    shares = distributed.world_size() * settings.accumulation_steps
+    shares = distributed.world_size()
     batch_size = min(settings.batch_size, math.ceil(images_in_round / shares) * shares)
     if batch_size < settings.batch_size:
         fault = "batch_size=%d is more than the %d images that a round shows: it is %d"

@@ -27,7 +27,7 @@ COMMANDS = {
     "evaluate": ["run=network", "photos=photos", "device=cpu", "precision=float32"],
     "fit": ["photograph=photos/orange/0.png", "mask=photos/orange/0.png", "mesh=solid:orange"],
     "lab": ["setups=6"],
-    "report": ["network", "photos"],
+    "report": ["runs=[network,photos]"],
     "train": ["experiment=paper", "data=shapes", "compare=[]", "train.device=cpu"],
 }
 
