@@ -86,8 +86,7 @@ def _refused_if_damaged(path: Path) -> AbstractContextManager[None]:
 def checks_architecture(path: Path) -> AbstractContextManager[None]:
     """Raise InputError if the block cannot load weights into a network of another architecture."""
     errors = (TypeError, ValueError, LookupError, AttributeError, RuntimeError)
-    advice = "use the model settings of the training run that wrote the checkpoint"
-    return _refused(path, "from another architecture", advice, *errors)
+    return _refused(path, "from another architecture", "use the model settings of its run", *errors)
 
 
 @contextmanager
@@ -246,16 +245,14 @@ def load_run(
         32
     """
     if weights is not None:
-        advice = "leave it out"
-        raise InputError(f"weights={weights} cannot replace those of a run: {advice}", "weights")
+        raise InputError(f"weights={weights}, but a run has its own: leave it out", "weights")
     require_kind("model", model, str | None, "python:package.module:function, or None")
     path, state = load_selected(as_path("run", run))
     # Arguments of `build_network`, and entries for the wrapper around the network.
     shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
-        own = f"load its weights in a {PYTHON}MODULE:FUNCTION of your own"
-        advice = f"give model={name} to run that code, or {own}"
+        advice = f"give model={name} to run that code"
         raise InputError(f"the network in {path} is built by {name}: {advice}")
     with checks_architecture(path):
         size = int(shape.pop("size"))
@@ -320,8 +317,7 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     """Read the file of the network that a training run selected, or of a published network."""
     path = selected_file(run)
     if path is None:
-        advice = "give another folder"
-        raise InputError(f"run={run} holds neither {BEST} nor {PUBLISHED}: {advice}", "run")
+        raise InputError(f"run={run} has no {BEST} or {PUBLISHED}: give another folder", "run")
     if path.suffix == ".safetensors":
         return path, _load_published(path)
     return path, load(path)

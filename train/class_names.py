@@ -91,14 +91,11 @@ def _unknown_class_error(mesh: str, classes: Sequence[str]) -> InputError:
     if solid and solid not in solids:
         return InputError(f"{mesh} is not a solid: choose one, such as {nearest(solid, solids)}")
     fault = f"label is not set, and {mesh} is not named like a class of the network"
-    remedy = f"give label=CLASS or {{mesh: '{mesh}', label: CLASS}}"
     choices = nearest(name_of_mesh(mesh), classes)
-    return InputError(f"{fault}: {remedy}, such as {choices}", "label")
+    return InputError(f"{fault}: give label=CLASS or {{mesh, label}}, such as {choices}", "label")
 
 
-def class_of_meshes(
-    items: Sequence[Any], classes: Sequence[str], key: str, label: Any = None
-) -> str:
+def class_of_meshes(items: list[Any], classes: Sequence[str], key: str, label: Any = None) -> str:
     """Find the class of meshes, which is `label`, a name or an index, if it is given.
 
     Meshes of several classes raise InputError.
@@ -107,8 +104,7 @@ def class_of_meshes(
         return class_name(classes, label, "label")
     found = sorted(set(classes_of_meshes(items, classes, key)))
     if len(found) != 1:
-        fault = f"label is not set, and {key} are of the classes {', '.join(found)}"
-        raise InputError(f"{fault}: give one", "label")
+        raise InputError(f"label is not set: {key} are of {', '.join(found)}: give one", "label")
     return found[0]
 
 
@@ -127,8 +123,7 @@ def require_others(
         if is_labeled:
             name = class_name(classes, item.label, f"label of {key}")
         if name in labels and not (is_labeled and len(labels) > 1):
-            fault = f"{key} is {item.mesh}, which is of the positive class {name}"
-            raise InputError(f"{fault}: remove it", key)
+            raise InputError(f"{key} is {item.mesh}, of the positive class {name}: remove it", key)
 
 
 def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> ExperimentSettings:
@@ -151,19 +146,17 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
     return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
 
 
-def as_mappings(
-    name: str, meshes: Sequence[MeshItem], classifier: TaskNetwork
-) -> list[dict[str, Any]]:
+def as_mappings(name: str, items: Sequence[MeshItem], network: TaskNetwork) -> list[dict[str, Any]]:
     """Convert the meshes of a caller to mappings with the fields of `ObjectSettings`.
 
     A mapping has a "label" if the class is given.
     """
     kinds = MeshSource | tuple | list | ObjectSettings
     mappings = []
-    for index, item in enumerate(as_list(name, meshes, kinds, EXPECTED)):
+    for index, item in enumerate(as_list(name, items, kinds, EXPECTED)):
         key = f"{name}[{index}]"
         if isinstance(item, list) and any(isinstance(of, tuple | ObjectSettings) for of in item):
-            mapping, *others = as_mappings(key, item, classifier)
+            mapping, *others = as_mappings(key, item, network)
             mappings.append(mapping | {"others": [*mapping.get("others", ()), *others]})
             continue
         if isinstance(item, ObjectSettings):
@@ -175,6 +168,6 @@ def as_mappings(
             mesh = name_mesh(source) if isinstance(source, Mesh) else str(source)
             mapping = {"mesh": mesh, **({"label": label[0]} if label else {})}
         if mapping.get("label", "") != "":
-            mapping["label"] = classifier.classes[classifier.label(mapping["label"])]
+            mapping["label"] = network.classes[network.label(mapping["label"])]
         mappings.append(mapping)
     return mappings

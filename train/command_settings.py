@@ -64,9 +64,7 @@ class AttackCommandSettings(AttackSettings):
         "Factors of each radius at which success is measured, such as [0.5, 1, 2]. null: 1.",
         within=SCALES,
     )
-    verify: str | None = setting(
-        "reload", "Render the files again: reload, mitsuba, reload+mitsuba."
-    )
+    verify: str | None = setting("reload", "Render files again: reload, mitsuba, reload+mitsuba.")
 
     def __post_init__(self) -> None:
         """Check all values, and that the renderers in `verify` exist."""
@@ -85,9 +83,7 @@ class AttackSceneSettings(SceneSettings):
     """Settings of the scene that the command pnb-attack attacks."""
 
     views: int = setting_like(SceneSettings, "views", 1)
-    search: int = setting(
-        10, "Cameras to try for a misclassified mesh.", within=(0, base.MAX_VIEWS)
-    )
+    search: int = setting(10, "Cameras tried for a misclassified mesh.", within=(0, base.MAX_VIEWS))
 
     def __post_init__(self) -> None:
         """Check all values, and that there is a background."""
@@ -135,9 +131,7 @@ class AttackExperimentSettings(TaskSettings):
     out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
     meshes: list[Any] = setting(["solid:orange:0"], MESHES, is_filled=True)
     unlabeled: str | None = setting(None, "Folder of photographs for attack=relighting.")
-    reload: str | None = setting(
-        None, "Folder of an adversary to classify or, with attack=..., to attack further."
-    )
+    reload: str | None = setting(None, "Folder of an adversary to classify, or to attack further.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
     attack: AttackCommandSettings = setting(AttackCommandSettings, "The attack: attack=NAME+NAME.")
@@ -150,9 +144,7 @@ class AttackExperimentSettings(TaskSettings):
         super().__post_init__()
         names = self.target if isinstance(self.target, list) else [self.target]
         if any(isinstance(name, dict | list) for name in names):
-            raise self.wrong(
-                "target", "is no class: give one, least_likely, or a list, one per view"
-            )
+            raise self.wrong("target", "is no class: give one, least_likely, or one per view")
         # The name of a class can be a number, which YAML reads as one.
         if isinstance(self.target, int | float):
             self.target = str(self.target)
@@ -160,8 +152,7 @@ class AttackExperimentSettings(TaskSettings):
         if (self.attack.relighting is None) != (self.unlabeled is None):
             raise InputError("attack=relighting and unlabeled=FOLDER: set both, or neither")
         if self.unlabeled is not None and (attacked or self.reload):
-            advice = "remove the others"
-            raise InputError(f"attack=relighting attacks photographs alone: {advice}", "attack")
+            raise InputError("attack=relighting takes no meshes: remove the others", "attack")
         # An attacked light that the scene lacks, such as a projector, is added with default
         # settings. An attack on the positions of lamps needs lamps that shine.
         for light, settings_class in scenes.LOCAL_LIGHT_SETTINGS.items():
@@ -194,9 +185,7 @@ class LabSettings(Settings):
         list(TRAINED_PATTERNS), f"Projected patterns: {', '.join(PATTERNS)}. a+b: two projectors."
     )
     slides: list[str] = setting([], "Image files that the pattern `slides` projects.")
-    environments: list[str] = setting(
-        [], "Environment maps (.npy, .hdr, .exr) instead of patterns."
-    )
+    environments: list[str] = setting([], "Maps (.npy, .hdr, .exr) of environments, not patterns.")
     brightness: list[float] = pair([0.2, 2.5], "radiance of white surfaces in the light.", SCALES)
     azimuth: list[float] = pair([-70, 70], "azimuth of a projector.", (-180, 180), "degrees")
     elevation: list[float] = pair([25, 70], "elevation of a projector.", (1, 89), "degrees")
@@ -225,9 +214,7 @@ class LabSettings(Settings):
             raise self.wrong("patterns", "need image files: set slides to them")
         sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
         if not sources or self.setups % len(sources):
-            raise self.wrong(
-                "setups", f"must be a multiple of the {len(sources)} patterns and environments"
-            )
+            raise self.wrong("setups", f"is no multiple of the {len(sources)} lights")
         if len(set(sources)) < len(sources):
             raise InputError(f"patterns and environments {sources} must have different names")
 
@@ -249,31 +236,21 @@ class AuditSettings(TaskSettings):
         "Folder of photographs: which keep their predicted class in the light of a projector? "
         "At most 100 times `budget` of them are attacked.",
     )
-    hard_negatives: list[Any] = setting(
-        [], "Meshes of other classes. []: generated fruit and balls."
-    )
+    hard_negatives: list[Any] = setting([], "Meshes of other classes. []: generated fruit, balls.")
     photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")
-    laboratory: str | None = setting(
-        None, "Folder of renders. null: made of the meshes by Mitsuba."
-    )
+    laboratory: str | None = setting(None, "Folder of renders. null: made of meshes by Mitsuba.")
     environments: list[str] = setting([*ENVIRONMENTS], "Environment lightings, or maps (.hdr ...).")
-    budget: float = setting(
-        1.0, "Factor of views, lightings and renders, and thus of the time.", within=(0.01, 100)
-    )
+    budget: float = setting(1.0, "Factor of views, lightings and renders.", within=(0.01, 100))
     overwrite: bool = setting(False, "Start anew in a folder that holds an audit or other results.")
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
-    out: str = setting(
-        f"runs/audits/{TIME_FOLDER}", "Folder of the audit. A stopped one continues in it."
-    )
+    out: str = setting(f"runs/audits/{TIME_FOLDER}", "Folder. A stopped audit continues in it.")
 
     def __post_init__(self) -> None:
         """Check all values, and that there is something to audit: meshes or photographs."""
         super().__post_init__()
         if not self.meshes and self.unlabeled is None:
-            raise self.wrong(
-                "meshes", "is empty: name a mesh, or set unlabeled to a folder of photographs"
-            )
+            raise self.wrong("meshes", "is empty: name a mesh, or set unlabeled")
         for key in ("hard_negatives", "photos", "laboratory"):
             if getattr(self, key) and not self.meshes:
                 raise InputError(f"{key} is set, but meshes is empty: set meshes, too", key)
@@ -329,8 +306,7 @@ class EvaluateSettings(TaskSettings):
         # With `run`, `network` may only name the function that built the network of the run.
         builds_run = bool(self.network and self.network.startswith("python:"))
         if (self.run is None) == (self.network is None) and not (self.run and builds_run):
-            fault = f"run={self.run} and network={self.network} do not name one network"
-            raise InputError(f"{fault}: give one")
+            raise InputError(f"run={self.run} and network={self.network} do not match: give one")
 
 
 def require_calibration(rate: float | None, calibrate: str | None) -> None:
@@ -341,8 +317,7 @@ def require_calibration(rate: float | None, calibrate: str | None) -> None:
     none.
     """
     if (rate is None) != (calibrate is None):
-        advice = "give both, or neither"
-        raise InputError(f"false_positive_rate={rate} and calibrate={calibrate}: {advice}")
+        raise InputError(f"false_positive_rate={rate}, calibrate={calibrate}: give both or none")
 
 
 @dataclass
@@ -374,8 +349,7 @@ class FitSettings(Settings):
         """Check all values, and that either a mask or a box says where the object is."""
         super().__post_init__()
         if bool(self.mask) == bool(self.box):
-            advice = "give mask=FILE, or a box instead"
-            raise InputError(f"mask={self.mask} and box={self.box}: {advice}")
+            raise InputError(f"mask={self.mask} and box={self.box}: give one of them")
 
 
 @dataclass(kw_only=True)

@@ -188,9 +188,8 @@ def build_network(
     if name == WIDERESNET:
         return WideResNet(len(classes), **shape, mean=mean, std=std)
     if not name.startswith((PYTHON, TORCHVISION)):
-        raise InputError(
-            f"name={name} is not {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION", "name"
-        )
+        choices = f"{WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION"
+        raise InputError(f"name={name}: choose {choices}", "name")
     architecture = name.removeprefix(TORCHVISION)
     is_own = name.startswith(PYTHON)
     if not is_own:
@@ -215,8 +214,7 @@ def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
     """Call a Python function of the user that builds a network."""
     network, own_size, own_classes = call_python(name.removeprefix(PYTHON))
     if not isinstance(network, nn.Module):
-        advice = "return a torch.nn.Module"
-        raise InputError(f"name={name} returns a {type(network).__name__}: {advice}", "name")
+        raise InputError(f"name={name} returns no torch.nn.Module: return one", "name")
     if own_size != size:
         fault = f"is for images of {own_size} pixels per side, but those of the data have {size}"
     elif list(own_classes) != list(classes):

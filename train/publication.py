@@ -175,8 +175,7 @@ def publish(
         if calibrate is not None and false_positive_rate is not None:
             labels: Any = label if label is not None else trained_labels(folder)
             if not labels:
-                advice = "give label"
-                raise InputError(f"label is not set, and run={run} records none: {advice}", "label")
+                raise InputError(f"label is not set, nor in run={run}: give label", "label")
             # Published weights have 16 bits.
             loaded.half().float()
             predictor = Predictor(loaded, loaded.classes, loaded.size)

@@ -142,8 +142,7 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
     if (folder / CONFIG).is_file():
         recorded = OmegaConf.to_container(read_config(folder / CONFIG))
     if not isinstance(recorded.get("train"), dict) or not isinstance(recorded.get("out"), str):
-        advice = "give another, or leave train.resume out"
-        raise InputError(f"out={folder} holds no run to resume: {advice}")
+        raise InputError(f"out={folder} holds no run: give another, or no train.resume")
     names = [item.name for item in fields(ExperimentSettings)]
     settings = {name: recorded[name] for name in names if name in recorded}
     # If the folder was moved, the paths of its files have changed. A baseline, which was
@@ -162,9 +161,7 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
     return merged, shlex.join(dict.fromkeys(words))
 
 
-def require_same_run(
-    folder: Path, settings: ExperimentSettings, finished: bool = False
-) -> DictConfig:
+def require_same_run(folder: Path, settings: ExperimentSettings, done: bool = False) -> DictConfig:
     """Check that the training run in a folder has the settings and input files of a command.
 
     The command may give a run that is not finished more epochs, and other
@@ -173,7 +170,7 @@ def require_same_run(
 
     def is_permitted(key: str, old: Any, new: Any) -> bool:
         is_longer = key == "train.epochs" and isinstance(old, int) and new > old
-        return not finished and (is_longer or key.startswith(("evaluate.", "photos")))
+        return not done and (is_longer or key.startswith(("evaluate.", "photos")))
 
     return require_same(folder, settings, "out= (sweep=)", is_permitted)
 

@@ -111,8 +111,7 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
     with ExitStack() as stack:
         for folder in folders:
             if not stack.enter_context(locked(folder)):
-                advice = "choose another"
-                raise InputError(f"{key}={folder} is being written by another process: {advice}")
+                raise InputError(f"{key}={folder} is in use by another process: choose another")
         try:
             yield
         finally:

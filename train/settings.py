@@ -101,8 +101,7 @@ class DataSettings(Settings):
         """Check all values, and that data sets of the user have a path."""
         super().__post_init__()
         if self.name in DATA_SETS_WITH_PATH and not self.path:
-            advice = f"give the file or folder of the data set {self.name!r}"
-            raise InputError(f"path is not set: {advice}", "path")
+            raise InputError(f"path is not set: give the path of the data set {self.name}", "path")
 
 
 @dataclass
@@ -110,9 +109,7 @@ class TrainingSceneSettings(SceneSettings):
     """Settings of the scene of training renders. The defaults are those of the paper."""
 
     backgrounds: list[Any] = setting_like(SceneSettings, "backgrounds", [0.0, 0.25, 0.5, 0.75, 1.0])
-    views: int | None = setting(
-        None, "Cameras per mesh. null: as augment.examples needs.", within=(1, MAX_VIEWS)
-    )
+    views: int | None = setting(None, "Cameras per mesh. null: as needed.", within=(1, MAX_VIEWS))
 
 
 @dataclass
@@ -134,8 +131,7 @@ class EvaluationSettings(Settings):
         """Check all values."""
         super().__post_init__()
         if self.laboratory_setups % KEPT_ASIDE_PATTERNS:
-            fault = f"is no multiple of {KEPT_ASIDE_PATTERNS}, the number of projected patterns"
-            raise self.wrong("laboratory_setups", fault)
+            raise self.wrong("laboratory_setups", f"is no multiple of {KEPT_ASIDE_PATTERNS}")
 
 
 @dataclass(kw_only=True)
@@ -197,12 +193,8 @@ class TaskSettings(NetworkSettings):
         "What the outputs mean. null: what their type tells.",
         choices=("classification", "detection", "segmentation"),
     )
-    threshold: float | None = setting(
-        None, "Lowest score of a detection. null: 0.4.", within=PROBABILITY
-    )
-    iou: float | None = setting(
-        None, "Lowest intersection over union of a match. null: 0.5.", within=(0.01, 1)
-    )
+    threshold: float | None = setting(None, "Threshold of scores. null: 0.4.", within=PROBABILITY)
+    iou: float | None = setting(None, "Least intersection over union. null: 0.5.", within=(0.01, 1))
     decode: str | None = setting(
         None,
         "Python function package.module:function from the outputs of the network in a file, such "
@@ -263,20 +255,19 @@ class ExperimentSettings(NetworkSettings):
     def __post_init__(self) -> None:
         """Check all values, and compute the number of renders."""
         if self.network == "":
-            advice = "give a run folder, or torchvision:NAME"
-            raise InputError(f"network is not set: {advice}", "network")
+            raise InputError("network is not set: give a run or torchvision:NAME", "network")
         super().__post_init__()
         for name in NEEDS_INITIAL_NETWORK:
             value = getattr(self.train, name)
             if value and not self.network:
-                fault = f"train.{name}={value} needs a network to begin with"
-                raise InputError(f"{fault}: set network", f"train.{name}")
+                key = f"train.{name}"
+                raise InputError(f"{key}={value} needs an initial network: set network", key)
         self._check_photographs()
         renders_meshes = self.augment.renders and self.augment.mode != "folder"
         attacks_pose = renders_meshes and "pose" in self.augment.attack.parameters
         if attacks_pose and not self.renderer.silhouettes:
-            advice = "an attack on the pose needs true"
-            raise InputError(f"renderer.silhouettes=false: {advice}", "renderer.silhouettes")
+            key = "renderer.silhouettes"
+            raise InputError(f"{key}=false: set it to true to attack the pose", key)
         if self.label is None:
             # The classes of the meshes will become the label when the classes of the network
             # are known. `with_class_names` then creates these settings again.
@@ -367,8 +358,7 @@ class ExperimentSettings(NetworkSettings):
         for key, item in objects.items():
             item.label = item.label or solid_name(item.mesh)
             if not item.label:
-                advice = f"give {{mesh: {item.mesh}, label: CLASS}}"
-                raise InputError(f"{key} has no class: {advice}", key)
+                raise InputError(f"{key} has no class: give {{mesh, label: CLASS}}", key)
         missing = set(labels) - {item.label for item in objects.values()}
         if missing and len(labels) > 1:
             raise self.wrong("label", f"has no mesh of {min(missing)}: add one to meshes")
@@ -439,8 +429,7 @@ def label_names(label: str | int | Sequence[str | int]) -> list[str]:
     is_valid = is_list and all(isinstance(item, str) or is_whole(item) for item in listed)
     names = [composed(str(name)) for name in listed] if is_valid else []
     if not names or len(set(names)) < len(names):
-        advice = "give the name of a class, or a list of several, each once"
-        raise InputError(f"label={label}: {advice}", "label")
+        raise InputError(f"label={label}: give a class, or a list of several, each once", "label")
     return names
 
 

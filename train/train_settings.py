@@ -76,9 +76,7 @@ class TrainSettings(Settings):
         "Name of the last module of the network that stays as it is. "
         "all_but_last: only the last layer learns. null: all layers learn.",
     )
-    schedule: str = setting(
-        "step", "Schedule of the rate. step: times 0.2 at 30%, 60%, 80%.", choices=SCHEDULES
-    )
+    schedule: str = setting("step", "step: times 0.2 at 30%, 60% and 80%.", choices=SCHEDULES)
     flips: str = setting(
         "random",
         "Flips of random images, or in every other epoch.",
@@ -93,9 +91,7 @@ class TrainSettings(Settings):
     relight_gain: float = setting(
         3.0, "Largest factor of a channel for relight, and 1 / the smallest.", within=(1, 100)
     )
-    relight_steps: int = setting(
-        0, "Gradient steps that find the factors. 0: random factors.", within=(0, 1000)
-    )
+    relight_steps: int = setting(0, "Gradient steps for the factors. 0: random.", within=(0, 1000))
     label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
     ranking_weight: float = setting(
         0.0, "Weight of the loss that ranks `label` above other classes.", within=(0, MAX_SCALE)
@@ -111,9 +107,7 @@ class TrainSettings(Settings):
         "At the end, interpolate between the weights of `network` and the trained weights, "
         "by the factor with the lowest loss on unchanged and relit validation images (WiSE-FT).",
     )
-    ema_decay: float = setting(
-        0.0, "Decay of the moving average of the weights. 0: none.", minimum=0, below=1
-    )
+    ema_decay: float = setting(0.0, "Decay of averaged weights. 0: none.", minimum=0, below=1)
     soup: bool = setting(False, "Keep the mean of all epochs, which all start with `network`.")
     eval_mode: bool | None = setting(
         None,
@@ -140,5 +134,4 @@ class TrainSettings(Settings):
         """Check all values, and that attacked images have a loss."""
         super().__post_init__()
         if self.relight_steps and not self.consistency_weight:
-            advice = "attacks the images of the consistency loss: set its weight"
-            raise self.wrong("relight_steps", advice)
+            raise self.wrong("relight_steps", "needs a consistency loss: set its weight")

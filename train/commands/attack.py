@@ -57,8 +57,8 @@ def run(settings: AttackExperimentSettings) -> None:
     `settings.reload`, the predictions for a saved adversary are printed, and
     the attack, if there is one, starts at this adversary.
     """
-    if settings.attack.relighting is not None and settings.unlabeled is not None:
-        _attack_photographs(settings, settings.attack.relighting, settings.unlabeled)
+    if settings.attack.relighting is not None:
+        _attack_photographs(settings, settings.attack.relighting)
         return
     # These settings are checked before any file is read.
     with keyed("transfer", **keys_of("transfer", settings.transfer)):
@@ -188,8 +188,7 @@ def attacks(
 
     if adversary is not None:
         if adversary.pixels is not None:
-            fault = "has changed pixels, which cannot be attacked on"
-            raise InputError(f"reload={settings.reload} {fault}")
+            raise InputError(f"reload={settings.reload} has changed pixels: give another")
         scene = adversary.scene(_start_rasterizer(settings), device)
         yield adversary.shown.name, settings.scene, start(scene, force=True)
         return
@@ -245,8 +244,7 @@ def load_targets(
     for item in chosen.networks:
         values = item if isinstance(item, dict) else {"network": item}
         if values.keys() - {"network", "weights"}:
-            advice = "give a name, or {network: NAME, weights: FILE}"
-            raise InputError(f"transfer.networks has {item}: {advice}")
+            raise InputError(f"transfer.networks has {item}: give a name, or {{network, weights}}")
         name = str(values.get("network"))
         with keyed(name="transfer.networks", weights="transfer.networks: weights"):
             other = load_network(name, values.get("weights"), trust_code=settings.trust)
@@ -303,13 +301,11 @@ def format_reloaded(
     return lines
 
 
-def _attack_photographs(
-    settings: AttackExperimentSettings, relighting: RelightingSettings, folder: str
-) -> None:
+def _attack_photographs(settings: AttackExperimentSettings, relighting: RelightingSettings) -> None:
     """Attack a network by the light of a projector on photographs, and print the results."""
     device = choose_device(settings.device)
     classifier = load_chosen(settings).to(device)
-    photographs = published_folder(Path(folder))
+    photographs = published_folder(Path(str(settings.unlabeled)))
     options: dict[str, Any] = {"seed": settings.seed, "batch_size": settings.attack.batch_size}
     options["sensor_noise"] = settings.attack.sensor_noise
     with _results_of(settings, classifier) as out, keyed("unlabeled"):

@@ -126,9 +126,7 @@ def audit(
             items = as_mappings("meshes", meshes, classifier)
             negatives = as_mappings("hard_negatives", hard_negatives, classifier)
             folders = {"photos": photos, "laboratory": laboratory, "out": folder}
-            given: dict[str, Any] = {
-                key: None if path is None else str(path) for key, path in folders.items()
-            }
+            given: dict[str, Any] = {key: path and str(path) for key, path in folders.items()}
             given |= {"label": label, "meshes": items, "hard_negatives": negatives, "seed": seed}
             given |= {"budget": budget, "device": str(device), "overwrite": overwrite}
             maps = as_list("environments", environments, str, "a list of names")

@@ -83,7 +83,7 @@ def _train_on_photographs(
     config = OmegaConf.merge(main.compose(["experiment=photographs"]), changes)
     on_photographs = read_settings(ExperimentSettings, cast(DictConfig, config))
     if settings.train.resume and is_finished(first):
-        require_same_run(first, on_photographs, finished=True)
+        require_same_run(first, on_photographs, done=True)
     else:
         if settings.overwrite and not settings.train.resume and distributed.rank() == 0:
             remove_run(folder)
@@ -97,12 +97,10 @@ def _train_on_photographs(
     return replace(settings, photographs_first=False, trust=True, network=str(first), **cleared)
 
 
-def _train_in(
-    folder: Path, settings: ExperimentSettings, command: str, resuming: Sequence[str]
-) -> None:
+def _train_in(folder: Path, settings: ExperimentSettings, command: str, resume: list[str]) -> None:
     """Check that the folders can be written to, and train a network and its baselines.
 
-    If the training is interrupted, the command that resumes it is printed: `resuming`.
+    If the training is interrupted, the command that resumes it is printed: `resume`.
     """
     # The baselines come first. Each has a sub-folder with the name of its kind of renders.
     settings_of_runs = {}
@@ -142,7 +140,7 @@ def _train_in(
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
             advice = "no checkpoint yet: start again"
             if any(map(checkpoints.exists, settings_of_runs)):
-                advice = f"to go on: {shlex.join(resuming)}"
+                advice = f"to go on: {shlex.join(resume)}"
             console.info("%s%s", cause, advice)
             raise
 

@@ -79,8 +79,7 @@ def run(settings: FitSettings) -> None:
     overlap = found.scene.overlap
     print(f"outlines overlap by {overlap:.1%}; the object's pixels differ by {error:.1%}")
     if overlap < MIN_OVERLAP or error > MAX_ERROR:
-        advice = "look at comparison.png, and check photograph, mask, mesh and fov"
-        print(f"warning: the mesh hardly fits; {advice}")
+        print("warning: the mesh hardly fits; see comparison.png, and check mask, mesh and fov")
     words = ["pnb-attack", "attack=lighting"]
     if settings.label is not None:
         words.append(f"label={settings.label}")
@@ -152,12 +151,11 @@ def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height w
         levels = _levels(path)
     # Pillow raises errors of almost any type for a damaged file.
     except Exception as error:
-        advice = "save white where the object is and black elsewhere"
-        raise InputError(f"mask={path} cannot be read ({single_line(error)}): {advice}") from error
+        fault = f"mask={path} cannot be read ({single_line(error)})"
+        raise InputError(f"{fault}: save the object in white on black") from error
     if levels.shape != (height, width):
         fault = f"mask={path} has {levels.shape[1]} × {levels.shape[0]} pixels"
-        reason = f"but the photograph has {width} × {height}"
-        raise InputError(f"{fault}, {reason}: give a mask of the same size")
+        raise InputError(f"{fault}: give a mask of {width} × {height}, as the photograph")
     return levels
 
 
@@ -218,13 +216,13 @@ def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndar
     try:
         cv2: Any = import_module("cv2")
     except ImportError as error:
-        advice = "run pip install opencv-python-headless, or give mask=FILE"
-        raise InputError(f"box= needs OpenCV: {advice}") from error
+        raise InputError("box= needs OpenCV: pip install opencv-python-headless") from error
     height, width = image.shape[:2]
     left, top, right, bottom = box if len(box) == 4 else [0, 0, 0, 0]
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):
-        wanted = f"[left, top, right, bottom] within {width} × {height} pixels"
-        raise InputError(f"box={box} is not {wanted}")
+        raise InputError(
+            f"box={box}: give [left, top, right, bottom] within {width} × {height} pixels"
+        )
     rectangle = (left, top, right - left, bottom - top)
     labels = np.zeros((height, width), np.uint8)
     # OpenCV takes the color channels in the order blue, green, red.

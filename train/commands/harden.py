@@ -152,8 +152,7 @@ def harden(
         )
         is_detector = isinstance(classifier.task, Detection)
         if not (is_detector or isinstance(classifier.task, Classification)):
-            reason = f"network is a network of {classifier.task.name}"
-            raise InputError(f"{reason}: give a classifier or a detector")
+            raise InputError(f"network is for {classifier.task.name}: give another")
         if next(classifier.parameters(), None) is None:
             raise InputError("network has no parameters: give a network that can be trained")
         keep_text_vectors(classifier.network, len(classifier.classes))
@@ -207,9 +206,8 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
     copy = deepcopy(network, {id(value): value.detach().clone() for value in results})
     # An optimizer can change a parameter only if it is a leaf of the autograd graph.
     if not all(weight.is_leaf for weight in copy.parameters()):
-        fault = "network contains a module of torch.jit, which cannot be trained"
-        advice = "norm_balls.load_classifier(FILE, trust_code=True)"
-        raise InputError(f"{fault}: write it with torch.jit.save, and give {advice}")
+        advice = "save it, and give norm_balls.load_classifier(FILE, trust_code=True)"
+        raise InputError(f"network has a module of torch.jit, which cannot be trained: {advice}")
     return copy
 
 
@@ -228,8 +226,7 @@ def _read_settings(
     for name, section in sections.items():
         values = asdict(cast(Any, section)) if isinstance(section, Settings) else section or {}
         if not isinstance(values, Mapping):
-            advice = "give a mapping of fields, or settings"
-            raise InputError(f"{name} is {describe(section)}: {advice}")
+            raise InputError(f"{name} is {describe(section)}: give a mapping, or settings")
         given[name] = values
     merged = OmegaConf.merge(settings, changes, given)
     return read_settings(ExperimentSettings, cast(DictConfig, merged))

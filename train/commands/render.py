@@ -41,8 +41,7 @@ def run(settings: RenderSettings) -> None:
     folder = writable_folder(settings.out, "out")
     for name in classes if settings.format == "imagefolder" else ():
         if (folder / name).resolve().parent != folder.resolve():
-            reason = f"a folder cannot have the name of the class {name}"
-            raise InputError(f"{reason}: rename the class or choose another format", "format")
+            raise InputError(f"the class {name} is no name of a folder: rename it", "format")
     device = choose_device(settings.device)
     network = load_chosen(settings).to(device) if settings.network else None
     if settings.size is None:
@@ -91,8 +90,7 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
         found = read_json(path)
         changed = [key for key in facts if found.get(key) != facts[key]]
         if changed:
-            reason = f"holds a data set with another {changed[0]}"
-            raise InputError(f"out={folder} {reason}: choose another folder", "out")
+            raise InputError(f"out={folder} has another {changed[0]}: choose another folder", "out")
     elif any(path.name not in (DESCRIPTION, LAUNCHER) for path in folder.iterdir()):
         raise InputError(f"out={folder} is not empty: choose a new folder", "out")
     else:

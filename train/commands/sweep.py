@@ -56,8 +56,7 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     runs = _expand([word for word in words if not word.startswith("-")])
     first_config = main.compose(runs[0])
     if first_config.photographs_first:
-        advice = "start the runs one by one"
-        raise InputError(f"photographs_first=true cannot be used in a sweep: {advice}")
+        raise InputError("photographs_first=true makes no sweep: start the runs one by one")
     overwrite = bool(first_config.overwrite)
     parent = writable_folder(str(first_config.sweep), "sweep")
     # An earlier report about the same sweep may be replaced.
@@ -73,7 +72,7 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     for folder, overrides in zip(folders, runs, strict=True):
         settings = with_label(main.read(overrides))
         if is_finished(folder) or checkpoints.exists(folder):
-            require_same_run(folder, settings, finished=True)
+            require_same_run(folder, settings, done=True)
         else:
             require_new_run(folder, "sweep", overwrite, resume=True)
             texts = [word for word in overrides if not re.search(r"=[-+.e\d]+$", word)]
@@ -105,11 +104,9 @@ def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
         if key == "out":
-            advice = "name the folder of a sweep with sweep="
-            raise InputError(f"out= names the folder of a single run: {advice}")
+            raise InputError("out= is the folder of a single run: name that of a sweep with sweep=")
         if key == "launcher" and override.value() == "slurm" and not shutil.which("sbatch"):
-            advice = "start the sweep on the cluster"
-            raise InputError(f"launcher=slurm needs the command sbatch of Slurm: {advice}")
+            raise InputError("launcher=slurm needs the command sbatch: start on the cluster")
         if override.is_sweep_override():
             values = list(override.sweep_string_iterator())
         else:

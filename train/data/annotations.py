@@ -131,8 +131,7 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
         if images.is_dir() and masks.is_dir():
             break
     else:
-        advice = "move them to its folders images and masks, under the same names"
-        raise InputError(f"photos={folder} has no photographs with masks: {advice}", "photos")
+        raise InputError(f"photos={folder} lacks images/ or masks/: move them there", "photos")
     marked, paths, missing = [], {}, []
     for item in find_unlabeled(images):
         name = str(item.path)
@@ -168,14 +167,12 @@ def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, 
         raise InputError(f"{path} cannot be read ({single_line(error)}): replace it") from error
     width, height = fitted.size
     if labels.shape != (height, width):
-        fault = f"{path} has the shape {labels.shape}, and is no mask of its photograph"
-        advice = f"give a gray or palette image of {width:g} × {height:g} pixels"
-        raise InputError(f"{fault}: {advice}, with indices of classes")
+        advice = f"give a gray or palette image of {width:g} × {height:g} indices of classes"
+        raise InputError(f"{path} has the shape {labels.shape}: {advice}")
     highest = int(labels[labels != UNSCORED].max(initial=0))
     if highest >= class_count:
-        fault = f"{path} has the value {highest}, but the network has {class_count} classes"
         advice = f"use 0 to {class_count - 1}, and {UNSCORED} for pixels that do not count"
-        raise InputError(f"{fault}: {advice}")
+        raise InputError(f"{path} has the value {highest}: {advice}")
     shown = (fitted.scale * fitted.size).round().astype(int)
     reduced = Image.fromarray(labels.astype(np.uint8)).resize((*shown,), Image.Resampling.NEAREST)
     result = np.full(fitted.pixels.shape[1:], UNSCORED, np.uint8)
@@ -237,9 +234,8 @@ def _read_coco(file: Path) -> Annotations:
         if isinstance(error, InputError):
             raise
         reason = f"no key {error}" if isinstance(error, KeyError) else single_line(error)
-        advice = "it needs images, categories, and annotations with image_id, category_id and bbox"
-        fault = f"{file} is no COCO file of detections ({reason})"
-        raise InputError(f"{fault}: {advice} (x, y, width, height)") from error
+        advice = "give images, categories, and annotations with image_id, category_id and bbox"
+        raise InputError(f"{file} is no COCO file of detections ({reason}): {advice}") from error
     if not photographs:
         first = f", such as {missing[0]}" if missing else ""
         raise InputError(f"{file} names no image that exists{first}: move the images beside it")
@@ -291,9 +287,8 @@ def _read_yolo(folder: Path) -> Annotations:
         photographs.append(_annotated(path, str(photograph.path), (1, 1), rows))
     if not label_count:
         first = _label_files(photographs[0].path.absolute())[0]
-        fault = f"photos={folder} has neither a COCO file nor label files"
-        advice = f"give one, or text files of YOLO such as {first}"
-        raise InputError(f"{fault}: {advice}", "photos")
+        fault = f"photos={folder} has neither a COCO file nor label files of YOLO"
+        raise InputError(f"{fault}: add some, such as {first}", "photos")
     return Annotations(folder, photographs, classes, [])
 
 
@@ -329,8 +324,7 @@ def _yolo_classes(folder: Path) -> tuple[str, ...]:
             if (parent / name).is_file():
                 lines = (parent / name).read_text(encoding="utf-8-sig").splitlines()
                 return tuple(line.strip() for line in lines if line.strip())
-    advice = "add data.yaml with names, or classes.txt"
-    raise InputError(f"photos={folder} does not name its classes: {advice}", "photos")
+    raise InputError(f"photos={folder} names no classes: add data.yaml or classes.txt", "photos")
 
 
 def _yolo_rows(file: Path, class_count: int) -> Iterator[Sequence[float]]:
@@ -351,8 +345,8 @@ def _yolo_rows(file: Path, class_count: int) -> Iterator[Sequence[float]]:
             if not all(-ROUNDING <= value <= 1 + ROUNDING for value in values):
                 raise ValueError("coordinates must be fractions of the sides, from 0 to 1")
         except ValueError as error:
-            advice = "write class x y width height"
-            raise InputError(f"line {number} of {file} is no box ({error}): {advice}") from error
+            fault = f"line {number} of {file} is no box ({error})"
+            raise InputError(f"{fault}: write class x y width height") from error
         if len(values) == 4:
             x, y, width, height = values
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
@@ -380,9 +374,7 @@ def fit(photograph: Annotated, size: tuple[int, int], how: str) -> Fitted:
     return Fitted(pixels, boxes[is_kept], is_kept, shown / upright, shift.astype(float), upright)
 
 
-def _upright_boxes(
-    photograph: Annotated, upright: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "M 4"]:
+def _upright_boxes(photograph: Annotated, upright: Float[np.ndarray, "2"]) -> np.ndarray:
     """Return boxes in the pixels of the upright photograph.
 
     If only its stored, turned form has the aspect ratio of the annotation, the boxes are turned.
@@ -396,8 +388,7 @@ def _upright_boxes(
             turn = TURNED.get(image.getexif().get(ExifTags.Base.Orientation, 1))
         if turn is None or not _is_similar(marked[::-1], upright):
             fault = f"{photograph.path} has {upright[0]:g} × {upright[1]:g} pixels"
-            said = f"its annotation says {marked[0]:g} × {marked[1]:g}"
-            raise InputError(f"{fault}, but {said}: its boxes are of another image")
+            raise InputError(f"{fault}, but its boxes are for {marked[0]:g} × {marked[1]:g}")
         corners = np.stack(turn(corners[..., 0], corners[..., 1]), axis=-1)
     corners = np.concatenate([corners.min(1), corners.max(1)], axis=-1)
     return corners * np.tile(upright, 2)

@@ -41,8 +41,7 @@ def require_outside(out: Path, folder: Path) -> None:
     photographs.
     """
     if out.resolve().is_relative_to(folder.resolve()):
-        advice = "choose a folder outside of it"
-        raise InputError(f"out={out} lies inside the folder of the photographs, {folder}: {advice}")
+        raise InputError(f"out={out} lies inside {folder}, the photographs: choose another")
 
 
 def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list[Photograph]:
@@ -73,9 +72,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     paths, files = _image_files(folder)
     has_class_folders = _has_class_folders(folder, paths, classes, labels)
     if len(labels) > 1 and not has_class_folders:
-        fault = f"{folder} has no class folders, and label names several classes"
-        advice = "move the images of the folder into one subfolder per class"
-        raise InputError(f"{fault}: {advice}")
+        raise InputError(f"{folder} has several labels, but no folders of classes: make some")
     table = folder / TABLE
     rows = _read_table(table)
     missing = sorted(rows.keys() - set(map(_composed_path, files)))
@@ -83,8 +80,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
         counts = f"{len(missing)} of {len(rows)} rows"
         fault = f"{table} names a missing file in {counts}, such as {missing[0]}"
         if len(missing) == len(rows):
-            advice = f"give paths relative to the folder, such as {paths[0]}"
-            raise InputError(f"{fault}: {advice}")
+            raise InputError(f"{fault}: give paths in the folder, such as {paths[0]}")
         _warn_once(fault)
     photographs = []
     for path in paths:
@@ -94,9 +90,8 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     hard_negatives = {name for item in photographs for name in item.hard_negatives}
     unknown = hard_negatives - {item.source for item in photographs}
     if unknown:
-        fault = f"{table} names the source {min(unknown)!r} in the column hard_negatives"
-        advice = "correct or remove this name"
-        raise InputError(f"{fault}, but no image has this source: {advice}")
+        fault = f"{table} names {min(unknown)!r} in the column hard_negatives"
+        raise InputError(f"{fault}, but no image has this source: correct it")
     return photographs
 
 
@@ -117,14 +112,11 @@ def choose_labels(
         return [classes[class_index(classes, name, "label")] for name in label_names(label)]
     labels = class_folders(folder, classes)
     if not labels:
-        known = ", ".join(classes[:3])
-        fault = f"photos={folder} has no sub-folder of a class of the network ({known}, ...)"
-        advice = "name the sub-folders by classes, or give classes or label"
-        raise InputError(f"{fault}: {advice}")
+        fault = f"photos={folder} has no sub-folder named by a class, such as {classes[0]}"
+        raise InputError(f"{fault}: rename them, or give classes or label")
     if len(labels) > MAX_LABELS:
-        fault = f"photos={folder} has sub-folders of {len(labels)} classes"
-        reason = f"and at most {MAX_LABELS} are scored one by one"
-        raise InputError(f"{fault}, {reason}: choose the positive classes with label", "label")
+        fault = f"photos={folder} has {len(labels)} classes, more than {MAX_LABELS}"
+        raise InputError(f"{fault}: choose the positive classes with label", "label")
     return labels
 
 
@@ -151,8 +143,7 @@ def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]
     all_paths = list(visible_files(folder))
     image_paths = sorted(path for path in all_paths if _is_image(folder, path))
     if not image_paths:
-        advice = f"give a folder with image files whose names end in one of {', '.join(SUFFIXES)}"
-        raise InputError(f"{folder} holds no photographs: {advice}")
+        raise InputError(f"{folder} holds no photographs: add some ({', '.join(SUFFIXES)})")
     return image_paths, all_paths
 
 
@@ -226,18 +217,14 @@ def _has_class_folders(
     for name in no_classes:
         is_misspelled = any(label in name.lower() for label in labels)
         if not known or is_misspelled or get_close_matches(name.lower(), labels):
-            fault = f"{folder / name} is not named after a class of the network"
-            advice = f"rename the folder to its class, or to {OTHER_PREFIX}{name}"
-            reason = f"{fault} (such as {nearest(name, classes)})"
-            raise InputError(f"{reason}: {advice} if it shows hard negatives")
+            fault = f"{folder / name} is not a class, such as {nearest(name, classes)}"
+            raise InputError(f"{fault}: rename it, hard negatives to {OTHER_PREFIX}{name}")
     if no_classes:
         count = f"{len(no_classes)} of {len(names)} folders in {folder}"
-        fault = "are not named after a class of the model and count as negatives"
-        _warn_once(f"{count} {fault}: {', '.join(no_classes)}")
+        _warn_once(f"{count} are no classes and count as negatives: {', '.join(no_classes)}")
     outside = [path for path in paths if len(path.parts) == 1]
     if names and outside:
-        fault = f"{folder / outside[0]} lies beside class folders, not in one of them"
-        raise InputError(f"{fault}: move the file into the folder of its class")
+        raise InputError(f"{folder / outside[0]} lies beside the class folders: move it into one")
     return bool(names)
 
 
@@ -259,9 +246,9 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
                 if rows.setdefault(path, row) != row:
                     raise ValueError(f"two different rows for {path}")
     except (ValueError, LookupError, csv.Error, OSError) as error:
-        advice = "write it as a UTF-8 text file with the columns path and source_tag"
         fault = f"{table} cannot be read ({single_line(error)})"
-        raise InputError(f"{fault}: {advice}, separated by commas, one row per image") from error
+        advice = "write UTF-8 text with the columns path and source_tag, separated by commas"
+        raise InputError(f"{fault}: {advice}") from error
     return rows
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
-from torch import Tensor
+from torch import Generator, Tensor
 
 import augment
 import renderer
@@ -113,9 +113,7 @@ def write_cached(cache: Path, key: str, images: Tensor) -> None:
         console.warning(f"the rendered images are not cached: {error}")
 
 
-def soft_front_light(
-    to_camera: Float[Tensor, " 3"], draws: torch.Generator
-) -> Float[Tensor, "49 3"]:
+def soft_front_light(to_camera: Float[Tensor, " 3"], draws: Generator) -> Float[Tensor, "49 3"]:
     """Draw uniform ambient light plus a directional light from near the camera.
 
     The direction, color and strength of the light are random. `to_camera` is a unit vector; the
@@ -140,9 +138,7 @@ def _render(
     return torch.cat(images)
 
 
-def _render_solid(
-    name: str, settings: ImageSettings, draws: torch.Generator
-) -> UInt8[Tensor, "_ 3 size size"]:
+def _render_solid(name: str, settings: ImageSettings, draws: Generator) -> UInt8[Tensor, "_ 3 S S"]:
     """Render a random solid in another light for each pair of random camera and background."""
     mesh = solid(name, int(torch.randint(2**31, (1,), generator=draws)))
     numbers = torch.rand(3, CAMERAS, generator=draws, dtype=torch.float64).T.tolist()

@@ -163,9 +163,8 @@ def held_out_rows(split: Split, fraction: float, argument: str = "fraction") -> 
         class_size = len(indices_of_class)
         count = round(fraction * class_size)
         if not 0 < count < class_size:
-            fault = f"{argument}={fraction} selects {count} of the {class_size} images of class"
-            advice = "choose a fraction that leaves images of each class in both splits"
-            raise InputError(f"{fault} {int(label)}: {advice}", argument)
+            fault = f"{argument}={fraction} selects {count} of the {class_size} images of a class"
+            raise InputError(f"{fault}: choose one that leaves some in both splits", argument)
         order = torch.randperm(class_size, generator=draws)
         is_held_out[indices_of_class[order[:count]]] = True
     return is_held_out
@@ -203,8 +202,7 @@ def load_cifar100(path: str) -> DataSet:
         both = [CIFAR100(path, train=is_train, download=True) for is_train in (True, False)]
     except (OSError, RuntimeError) as error:
         fault = f"path={path} does not contain CIFAR-100, and the download failed ({error})"
-        advice = "give the folder of a copy, or connect to the internet"
-        raise InputError(f"{fault}: {advice}", "path") from error
+        raise InputError(f"{fault}: give a copy, or connect to the internet", "path") from error
     splits = []
     for cifar in both:
         images = torch.from_numpy(cifar.data).permute(0, 3, 1, 2).contiguous()
@@ -241,8 +239,7 @@ def load_npz(path: str) -> DataSet:
     # zipfile, zlib and NumPy raise errors of many types for a damaged file.
     except Exception as error:
         fault = f"path={path} is not an .npz file of labeled images ({single_line(error)})"
-        arrays = "train_images, train_labels, test_images, test_labels and classes"
-        raise InputError(f"{fault}: give a file with the arrays {arrays}", "path") from error
+        raise InputError(f"{fault}: give one, as conf/data/npz.yaml says", "path") from error
 
 
 def _npz_split(images: np.ndarray, labels: np.ndarray, class_count: int) -> Split:
@@ -272,45 +269,37 @@ def load_folder(
     root = Path(path)
     split_names = [name for name in photographs.folder_names(root) if name.lower() in SPLIT_NAMES]
     if split_names not in ([], ["test", "train"]):
-        advice = "give a folder with the two folders train and test, or with class folders only"
         fault = f"path={path} holds the folders {', '.join(split_names)}"
-        raise InputError(f"{fault}: {advice}", "path")
+        raise InputError(f"{fault}: give train and test, or class folders only", "path")
     train_root = root / "train" if split_names else root
     classes = tuple(photographs.folder_names(train_root))
     if len(classes) < 2:
-        fault = f"path={path} holds {len(classes)} class folders"
-        raise InputError(f"{fault}: give a folder with two or more", "path")
+        raise InputError(f"path={path} has {len(classes)} class folders: give two or more", "path")
     other_files = photographs.unsupported_files(root)
     if other_files:
-        shown = ", ".join(map(str, other_files[:3]))
-        console.warning("%d files in %s are not images: %s", len(other_files), root, shown)
+        console.warning("%d files are no images: %s", len(other_files), root / other_files[0])
     options = (classes, size, skip_unreadable, workers)
     train = _read(train_root, *options)
     for label in sorted(set(range(len(classes))).difference(train.labels.tolist())):
-        advice = "put images there, or remove the folder"
-        raise InputError(f"{train_root / classes[label]} holds no image: {advice}")
+        raise InputError(f"{train_root / classes[label]} holds no image: add some, or remove it")
     if split_names:
         return DataSet(classes, train, _read(root / "test", *options))
     is_test = held_out_rows(train, test_fraction, "test_fraction")
     return DataSet(classes, train[~is_test], train[is_test])
 
 
-def load_unlabeled(
-    path: str, size: int, test_fraction: float, skip_unreadable: bool, workers: int
-) -> DataSet:
+def load_unlabeled(path: str, size: int, test_fraction: float, skip: bool, workers: int) -> DataSet:
     """Load all images of a folder and its subfolders as an unlabeled data set.
 
     It has no classes, every label is 0, and at most HELD_OUT images are test images.
     """
-    split = _read(Path(path), (), size, skip_unreadable, workers)
+    split = _read(Path(path), (), size, skip, workers)
     fraction = min(test_fraction, HELD_OUT / len(split))
     is_test = held_out_rows(split, fraction, "test_fraction")
     return DataSet((), split[~is_test], split[is_test], labeled=False)
 
 
-def _read(
-    root: Path, classes: Sequence[str], size: int, skip_unreadable: bool, workers: int
-) -> Split:
+def _read(root: Path, classes: Sequence[str], size: int, skip: bool, workers: int) -> Split:
     """Read the images of a folder into memory if `size` is small. Otherwise leave them on disk.
 
     Unreadable images are left out, but files on disk are not read yet. Without `classes`, every
@@ -323,12 +312,10 @@ def _read(
     images: Tensor | ImageFiles
     if size > MAX_SIZE_IN_MEMORY:
         paths = tuple(item.path for item in found)
-        images = ImageFiles(root, paths, size, workers, skip_unreadable)
+        images = ImageFiles(root, paths, size, workers, skip)
     else:
-        count = len(found)
-        found, images, broken = photographs.load_photographs(root, found, size, skip_unreadable)
+        found, images, broken = photographs.load_photographs(root, found, size, skip)
         if broken:
-            line = "%d of %d images cannot be read and are skipped: %s"
-            console.warning(line, len(broken), count, broken[0])
+            console.warning("%d unreadable images are skipped: %s", len(broken), broken[0])
     labels = [class_index(classes, item.label, str(root)) if classes else 0 for item in found]
     return Split(images, torch.tensor(labels))

@@ -31,6 +31,7 @@ from train.train_settings import LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, Trai
 # 8/255 on CIFAR-10.
 PGD = StepSettings(norm="linf", radius=2 / 255, step="sign", step_size=1 / 255)
 PGD_STEPS = 3
+Images = UInt8[Tensor, "B 3 H W"]
 
 
 @dataclass
@@ -52,9 +53,7 @@ class Augmentation:
     seed: int = 0
     absent: Sequence[int] = ()
 
-    def apply(
-        self, images: UInt8[Tensor, "B 3 H W"], labels: Tensor, step: int
-    ) -> UInt8[Tensor, "B 3 H W"]:
+    def apply(self, images: Images, labels: Tensor, step: int) -> Images:
         """Augment the images of a batch. Only "pgd" needs `labels`, which are of classes then.
 
         The random numbers for an image depend on the seed, the step and the index of the image in
@@ -99,9 +98,7 @@ class Augmentation:
         transforms["color_jitter+augmix"] = v2.Compose([jitter, v2.AugMix()])
         return transforms[self.settings.augmentation]
 
-    def _relight(
-        self, images: UInt8[Tensor, "B 3 size size"], step: int
-    ) -> UInt8[Tensor, "B 3 size size"]:
+    def _relight(self, images: Images, step: int) -> Images:
         """Show the images of a batch in the light of a projector, each in a light of its own.
 
         A slide is the picture that the projector shows. It is a random pattern or another image of
@@ -127,9 +124,7 @@ class Augmentation:
         with torch.no_grad():
             return to_bytes(light.expose(albedo, problem.log_gain(values)))
 
-    def _attack_pixels(
-        self, images: UInt8[Tensor, "B 3 H W"], labels: Int[Tensor, " B"], step: int
-    ) -> UInt8[Tensor, "B 3 H W"]:
+    def _attack_pixels(self, images: Images, labels: Int[Tensor, " B"], step: int) -> Images:
         """Attack images by projected gradient descent from a random start (Madry et al. 2018).
 
         All PGD_STEPS steps are taken, also if an image is misclassified earlier. A negative label
@@ -157,7 +152,7 @@ class Augmentation:
 class _Pixels(NormBalls):
     """Pixels of images as attacked values, in balls around the images."""
 
-    def __init__(self, images: UInt8[Tensor, "B 3 H W"]):
+    def __init__(self, images: Images):
         super().__init__(PGD, to_unit(images).flatten(1))
         self.group_size = len(images)
         self._shape = images.shape[1:]

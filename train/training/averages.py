@@ -23,6 +23,7 @@ FACTORS = (0.0, 0.25, 0.5, 0.75, 1.0)
 INTERPOLATION = "interpolation"
 # Number of images in a pass through a network.
 BATCH = 32
+Weights = Mapping[str, Tensor]
 
 
 class MovingAverage(AveragedModel):
@@ -68,16 +69,14 @@ class Averages:
             else the network in training.
     """
 
-    def __init__(
-        self, model: MixedPrecision, ema_decay: float, soup: bool, keeps_latest: bool = False
-    ):
+    def __init__(self, model: MixedPrecision, decay: float, soup: bool, keeps_latest: bool = False):
         """Create the averages, which are empty at first.
 
-        `ema_decay` is the decay in a step, or 0 for no moving average. With `keeps_latest` or a
+        `decay` is that of a step, or 0 for no moving average. With `keeps_latest` or a
         soup, the last network is kept instead of the one with the highest validation accuracy.
         """
         self._model = model
-        self._ema = MovingAverage(model, ema_decay) if ema_decay else None
+        self._ema = MovingAverage(model, decay) if decay else None
         mean = get_swa_avg_fn()
         self._soup = AveragedModel(model, avg_fn=mean, use_buffers=True) if soup else None
         self._keeps_latest = soup or keeps_latest
@@ -136,7 +135,7 @@ class Averages:
 def interpolate(
     initial: MixedPrecision,
     selected: MixedPrecision,
-    trained: Mapping[str, Tensor],
+    trained: Weights,
     validation: Split,
     seed: int,
     weights: tuple[float, float] = (1.0, 1.0),
@@ -174,9 +173,7 @@ def interpolate(
     return mix(initial_weights, trained, best_factor), best_factor
 
 
-def mix(
-    initial: Mapping[str, Tensor], trained: Mapping[str, Tensor], factor: float
-) -> dict[str, Tensor]:
+def mix(initial: Weights, trained: Weights, factor: float) -> dict[str, Tensor]:
     """Interpolate linearly between the weights of two networks.
 
     The factor 0 gives `initial`. Integers, such as counters, are those of `trained`.

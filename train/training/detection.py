@@ -63,8 +63,7 @@ def losses_of(network: nn.Module, images: Tensor, targets: Sequence[Target]) -> 
     losses = network(images, targets)
     if not isinstance(losses, Mapping) or not losses:
         fault = f"network returned {describe(losses)} in training mode"
-        advice = "it must take images and targets and return its losses by name"
-        raise InputError(f"{fault}: {advice}, as the detectors of torchvision do")
+        raise InputError(f"{fault}: return losses by name, as the detectors of torchvision do")
     return torch.stack([*losses.values()]).sum()
 
 
@@ -76,8 +75,7 @@ def require_losses(network: TaskNetwork, needs_boxes: bool) -> None:
     """
     if isinstance(network.task, Detection) and network.task.decode is not None:
         if needs_boxes:
-            reason = "a raw network, whose outputs are decoded, returns no losses for renders"
-            raise InputError(f"meshes: {reason}: give no meshes, or a network that returns losses")
+            raise InputError("meshes need a network that returns losses: give no meshes")
         return
     copy = deepcopy(network.network).train()
     # Batch normalization in training mode needs two images.
@@ -89,8 +87,7 @@ def require_losses(network: TaskNetwork, needs_boxes: bool) -> None:
         raise
     except Exception as error:  # Networks of users raise errors of many kinds.
         fault = f"network fails on images and targets in training mode ({single_line(error)})"
-        advice = "it must return its losses by name, as the detectors of torchvision do"
-        raise InputError(f"{fault}: {advice}") from error
+        raise InputError(f"{fault}: return losses as the detectors of torchvision do") from error
 
 
 @dataclass

@@ -73,8 +73,7 @@ class Initial:
         """Pixels per side of the images that the network takes."""
         size = self.architecture["size"]
         if not is_whole(size):
-            reason = f"size={size} of {self.source} is rectangular, but training takes squares"
-            raise InputError(f"{reason}: give a network of square images, and one number", "size")
+            raise InputError(f"size={size} of {self.source} is no square: give one number", "size")
         return size
 
     @property
@@ -93,8 +92,7 @@ class Initial:
         """
         for key in ("classes", "size"):
             if self.architecture[key] != description[key]:
-                advice = f"give the same {key}"
-                raise InputError(f"network={self.source} differs from this run in {key}: {advice}")
+                raise InputError(f"network={self.source} has another {key}: give the same {key}")
         with checkpoints.checks_architecture(self.source):
             network.load_state_dict(self.weights)
 
@@ -108,12 +106,10 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         return _load_classifier(settings, name)
     source = Path(name.removeprefix(checkpoints.RUN))
     if checkpoints.is_state_dict(source):
-        fault = f"network={name} contains weights, but not their architecture"
         advice = f"give both, as in network=torchvision:resnet50 weights={source}"
-        raise InputError(f"{fault}: {advice}", "network")
+        raise InputError(f"network={name} has weights, but no architecture: {advice}", "network")
     if settings.weights is not None:
-        fault = f"weights={settings.weights} cannot replace the weights of network={name}"
-        raise InputError(f"{fault}, which is a training run: leave weights out", "weights")
+        raise InputError(f"weights: network={name} has its own: leave weights out", "weights")
     # The network of a run has its own classes and its own normalization.
     given = as_facts(settings.classes, None, settings.normalization, settings.prompt)
     require_no_facts(f"network={name}", given)
@@ -161,12 +157,11 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         weights = None if settings.weights is None else as_path("weights", settings.weights)
         classifier = load_source(name, weights, facts, settings.trust)
     if not isinstance(classifier.task, Classification):
-        reason = f"network={name} is a network of {classifier.task.name}, and pnb-train takes "
-        raise InputError(f"{reason}classifiers: train a detector by nb.harden in Python", "network")
+        fault = f"network={name} is no classifier, but for {classifier.task.name}"
+        raise InputError(f"{fault}: train it by nb.harden in Python", "network")
     if not list(classifier.network.parameters()):  # ONNX and quantized networks have none.
-        fault = f"network={name} is a network without weights that can be trained"
-        advice = "give a file of the network in the format of TorchScript or torch.export"
-        raise InputError(f"{fault}: {advice}", "network")
+        advice = "give a file of TorchScript or torch.export"
+        raise InputError(f"network={name} has no weights to train: {advice}", "network")
     # A run builds the network again, since modules of TorchScript cannot be copied.
     return replace(initial_of(classifier, size), source=Path(name), network=None)
 
@@ -279,9 +274,8 @@ def relabel(
     """
     if not data.labeled:
         if not (initial and settings.train.distillation_weight):
-            fault = f"data.name={settings.data.name} has no labels"
             advice = "set network and train.distillation_weight"
-            raise InputError(f"{fault}, and requires a network to imitate: {advice}")
+            raise InputError(f"data.name={settings.data.name} has no labels: {advice}")
         return replace(data, classes=initial.classes)
     if initial and (data.rendered or initial.is_classifier):
         return sets.relabeled(data, initial.classes, f"data.name={settings.data.name}")
@@ -340,9 +334,8 @@ def build_service(
         labels = torch.tensor([label_of_class[name] for name in scene.labels])
     has_all = is_classifier and len(positive_classes) == len(data.classes)
     if has_all and (labels < 0).any():
-        fault = f"label={settings.label} has all classes of the network"
-        advice = "remove the objects without a class, or give them a label"
-        raise InputError(f"{fault}, but some renders show none of them: {advice}")
+        fault = f"label={settings.label} has all classes of the network, but some renders none"
+        raise InputError(f"{fault}: give all objects a label")
     rendered = (settings.augment, scene, labels.to(device), settings.seed, phases)
     ranked = positive_classes if is_ranked else ()
     processes = (distributed.rank(), distributed.world_size())
@@ -379,7 +372,6 @@ def load_renders(settings: ExperimentSettings, data: sets.DataSet) -> tuple[Tens
         found = find_photographs(folder, data.classes, positive_classes)
         found, images, _ = load_photographs(folder, found, data.size, skip)
         for name in sorted(set(positive_classes) - {item.label for item in found}):
-            advice = f"add a sub-folder {name} with images of this class"
-            raise InputError(f"{folder} has no image of label={name}: {advice}")
+            raise InputError(f"{folder} has no image of label={name}: add a sub-folder {name}")
     labels = [label_of_class.get(item.label, label_of_negative) for item in found]
     return images, torch.tensor(labels)

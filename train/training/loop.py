@@ -113,8 +113,7 @@ class Trainer:
         require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
             fault = f"ranking_weight={settings.ranking_weight} requires hard negatives"
-            advice = "add some to the scene, or set a folder of images that has some"
-            raise InputError(f"{fault}: {advice}", "ranking_weight")
+            raise InputError(f"{fault}: add some", "ranking_weight")
         self.settings = settings
         self.architecture = architecture
         self.service = service
@@ -295,9 +294,8 @@ class Trainer:
         is_finite = torch.stack([value.isfinite().all() for value in weights]).all()
         if not (math.isfinite(loss) and is_finite):
             rate, decay = self.settings.learning_rate, self.settings.weight_decay
-            fault = f"learning_rate={rate} with weight_decay={decay} made the loss or weights NaN"
-            advice = f"or infinite in epoch {epoch}: set lower values"
-            raise InputError(f"{fault} {advice}", "learning_rate")
+            fault = f"learning_rate={rate} with weight_decay={decay} diverged in epoch {epoch}"
+            raise InputError(f"{fault}: set lower values", "learning_rate")
 
     def _save(self) -> None:
         """Write last.pt (the former becomes previous.pt), and best.pt, in the first process."""
@@ -385,10 +383,8 @@ class Trainer:
                 raise ValueError("it has another architecture or other classes")
             self.load_state_dict(state)
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            folder = f"{self.folder} ({single_line(error)})"
-            fault = f"this run cannot continue from the checkpoint in {folder}"
-            advice = f"restore {run_folder.LAST}, or start in another folder"
-            raise InputError(f"{fault}: {advice}") from error
+            fault = f"{self.folder} has a checkpoint of another run ({single_line(error)})"
+            raise InputError(f"{fault}: restore {run_folder.LAST}, or start elsewhere") from error
         if self.epoch:
             # It is read before the training, so that no time is lost if it is damaged.
             self.best = checkpoints.load(self.folder / run_folder.BEST)
@@ -402,9 +398,7 @@ class Trainer:
 
 
 @torch.no_grad()
-def evaluate(
-    model: nn.Module, split: Split, rows: Int[Tensor, " N"] | None = None
-) -> dict[str, float]:
+def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict[str, float]:
     """Measure the loss and the accuracy of a network in evaluation mode.
 
     If a run has several processes, each of them scores a part of the images, and

@@ -34,6 +34,8 @@ WARMUP = 0.2
 # Modules whose outputs differ in training mode: by statistics of the batch, or at random.
 RANDOM = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._DropoutNd)
 
+Logits = Float[Tensor, "N classes"]
+
 
 def learning_rate(settings: TrainSettings, done: float) -> float:
     """Compute the learning rate at a time of the training.
@@ -132,8 +134,7 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
     chosen = [name for name in names if name.startswith(f"{stage}.")]
     if not chosen:
         examples = nearest(stage, sorted({_module_of(name) for name in names}))
-        advice = f"choose a module, such as {examples}"
-        raise InputError(f"stage={stage} is no module of the network: {advice}", "stage")
+        raise InputError(f"stage={stage} is no module: choose one, such as {examples}", "stage")
     frozen_count = names.index(chosen[-1]) + 1
     for parameter in list(network.parameters())[:frozen_count]:
         parameter.requires_grad_(False)
@@ -156,9 +157,7 @@ def set_training_mode(
             module.eval()
 
 
-def scale_learning_rate(
-    settings: TrainSettings, network: nn.Module, images: Float[Tensor, "N 3 H W"]
-) -> float:
+def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Tensor) -> float:
     """Adapt the learning rate of the last layer to the norm of its features.
 
     A step with a clipped gradient changes the weights of the layer by at most
@@ -173,10 +172,8 @@ def scale_learning_rate(
     norm = feature_norm(network, images)
     rate = settings.learning_rate * wanted / norm if norm else math.inf
     if not 0 < rate <= MAX_SCALE:
-        fault = f"feature_norm={wanted:g} has no meaning for this network"
-        reason = f"since the norm of the features of its last layer is {norm:g}"
-        advice = "check the weights, or set feature_norm=null"
-        raise InputError(f"{fault}, {reason}: {advice}", "feature_norm")
+        fault = f"feature_norm={wanted:g}, but the features of the last layer have norm {norm:g}"
+        raise InputError(f"{fault}: check the weights, or set null", "feature_norm")
     return rate
 
 
@@ -197,10 +194,8 @@ def feature_norm(network: nn.Module, images: Float[Tensor, "N 3 H W"]) -> float:
         for image in images.split(1):
             logit = network(image).max()
             if not (weights and logit.requires_grad):
-                fault = f"the logits do not depend on weights of the last layer, {name!r}"
-                advice = "name the last module that stays as it is"
-                reason = f"freeze={ALL_BUT_LAST}: {fault}, by gradients"
-                raise InputError(f"{reason}: {advice}", "freeze")
+                fault = f"freeze={ALL_BUT_LAST}: the last layer, {name!r}, has no gradient"
+                raise InputError(f"{fault}: name the last module that stays as it is", "freeze")
             gradients = torch.autograd.grad(logit, weights)
             squares.append(sum(float(gradient.square().sum()) for gradient in gradients))
     return math.sqrt(fmean(squares))
@@ -277,9 +272,7 @@ class TrainingLoss:
         return loss, hits
 
 
-def ranking_loss(
-    logits: Float[Tensor, "N classes"], labels: Int[Tensor, " N"], label: int
-) -> Tensor:
+def ranking_loss(logits: Logits, labels: Int[Tensor, " N"], label: int) -> Tensor:
     """Compute the pairwise ranking loss of a class (RankNet, Burges et al. 2005).
 
     It is low if the images of the class have higher log-odds than all other images. It is the mean
@@ -295,9 +288,7 @@ def ranking_loss(
     return losses.sum() / is_pair.sum().clamp(min=1)
 
 
-def kl_divergence(
-    logits: Float[Tensor, "N classes"], predictions: Float[Tensor, "N classes"]
-) -> Float[Tensor, " N"]:
+def kl_divergence(logits: Logits, predictions: Logits) -> Float[Tensor, " N"]:
     """Compute the distillation loss (Hinton et al. 2015) at temperature 1.
 
     It is the Kullback–Leibler divergence Σ q log(q / p), summed over the classes, where p are the

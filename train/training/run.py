@@ -87,9 +87,8 @@ class Run:
             if settings.train.resume:
                 earlier = require_same_run(folder, settings)
             elif not settings.overwrite:
-                fault = f"out={folder} holds a run already"
-                advice = "set train.resume=true to continue it, overwrite=true to replace it"
-                raise InputError(f"{fault}: {advice}, or run to another folder")
+                advice = "set train.resume=true or overwrite=true, or another folder"
+                raise InputError(f"out={folder} holds a run already: {advice}")
         self._is_resumed = earlier is not None
         # The number of threads changes the last bits of the results, so a resumed run keeps it.
         known = None if earlier is None else OmegaConf.select(earlier, "hardware.threads")
@@ -373,7 +372,6 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
     own_name = initial.architecture.get("name", WIDERESNET)
     name = shape.get("name", own_name)
     if name != own_name:
-        fault = f"model.name={name} is not the architecture of network={initial.source}"
-        raise InputError(f"{fault}: leave model.name out")
+        raise InputError(f"model.name={name} is not that of {initial.source}: leave it out")
     statistics = {key: initial.architecture.get(key) for key in ("mean", "std")}
     return {"name": own_name, CLASSIFIER: True, **statistics}

@@ -42,12 +42,7 @@ class RunLog:
     sub-folder renders/. All methods raise OSError if the disk is full.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        history: Sequence[Mapping[str, float]] = (),
-        logger: Logger | None = None,
-    ):
+    def __init__(self, folder: Path, history: Sequence[Any] = (), logger: Logger | None = None):
         """Begin the log.
 
         `history` replaces the lines in metrics.jsonl, because a resumed run repeats the epochs
@@ -102,9 +97,7 @@ class RunLog:
         if self._board is not None:
             self._board.add_image("renders", grid, epoch)
 
-    def attack_examples(
-        self, attack_examples: AttackExamples, classes: Sequence[str], epoch: int
-    ) -> None:
+    def attack_examples(self, found: AttackExamples, classes: Sequence[str], epoch: int) -> None:
         """Write an image of successful attacks on training renders: renders/attacks_EPOCH.png.
 
         Each attack has a row with four images: the render before the attack, a
@@ -112,21 +105,21 @@ class RunLog:
         class and the true class stand below a render.
         """
         # A negative label is complementary: the render shows no object of the positive class.
-        labels = [classes[one] if one >= 0 else "negative" for one in attack_examples.labels]
-        basis = attack_examples.basis
+        labels = [classes[one] if one >= 0 else "negative" for one in found.labels]
+        basis = found.basis
         columns = {}
-        # The fields of `attack_examples` have the state before the attack at index 0,
+        # The fields of `found` have the state before the attack at index 0,
         # and the state after it at index 1.
         for index, name in enumerate(("before", "after")):
-            images = attack_examples.images[index]
-            highest, predicted = attack_examples.predictions[index].max(1)
+            images = found.images[index]
+            highest, predicted = found.predictions[index].max(1)
             captions = [
                 (f"{value:.0%} {classes[shown]}", label)
                 for value, shown, label in zip(highest, predicted, labels, strict=True)
             ]
             reduced = interpolate(images, min(EXAMPLE, images.shape[-1]), mode="area")
             columns[name] = tiles_of(reduced, captions, EXAMPLE)
-            lights = attack_examples.lights[index]
+            lights = found.lights[index]
             balls = (light_sphere(light, EXAMPLE // 2, basis=basis) for light in lights)
             columns[f"light {name}"] = tiles_of(balls)
         self._renders.mkdir(exist_ok=True)

@@ -113,24 +113,20 @@ class TrainingStep:
 def require_equal_shares(settings: TrainSettings) -> None:
     """Raise InputError if a batch cannot be divided equally among the processes."""
     if settings.batch_size % distributed.world_size():
-        fault = f"batch_size={settings.batch_size} is no multiple of the number of processes"
-        raise InputError(
-            f"{fault}: set it to a multiple of {distributed.world_size()}", "batch_size"
-        )
+        advice = f"set a multiple of {distributed.world_size()}, the number of processes"
+        raise InputError(f"batch_size={settings.batch_size}: {advice}", "batch_size")
 
 
-def fitting_batch_size(
-    settings: TrainSettings, model: nn.Module, images_in_round: int, size: int
-) -> int:
+def fitting_batch_size(settings: TrainSettings, model: nn.Module, in_round: int, size: int) -> int:
     """Limit the batch size to the images of a round, and check that a batch fits in memory.
 
     A larger batch would only hold copies of the images.
     """
     shares = distributed.world_size()
-    batch_size = min(settings.batch_size, math.ceil(images_in_round / shares) * shares)
+    batch_size = min(settings.batch_size, math.ceil(in_round / shares) * shares)
     if batch_size < settings.batch_size:
         fault = "batch_size=%d is more than the %d images that a round shows: it is %d"
-        console.warning(fault, settings.batch_size, images_in_round, batch_size)
+        console.warning(fault, settings.batch_size, in_round, batch_size)
     at_once = batch_size // shares
     needed = at_once * activation_bytes(deepcopy(model), size)
     device = next(model.parameters()).device

@@ -100,5 +100,5 @@ def test_a_mask_of_other_classes_or_of_another_size_is_refused(folder, mask, mes
 
 
 def test_a_folder_without_masks_is_refused(folder):
-    with pytest.raises(InputError, match="no photographs with masks"):
+    with pytest.raises(InputError, match="lacks images/ or masks/"):
         nb.evaluate(_by_brightness, folder / "images", classes=CLASSES, size=SIZE)

@@ -137,10 +137,10 @@ def test_pipes_and_sockets_are_no_photographs(tmp_path):
         (("orange/notes.txt",), "orange", "holds no photographs"),
         (("Oranges/a.jpg",), "orange", "Oranges is not .*such as orange, .* other_Oranges"),
         (("pear/a.jpg", "blood_oranges/b.jpg"), "orange", "blood_oranges is not .* other_blood"),
-        (("lion/a.jpg", "bee/b.jpg"), "orange", "bee is not named after a class"),
-        (("orange/a.jpg", "b.jpg"), "orange", r"b\.jpg lies beside class folders"),
+        (("lion/a.jpg", "bee/b.jpg"), "orange", "bee is not a class"),
+        (("orange/a.jpg", "b.jpg"), "orange", r"b\.jpg lies beside the class folders"),
         (("other_lemon/a.jpg",), "other_lemon", "'other_lemon' is not a class"),
-        (("a.jpg",), ["orange", "pear"], "has no class folders, and label names several"),
+        (("a.jpg",), ["orange", "pear"], "has several labels, but no folders of classes"),
     ],
 )
 def test_a_folder_of_another_layout_is_refused(tmp_path, files, label, message):
@@ -181,12 +181,12 @@ def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        (b"path;source_tag\na.jpg;web\n", "UTF-8 text file with the columns path and source_tag"),
+        (b"path;source_tag\na.jpg;web\n", "UTF-8 text with the columns path and source_tag"),
         (b"path,source_tag\nb/a.jpg,web\n", "a missing file in 1 of 1 rows, .* a.jpg$"),
         (b"path,source_tag\na.jpg,web\na.jpg,web\n./a.jpg,lab\n", "two different rows for a.jpg"),
         (
             b"path,source_tag,hard_negatives\na.jpg,web,lib\n",
-            "names the source 'lib' in the column hard_negatives, but no image has this source",
+            "names 'lib' in the column hard_negatives, but no image has this source",
         ),
     ],
 )

@@ -140,10 +140,7 @@ def test_a_step_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tm
     torch.testing.assert_close(linear.bias, parameters[1])
 
 
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [({}, 40), ({"images_per_epoch": 9}, 9)],
-)
+@pytest.mark.parametrize(("settings", "expected"), [({}, 40), ({"images_per_epoch": 9}, 9)])
 def test_a_batch_larger_than_the_data_is_the_data(tmp_path, settings, expected):
     """A batch of 960,000 was filled up with copies of 40 images."""
     trainer = make_trainer(tmp_path, color_network(), epochs=1, batch_size=960_000, **settings)
