@@ -252,8 +252,7 @@ def load_run(
     shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
-        advice = f"give model={name} to run that code"
-        raise InputError(f"the network in {path} is built by {name}: {advice}")
+        raise InputError(f"{path} is built by {name}: give model={name} to run that code")
     with checks_architecture(path):
         size = int(shape.pop("size"))
         classes = tuple(map(str, shape.pop("classes")))
@@ -297,8 +296,7 @@ def selected_file(run: Path) -> Path | None:
     None if there is none. `run` can also be the file itself, or a folder below pretrained/.
     """
     found = published_folder(run)
-    files = (found, found / BEST, found / PUBLISHED)
-    return next((file for file in files if file.is_file()), None)
+    return next(filter(Path.is_file, (found, found / BEST, found / PUBLISHED)), None)
 
 
 def is_state_dict(path: Path) -> bool:

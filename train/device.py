@@ -83,8 +83,7 @@ def choose_threads(network: nn.Module, batch_size: int, size: int) -> int:
     follows from the settings, and is not measured: the same command gives the same results.
     """
     weight_count = sum(parameter.numel() for parameter in network.parameters())
-    is_small = weight_count * batch_size * size**2 < SMALL_WORK
-    return 1 if is_small else most_threads()
+    return 1 if weight_count * batch_size * size**2 < SMALL_WORK else most_threads()
 
 
 def set_deterministic(deterministic: bool) -> None:
@@ -102,10 +101,9 @@ def set_deterministic(deterministic: bool) -> None:
 def choose_precision(precision: str, device: torch.device, trained: nn.Module | None = None) -> str:
     """Choose the precision in which a network computes.
 
-    A warning is logged if `precision` is "bfloat16" and the CPU only emulates it. "auto" is
-    bfloat16 if the hardware computes in it, or else float16 on a GPU and float32 on a CPU. Training
-    of depthwise convolutions on a CPU also gets float32, because their gradients take 3 times as
-    long in bfloat16.
+    "auto" is bfloat16 if the hardware computes in it, or else float16 on a GPU and float32 on a
+    CPU. Training of depthwise convolutions on a CPU also gets float32, because their gradients take
+    3 times as long in bfloat16.
     """
     require_choice("precision", precision, ("auto", *PRECISIONS))
     is_gpu = device.type == "cuda"
@@ -116,9 +114,6 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
         is_native = torch.cpu._is_avx512_bf16_supported()
     else:
         is_native = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    if precision == "bfloat16" and not is_native and not is_gpu:
-        slow = "this CPU emulates bfloat16, some 10 times slower than float32"
-        console.warning("%s: leave precision out", slow)
     if precision != "auto":
         return precision
     modules = [] if is_gpu or trained is None else trained.modules()

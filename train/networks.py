@@ -97,13 +97,9 @@ def _require_shape(depth: int, width: int) -> None:
     # Each group has (depth - 4) / 6 blocks. A block has two 3 × 3 convolutions, whose weights are
     # most of the parameters of the network. The groups have 16, 32 and 64 times `width` channels.
     parameter_count = (depth - 4) // 6 * 2 * 3 * 3 * (16**2 + 32**2 + 64**2) * width**2
-    if depth < 10 or (depth - 4) % 6 or width < 1:
-        advice = "set depth to 10, 16, 22 ..., and width to 1 or more"
-    elif parameter_count > MAX_PARAMETER_COUNT:
-        advice = f"set less than {parameter_count:.1g} parameters"
-    else:
-        return
-    raise InputError(f"depth={depth}, width={width}: {advice}", "depth")
+    if depth < 10 or (depth - 4) % 6 or width < 1 or parameter_count > MAX_PARAMETER_COUNT:
+        advice = f"set depth to 10, 16 ..., and at most {MAX_PARAMETER_COUNT:.0g} parameters"
+        raise InputError(f"depth={depth}, width={width}: {advice}", "depth")
 
 
 class _Block(nn.Module):
@@ -215,13 +211,10 @@ def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
     network, own_size, own_classes = call_python(name.removeprefix(PYTHON))
     if not isinstance(network, nn.Module):
         raise InputError(f"name={name} returns no torch.nn.Module: return one", "name")
-    if own_size != size:
-        fault = f"is for images of {own_size} pixels per side, but those of the data have {size}"
-    elif list(own_classes) != list(classes):
-        fault = f"has other classes than the data, or another order: {classes[0]!r} is the first"
-    else:
-        return network
-    raise InputError(f"name={name} {fault}: return the size and classes of the data", "name")
+    if own_size != size or list(own_classes) != list(classes):
+        fault = f"is for {own_size} pixels per side and classes such as {own_classes[0]!r}"
+        raise InputError(f"name={name} {fault}: return the size and classes of the data", "name")
+    return network
 
 
 def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Module:
@@ -249,5 +242,4 @@ def describe(
     if isinstance(network, Network) and network.transforms:
         owner = network.transforms[-1]
     names = [name for name in ("mean", "std") if hasattr(owner, name)]
-    normalization = {name: getattr(owner, name).flatten().tolist() for name in names}
-    return facts | shape | normalization
+    return facts | shape | {name: getattr(owner, name).flatten().tolist() for name in names}

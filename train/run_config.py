@@ -106,16 +106,14 @@ def decisive_settings(settings: Any) -> dict[str, object]:
     nested = _move_paths(nested, str(nested.get("out")), "<run>")
     # Each key gets a dot at its end, so that "out" does not match "outer".
     circumstances = tuple(f"{key}." for key in CIRCUMSTANCES)
-    pairs = dotted(nested)
-    return {key: value for key, value in pairs if not f"{key}.".startswith(circumstances)}
+    return {key: value for key, value in dotted(nested) if not f"{key}.".startswith(circumstances)}
 
 
 def _move_paths(value: Any, folder: str, to: str) -> Any:
     """Replace the path of a folder at the start of all texts in nested settings."""
 
     def move(text: str) -> str:
-        is_inside = f"{text}/".startswith(f"{folder}/")
-        return to + text.removeprefix(folder) if is_inside else text
+        return to + text.removeprefix(folder) if f"{text}/".startswith(f"{folder}/") else text
 
     return mapped(value, move)
 
@@ -186,8 +184,7 @@ def require_same(
     """
     config = read_config(folder / CONFIG)
     # A setting that the earlier version did not have has its default value.
-    defaults = OmegaConf.structured(type(settings))
-    before = decisive_settings(defaults) | decisive_settings(config)
+    before = decisive_settings(OmegaConf.structured(type(settings))) | decisive_settings(config)
     now = decisive_settings(settings)
     for key in sorted(before.keys() | now.keys()):
         old, new = before.get(key), now.get(key)

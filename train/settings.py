@@ -353,8 +353,7 @@ class ExperimentSettings(NetworkSettings):
         """
         labels = label_names(self.label)
         default_label = labels[0] if len(labels) == 1 else ""
-        meshes = read_objects(self.meshes, default_label, "meshes")
-        objects = meshes | self.negative_objects
+        objects = read_objects(self.meshes, default_label, "meshes") | self.negative_objects
         for key, item in objects.items():
             item.label = item.label or solid_name(item.mesh)
             if not item.label:

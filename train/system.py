@@ -42,8 +42,6 @@ LARGEST_REUSED = 2**30
 # Numbers of the system errors of a full disk, of an exceeded quota and of a file that
 # is too large.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-# Largest number of characters of a text that an error message quotes.
-MAX_NAME_LENGTH = 200
 
 
 def take_flag(words: list[str]) -> list[str]:
@@ -180,10 +178,6 @@ def user_message(error: BaseException) -> str | None:
     match error:
         case InputError():
             return str(error)
-        case UnicodeEncodeError():
-            name = ascii(error.object[:MAX_NAME_LENGTH])
-            fault = f"{name} has characters that this system or library cannot write"
-            return f"{fault}: rename it, or set PYTHONUTF8=1"
         case OSError() if error.errno in NO_ROOM:
             fault = f"{error.filename or 'the output'} cannot be written ({error.strerror})"
             return f"{fault}: make room and start again"
@@ -192,9 +186,7 @@ def user_message(error: BaseException) -> str | None:
         # NCCL and Gloo connect processes. Gloo has no class of errors; its messages contain the
         # path of a source file.
         case RuntimeError() if type(error).__name__.startswith("Dist") or "/gloo/" in str(error):
-            fault = "another process of this run has ended"
-            return f"{fault}: fix what ended it, and continue with train.resume=true"
+            return "another process of this run has ended: continue with train.resume=true"
         case RuntimeError() | MemoryError() if is_out_of_memory(error):
-            advice = "ask for fewer or smaller images, views or meshes, or for a smaller batch_size"
-            return f"memory ran out: {advice}"
+            return "memory ran out: ask for fewer or smaller images, meshes, views or batches"
     return None

@@ -210,7 +210,7 @@ def test_a_torchvision_network_is_torchvisions_own_after_normalization():
         ("torchvision:resnet19", 16, "resnet18"),
         ("torchvision:vit_b_32", 40, "40 pixels per side"),
         ("python:own_models:of_other_size", 16, "32 pixels per side"),
-        ("python:own_models:of_other_classes", 16, "other classes"),
+        ("python:own_models:of_other_classes", 16, "classes such as"),
         ("python:own_models:of_other_logits", 16, "(2, 4)"),
     ],
 )
@@ -306,5 +306,5 @@ def test_a_published_network_has_the_weights_in_half_precision(network, tmp_path
 def test_a_network_of_the_package_is_found_from_any_folder_unless_that_has_its_name(tmp_path, name):
     assert load_run(name).name == f"run:{name}"
     (tmp_path / "pretrained" / "none").mkdir(parents=True)
-    with pytest.raises(InputError, match=r"run=pretrained/none holds neither"):
+    with pytest.raises(InputError, match=r"run=pretrained/none has no"):
         load_run("pretrained/none")

@@ -109,7 +109,7 @@ TWO_CLASSES += ["scene.views=1", "augment.examples=null"]
         (["meshes=[{mesh: 'solid:orange', lable: orange}]"], "meshes[0].lable"),
         (
             ["hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
-            "hard_negatives[0] is solid:orange, which is of the positive class orange",
+            "hard_negatives[0] is solid:orange, of the positive class orange",
         ),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["label=null"], "label is not set: set it to the class of the meshes, one of the 3 class"),

@@ -19,7 +19,7 @@ from augment.attacks.adversary import Adversary, reload
 from augment.attacks.attack import attack, find_scene
 from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
 from augment.attacks.files import require_renderers, save
-from augment.attacks.objective import Objective, add_sensor_noise
+from augment.attacks.objective import Objective
 from augment.attacks.result import ZERO_GRADIENT, AttackResult, warnings
 from augment.classifier import Classifier, TaskNetwork
 from augment.network import device_of
@@ -73,7 +73,7 @@ def run(settings: AttackExperimentSettings) -> None:
     classifier = load_chosen(settings).to(device)
     if adversary is not None:
         rasterizer = _start_rasterizer(settings)
-        views = format_reloaded(adversary, rasterizer, classifier, settings.attack, settings.seed)
+        views = format_reloaded(adversary, rasterizer, classifier, settings.attack)
         print("\n".join(shortened(views)))
         if not settings.attack.parameters:
             return
@@ -254,22 +254,16 @@ def load_targets(
     objects = []
     for mesh in read_objects(chosen.meshes, label, "transfer.meshes").values():
         attacked.label(mesh.label)
-        loaded = load_object(mesh, settings.scene.vertices)
-        objects.append(add_table(loaded, settings.scene.ground))
+        objects.append(add_table(load_object(mesh, settings.scene.vertices), settings.scene.ground))
     return {"classifiers": classifiers, "azimuths": chosen.azimuths, "objects": objects}
 
 
 def format_reloaded(
-    adversary: Adversary,
-    rasterizer: Rasterizer,
-    classifier: TaskNetwork,
-    settings: AttackSettings,
-    seed: int,
+    adversary: Adversary, rasterizer: Rasterizer, classifier: TaskNetwork, settings: AttackSettings
 ) -> list[str]:
     """Render a reloaded adversary again, and describe what a network finds in its views.
 
-    Each line has the prediction, whether noise changes it, and the largest difference from the
-    saved image.
+    Each line has the prediction, and the largest difference from the saved image.
     """
     device = device_of(classifier)
     images = adversary.render_views(rasterizer).to(device)
@@ -279,32 +273,22 @@ def format_reloaded(
     source = torch.full((1, len(images)), known, device=device)
     truth = partial(adversary.scene(rasterizer, device).truth, classifier.label)
     criterion = classifier.task.criterion(source, truth, len(classifier.classes))
-    objective = Objective(classifier, criterion, settings, seed)
     # `images[None]` is one example with V views. Evidence has the shape (1, V, K).
-    evidence = objective.evidence(images[None])
-    predicted = criterion.predicted(evidence)
-    is_same_with_noise = torch.ones_like(predicted[0], dtype=torch.bool)
-    noise = (settings.sensor_noise, torch.zeros(1, dtype=torch.int64), seed, "sensor noise")
-    for noisy in add_sensor_noise(images[None], *noise):
-        is_same_with_noise &= (criterion.predicted(objective.evidence(noisy)) == predicted)[0]
+    evidence = Objective(classifier, criterion, settings, seed=0).evidence(images[None])
     difference = images - adversary.images_in_views.to(images)
     levels = (255 * difference.abs().flatten(1).amax(1)).tolist()
-    named = classifier.task.found(evidence[0], predicted[0], classifier.classes)
-    lines = []
-    for view, level in enumerate(levels):
-        line = f"view {view}: {label} is recognized as {named['predicted'][view]}"
-        line += f" ({named['confidence'][view]:.1%})"
-        if settings.sensor_noise:
-            change = "and so" if is_same_with_noise[view] else "but not always"
-            line += f", {change} with a sensor's noise"
-        lines.append(f"{line}; values differ from the saved image's by {level:.3g}/255 at most")
-    return lines
+    named = classifier.task.found(evidence[0], criterion.predicted(evidence)[0], classifier.classes)
+    return [
+        f"view {view}: {label} is recognized as {named['predicted'][view]} "
+        f"({named['confidence'][view]:.1%}); "
+        f"values differ from the saved image's by {level:.3g}/255 at most"
+        for view, level in enumerate(levels)
+    ]
 
 
 def _attack_photographs(settings: AttackExperimentSettings, relighting: RelightingSettings) -> None:
     """Attack a network by the light of a projector on photographs, and print the results."""
-    device = choose_device(settings.device)
-    classifier = load_chosen(settings).to(device)
+    classifier = load_chosen(settings).to(choose_device(settings.device))
     photographs = published_folder(Path(str(settings.unlabeled)))
     options: dict[str, Any] = {"seed": settings.seed, "batch_size": settings.attack.batch_size}
     options["sensor_noise"] = settings.attack.sensor_noise

@@ -19,6 +19,5 @@ def run(settings: CompareSettings) -> None:
     if is_verbose():
         print(format_comparison(runs, *options))
         return
-    table = format_short_comparison(runs, *options)
-    print("\n".join(shortened(table.splitlines())))
+    print("\n".join(shortened(format_short_comparison(runs, *options).splitlines())))
     print(f"-v shows intervals, settings, differences and scores by {settings.by}")

@@ -204,8 +204,7 @@ def evaluate(
                 with keyed(folder="calibrate"):
                     options = labels, false_positive_rate, skip_unreadable
                     points = scoring.choose_operating_points(predictor, negatives, *options)
-            predictions = predictor.predict(folder, labels, skip_unreadable)
-            scores = scoring.score(predictions, by, points)
+            scores = scoring.score(predictor.predict(folder, labels, skip_unreadable), by, points)
             if target:
                 scoring.write(scores, target)
     return scores

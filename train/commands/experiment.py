@@ -17,7 +17,6 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 
 from augment import distributed
-from augment.augmentation_settings import MODES
 from renderer.errors import keyed
 from renderer.settings import field_types
 from train import checkpoints, console
@@ -115,8 +114,7 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, resume: 
         require_new_run(path, "out", settings.overwrite, settings.train.resume)
     with ExitStack() as first_process:
         if distributed.rank() == 0:
-            log = writable_folder(str(folder), "out") / LOG
-            first_process.enter_context(logged_to(log))
+            first_process.enter_context(logged_to(writable_folder(folder, "out") / LOG))
             first_process.enter_context(sole_writer("out", *settings_of_runs))
         try:
             data, initial = load_inputs(next(iter(settings_of_runs.values())))
@@ -127,9 +125,7 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, resume: 
             for run in reversed(runs):
                 run.begin()
             for run in runs:
-                mode = run.settings.augment.mode
-                purpose = "" if run.folder == folder else ", for comparison"
-                console.debug("\n== augment=%s: %s%s", mode, MODES[mode], purpose)
+                console.debug("\n== %s", run.folder)
                 run.train()
             if distributed.rank() == 0:
                 summaries = [summarize(path) for path in settings_of_runs]

@@ -123,9 +123,8 @@ def render_attacked(
     mesh = ObjectSettings(settings.mesh, label=label, albedo_scale=settings.albedo_scale)
     shown = build_attacked(attacked, mesh, attacked.scene, ATTACKED_SIZE, torch.device("cpu"))
     first_example = torch.arange(1)
-    images = shown.render(shown.conditions(first_example), first_example)
-    # `images` has one example and one view, shape (1, 1, 3, size, size).
-    return shown.backgrounds[0], images[0, 0]
+    # The render has one example and one view, shape (1, 1, 3, size, size).
+    return shown.backgrounds[0], shown.render(shown.conditions(first_example), first_example)[0, 0]
 
 
 def read_file(path: str) -> UInt8[np.ndarray, "H W 3"]:
@@ -230,5 +229,4 @@ def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndar
     # `grabCut` stores its color models in two arrays of this size.
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(bgr, labels, rectangle, *models, GRAB_CUT_STEPS, cv2.GC_INIT_WITH_RECT)
-    is_object = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
-    return np.where(is_object, 255, 0).astype(np.uint8)
+    return np.where(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), 255, 0).astype(np.uint8)

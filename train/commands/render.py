@@ -11,7 +11,6 @@ from augment import dataset
 from augment.progress import progress
 from renderer.errors import InputError, keyed, keys_of
 from renderer.io.files import atomic_write
-from renderer.settings import height_and_width
 from train.checkpoints import load_chosen
 from train.class_names import name_of_mesh
 from train.command_settings import RenderSettings
@@ -26,8 +25,6 @@ CIRCUMSTANCES = ("out", "shard", "shards", "device", "trust")
 # Folder of files of Hydra and submitit for --multirun, as conf/render.yaml says.
 LAUNCHER = ".launcher"
 DEFAULT_SIZE = 224
-# Bytes of a pixel in the files of a render, before compression, by the name of the map.
-BYTES = {"image": 3, "mask": 1, "depth": 2, "normals": 3}
 
 
 def run(settings: RenderSettings) -> None:
@@ -52,9 +49,7 @@ def run(settings: RenderSettings) -> None:
     own = shards[settings.shard]
     finished = {index for index in own if data.last_file(index).exists()}
     missing = len(own) - len(finished)
-    height, width = height_and_width(settings.size)
-    size = height * width * sum(BYTES[name] for name in ("image", *settings.maps)) * missing
-    print(f"{folder}: {missing} of {settings.count} renders to do, at most {size / 1e9:.2g} GB")
+    print(f"{folder}: {missing} of {settings.count} renders to do")
     options: dict[str, Any] = {"settings": settings.augment, "network": network, "device": device}
     options |= {"scene": settings.scene, "renderer": settings.renderer, "seed": settings.seed}
     options |= {"first": own.start, "skip": finished, "views": settings.scene.views}
@@ -62,8 +57,7 @@ def run(settings: RenderSettings) -> None:
     options["maps"] = not {"depth", "normals"}.isdisjoint(settings.maps)
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
-        shown = [*objects.values()]
-        renders = dataset.render_dataset(shown, settings.size, len(own), **options)
+        renders = dataset.render_dataset([*objects.values()], settings.size, len(own), **options)
     data.write(progress(renders, "renders", missing))
     if data.is_finished():
         data.finish()

@@ -89,8 +89,7 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
         start()
     finally:
         print(format_sweep(folders), flush=True)
-    existing = [folder for folder in folders if folder.exists()]
-    print(report_of(existing, parent))
+    print(report_of([folder for folder in folders if folder.exists()], parent))
     if not all(map(is_finished, folders)):
         sys.exit(1)
 
@@ -138,8 +137,7 @@ def _run(config: DictConfig, folder: Path) -> None:
     job = HydraConfig.get()
     # Hydra's joblib launcher trains several runs at once. Their lines on the terminal
     # then start with the number of the run.
-    is_parallel = "n_jobs" in job.launcher
-    prefix = f"#{job.job.num} " if is_parallel else ""
+    prefix = f"#{job.job.num} " if "n_jobs" in job.launcher else ""
     with logged_to(folder / LOG, prefix, level=logging.CRITICAL):
         try:
             settings = with_label(read_settings(ExperimentSettings, config))
@@ -186,7 +184,6 @@ def format_sweep(folders: Sequence[Path]) -> str:
         max_lines = MAX_TABLE_LINES - MAX_UNFINISHED if unfinished else MAX_TABLE_LINES
         lines += shortened(table.splitlines(), max_lines)
     if unfinished:
-        states = [f"{folder}: {state(folder)}" for folder in unfinished]
-        lines += shortened(states, MAX_UNFINISHED)
+        lines += shortened([f"{folder}: {state(folder)}" for folder in unfinished], MAX_UNFINISHED)
         lines.append("to go on, give the same command again")
     return "\n".join(lines)

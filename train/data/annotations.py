@@ -74,8 +74,7 @@ class Annotated:
     @property
     def source(self) -> str:
         """Folder of the photograph in its name. Empty without one."""
-        folder = PurePosixPath(self.name).parent
-        return "" if folder == PurePosixPath(".") else str(folder)
+        return self.name.rpartition("/")[0]
 
 
 @dataclass(frozen=True)
@@ -309,17 +308,14 @@ def _yolo_classes(folder: Path) -> tuple[str, ...]:
         for file in sorted([*parent.glob("*.yaml"), *parent.glob("*.yml")]):
             try:
                 content = yaml.safe_load(file.read_text(encoding="utf-8-sig"))
-            except (OSError, ValueError, yaml.YAMLError) as error:
-                raise InputError(f"{file} cannot be read: {single_line(error)}") from error
-            names = content.get("names") if isinstance(content, dict) else None
-            if isinstance(names, list):
-                return tuple(map(str, names))
-            if isinstance(names, dict):
-                if not all(str(key).isdecimal() for key in names):
-                    raise InputError(f"{file} has names {names}: give a list, or index: name")
-                # Some indices may be missing.
-                known = {int(key): str(name) for key, name in names.items()}
-                return tuple(known.get(i, str(i)) for i in range(max(known, default=-1) + 1))
+                names = content.get("names") if isinstance(content, dict) else None
+                listed = enumerate(names) if isinstance(names, list) else dict(names or {}).items()
+                known = {int(key): str(name) for key, name in listed}
+            except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
+                fault = f"{file} cannot be read ({single_line(error)})"
+                raise InputError(f"{fault}: give names as a list, or index: name") from error
+            if known:  # Some indices may be missing.
+                return tuple(known.get(i, str(i)) for i in range(max(known) + 1))
         for name in (*CLASS_FILES, *(f"labels/{name}" for name in CLASS_FILES)):
             if (parent / name).is_file():
                 lines = (parent / name).read_text(encoding="utf-8-sig").splitlines()

@@ -223,8 +223,7 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
     """Return the uncompressed run lengths of COCO: of 0, then 1, ... down the columns."""
     flat = np.concatenate([[False], mask.T.ravel(), [False]])
     changes = np.flatnonzero(flat[1:] != flat[:-1])
-    ends = np.concatenate([[0], changes, [mask.size]])
-    counts = np.diff(ends).tolist()
+    counts = np.diff(changes, prepend=0, append=mask.size).tolist()
     return counts if counts[-1] else counts[:-1]
 
 

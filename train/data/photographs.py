@@ -153,9 +153,8 @@ def unsupported_files(folder: Path) -> list[PurePosixPath]:
     Files that the library itself reads or writes there, photos.csv and
     lab.json, are left out.
     """
-    own_files = {PurePosixPath(TABLE), PurePosixPath(DESCRIPTION)}
-    other_files = {*visible_files(folder)} - own_files
-    return sorted(path for path in other_files if not _is_image(folder, path))
+    others = {*visible_files(folder)} - {PurePosixPath(TABLE), PurePosixPath(DESCRIPTION)}
+    return sorted(path for path in others if not _is_image(folder, path))
 
 
 def _composed_path(path: PurePosixPath) -> PurePosixPath:
@@ -238,8 +237,7 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
         if not table.is_file():
             raise OSError("it is not a regular file")
         with table.open(newline="", encoding="utf-8-sig") as file:
-            lines = (composed(line) for line in file)
-            for line in csv.DictReader(lines, restval="", strict=True):
+            for line in csv.DictReader(map(composed, file), restval="", strict=True):
                 path = PurePosixPath(line["path"].replace("\\", "/"))
                 hard_negatives = split_sources(line.get("hard_negatives", ""))
                 row = (line["source_tag"] or None, hard_negatives, line.get("mesh") or None)

@@ -85,7 +85,6 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: Path | None 
             images = _render(split_name, images_per_class, seed, settings)
             if cache:
                 write_cached(cache, key, images)
-        console.debug("%s images: %d", split_name, len(images))
         labels = torch.arange(len(CLASSES)).repeat_interleave(images_per_class)
         splits.append(Split(images, labels))
     return DataSet(CLASSES, splits[0], splits[1], rendered=True)
@@ -154,5 +153,4 @@ def _render_solid(name: str, settings: ImageSettings, draws: Generator) -> UInt8
     shown = ([SceneObject("", normalize(mesh))], cameras, load_backgrounds(grays, settings.size))
     scene = Scene.grid(*shown, torch.stack(lights), settings, choose("numpy"))
     examples = torch.arange(len(scene))
-    images = scene.render(scene.conditions(examples), examples)
-    return to_bytes(images.flatten(0, 1))
+    return to_bytes(scene.render(scene.conditions(examples), examples).flatten(0, 1))

@@ -239,7 +239,8 @@ def load_npz(path: str) -> DataSet:
     # zipfile, zlib and NumPy raise errors of many types for a damaged file.
     except Exception as error:
         fault = f"path={path} is not an .npz file of labeled images ({single_line(error)})"
-        raise InputError(f"{fault}: give one, as conf/data/npz.yaml says", "path") from error
+        arrays = "train_images, train_labels, test_images, test_labels and classes"
+        raise InputError(f"{fault}: give the arrays {arrays}", "path") from error
 
 
 def _npz_split(images: np.ndarray, labels: np.ndarray, class_count: int) -> Split:
@@ -311,8 +312,7 @@ def _read(root: Path, classes: Sequence[str], size: int, skip: bool, workers: in
         found = photographs.find_unlabeled(root)
     images: Tensor | ImageFiles
     if size > MAX_SIZE_IN_MEMORY:
-        paths = tuple(item.path for item in found)
-        images = ImageFiles(root, paths, size, workers, skip)
+        images = ImageFiles(root, tuple(item.path for item in found), size, workers, skip)
     else:
         found, images, broken = photographs.load_photographs(root, found, size, skip)
         if broken:

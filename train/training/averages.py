@@ -161,16 +161,11 @@ def interpolate(
         unchanged = predict(selected, validation, device)
         # All factors are tried in the same light, of which these are the keys of random numbers.
         relit = predict(selected, validation, device, seed, "validation")
-        both = (unchanged, relit)
-        divergences = [float(kl_divergence(logits, targets).mean()) for logits in both]
-        losses[factor] = weights[0] * divergences[0] + weights[1] * divergences[1]
-        agreements = [agreement(logits, targets) for logits in both]
-        line = "weights %.2f: loss %.4f, agreement %.4f, relit %.4f"
-        console.debug(line, factor, losses[factor], *agreements)
-    best_factor = min(losses, key=losses.__getitem__)
-    percentage = 100 * best_factor
-    console.info("weights: %.0f%% trained, %.0f%% original", percentage, 100 - percentage)
-    return mix(initial_weights, trained, best_factor), best_factor
+        divergences = [kl_divergence(logits, targets).mean() for logits in (unchanged, relit)]
+        losses[factor] = weights[0] * float(divergences[0]) + weights[1] * float(divergences[1])
+    factor = min(losses, key=losses.__getitem__)
+    console.info("weights: %.0f%% trained, %.0f%% original", 100 * factor, 100 * (1 - factor))
+    return mix(initial_weights, trained, factor), factor
 
 
 def mix(initial: Weights, trained: Weights, factor: float) -> dict[str, Tensor]:
@@ -184,11 +179,6 @@ def mix(initial: Weights, trained: Weights, factor: float) -> dict[str, Tensor]:
         if value.is_floating_point():
             mixed[name] = torch.lerp(initial[name].to(value), value, factor)
     return mixed
-
-
-def agreement(logits: Float[Tensor, "N classes"], targets: Float[Tensor, "N classes"]) -> float:
-    """Return the fraction of images for which two networks predict the same class."""
-    return float((logits.argmax(1) == targets.argmax(1)).double().mean())
 
 
 def predict(

@@ -75,7 +75,7 @@ def require_losses(network: TaskNetwork, needs_boxes: bool) -> None:
     """
     if isinstance(network.task, Detection) and network.task.decode is not None:
         if needs_boxes:
-            raise InputError("meshes need a network that returns losses: give no meshes")
+            raise InputError("meshes: a raw network returns no losses: give no meshes, or another")
         return
     copy = deepcopy(network.network).train()
     # Batch normalization in training mode needs two images.
@@ -169,8 +169,7 @@ def candidate_loss(found: Candidates, expected: Candidates) -> Float[Tensor, ""]
         old = old_scores.clamp(SMALLEST_SCORE, 1 - SMALLEST_SCORE)
         entropy = binary_cross_entropy(old, old, reduction="sum")
         changes.append(binary_cross_entropy(scores, old, reduction="sum") - entropy)
-        moves = generalized_box_iou_loss(boxes, old_boxes)
-        changes.append((old_scores.amax(1) * moves).sum())
+        changes.append((old_scores.amax(1) * generalized_box_iou_loss(boxes, old_boxes)).sum())
     return torch.stack(changes).sum() / len(found)
 
 

@@ -204,14 +204,16 @@ def choose_validation(
     record |= {"data": "shapes"} if data.rendered else {}
     stored = initial.architecture.get("validation") if initial else None
     earlier = stored if isinstance(stored, dict) else {}
-    left_out = earlier.get("fraction")
+    left_out: Any = earlier.get("fraction")
     is_of_other_kind = data.rendered and left_out is not None and "data" not in earlier
     if initial is None or is_of_other_kind:
         return asked or default, record
     # The records of the same images differ only in the fraction.
-    if not isinstance(left_out, float) or record | {"fraction": left_out} != earlier:
-        return asked or default, None
-    return asked or left_out, record | {"fraction": min(asked or left_out, left_out)}
+    is_known = isinstance(left_out, float) and record | {"fraction": left_out} == earlier
+    fraction: float = asked or (left_out if is_known else default)
+    if not is_known or fraction > left_out:
+        console.debug("validation: %s may have learned from these images", settings.network)
+    return fraction, record | {"fraction": min(fraction, left_out)} if is_known else None
 
 
 def load_inputs(settings: ExperimentSettings) -> tuple[sets.DataSet, Initial | None]:
@@ -226,7 +228,6 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> s
     Without a size in the settings, the images get the size that `initial` takes.
     """
     data = settings.data
-    console.debug("data: %s", data.name)
     size = settings.size or (initial.size if initial else SIZE)
     group = UNLABELED if data.name == UNLABELED else ""
     with main_process_first(), keyed(group, **keys_of("data", data)):
@@ -274,8 +275,7 @@ def relabel(
     """
     if not data.labeled:
         if not (initial and settings.train.distillation_weight):
-            advice = "set network and train.distillation_weight"
-            raise InputError(f"data.name={settings.data.name} has no labels: {advice}")
+            raise InputError("data=unlabeled: set network and train.distillation_weight")
         return replace(data, classes=initial.classes)
     if initial and (data.rendered or initial.is_classifier):
         return sets.relabeled(data, initial.classes, f"data.name={settings.data.name}")
@@ -348,7 +348,6 @@ def _build_scene(
     """Build the scene with meshes and hard negatives, in the first process before the others."""
     with keyed(**keys_of("renderer", settings.renderer)):
         rasterizer = choose_rasterizer(settings.renderer)
-    console.debug("rasterizer: %s", rasterizer.description)
     objects = [*settings.objects.values()]
     options: dict[str, Any] = {"attack": settings.augment.attack, "vary": settings.augment.vary}
     options |= {"scene": settings.scene, "renderer": settings.renderer, "rasterizer": rasterizer}

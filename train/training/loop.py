@@ -28,11 +28,9 @@ from augment.tasks.detection import Detection
 from renderer.errors import InputError, single_line
 from renderer.image import to_bytes, to_unit
 from train import checkpoints, console, run_folder
-from train.checkpoints import random_state, restore_random_state
 from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_batches
 from train.data.sets import Split
 from train.device import MixedPrecision, SignalHandler, all_reduce_sum
-from train.run_folder import PHASES
 from train.train_settings import TrainSettings
 from train.training.averages import Averages
 from train.training.detection import object_maps, validate
@@ -112,8 +110,7 @@ class Trainer:
         """
         require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
-            fault = f"ranking_weight={settings.ranking_weight} requires hard negatives"
-            raise InputError(f"{fault}: add some", "ranking_weight")
+            raise InputError("ranking_weight requires hard negatives: add some", "ranking_weight")
         self.settings = settings
         self.architecture = architecture
         self.service = service
@@ -144,8 +141,7 @@ class Trainer:
         self.averages = Averages(model, settings.ema_decay, settings.soup, keeps_latest=not labeled)
         has_teacher = settings.distillation_weight or settings.consistency_weight
         teacher = self.initial if has_teacher else None
-        size = architecture["size"]
-        self.step = TrainingStep(settings, model, teacher, service, size, labeled)
+        self.step = TrainingStep(settings, model, teacher, service, architecture["size"], labeled)
 
     @property
     def is_detector(self) -> bool:
@@ -170,8 +166,7 @@ class Trainer:
         validation = torch.nonzero(held_out).squeeze(1)
         # The batch size is limited to the images of a round and to the memory.
         in_round = min([len(train), *filter(None, self._limits)]) + len(self.service)
-        size = split.images.shape[-1]
-        batch_size = fitting_batch_size(self.settings, self.model, in_round, size)
+        batch_size = fitting_batch_size(self.settings, self.model, in_round, split.images.shape[-1])
         self.settings = replace(self.settings, batch_size=batch_size)
         with SignalHandler() as signals:
             while self.epoch < self.settings.epochs:
@@ -197,7 +192,7 @@ class Trainer:
         steps = [math.ceil(len(one.rows) / settings.batch_size) for one in rounds]
         if self._epoch_state:
             # A resumed run continues within an epoch, with the random numbers of the first attempt.
-            restore_random_state(self._random_state)
+            checkpoints.restore_random_state(self._random_state)
         else:
             self.averages.begin_epoch(self.initial, self.step.optimizer)
             renders = self._regenerate(rounds[0])
@@ -281,7 +276,7 @@ class Trainer:
         trained["learning_rate"] = self.step.optimizer.param_groups[0]["lr"]
         # A phase that this process did not run counts as 0 seconds. The attack is such a
         # phase if the run was resumed after it.
-        seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()
+        seconds = dict.fromkeys(run_folder.PHASES, 0.0) | self.phases.take()
         metrics = epoch_metrics(trained, validated, state.diagnostics, seconds)
         self.history.append({"epoch": self.epoch, **metrics})
         if self._log:
@@ -342,7 +337,7 @@ class Trainer:
             **self.averages.state_dict(),
             "precision": self.model.precision,
             "service": self.service.state_dict(),
-            "random_state": random_state(),
+            "random_state": checkpoints.random_state(),
             "under_way": self._epoch_state.state_dict() if self._epoch_state else None,
             "history": self.history,
         }

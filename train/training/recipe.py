@@ -69,8 +69,7 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
     # Biases and the weights of normalization layers are vectors.
     vectors = [parameter for parameter in model.parameters() if parameter.ndim <= 1]
     matrices = [parameter for parameter in model.parameters() if parameter.ndim > 1]
-    decayed = {"params": matrices, "weight_decay": decay}
-    groups = [{"params": vectors, "weight_decay": 0.0}, decayed]
+    groups = [{"params": vectors, "weight_decay": 0.0}, {"params": matrices, "weight_decay": decay}]
     return torch.optim.AdamW(groups, rate, fused=True)
 
 
@@ -262,14 +261,12 @@ class TrainingLoss:
                 divergences = divergences + kl_divergence(others, targets) * rendered
             loss = loss + settings.distillation_weight * divergences.mean()
         if teacher_logits is not None and augmented is not None:
-            augmented_logits = self.model(to_unit(augmented))
-            divergences = kl_divergence(augmented_logits, teacher_logits) * ~rendered
+            divergences = kl_divergence(self.model(to_unit(augmented)), teacher_logits) * ~rendered
             loss = loss + settings.consistency_weight * divergences.mean()
         if self.positive_classes and settings.ranking_weight:
             loss_sum = sum(ranking_loss(logits, labels, label) for label in self.positive_classes)
             loss = loss + settings.ranking_weight * loss_sum / len(self.positive_classes)
-        hits = is_correct(logits.detach().argmax(1), labels, other_positives).sum()
-        return loss, hits
+        return loss, is_correct(logits.detach().argmax(1), labels, other_positives).sum()
 
 
 def ranking_loss(logits: Logits, labels: Int[Tensor, " N"], label: int) -> Tensor:

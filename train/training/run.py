@@ -13,29 +13,27 @@ from torch import Tensor
 
 from augment import distributed
 from augment import network as wrappers
-from augment.network import FROM_DATA, say_inputs
 from augment.random_streams import stream_seed
 from augment.tasks.classification import Classification
 from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
-from train import checkpoints, console, run_folder
+from train import checkpoints, console
 from train.data import photographs
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
 from train.device import MixedPrecision, place
 from train.laboratory.laboratory import is_laboratory, kept_aside_settings, write_laboratory
-from train.networks import CLASSIFIER, PYTHON, build_network, describe
+from train.networks import CLASSIFIER, build_network, describe
 from train.results.metrics import METRICS
 from train.results.overwrite import remove_run
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
-from train.run_folder import BEFORE, WEIGHTS
+from train.run_folder import BEFORE, BEST, WEIGHTS
 from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
 from train.train_settings import WIDERESNET
 from train.training import inputs
 from train.training.averages import INTERPOLATION, interpolate, predict
-from train.training.inputs import Initial
 from train.training.loop import Trainer, evaluate
-from train.training.recipe import freeze, learning_rate, scale_learning_rate
+from train.training.recipe import freeze, scale_learning_rate
 from train.training.run_log import Logger, RunLog
 
 # If the training images are on disk, the mean and the standard deviation of their color
@@ -61,7 +59,7 @@ class Run:
         settings: ExperimentSettings,
         data: DataSet,
         folder: Path,
-        initial: Initial | None = None,
+        initial: inputs.Initial | None = None,
         command: str = "",
     ):
         """Check all inputs and build the network. If the run is resumed, restore its checkpoint."""
@@ -70,7 +68,7 @@ class Run:
         self.data = inputs.relabel(settings, data, initial)
         self.folder = folder
         self.command = command
-        self._inputs = initial.inputs if initial else FROM_DATA
+        self._inputs = initial.inputs if initial else wrappers.FROM_DATA
         self.scored_folders = settings.scored_folders
         # Class that the initial network predicts for each test image, shape (N,). None
         # if it was not computed.
@@ -107,7 +105,7 @@ class Run:
             console.info("nothing to resume in %s; starting at epoch 1", folder)
 
     def _build_trainer(
-        self, initial: Initial | None, validation: dict[str, Any] | None, threads: int | None
+        self, initial: inputs.Initial | None, validation: dict[str, Any] | None, threads: int | None
     ) -> Trainer:
         """Build the network, the optimizer and the service of renders. No file is written.
 
@@ -135,7 +133,7 @@ class Run:
         if initial:
             initial.copy_to(network, facts)
             if initial.network is None:
-                say_inputs(str(settings.network), network, data.size, initial.inputs)
+                wrappers.say_inputs(str(settings.network), network, data.size, initial.inputs)
             assumed = [name for name, source in vars(initial.inputs).items() if source is None]
             facts |= {checkpoints.ASSUMED: assumed} if assumed else {}
             light = light or initial.architecture.get(checkpoints.NORMALIZE_LIGHT)
@@ -188,10 +186,6 @@ class Run:
         # Another run that was made in between may have set another number of threads.
         torch.set_num_threads(self._threads)
         trainer = self.trainer
-        line = "%d images, %d classes; %s, %s, threads: %d, processes: %d"
-        counts = (int((~self.held_out).sum()), len(self.data.classes))
-        hardware = (trainer.device, trainer.model.precision, self._threads)
-        console.debug(line, *counts, *hardware, distributed.world_size())
         is_first = distributed.rank() == 0
         log = RunLog(self.folder, trainer.history, logger) if is_first else None
         if is_first:
@@ -218,11 +212,7 @@ class Run:
             return
         path = self.folder / WEIGHTS
         checkpoints.export(path, self.trainer.selected.network)
-        # The first value that a function of the user returns is the network.
-        name = self.trainer.architecture["name"]
-        function = name.removeprefix(PYTHON).replace(":", ".")
-        network = f"{function}()[0]" if name.startswith(PYTHON) else "network"
-        console.info("%s.load_state_dict(torch.load(%r)) loads the result", network, str(path))
+        console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
         light = wrappers.light_settings(self.trainer.selected.network)
         if light is not None:
             given = json.dumps(asdict(light))
@@ -234,15 +224,10 @@ class Run:
         The schedule of the learning rate extends over all epochs, but each epoch of a model soup
         has the whole schedule.
         """
-        # The trainer may have adapted the learning rate to the network.
-        settings = self.trainer.settings
-        if settings.epochs == planned or settings.soup:
-            return
-        both = (settings.epochs, planned)
-        rates = [learning_rate(settings, self.trainer.epoch / epochs) for epochs in both]
-        change = "train.epochs=%d, not %d, stretches train.schedule=%s"
-        now = "the learning rate goes on at %.3g, not %.3g"
-        console.warning(f"{change}: {now}", *both, settings.schedule, *rates)
+        recipe = self.settings.train
+        if recipe.epochs != planned and not recipe.soup:
+            line = "train.epochs=%d, not %d, stretches train.schedule=%s"
+            console.warning(line, recipe.epochs, planned, recipe.schedule)
 
     def _score_initial(self, model: MixedPrecision) -> dict[str, float]:
         """Score the initial network, whose predictions become labels if the data have none."""
@@ -296,9 +281,6 @@ class Run:
         if epoch != trainer.epoch or INTERPOLATION in best:
             trainer.selected.network.load_state_dict(best["model"])
             selected = evaluate(trainer.selected, test)["accuracy"]
-        images = inputs.describe_test_images(self.settings, self.data)
-        both = "accuracy %.4f (epoch %d, selected), %.4f (the last) on %s"
-        console.debug(both, selected, epoch, last, images)
         scores = {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": epoch}
         if INTERPOLATION in best:
             scores["test/interpolation"] = best[INTERPOLATION]
@@ -326,7 +308,7 @@ class Run:
         weights, factor = interpolate(*networks, validation, self.settings.seed, losses)
         trainer.best |= {"model": weights, INTERPOLATION: factor}
         if distributed.rank() == 0:
-            checkpoints.save(self.folder / run_folder.BEST, trainer.best)
+            checkpoints.save(self.folder / BEST, trainer.best)
 
     def _relit_agreement(self, targets: Int[Tensor, " N"], unchanged: float) -> dict[str, float]:
         """Measure on which fraction of the test images a projector does not change the prediction.
@@ -364,7 +346,7 @@ class Run:
         return values
 
 
-def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:
+def _network_shape(settings: ExperimentSettings, initial: inputs.Initial | None) -> dict[str, Any]:
     """Return the arguments of `build_network` that choose the architecture of a run."""
     shape = settings.model.shape
     if initial is None or not initial.is_classifier:

@@ -89,11 +89,9 @@ class RunLog:
         """
         from torchvision.utils import make_grid
 
-        tiles = to_bytes(images.cpu())
-        grid = make_grid(tiles, nrow=GRID_COLUMNS, padding=1, pad_value=255)
+        grid = make_grid(to_bytes(images.cpu()), nrow=GRID_COLUMNS, padding=1, pad_value=255)
         self._renders.mkdir(exist_ok=True)
-        path = self._renders / f"epoch_{epoch:03d}.png"
-        write_image(path, grid, compress_level=1)
+        write_image(self._renders / f"epoch_{epoch:03d}.png", grid, compress_level=1)
         if self._board is not None:
             self._board.add_image("renders", grid, epoch)
 

@@ -49,8 +49,7 @@ class TrainingStep:
         # The first optimizer of a process imports the compiler of torch, which takes seconds.
         with progress_message("loading the optimizer"):
             self.optimizer = build_optimizer(model, settings)
-        is_scaled = model.precision == "float16"
-        self.scaler = torch.amp.GradScaler(self._device.type, enabled=is_scaled)
+        self.scaler = torch.amp.GradScaler(self._device.type, enabled=model.precision == "float16")
         classes = service.positive_classes
         self._augmentation = Augmentation(settings, model, teacher, service.seed, classes[1:])
         with keyed(choice="compile"):

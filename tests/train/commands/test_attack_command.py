@@ -104,7 +104,7 @@ def test_an_adversary_of_two_views_is_rendered_again_and_attacked_further(run, t
     for view, text in enumerate(printed):
         predicted = line["predicted"][view]
         confidence = line["confidence"][view]
-        start = f"view {view}: orange is recognized as {predicted} ({confidence:.1%}), "
+        start = f"view {view}: orange is recognized as {predicted} ({confidence:.1%}); "
         assert text.startswith(start)
         levels = float(text.rpartition("by ")[2].partition("/255")[0])
         assert levels <= 1
@@ -125,7 +125,7 @@ def test_an_adversary_of_a_detector_is_rendered_and_detected_again(tmp_path):
     lines = read_lines(tmp_path / "attack.jsonl")
     for line in lines:
         adversary = nb.reload(tmp_path / f"example_{line['example']:03d}")
-        reloaded = (adversary, choose("auto"), result.classifier, result.settings, 0)
+        reloaded = (adversary, choose("auto"), result.classifier, result.settings)
         (text,) = format_reloaded(*reloaded)
         expected = f"recognized as {line['predicted'][0]} ({line['confidence'][0]:.1%})"
         assert expected in text

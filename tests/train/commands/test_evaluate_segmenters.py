@@ -88,7 +88,7 @@ def test_palettes_and_folders_of_voc_are_read_and_photographs_without_a_mask_are
 @pytest.mark.parametrize(
     ("mask", "message"),
     [
-        (Image.new("L", (24, 24), 3), "the value 3, but the network has 3 classes"),
+        (Image.new("L", (24, 24), 3), "the value 3: use 0 to 2"),
         (Image.new("RGB", (24, 24)), r"shape \(24, 24, 3\)"),
         (Image.new("L", (24, 48)), r"shape \(48, 24\)"),
     ],

@@ -151,7 +151,10 @@ def test_names_of_yolo_are_a_list_or_a_mapping_of_indices(tmp_path, names, expec
 
 @pytest.mark.parametrize(
     ("file", "content", "message"),
-    [("data.yaml", b"names: {cat: 0}", "has names"), ("a.txt", b"\xff\xfe\x00", "no text")],
+    [
+        ("data.yaml", b"names: {cat: 0}", "give names as a list"),
+        ("a.txt", b"\xff\xfe\x00", "no text"),
+    ],
 )
 def test_files_of_yolo_in_another_form_are_refused(tmp_path, file, content, message):
     _draw(tmp_path / "a.png")
@@ -196,7 +199,7 @@ def test_a_wrong_coco_file_is_refused_in_one_sentence(tmp_path, changes, message
 def test_boxes_of_an_image_with_another_aspect_ratio_are_refused(tmp_path):
     _draw(tmp_path / "a.png")
     _write_coco(tmp_path / "a.json", size=(80, 80))
-    with pytest.raises(InputError, match="80 × 40 pixels, but its annotation says 80 × 80"):
+    with pytest.raises(InputError, match="80 × 40 pixels, but its boxes are for 80 × 80"):
         [*fit_batches(read_annotations(tmp_path).photographs, (8, 8), LETTERBOX, 2)]
 
 
