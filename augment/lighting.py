@@ -286,6 +286,8 @@ def _batch_shape(image: Any) -> tuple[int, ...]:
     """Return the shape of the batch of a tensor. All frames of a video are one image."""
     if not isinstance(image, Tensor):
         return ()
+    if torch._C._functorch.is_batchedtensor(image):
+        raise InputError("torch.vmap hides the batch of images: call the transform with the batch")
     return tuple(image.shape[: -4 if isinstance(image, tv_tensors.Video) else -3])
 
 
@@ -352,10 +354,11 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         depth_of_rows = None if depths is None else depths[rows]
         with torch.autocast(plain.device.type, enabled=False) if is_mixed else nullcontext():
             parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
-    if len(parts) == 1:
-        return parts[0].reshape(plain.shape)
     order = torch.tensor([row for rows in groups.values() for row in rows]).argsort()
-    return torch.cat(parts)[order.to(plain.device)].reshape(plain.shape)
+    relit = torch.cat(parts)[order.to(plain.device)] if len(parts) > 1 else parts[0]
+    if frames.is_contiguous(memory_format=torch.channels_last):
+        relit = relit.contiguous(memory_format=torch.channels_last)
+    return relit.reshape(plain.shape)
 
 
 def _as_depth(depth: Any, frames: Tensor, count: int) -> Float[Tensor, "N 1 H W"]:

@@ -72,17 +72,22 @@ def lightning_callback(service: AugmentationService, network: nn.Module | None =
 
         def __init__(self) -> None:
             self.renders = CurrentRenders(len(service))
+            self.epoch = 0
 
-        def regenerate(self, trainer: Any, pl_module: Any) -> None:
+        def regenerate(self, epoch: int, pl_module: Any) -> None:
             """Attack the weights as they are now."""
             attacked = pl_module if network is None else network
-            self.epoch = trainer.current_epoch
+            self.epoch = epoch
             made = service.regenerate(attacked, self.epoch)
             self.renders.current, self.diagnostics = made, made.diagnostics
 
+        def on_load_checkpoint(self, trainer: Any, pl_module: Any, checkpoint: Any) -> None:
+            """Keep the epoch, which Lightning restores after workers have copied the renders."""
+            self.epoch = checkpoint["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
+
         def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
             """Make the first renders before workers copy them."""
-            self.regenerate(trainer, pl_module)
+            self.regenerate(max(self.epoch, trainer.current_epoch), pl_module)
 
         def on_train_epoch_start(self, trainer: Any, pl_module: Any) -> None:
             """Render anew if the epoch has no renders yet, and log numbers about them."""
@@ -91,7 +96,7 @@ def lightning_callback(service: AugmentationService, network: nn.Module | None =
                 reason = "the loader has persistent_workers=True, which keep the first renders"
                 raise InputError(f"{reason}: set it to False")
             if self.epoch != trainer.current_epoch:
-                self.regenerate(trainer, pl_module)
+                self.regenerate(trainer.current_epoch, pl_module)
             for name, value in self.diagnostics.items():
                 pl_module.log(f"renders/{name}", value)
 

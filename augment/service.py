@@ -184,6 +184,8 @@ class AugmentationService:
         options = paper | {"backgrounds": [0.0, 0.25, 0.5, 0.75, 1.0]} | of_scene
         settings = settings or AugmentationSettings()
         count = settings.examples
+        if count == 0:
+            raise InputError("settings.examples is 0: give the number of renders, or None")
         if count and not {"views", "cameras"} & of_scene.keys():
             options["views"] = views_of(count, len(meshes), len(options["backgrounds"]))
         scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **options)

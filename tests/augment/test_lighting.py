@@ -224,6 +224,13 @@ class _Relit(torch.utils.data.Dataset):
         return self.transform(self.images[index])
 
 
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_a_batch_keeps_channels_last(dtype):
+    images = picture(2, 3, 6, 6).to(dtype).contiguous(memory_format=torch.channels_last)
+    relit = nb.RandomLighting(["linear", "low_light"])(images.clamp(max=1))
+    assert relit.is_contiguous(memory_format=torch.channels_last)
+
+
 def test_torch_draws_the_light():
     image = picture(3, 8, 8)
     torch.manual_seed(5)
@@ -245,6 +252,7 @@ def test_torch_draws_the_light():
         lambda: nb.RandomLighting()(picture(5, 4, 4)),
         lambda: nb.RandomLighting()(np.zeros((4, 4, 3))),
         lambda: nb.RandomLighting()(torch.full((3, 2, 2), torch.nan)),
+        lambda: torch.vmap(nb.RandomLighting("linear"))(picture(2, 3, 4, 4)),
         lambda: nb.RandomLighting("low_light")(torch.full((3, 2, 2), 3e38)),
         lambda: nb.RandomLighting()({"image": picture(3, 4, 4), "depth": torch.ones(5, 4)}),
         lambda: nb.RandomLighting()({"image": picture(3, 4, 4), "depth": "far"}),

@@ -45,8 +45,16 @@ def test_workers_that_would_keep_the_first_renders_are_refused(tmp_path):
         fit(tmp_path, num_workers=1, persistent_workers=True)
 
 
-def fit(tmp_path, **of_loader):
-    """Train for two epochs, and return the service and the module."""
+def test_workers_of_a_resumed_run_get_the_renders_of_its_epoch(tmp_path):
+    fit(tmp_path, num_workers=1, enable_checkpointing=True)
+    [file] = tmp_path.rglob("*.ckpt")
+    service, module = fit(tmp_path, num_workers=1, max_epochs=3, ckpt_path=file)
+    [(epoch, images, _)] = module.seen
+    assert epoch == 2 and torch.equal(images[2:], service.regenerate(module, 2).images)
+
+
+def fit(tmp_path, max_epochs=2, enable_checkpointing=False, ckpt_path=None, **of_loader):
+    """Train for some epochs, and return the service and the module."""
     settings = nb.AugmentationSettings(mode="random")
     meshes = [("solid:orange", 0), ("solid:cup", 1)]
     options = {"views": 2, "backgrounds": [0.5], "samples": 1}
@@ -55,15 +63,15 @@ def fit(tmp_path, **of_loader):
     data = [(torch.zeros(3, 8, 8), 0)] * 2
     module = Module()
     trainer = lightning.Trainer(
-        max_epochs=2,
+        max_epochs=max_epochs,
         callbacks=[callback],
         logger=False,
-        enable_checkpointing=False,
+        enable_checkpointing=enable_checkpointing,
         enable_progress_bar=False,
         enable_model_summary=False,
         accelerator="cpu",
         default_root_dir=tmp_path,
     )
     both = torch.utils.data.ConcatDataset([data, callback.renders])
-    trainer.fit(module, DataLoader(both, batch_size=6, **of_loader))
+    trainer.fit(module, DataLoader(both, batch_size=6, **of_loader), ckpt_path=ckpt_path)
     return service, module

@@ -22,6 +22,7 @@ from torch import Tensor
 from augment.dataset import LabeledRender
 from renderer.io.files import atomic_write, replacing
 from renderer.io.images import encode_image
+from train import console
 
 # Folder with a JSON file for each render, and with its maps.
 DETAILS = "details"
@@ -114,6 +115,15 @@ class ImageFolder(DataSet):
     """A folder for each part and class, as `torchvision.datasets.ImageFolder` reads it."""
 
     image = "{part}/{label}/{number}.png"
+
+    def finish(self) -> None:
+        """Make the folders of all classes in each part, so that all parts number them alike."""
+        hidden = NO_CLASS if any(self.folder.glob(f"*/{NO_CLASS}")) else ""
+        for part, label in itertools.product(self.splits, filter(None, [*self.classes, hidden])):
+            (self.folder / part / label).mkdir(parents=True, exist_ok=True)
+            if not any((self.folder / part / label).iterdir()):
+                note = "give torchvision's ImageFolder allow_empty=True, or render more images"
+                console.warning("%s has no render of %s: %s", part, label, note)
 
 
 class Coco(DataSet):

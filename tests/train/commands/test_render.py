@@ -67,6 +67,14 @@ def decoded(counts: list[int], size: list[int]) -> np.ndarray:
     return values.reshape(size[::-1]).T.astype(bool)
 
 
+def test_parts_without_a_render_of_a_class_number_the_classes_alike(meshes, tmp_path):
+    write(meshes, tmp_path / "out", count=3, maps=[])
+    parts = [
+        ImageFolder(str(tmp_path / "out" / part), allow_empty=True) for part in ("train", "val")
+    ]
+    assert parts[0].class_to_idx == parts[1].class_to_idx == {"ball": 0, "box": 1}
+
+
 def test_torchvision_reads_the_classes_of_folders(written):
     for part, count in {"train": 7, "val": 4}.items():
         found = ImageFolder(str(written / part))
