@@ -163,7 +163,7 @@ def mean_square(values: np.ndarray) -> float:
 )
 @pytest.mark.parametrize(
     ("size", "samples", "ray_count"),
-    [(24, 32, 128), pytest.param(64, 64, 512, marks=pytest.mark.slow)],
+    [(16, 32, 128), pytest.param(64, 64, 512, marks=pytest.mark.slow)],
 )
 def test_a_convex_mesh_is_rendered_as_by_mitsuba_within_its_noise(
     tmp_path, make_mesh, view, size, samples, ray_count

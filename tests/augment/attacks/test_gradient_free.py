@@ -14,8 +14,7 @@ OPTIMIZERS = ["random_search", "cma_es"]
 BALLS = [augment.StepSettings("linf", 0.05), augment.StepSettings("l2", 0.2)]
 
 
-@pytest.mark.parametrize("optimizer", OPTIMIZERS)
-@pytest.mark.parametrize("ball", BALLS, ids=["linf", "l2"])
+@pytest.mark.parametrize(("optimizer", "ball"), [*zip(OPTIMIZERS, BALLS, strict=True)])
 def test_no_candidate_leaves_the_ball_or_has_negative_light(attacked, monkeypatch, optimizer, ball):
     pytest.importorskip("cma")
     rendered = []

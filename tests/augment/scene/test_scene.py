@@ -279,7 +279,7 @@ def test_values_that_a_smaller_mesh_does_not_use_have_no_gradient(several, padde
     assert gradient.any(1).all()
 
 
-@pytest.mark.parametrize(("names", "bounces"), [(["cup", "ball"], 0), (["cup"], 2)])
+@pytest.mark.parametrize(("names", "bounces"), [(["cup", "ball"], 0), (["cup"], 1)])
 def test_shadows_of_unmoved_vertices_and_colors_are_those_of_the_operators(names, bounces):
     scene = built(*names, shadows=True, bounces=bounces)
     rows = torch.arange(len(scene))

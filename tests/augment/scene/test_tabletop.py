@@ -26,6 +26,9 @@ CAMERAS = {
     "parallel": OrthographicCamera(63.0, 22.9, 3.0, 0.1, -0.2),
 }
 each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+each_surface = pytest.mark.parametrize(
+    ("surface", "camera"), [*zip(("table", "wall"), CAMERAS.values(), strict=True)]
+)
 
 
 def square(middle: list[float], first: list[float], second: list[float]) -> Mesh:
@@ -100,9 +103,8 @@ def compare(surface, camera, sky=None, lamps=(), light=(), scale: float = 1.0) -
     return Comparison(found[:, is_surface], expected[:, is_surface])
 
 
-@each_camera
-@pytest.mark.parametrize("surface", ["table", "wall"])
-def test_table_and_wall_are_lit_by_a_sky_as_meshes_are(camera, surface):
+@each_surface
+def test_table_and_wall_are_lit_by_a_sky_as_meshes_are(surface, camera):
     """The room has 48 directions of the sky, at every second pixel."""
     sky = probe("grace").double() / 5
     no_direction = torch.zeros(3).double()
@@ -110,9 +112,8 @@ def test_table_and_wall_are_lit_by_a_sky_as_meshes_are(camera, surface):
     compared.require_close(mean=0.02, typical=0.07)
 
 
-@each_camera
-@pytest.mark.parametrize("surface", ["table", "wall"])
-def test_table_and_wall_are_lit_by_a_far_lamp_as_meshes_are(camera, surface):
+@each_surface
+def test_table_and_wall_are_lit_by_a_far_lamp_as_meshes_are(surface, camera):
     """Only the edge of the shadow differs."""
     direction = torch.nn.functional.normalize(torch.tensor([0.5, 0.1, 0.8]).double(), dim=0)
     position = tuple((FAR * direction).tolist())

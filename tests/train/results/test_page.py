@@ -152,6 +152,7 @@ def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_tr
 def test_each_predictions_csv_is_parsed_once_for_tables_and_the_report(
     finished, tmp_path, monkeypatch
 ):
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)
     parsed = []
     reader = csv.DictReader
     monkeypatch.setattr(csv, "DictReader", lambda file: parsed.append(file.name) or reader(file))

@@ -183,15 +183,14 @@ class TestTheMetricsOfAKnownModel:
         counts = {source: row["n"] for source, row in summary["by_source"].items()}
         assert counts == {"lab": 2, "shop": 2, "street": 4}
 
-    @pytest.mark.parametrize("source", [None, "lab", "shop", "street"])
-    def test_are_those_of_counting_and_of_all_pairs(self, summary, source):
-        metrics = summary if source is None else summary["by_source"][source]
-        shown = [item for item in FRUIT if source in (None, item.source)]
-        expected = count_metrics(shown)
-        auc = metrics["auc"]
-        assert auc["value"] == pytest.approx(expected.pop("auc"), abs=1e-12)
-        assert auc["value"] is None or auc["low"] <= auc["value"] <= auc["high"]
-        assert {name: metrics[name] for name in expected} == expected
+    def test_are_those_of_counting_and_of_all_pairs(self, summary):
+        for source in (None, "lab", "shop", "street"):
+            metrics = summary if source is None else summary["by_source"][source]
+            expected = count_metrics([item for item in FRUIT if source in (None, item.source)])
+            auc = metrics["auc"]
+            assert auc["value"] == pytest.approx(expected.pop("auc"), abs=1e-12)
+            assert auc["value"] is None or auc["low"] <= auc["value"] <= auc["high"]
+            assert {name: metrics[name] for name in expected} == expected
 
     def test_name_the_wrong_classes(self, summary):
         assert summary["by_class"]["pear"]["recall"] == wilson(1, 3)
@@ -240,23 +239,22 @@ class TestMeshes:
         assert auc["over"] == THESE_OBJECTS
         assert THESE_OBJECTS in format_scores(scores)
 
-    @pytest.mark.parametrize(("mesh", "is_orange"), [("k", False), ("m", True)])
-    def test_are_ranked_against_all_images_of_the_other_kind(self, scores, mesh, is_orange):
-        metrics = scores.to_summary()["by_mesh"][mesh]
-        shown = [item for item in FRUIT if self.MESH_OF_LETTER.get(item.letter) == mesh]
-        others = [item for item in FRUIT if item.is_of("orange") != is_orange]
-        expected = count_metrics(shown + others)["auc"]
-        assert metrics["auc"]["value"] == pytest.approx(expected, abs=1e-12)
-        expected = count_metrics(shown)["recall"]
-        assert counts(metrics["recall"]) == counts(expected)
+    def test_are_ranked_against_all_images_of_the_other_kind(self, scores):
+        for mesh, is_orange in (("k", False), ("m", True)):
+            metrics = scores.to_summary()["by_mesh"][mesh]
+            shown = [item for item in FRUIT if self.MESH_OF_LETTER.get(item.letter) == mesh]
+            others = [item for item in FRUIT if item.is_of("orange") != is_orange]
+            expected = count_metrics(shown + others)["auc"]
+            assert metrics["auc"]["value"] == pytest.approx(expected, abs=1e-12)
+            assert counts(metrics["recall"]) == counts(count_metrics(shown)["recall"])
 
 
 class TestAnOperatingPoint:
     """The ranks of orange are 1, 2, 6, 5, 2 for oranges and 1, 5, 2, 1, 2 for others."""
 
-    @pytest.mark.parametrize("is_in_sample", [True, False])
     @pytest.mark.parametrize(
-        ("rate", "recall", "false_positives"), [(0.4, 1, 2), (0.39, 0, 0), (0.8, 3, 4), (0.6, 1, 2)]
+        ("rate", "recall", "false_positives", "is_in_sample"),
+        [(0.4, 1, 2, True), (0.39, 0, 0, False), (0.8, 3, 4, True), (0.6, 1, 2, False)],
     )
     def test_is_the_lowest_threshold_within_its_rate(
         self, fruit, tmp_path, rate, recall, false_positives, is_in_sample

@@ -136,8 +136,7 @@ def test_all_faces_of_the_object_change_alike_and_the_table_stays(three_eggs, va
     np.testing.assert_array_equal(three_eggs.objects[1].mesh.gloss, gloss_before)
 
 
-@pytest.mark.parametrize("norm", ["linf", "l2"])
-@pytest.mark.parametrize("radius", [0.5, 4.0, None])
+@pytest.mark.parametrize(("norm", "radius"), [("linf", 0.5), ("l2", 4.0), ("linf", None)])
 def test_a_material_stays_in_its_norm_ball_and_physical(norm, radius):
     scene = scene_of(egg(Gloss(0.1, 0.0, 0.5)), egg(Gloss(0.9, 1.0, 0.0)))
     problem = problem_of(scene, norm=norm, radius=radius)
@@ -207,7 +206,7 @@ def test_a_material_is_read_back_to_its_image_and_written_as_gltfs_factors(writt
 
 
 def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color):
-    """Descent reaches at least 98 % of the gain of the best of 5 × 5 materials."""
+    """Descent reaches at least 98 % of the gain of the best of 4 × 4 materials."""
     lamps = augment.LampsSettings([[1.5, 0.5, 2.0], [-1.0, 2.0, 1.5]], start=6.0)
     steps = augment.MaterialSettings("linf", 1.0, "sign", 0.2, roughness=0.3, specular_factor=1.0)
     result = attacked(
@@ -217,11 +216,11 @@ def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color)
         backtracking=True,
         margin=1000.0,
     )
-    roughness = torch.linspace(0.2001, 0.8, 5) / 0.3
-    strength = torch.linspace(0, 1 - 1e-6, 5)
-    grid = torch.zeros(25, 4)
+    roughness = torch.linspace(0.2001, 0.8, 4) / 0.3
+    strength = torch.linspace(0, 1 - 1e-6, 4)
+    grid = torch.zeros(16, 4)
     grid[:, [0, 2]] = torch.cartesian_prod(roughness, strength)
-    rows = torch.zeros(25, dtype=torch.int64)
+    rows = torch.zeros(16, dtype=torch.int64)
     logits = by_color(result.problem.render(grid, rows)[:, 0])
     lowest = float(logits.log_softmax(1)[:, result.criterion.source[0, 0]].min())
     before = float(result.minimum.cost_before[0])

@@ -254,7 +254,7 @@ def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm, radi
     torch.testing.assert_close(light.project_feasible(nearest), nearest, rtol=0, atol=TOLERANCE)
 
     distance = (light.start - values).norm(dim=1)
-    others = [light.sample(draws), light.sample(draws), light.start, light.start + offset / 2]
+    others = [light.sample(draws), light.start, light.start + offset / 2]
     for other in others:
         product = ((values - nearest) * (other - nearest)).sum(1)
         assert (product <= 1e-3 * distance * (other - nearest).norm(dim=1)).all()
@@ -269,11 +269,11 @@ def test_an_attack_in_nonnegative_light_ends_in_light_that_a_map_holds(
     scene = in_sunlight(make_scene())
     settings = StepSettings(step_size=0.5)
     problem = SceneProblem(scene, [make_parameter("lighting", scene, settings, nonnegative=True)])
-    result = attack(make_linear(2, bias=50.0), problem, towards(problem), steps=4)
+    result = attack(make_linear(2, bias=50.0), problem, towards(problem), steps=3)
     assert (result.values - problem.start).norm(dim=1).min() > 1
     lights = []
     for values in result.values:
-        write_map(tmp_path / "light.hdr", to_map(values.unflatten(0, (49, 3)), 128))
+        write_map(tmp_path / "light.hdr", to_map(values.unflatten(0, (49, 3)), 64))
         lights.append(project(read_map(tmp_path / "light.hdr"), DEGREE))
     images = scene.render(Conditions(torch.stack(lights)), EVERY)
     torch.testing.assert_close(images, result.images, rtol=0, atol=0.5 / 255)
@@ -474,9 +474,9 @@ def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):
 @pytest.mark.parametrize(
     ("names", "steps", "expected"),
     [
-        (("lighting", "pixels"), 9, [3]),  # All cameras at once.
-        (("lighting", "albedo"), 9, [1, 1, 1]),  # Each camera once.
-        (("lighting", "geometry"), 4, [1] * 5 * 6),  # Six views of five images.
+        (("lighting", "pixels"), 3, [3]),  # All cameras at once.
+        (("lighting", "albedo"), 3, [1, 1, 1]),  # Each camera once.
+        (("lighting", "geometry"), 2, [1] * 3 * 6),  # Six views of three images.
     ],
 )
 def test_only_an_attack_on_shape_rasterizes_in_every_step(
