@@ -261,17 +261,6 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
             raise InputError(f"{name}={item} must be {range_in_words}", name)
 
 
-def require_field_types(settings: Any, *unchecked: str) -> None:
-    """Check that the fields of a dataclass have the types with which they are annotated.
-
-    This is for dataclasses that are not derived from `Settings`. A whole number is accepted for a
-    float, and a path for a string.
-    """
-    for name, hint, _ in _checked_fields(type(settings)):  # type: ignore[arg-type]  # types are hashable
-        if name not in unchecked:
-            _check_type(name, getattr(settings, name), hint)
-
-
 def _check_type(name: str, value: Any, hint: Any) -> None:
     """Check that a value has the annotated type of its field."""
     if not _fits(value, hint):

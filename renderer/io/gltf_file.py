@@ -31,9 +31,6 @@ from renderer.io.mesh_file import CPU, TEXEL_BYTES, MeshFile, decode_image
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 # Count of numbers in one element of an accessor (3.6.2.2).
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-# Types of the chunks of a .glb file (4.4.3): "JSON" and "BIN\0".
-JSON_CHUNK = 0x4E4F534A
-BINARY_CHUNK = 0x004E4942
 WEBP = "EXT_texture_webp"
 INSTANCING = "EXT_mesh_gpu_instancing"
 VISIBILITY = "KHR_node_visibility"
@@ -54,11 +51,12 @@ class GltfFile:
         """Parse the JSON of a file, and check its version."""
         self.file = file
         content = file.content
-        chunks = _chunks(content) if content.startswith(b"glTF") else {JSON_CHUNK: content}
-        self._binary_chunk = chunks.get(BINARY_CHUNK)
+        self._binary_chunk: bytes | None = None
+        if content.startswith(b"glTF"):
+            content, self._binary_chunk = _chunks(content)
         # Python's parser accepts NaN and Infinity, which glTF forbids. It passes
         # these names to `parse_constant`, and `int("NaN")` raises ValueError.
-        self.tree: dict[str, Any] = json.loads(chunks[JSON_CHUNK], parse_constant=int)
+        self.tree: dict[str, Any] = json.loads(content, parse_constant=int)
         version = self.tree["asset"]["version"]
         if not version.startswith("2."):
             raise ValueError(f"it is glTF {version}: export it as glTF 2.0")
@@ -109,11 +107,9 @@ class GltfFile:
         stride = self.entry("bufferViews", index).get("byteStride", row_size)
         offset = location.get("byteOffset", 0)
         end = offset + stride * (count - 1) + row_size
-        if stride < row_size:
-            raise ValueError(f"the elements of an array overlap in its buffer view {index}")
         # NumPy would read bytes before the buffer at a negative offset.
-        if min(offset, count) < 0 or end > len(view):
-            raise ValueError(f"an array ends behind its buffer view {index}: the file is damaged")
+        if stride < row_size or min(offset, count) < 0 or end > len(view):
+            raise ValueError(f"an array overlaps itself or leaves its buffer view {index}")
         return np.ndarray((count, width), dtype, view, offset, (stride, dtype.itemsize))
 
     def _view(self, index: int) -> memoryview:
@@ -200,20 +196,16 @@ class GltfFile:
         return list(listed)
 
 
-def _chunks(content: bytes) -> dict[int, bytes]:
-    """Divide a .glb file into its chunks, by their types (4.4)."""
-    _, version, length = struct.unpack_from("<4sII", content)
+def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
+    """Return the JSON object and the binary chunk, if there is one, of a .glb file (4.4)."""
+    version, length, json_length = struct.unpack_from("<4x3I", content)
     if version != 2:
         raise ValueError(f"it is glTF {version}.0: export it as glTF 2.0")
     if length > len(content):
         raise ValueError("its end is missing: copy the file again")
-    chunks: dict[int, bytes] = {}
-    start = 12
-    while start + 8 <= length:
-        chunk_length, kind = struct.unpack_from("<II", content, start)
-        chunks.setdefault(kind, content[start + 8 : start + 8 + chunk_length])
-        start += 8 + chunk_length
-    return chunks
+    end = 20 + json_length
+    has_binary = content[end + 4 : end + 8] == b"BIN\0"
+    return content[20:end], content[end + 8 : length] if has_binary else None
 
 
 def _local_matrix(node: dict[str, Any]) -> np.ndarray:

@@ -49,7 +49,11 @@ _Values = dict[str, np.ndarray | _Lists]
 
 def read_ply(file: MeshFile) -> list[Part]:
     """Read a .ply file as one part, or none if the file has no faces."""
-    elements, texture_names = _elements(file.content)
+    return _parts(file, *_elements(file.content))
+
+
+def _parts(file: MeshFile, elements: dict[str, _Values], texture_names: list[str]) -> list[Part]:
+    """Create a part from the elements of a file, or none if the file has no faces."""
     vertex, face = elements.pop("vertex", {}), elements.pop("face", {})
     vertices = _columns(vertex, ("x", "y", "z"))
     faces = face.pop("vertex_indices", face.pop("vertex_index", None))
@@ -243,21 +247,18 @@ def read_off(file: MeshFile) -> list[Part]:
     vertex_count, face_count = map(int, header.groups())
     lines = [line + b"\n" for line in text[header.end() :].split(b"\n") if line.strip()]
     if len(lines) < vertex_count + face_count:
-        raise ValueError("the file is truncated: export it again")
-    vertex_text = b"".join(lines[:vertex_count])
-    face_text = b"".join(lines[vertex_count : vertex_count + face_count])
-    word_counts = mesh_file.words_per_line(face_text)
-    numbers = mesh_file.parse_numbers(face_text, np.float64)
-    starts = np.cumsum(word_counts) - word_counts
-    sizes = numbers[starts]
-    if (mesh_file.words_per_line(vertex_text) != 3).any() or (sizes + 1 != word_counts).any():
+        raise ValueError(_TRUNCATED)
+    # What follows the header is the same as in a .ply file.
+    rows = b"".join(lines[: vertex_count + face_count])
+    sizes = [int(line.split()[0]) for line in lines[vertex_count : vertex_count + face_count]]
+    word_counts = [*[3] * vertex_count, *(1 + size for size in sizes)]
+    if mesh_file.words_per_line(rows).tolist() != word_counts:
         raise ValueError("a vertex or a face has colors or other numbers: export the mesh as .ply")
-    vertices = mesh_file.parse_numbers(vertex_text, np.float64).reshape(-1, 3)
-    indices = _cast(np.delete(numbers, starts), "i8")
-    corners, _ = mesh_file.triangles_of(file, vertices, indices, sizes.astype(np.int64))
-    if not len(corners):
-        return []
-    return [Part(mesh_file.colored_mesh(vertices, indices[corners], np.ones((1, 3))))]
+    body = mesh_file.parse_numbers(rows, np.float64).tobytes()
+    positions = [_Property(axis, "f8") for axis in "xyz"]
+    vertex, offset = _rows(body, 0, vertex_count, positions, _ASCII)
+    face, _ = _rows(body, offset, face_count, [_Property("vertex_indices", "i8", "i8")], _ASCII)
+    return _parts(file, {"vertex": vertex, "face": face}, [])
 
 
 # Face of a binary .stl file. Some programs store a color in `attribute`, and say so by `_FLAG`,
@@ -282,7 +283,7 @@ def read_stl(file: MeshFile) -> list[Part]:
         if len(coordinates) != 9 * face_count or len(lines) != 3 * face_count:
             raise ValueError("a facet does not have three vertices with three coordinates")
     elif len(content) < _HEADER_SIZE + face_count * _STL_FACE.itemsize:
-        raise ValueError("the file is truncated: export it again")
+        raise ValueError(_TRUNCATED)
     else:
         faces = np.frombuffer(content, _STL_FACE, face_count, _HEADER_SIZE)
         has_colors = b"COLOR=" in header or bool((faces["attribute"] & _FLAG).any())

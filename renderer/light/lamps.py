@@ -14,12 +14,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer.camera import MAX_FOV, MIN_FOV, OrthographicCamera, PerspectiveCamera
-from renderer.errors import MAX_SCALE, InputError, as_array, as_tensor, require_range
+from renderer.errors import (
+    MAX_SCALE,
+    InputError,
+    as_array,
+    as_tensor,
+    require_number,
+    require_whole,
+)
 from renderer.io.images import gray_or_image
 from renderer.io.mitsuba_entries import pose_of, projector
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.files import read_light
-from renderer.settings import require_field_types
 from renderer.vectors import tangent_axes
 
 # Largest number of pixels along one side of a projected pattern.
@@ -66,11 +72,12 @@ class Projector(LocalBasis):
 
     def __post_init__(self) -> None:
         """Check the fields."""
-        require_field_types(self)
-        require_range("projector.pixels", self.pixels, 1, MAX_PIXELS)
-        require_range("projector.distance", self.distance, 2, MAX_SCALE)
-        require_range("projector.fov", self.fov, MIN_FOV, MAX_FOV)
-        require_range("projector.power", self.power, 1 / MAX_SCALE, MAX_SCALE)
+        require_whole("projector.pixels", self.pixels, 1, MAX_PIXELS)
+        for name in ("polar", "azimuth"):
+            require_number(f"projector.{name}", getattr(self, name), -MAX_SCALE, MAX_SCALE)
+        require_number("projector.distance", self.distance, 2, MAX_SCALE)
+        require_number("projector.fov", self.fov, MIN_FOV, MAX_FOV)
+        require_number("projector.power", self.power, 1 / MAX_SCALE, MAX_SCALE)
 
     @classmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
@@ -225,9 +232,8 @@ class Lamps(LocalBasis):
             )
         # Plain assignment to a field of a frozen dataclass raises an error.
         object.__setattr__(self, "positions", tuple(map(tuple, positions.tolist())))
-        require_field_types(self, "positions")
-        require_range("lamps.power", self.power, 1 / MAX_SCALE, MAX_SCALE)
-        require_range("lamps.radius", self.radius, 0, MAX_SCALE)
+        require_number("lamps.power", self.power, 1 / MAX_SCALE, MAX_SCALE)
+        require_number("lamps.radius", self.radius, 0, MAX_SCALE)
 
     @classmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
