@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torchvision.models import get_model
 from torchvision.transforms import Normalize
 
 import augment
@@ -226,9 +227,12 @@ def test_adversaries_are_shown_to_a_plain_network_as_to_its_classifier(network):
     assert all(parameter.requires_grad for parameter in network.parameters())
 
 
-@pytest.mark.parametrize("layer", [nn.BatchNorm2d(3), nn.Dropout(0.5)])
 @pytest.mark.parametrize(
-    "wrap", [lambda network: partial(network.forward), nn.Module.__call__.__get__]
+    ("layer", "wrap"),
+    [
+        (nn.BatchNorm2d(3), lambda network: partial(network.forward)),
+        (nn.Dropout(0.5), nn.Module.__call__.__get__),
+    ],
 )
 def test_a_function_whose_network_is_in_training_mode_is_refused(layer, wrap):
     network = nn.Sequential(layer, nn.AdaptiveAvgPool2d(1), nn.Flatten()).train()
@@ -237,6 +241,7 @@ def test_a_function_whose_network_is_in_training_mode_is_refused(layer, wrap):
     as_network(wrap(network.eval()), size=8)
 
 
+SMALL = "shufflenet_v2_x0_5"
 IMAGENET = "normalized by mean (0.485, 0.456, 0.406) and std (0.229, 0.224, 0.225)"
 
 
@@ -254,20 +259,18 @@ def warned(caplog):
 
 
 @pytest.fixture(scope="module")
-def resnet_weights(tmp_path_factory):
-    from torchvision.models import resnet18
-
+def small_weights(tmp_path_factory):
     path = tmp_path_factory.mktemp("weights") / "my64.pth"
-    torch.save(resnet18(num_classes=3).state_dict(), path)
+    torch.save(get_model(SMALL, num_classes=3).state_dict(), path)
     return path
 
 
 def test_what_is_known_of_own_weights_is_said_once_and_what_the_user_leaves_out_is_assumed(
-    resnet_weights, said, warned
+    small_weights, said, warned
 ):
     half = ((0.5, 0.5, 0.5), (0.25, 0.25, 0.25))
     for options in ({}, {}, {"size": 64}, {"size": 64, "normalization": half}):
-        nb.load_classifier("torchvision:resnet18", resnet_weights, **options)
+        nb.load_classifier(f"torchvision:{SMALL}", small_weights, **options)
     first, second, third = said()
     sizes = ["224 × 224 pixels, assumed", *["64 × 64 pixels, stated by you"] * 2]
     for line, size in zip((first, second, third), sizes, strict=True):
@@ -283,11 +286,6 @@ def test_what_is_known_of_own_weights_is_said_once_and_what_the_user_leaves_out_
     ("options", "facts"),
     [
         ({}, "224 × 224 pixels, assumed; not normalized, assumed; values from 0 to 1, assumed"),
-        (
-            {"size": 8, "value_range": (0, 255)},
-            "8 × 8 pixels, stated by you; not normalized, assumed; "
-            "values from 0 to 255, stated by you",
-        ),
         (
             {"size": 8, "value_range": (-1, 1), "normalization": ((0, 0.1, 0), (1, 2, 1))},
             "8 × 8 pixels, stated by you; normalized by mean (0, 0.1, 0) and std (1, 2, 1), "

@@ -2,18 +2,15 @@
 
 import json
 from collections.abc import Callable
-from copy import deepcopy
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from omegaconf import DictConfig, OmegaConf
 
 from tests.helpers import save_colored_noise, save_noise
 from tests.runs import completed_run
+from tests.train.helpers import read_quickly
 from train.__main__ import main as train_command
-from train.cli import read_settings
 from train.run_config import write_config
 from train.settings import ExperimentSettings
 
@@ -51,21 +48,8 @@ def photos(tmp_path_factory) -> Path:
 def tiny(tiny_npz) -> Callable[..., ExperimentSettings]:
     """Return a function that reads the real configuration with small sizes and other overrides."""
 
-    @cache  # Composing the configuration takes half a second.
-    def composed(*choices: str) -> DictConfig:
-        return train_command.compose(["experiment=paper", *TINY, f"data.path={tiny_npz}", *choices])
-
-    keys = train_command.keys.keys() - set(train_command.groups)
-
-    @cache
-    def read(*overrides: str) -> ExperimentSettings:
-        # A choice of a file changes how the configuration is composed, unlike a value of a key.
-        values = [item for item in overrides if item.partition("=")[0] in keys]
-        config = composed(*(item for item in overrides if item not in values))
-        changes = OmegaConf.from_dotlist(train_command.to_overrides(values))
-        return read_settings(ExperimentSettings, OmegaConf.merge(config, changes))
-
-    return lambda *overrides: deepcopy(read(*overrides))
+    words = ["experiment=paper", *TINY, f"data.path={tiny_npz}"]
+    return lambda *overrides: read_quickly(train_command, words, overrides)
 
 
 @pytest.fixture(scope="session")

@@ -1,14 +1,36 @@
 """Functions that tests of several modules of training use."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
+from omegaconf import DictConfig, OmegaConf
 
 from train.checkpoints import save
+from train.cli import Command, read_settings
 from train.networks import WideResNet, describe
 from train.run_folder import BEST
 
 FIG_LIME_ORANGE = ["fig", "lime", "orange"]
+
+
+COMPOSED: dict[tuple[str, ...], DictConfig] = {}
+
+
+def read_quickly(command: Command, words: Sequence[str], overrides: Sequence[str]) -> Any:
+    """Return the settings of a command, which is composed once for the same words.
+
+    Composing takes half a second. Only overrides that choose a file need it.
+    """
+    keys = command.keys.keys() - set(command.groups)
+    values = [item for item in overrides if item.partition("=")[0] in keys]
+    choices = *words, *(item for item in overrides if item not in values)
+    if (command.name, *choices) not in COMPOSED:
+        COMPOSED[command.name, *choices] = command.compose(choices)
+    changes = OmegaConf.from_dotlist(command.to_overrides(values))
+    merged = OmegaConf.merge(COMPOSED[command.name, *choices], changes)
+    return read_settings(command.kind, merged)
 
 
 def save_untrained_network(folder: Path, size: int) -> None:

@@ -16,13 +16,14 @@ from renderer.light.files import probe
 from renderer.visibility import opengl
 from scripts.attack import main as attack_command
 from tests.runs import loaded_run
+from tests.train.helpers import read_quickly
 from train.command_settings import AttackExperimentSettings
 from train.commands.attack import attacks
 
 
 def configured(*arguments: str) -> AttackExperimentSettings:
     small = ["renderer.rasterizer=numpy", "renderer.shadows=false", "attack.max_steps=8"]
-    return attack_command.read([*small, "attack.margin=0", *arguments])
+    return read_quickly(attack_command, [*small, "attack.margin=0"], arguments)
 
 
 def by_color(classes: tuple[str, ...] = ("orange", "lime", "sky")) -> Classifier:

@@ -332,8 +332,7 @@ class TestSeveralClasses:
         assert summary["n"]["photographs"] == 10
         assert summary["n"]["positives"] == 8
         assert summary["n"]["negatives"] == 12
-
-    def test_sum_their_hits_at_the_thresholds(self, summary):
+        # Hits at the thresholds of the classes add up, too.
         for name in AT_THRESHOLD:
             hits = [part[name]["hits"] for part in summary["by_label"].values()]
             assert summary[name]["hits"] == sum(hits)
