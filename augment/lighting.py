@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect
+from collections import UserDict
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from copy import copy
 from functools import cache
 from itertools import accumulate
 from typing import Any, NamedTuple, cast
@@ -171,7 +173,10 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
             kind = type(image).__name__
             raise InputError(f"the image is a {kind}: give a PIL image or a tensor (C, H, W)")
         relit = _apply_to_tensor(image, params["lights"], depth)
-        return tv_tensors.wrap(relit, like=image) if type(image) is not Tensor else relit
+        if type(image) is not Tensor:
+            relit = tv_tensors.wrap(relit, like=image)
+            vars(relit).update(vars(image))  # Such as the affine matrix of an image of MONAI.
+        return relit
 
     def transform(self, inpt: Any, params: dict[str, Any]) -> Any:
         """Show an image of a sample in the drawn light (called by torchvision)."""
@@ -190,7 +195,12 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         Raises:
             InputError: If the sample has no image.
         """
-        paths, spec = tree_flatten_with_path(inputs if len(inputs) > 1 else inputs[0])
+        sample = inputs if len(inputs) > 1 else inputs[0]
+        if isinstance(sample, UserDict):  # Such as what a processor of Transformers returns.
+            relit = copy(sample)
+            relit.update(self(sample.data))
+            return relit
+        paths, spec = tree_flatten_with_path(sample)
         leaves = [leaf for _, leaf in paths]
         keys = [getattr(path[-1], "key", None) if path else None for path, _ in paths]
         hidden = {"depth"} if {*IMAGES}.isdisjoint(keys) else {*keys} - {*IMAGES}

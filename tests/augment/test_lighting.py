@@ -3,6 +3,7 @@
 import json
 import math
 import pickle
+from collections import UserDict
 
 import numpy as np
 import pytest
@@ -222,6 +223,20 @@ class _Relit(torch.utils.data.Dataset):
 
     def __getitem__(self, index):
         return self.transform(self.images[index])
+
+
+def test_a_subclass_keeps_its_attributes_as_images_of_monai_need():
+    image = picture(3, 6, 6).as_subclass(type("Meta", (torch.Tensor,), {}))
+    image.affine = torch.eye(4)
+    relit = nb.RandomLighting("linear")(image)
+    assert type(relit) is type(image) and relit.affine is image.affine
+
+
+def test_the_result_of_a_processor_of_transformers_is_a_sample():
+    sample = UserDict(labels=torch.tensor([1, 2]), pixel_values=picture(2, 3, 6, 6))
+    relit = nb.RandomLighting("linear")(sample)
+    assert type(relit) is UserDict and relit["labels"] is sample["labels"]
+    assert not torch.equal(relit["pixel_values"], sample["pixel_values"])
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])

@@ -141,6 +141,7 @@ def harden(
         >>> torch.save(hardened.state_dict(), "hardened.pth")  # doctest: +SKIP
     """
     require_kind("network", network, nn.Module, "a torch.nn.Module, whose weights are trained")
+    require_kind("logger", logger, Logger | None, "an object with a method log(values, step)")
     device = device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with folder_or_temporary(out) as folder:

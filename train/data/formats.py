@@ -183,7 +183,7 @@ class Yolo(DataSet):
         first, *_ = self.splits
         parts = {"train": first, "val": first} | {part: part for part in self.splits}
         paths = {key: f"images/{part}" for key, part in parts.items()}
-        content = {**paths, "names": dict(enumerate(self.classes))}
+        content = {**paths, "nc": len(self.classes), "names": dict(enumerate(self.classes))}
         atomic_write(self.folder / "data.yaml", yaml.safe_dump(content, sort_keys=False))
 
 

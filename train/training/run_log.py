@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -28,6 +28,7 @@ EXAMPLE = 128
 GRID_COLUMNS = 20
 
 
+@runtime_checkable
 class Logger(Protocol):
     """Anything with a method `log`, such as a run of Weights & Biases."""
 

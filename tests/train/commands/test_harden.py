@@ -109,6 +109,11 @@ def test_the_weights_are_those_of_the_command(network, photographs, tmp_path, mo
     assert all(value.equal(expected[name]) for name, value in written.items())
 
 
+def test_a_logger_without_a_method_log_is_refused_before_the_training(network, photographs):
+    with pytest.raises(nb.InputError, match="logger"):
+        harden(network, photographs, logger=print)
+
+
 def test_a_hardened_classifier_has_no_threshold_of_the_original(network, photographs):
     classifier = nb.Classifier(network, SIZE, CLASSES, name="mine")
     classifier.operating_points = [OperatingPoint("orange", 0.5, 0.05, "lab", "", 20)]

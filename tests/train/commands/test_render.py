@@ -317,7 +317,7 @@ def test_a_light_that_is_named_replaces_those_that_are_drawn():
 def test_parts_without_renders_are_left_out(meshes, tmp_path):
     folder = write(meshes, tmp_path / "out", format="yolo", count=1, splits={"train": 9, "test": 1})
     paths = yaml.safe_load((folder / "data.yaml").read_text())
-    assert {key: paths[key] for key in paths if key != "names"} == {
+    assert {key: paths[key] for key in paths if key not in ("nc", "names")} == {
         "train": "images/train",
         "val": "images/train",
     }
