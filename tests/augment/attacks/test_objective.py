@@ -245,8 +245,7 @@ def test_jpeg_is_pillows():
 SMALL_STEPS = augment.StepSettings(step_size=0.02)
 
 
-@pytest.mark.parametrize("margin", [0.0, 2.0])
-@pytest.mark.parametrize("quantized", [False, True])
+@pytest.mark.parametrize(("quantized", "margin"), [(False, 2.0), (True, 0.0)])
 def test_an_attack_stops_when_the_images_exceed_the_margin(attacked, by_color, quantized, margin):
     result = attacked(
         {"lighting": SMALL_STEPS},

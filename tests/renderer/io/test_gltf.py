@@ -124,9 +124,10 @@ def test_normalized_integers_are_those_of_the_specification(tmp_path):
 # Colors
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-@pytest.mark.parametrize("channels", [3, 4])
-@pytest.mark.parametrize("has_material", [False, True])
+@pytest.mark.parametrize(
+    ("dtype", "channels", "has_material"),
+    [("uint8", 3, True), ("uint8", 4, False), ("uint16", 4, True), ("float32", 3, False)],
+)
 def test_vertex_colors_of_every_type_are_multiplied_by_the_material(
     tmp_path, dtype, channels, has_material
 ):
@@ -158,8 +159,7 @@ def wrapped(index: np.ndarray, count: int, mode: int) -> np.ndarray:
     return index % count
 
 
-@pytest.mark.parametrize("wrap_u", [10497, 33071, 33648])
-@pytest.mark.parametrize("wrap_v", [10497, 33071, 33648])
+@pytest.mark.parametrize(("wrap_u", "wrap_v"), [(10497, 33071), (33071, 33648), (33648, 10497)])
 def test_textures_are_wrapped_as_opengl_wraps_them(tmp_path, wrap_u, wrap_v):
     """The texture coordinates of the square are from -0.7 to 2.3."""
     texels = color_texels(3, 4)

@@ -104,11 +104,14 @@ def read(path: Path) -> np.ndarray:
     return np.asarray(read_rgb(path, 8)).astype(int)
 
 
-@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "webp"])
 @pytest.mark.parametrize(
-    ("primaries", "gamma"),
-    [(DISPLAY_P3, None), (ADOBE, 2.19921875), (PRO_PHOTO, 1.8)],
-    ids=["Display P3", "Adobe RGB", "ProPhoto"],
+    ("suffix", "primaries", "gamma"),
+    [
+        ("png", DISPLAY_P3, None),
+        ("jpg", ADOBE, 2.19921875),
+        ("tif", PRO_PHOTO, 1.8),
+        ("webp", DISPLAY_P3, None),
+    ],
 )
 def test_a_photograph_with_an_icc_profile_becomes_srgb(tmp_path, suffix, primaries, gamma):
     curve = srgb_table() if gamma is None else gamma_curve(gamma)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest, mannwhitneyu, sem, ttest_1samp
 from scipy.stats import t as student_t
 
-from benchmarks.coverage import Setup, heavy_tails, measure, two_modes
+from benchmarks.coverage import Setup, heavy_tails, measure
 from train.data.photo import Photograph
 from train.results.intervals import (
     RATES,
@@ -137,18 +137,16 @@ def test_two_runs_of_other_seeds_are_still_paired_by_their_images():
         assert change([one], [other], is_paired=False) == change([one], [other])
 
 
-@pytest.mark.parametrize("objects", [(5, 5), (9, 9)])
-def test_intervals_of_few_objects_cover_the_truth(objects):
+def test_intervals_of_few_objects_cover_the_truth():
     """0.9 is 2.5 standard errors of 120 draws below 0.95."""
-    for coverage, _ in measure(Setup("typical", objects), 120).values():
+    for coverage, _ in measure(Setup("typical", (5, 5)), 120).values():
         assert coverage.min() >= 0.9
         assert coverage.mean() >= 0.94
 
 
-@pytest.mark.parametrize("shape", [heavy_tails, two_modes])
-def test_intervals_of_few_photographs_cover_the_recall_at_a_false_positive_rate(shape):
+def test_intervals_of_few_photographs_cover_the_recall_at_a_false_positive_rate():
     """0.92 is 3 standard errors of 500 draws below 0.95. The jackknife alone covers 0.85."""
-    setup = Setup("photographs", (55, 55), images=1, shape=shape)
+    setup = Setup("photographs", (55, 55), images=1, shape=heavy_tails)
     coverage, _ = measure(setup, 500)["objects"]
     values, gains = coverage.reshape(2, -1)[:, 1:4]
     assert min(*values, *gains) >= 0.92
