@@ -20,7 +20,6 @@ These are read from the environment:
   DATA      CIFAR-100, as data=npz reads it
   MESHES    meshes, a list
   PHOTOS    a folder of photographs on which the networks are scored
-  EXCLUDE   sources of photographs that averages leave out; default []
   LAB       harden, best: a folder that pnb-lab wrote
   BASE      harden, best: the network to start from; default pretrained/none
   DISTANCE  harden: L2 norm of the random perturbations of the fourth method. It is
@@ -39,20 +38,19 @@ sweep() {
         label=orange "meshes=$MESHES" "sweep=$runs/$experiment" "$@"
 }
 
-# Print the tables of experiment $1 on the photographs $2 without the sources $3.
+# Print the tables of experiment $1.
 tables() {
-    local experiment=$1 photographs=$2 exclude=$3
+    local experiment=$1
     local folders=("$runs/$experiment"/*/)
-    printf '\n## experiment=%s: %s\n\n' "$experiment" "$photographs"
+    printf '\n## experiment=%s\n\n' "$experiment"
     local list
     list=$(IFS=, && echo "${folders[*]%/}")
-    "$python" -m scripts.compare "runs=[$list]" "photos=$photographs" "exclude=$exclude" -v
+    "$python" -m scripts.compare "runs=[$list]" -v
 }
 
 [[ -n ${DATA:-} && -n ${MESHES:-} && -n ${PHOTOS:-} ]] || usage
 python=${PYTHON:-python}
 runs=${RUNS:-runs/reproduce}
-exclude=${EXCLUDE:-[]}
 command=${1:-}
 from_network=("network=${BASE:-pretrained/none}" seed=0,1,2)
 from_network+=("photos={photographs:$PHOTOS,laboratory:${LAB:-}}")
@@ -78,7 +76,7 @@ gpu | cpu)
     for experiment in "${experiments[@]}"; do
         sweep "$experiment" augment=none,random,adversarial seed=0,1,2,3,4 "photos=$PHOTOS" \
             "train.device=$device" "$@"
-        tables "$experiment" photographs "$exclude"
+        tables "$experiment"
     done
     exit
     ;;
@@ -102,5 +100,4 @@ harden)
     sweep harden augment=random "augment.random_light.radius=${DISTANCE:-0.6}" "${from_network[@]}" "$@"
     ;;
 esac
-tables "$command" laboratory []
-tables "$command" photographs "$exclude"
+tables "$command"

@@ -427,9 +427,7 @@ class CompareSettings(Settings):
     """Settings of the command pnb-compare, which prints tables of the metrics of training runs."""
 
     runs: list[str] = setting(REQUIRED, "Runs and sweeps, or folders above them.", is_filled=True)
-    exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
     by: str = setting("source", "Groups of the tables.", choices=common.GROUPS)
-    photos: str = setting("photographs", "Name in `photos` of the scores to compare.")
 
 
 @dataclass

@@ -15,9 +15,8 @@ def run(settings: CompareSettings) -> None:
     printed, too.
     """
     runs = finished_runs([Path(run) for run in settings.runs])
-    options = (settings.exclude, settings.photos, settings.by)
     if is_verbose():
-        print(format_comparison(runs, *options))
+        print(format_comparison(runs, settings.by))
         return
-    print("\n".join(shortened(format_short_comparison(runs, *options).splitlines())))
+    print("\n".join(shortened(format_short_comparison(runs, settings.by).splitlines())))
     print(f"-v shows intervals, settings, differences and scores by {settings.by}")

@@ -23,7 +23,7 @@ from train import checkpoints, console
 from train.__main__ import main
 from train.cli import read_settings
 from train.device import Interrupted, broadcast, process_group
-from train.results.compare import format_short_comparison, format_table
+from train.results.compare import format_comparison, format_short_comparison
 from train.results.overwrite import remove_run, require_new_run
 from train.results.page import report_of
 from train.results.store import is_finished, summarize
@@ -129,7 +129,7 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, resume: 
                 run.train()
             if distributed.rank() == 0:
                 summaries = [summarize(path) for path in settings_of_runs]
-                console.debug("\n%s\n", format_table(summaries))
+                console.debug("\n%s\n", format_comparison(summaries))
                 console.info("%s\n", format_short_comparison(summaries))
                 console.info("%s", report_of([folder], folder))
         except (Interrupted, KeyboardInterrupt) as stop:

@@ -27,7 +27,7 @@ from train import checkpoints, console
 from train.__main__ import main, run_name
 from train.cli import quoted, read_settings
 from train.commands.experiment import LOG, logged_to
-from train.results.compare import format_short_comparison, format_table
+from train.results.compare import format_comparison, format_short_comparison
 from train.results.overwrite import require_new_run, require_replaceable
 from train.results.page import PAGE, report_of
 from train.results.store import is_finished, summarize
@@ -179,7 +179,7 @@ def format_sweep(folders: Sequence[Path]) -> str:
     unfinished = [folder for folder in folders if folder not in finished]
     if finished:
         runs = [summarize(folder) for folder in finished]
-        table = format_table(runs) if is_verbose() else format_short_comparison(runs)
+        table = format_comparison(runs) if is_verbose() else format_short_comparison(runs)
         # The table and the list of unfinished runs have MAX_TABLE_LINES lines together.
         max_lines = MAX_TABLE_LINES - MAX_UNFINISHED if unfinished else MAX_TABLE_LINES
         lines += shortened(table.splitlines(), max_lines)

@@ -1,4 +1,4 @@
-"""Comparison of finished training runs: tables of their accuracy, scores, gains and seconds.
+"""Comparison of finished training runs: tables of their accuracy, scores and gains.
 
 A method is a way to train a network. Runs that differ only in their seed are
 runs of the same method. An `Evaluation` holds the predictions of one run for one
@@ -7,23 +7,18 @@ interval.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from statistics import fmean, stdev
 from typing import NamedTuple
 
-from augment.augmentation_settings import MODES
-from renderer.errors import InputError
 from train.results import store
 from train.results.intervals import Jackknife, change
-from train.results.metrics import COUNTED_EACH, METRICS, TOP_RANKS, Pool, Pooled, metric_title
-from train.results.predictions import CONTACT_SHEET, PREDICTIONS
+from train.results.metrics import COUNTED_EACH, METRICS, Pool, Pooled, metric_title
+from train.results.predictions import PREDICTIONS
 from train.results.store import INITIAL, Methods, RunSummary, Scored, ScoredRun
 from train.results.tables import Estimate, Table, describe_intervals, format_interval
-from train.run_folder import PHASES
-from train.settings import PHOTOGRAPHS, UNLABELED, in_words
+from train.settings import PHOTOGRAPHS, UNLABELED
 
-# `class_table` has no rows if there are more classes than this.
-MAX_CLASSES = 30
 # Titles of the columns of tables that have a column for each metric in `METRICS`.
 TITLES = [metric_title(name) for name in METRICS]
 # Metrics in the table that commands print without --verbose.
@@ -43,12 +38,13 @@ class Subset(NamedTuple):
     by: str = "all"
     name: str = ""
 
-    def title(self, overall: str = "all") -> str:
-        """Return the title of the row of this subset in a table."""
-        return {"all": overall, "label": f"label={self.name}"}.get(self.by, self.name)
+    @property
+    def title(self) -> str:
+        """Title of the row of this subset in a table."""
+        return {"all": "all", "label": f"label={self.name}"}.get(self.by, self.name)
 
 
-# All images, except those of sources that the user excludes.
+# All images.
 ALL = Subset()
 
 
@@ -103,26 +99,16 @@ def group_by_images(methods: Methods) -> dict[str, Scored]:
     return titled
 
 
-def read_evaluations(group: Scored, exclude: Sequence[str] = ()) -> Evaluations:
+def read_evaluations(group: Scored) -> Evaluations:
     """Read the predictions of runs that were scored on the same images.
 
-    A published network has no file of predictions, and is left out. Images of the sources in
-    `exclude` are in no subset but that of their source.
+    A published network has no file of predictions, and is left out.
     """
     methods: dict[str, list[Evaluation]] = {}
     for method, scored_runs in group.items():
         for scored in sorted(scored_runs, key=lambda item: item.run.seed or 0):
-            if not (scored.folder / PREDICTIONS).is_file():
-                continue
-            pooled = scored.pooled(exclude)
-            sources = {*pooled.predictions.source}
-            unknown = {*exclude} - sources
-            if unknown:
-                known = ", ".join(sorted(filter(None, sources)))
-                raise InputError(
-                    f"exclude: no photograph is of source {min(unknown)!r}: choose among {known}"
-                )
-            methods.setdefault(method, []).append(Evaluation(scored.run, pooled))
+            if (scored.folder / PREDICTIONS).is_file():
+                methods.setdefault(method, []).append(Evaluation(scored.run, scored.pooled()))
     return methods
 
 
@@ -146,14 +132,8 @@ def _mean(estimates: Iterable[Estimate | None]) -> Estimate | None:
     return Estimate(fmean(values), min(values), max(values), over)
 
 
-def group_table(methods: Evaluations, overall: str = "all", by: str = "source") -> Table:
+def group_table(methods: Evaluations, by: str) -> Table:
     """Make a table of the metrics, means over seeds, of each method on each subset of images."""
-    for method, evaluations in methods.items():
-        if by == "mesh" and not all(evaluation.pooled.by_mesh for evaluation in evaluations):
-            raise InputError(
-                f"by=mesh needs the mesh of each photograph, but the photographs of {method} have "
-                "none: leave by=mesh out"
-            )
     every_evaluation = [item for evaluations in methods.values() for item in evaluations]
     # A dictionary has each subset once, in order.
     subsets = dict.fromkeys(subset for item in every_evaluation for subset in item.rows(by))
@@ -163,7 +143,7 @@ def group_table(methods: Evaluations, overall: str = "all", by: str = "source") 
         for method, evaluations in methods.items():
             metrics = [mean_metric(evaluations, subset, name) for name in METRICS]
             shown += metrics
-            rows.append([subset.title(overall), method, *map(format_interval, metrics)])
+            rows.append([subset.title, method, *map(format_interval, metrics)])
     return Table(f"by {by}, {describe_intervals(shown)}", [by, "network", *TITLES], rows)
 
 
@@ -183,30 +163,6 @@ def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
     ]
     trained = [method for method, run in first_runs.items() if run.mode != INITIAL]
     return pairs + [(method, trained[0]) for method in trained[1:]]
-
-
-def class_table(methods: Evaluations) -> Table:
-    """Make a table of the top-1 and top-5 accuracy for the images of each class.
-
-    The accuracies are among all classes of the network. The table has no rows if the networks have
-    one such class, or more than MAX_CLASSES.
-    """
-    image_counts = {
-        name: len(pool.classified)
-        for evaluations in methods.values()
-        for name, pool in evaluations[0].pooled.by_class.items()
-        if len(pool.classified)
-    }
-    rows: list[list[str]] = []
-    if 1 < len(image_counts) <= MAX_CLASSES:
-        for name, image_count in image_counts.items():
-            for method, evaluations in methods.items():
-                subset = Subset("class", name)
-                metrics = (mean_metric(evaluations, subset, metric) for metric in TOP_RANKS)
-                cells = map(format_interval, metrics)
-                rows.append([in_words(name), str(image_count), method, *cells])
-    header = ["class", "images", "network", "top-1", "top-5"]
-    return Table("by class, among all classes of the network", header, rows)
 
 
 @dataclass(frozen=True)
@@ -261,70 +217,48 @@ def _seeds(evaluations: Sequence[Evaluation]) -> list[int]:
     return [item.run.seed or 0 for item in evaluations]
 
 
-def difference_tables(
-    methods: Evaluations, overall: str = "all", by: str = "source", overall_only: bool = False
-) -> list[Table]:
+def difference_table(methods: Evaluations, *properties: str) -> Table:
     """Make a table of the differences of the metrics for each pair of methods.
 
-    With `overall_only`, the rows are all images, and all images for each positive class.
+    The rows are all images, those of each positive class, and subsets by other properties.
     """
-    tables = []
+    rows = []
+    shown: list[Difference | None] = []
     for method, base in choose_pairs(methods):
         evaluations, reference = methods[method], methods[base]
-        rows = []
-        shown: list[Difference | None] = []
-        for subset in reference[0].rows(*([] if overall_only else [by])):
+        paired = ", paired" if _seeds(evaluations) == _seeds(reference) else ""
+        counts = f"{len(evaluations)} and {len(reference)} seeds{paired}"
+        for subset in reference[0].rows(*properties):
             differences = [difference(evaluations, reference, subset, name) for name in METRICS]
             shown += differences
             cells = [format_interval(item, sign="+") for item in differences]
-            rows.append([subset.title(overall), *cells])
-        paired = ", paired" if _seeds(evaluations) == _seeds(reference) else ""
-        counts = f"{len(evaluations)} and {len(reference)} seeds{paired}"
-        title = f"{method} minus {base} ({counts}), {describe_intervals(shown)}"
-        tables.append(Table(title, [by, *TITLES], rows))
-    return tables
+            rows.append([f"{method} minus {base} ({counts})", subset.title, *cells])
+    title = f"differences on the same images, {describe_intervals(shown)}"
+    return Table(title, ["networks", "images", *TITLES], rows)
 
 
-def overall_differences(methods: Evaluations) -> Table:
-    """Make one table of the differences between methods on the images of all sources."""
-    rows = []
-    for table in difference_tables(methods, overall="", overall_only=True):
-        for name, *cells in table.rows:
-            title = f"{table.title}, {name}" if name else table.title
-            rows.append([title, *cells])
-    return Table("differences on the same images", ["networks", *TITLES], rows)
-
-
-def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:
-    """Make tables of the accuracy, the scores and the settings of runs."""
-    tables = [_accuracy_table(methods)]
-    tables += [score_table(title, group) for title, group in groups.items()]
-    # The first run of each method. Networks without a run have no settings of a training.
-    heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
-    varied = store.varied_settings([*heads.values()])
-    if varied:
-        rows = [
-            [method, *(str(head.settings.get(key)) for key in varied)]
-            for method, head in heads.items()
-        ]
-        header = ["network", *varied.values()]
-        tables.append(Table("settings in which the methods differ", header, rows))
-    return tables
-
-
-def _accuracy_table(methods: Methods) -> Table:
-    """Make a table of the accuracy of each run on the test images."""
+def run_tables(methods: Methods) -> list[Table]:
+    """Make tables of the accuracy and the settings of runs."""
     every_run = [run for runs in methods.values() for run in runs]
-    lines: dict[str, list[Line]] = {}
-    for method, runs in methods.items():
-        for run in runs if runs[0].accuracy is not None else ():
-            last = run.scores.get("test/accuracy_last")
-            line = (run.seed, [Estimate(run.accuracy), Estimate(last)])
-            lines.setdefault(method, []).append(line)
+    lines: dict[str, list[Line]] = {
+        method: [(run.seed, [Estimate(run.accuracy)]) for run in runs]
+        for method, runs in methods.items()
+        if runs[0].accuracy is not None
+    }
     # A dictionary has each name once, in the order of the runs.
     names = dict.fromkeys(run.config.get("test_images", "") for run in every_run)
     title = " or ".join(f"accuracy on {name}" for name in names if name)
-    return _run_table(title, [_accuracy_title(every_run), "of the last epoch"], lines)
+    tables = [_run_table(title, [_accuracy_title(every_run)], lines)]
+    # The first run of each method. Networks without a run have no settings of a training.
+    heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
+    varied = store.varied_settings([*heads.values()])
+    rows = [
+        [method, *(str(head.settings.get(key)) for key in varied)]
+        for method, head in heads.items()
+        if varied
+    ]
+    header = ["network", *varied.values()]
+    return [*tables, Table("settings in which the methods differ", header, rows)]
 
 
 def _accuracy_title(runs: Sequence[RunSummary]) -> str:
@@ -353,24 +287,6 @@ def score_table(title: str, group: Scored) -> Table:
     return _run_table(title, TITLES, lines)
 
 
-def seconds_table(methods: Methods) -> Table:
-    """Make a table of the seconds that an epoch of the first run of each method takes, by phase."""
-    titles = {phase: phase.replace("_", " and ") for phase in PHASES}
-    titles["attack_classifier"] = "attack: in the classifier"
-    titles["operators"] = "operators, once"
-    rows = []
-    for method, (run, *_) in methods.items():
-        means = {}
-        for phase in titles:
-            name = f"seconds/{phase}"
-            seconds = [line[name] for line in run.epochs if name in line]
-            means[phase] = fmean(seconds) if seconds else 0.0
-        total = sum(means[phase] for phase in PHASES)
-        if any(means.values()):
-            rows.append([method, *(f"{mean:.2f}" for mean in (total, *means.values()))])
-    return Table("seconds per epoch", ["network", "all", *titles.values()], rows)
-
-
 # A row of a table: the seed of a run, and the metric of each column.
 Line = tuple[int | None, Sequence[Estimate | None]]
 
@@ -397,110 +313,43 @@ def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[L
     return Table(title, ["network", "seed", *header], rows)
 
 
-def format_table(runs: Sequence[RunSummary]) -> str:
-    """Compare runs in the tables that pnb-train --verbose prints after training."""
+def format_comparison(runs: Sequence[RunSummary], by: str = "source") -> str:
+    """Compare runs in the tables that pnb-train and pnb-compare print with --verbose."""
     methods = store.group_by_method(runs)
-    groups = group_by_images(methods)
-    tables = run_tables(methods, groups)
-    tables += [overall_differences(read_evaluations(group)) for group in groups.values()]
-    used_modes = {run.mode for run in runs}
-    captions = [f"{mode}: {caption}" for mode, caption in MODES.items() if mode in used_modes]
-    sheets = [
-        f"image: {run.folder / name / CONTACT_SHEET}" for run in runs for name in run.photographs
-    ]
-    parts = [_format_tables(tables), "; ".join(captions), "\n".join(sheets)]
-    return "\n\n".join(part for part in parts if part)
-
-
-def _format_tables(tables: Sequence[Table]) -> str:
-    """Write tables as Markdown, without empty tables and columns of unknown values."""
+    tables = run_tables(methods)
+    for title, group in group_by_images(methods).items():
+        tables.append(score_table(title, group))
+        evaluations = read_evaluations(group)
+        for table in (group_table(evaluations, by), difference_table(evaluations, by)):
+            tables.append(replace(table, title=f"{title.partition(':')[0]}: {table.title}"))
     return "\n\n".join(str(table.without_unknown_columns) for table in tables if table.rows)
 
 
-def format_comparison(
-    runs: Sequence[RunSummary],
-    exclude: Sequence[str],
-    photographs: str = PHOTOGRAPHS,
-    by: str = "source",
-) -> str:
-    """Compare runs in the tables that pnb-compare --verbose prints."""
-    methods = store.group_by_method(runs)
-    groups = group_by_images(methods)
-    tables = run_tables(methods, groups)
-    title = _find_group(groups, photographs)
-    if title:
-        evaluations = read_evaluations(groups[title], exclude)
-        overall = _title_of_all(exclude)
-        tables.append(group_table(evaluations, overall, by))
-        tables += difference_tables(evaluations, overall, by)
-    return _format_tables([*tables, seconds_table(methods)])
-
-
-def format_short_comparison(
-    runs: Sequence[RunSummary],
-    exclude: Sequence[str] = (),
-    photographs: str = PHOTOGRAPHS,
-    by: str = "source",
-) -> str:
+def format_short_comparison(runs: Sequence[RunSummary], by: str = "source") -> str:
     """Compare runs in one table, which pnb-train and pnb-compare print without --verbose.
 
-    Without the usual sub-folder "photographs", the first photographs of the runs are compared. The
-    gain in AUC is over the first method.
+    It is about the images on which most methods were scored, and of several such images, about
+    the usual sub-folder "photographs" of the runs. The gain in AUC is over the first method.
     """
     methods = store.group_by_method(runs)
     groups = group_by_images(methods)
-    title = _find_group(groups, photographs)
+    title = max(
+        groups, key=lambda name: (len(groups[name]), name.startswith(PHOTOGRAPHS)), default=""
+    )
     group = groups.get(title, {})
-    evaluations = read_evaluations(group, exclude)
+    evaluations = read_evaluations(group)
     if by != "source" and evaluations:
-        return str(group_table(evaluations, _title_of_all(exclude), by).without_unknown_columns)
+        return str(group_table(evaluations, by).without_unknown_columns)
     first = next(iter(evaluations), None)
     rows = []
     for method, runs_of_method in methods.items():
-        evaluated = evaluations.get(method, ())
         shown = [_mean(Estimate(run.accuracy) for run in runs_of_method)]
         for name in SHORT_METRICS:
-            if evaluated or exclude:
-                shown.append(mean_metric(evaluated, ALL, name))
-            else:
-                # A published network has stored metrics, but no predictions.
-                stored = (scored.scores.overall.find(name) for scored in group.get(method, ()))
-                shown.append(_mean(stored))
+            shown.append(_mean(item.scores.overall.find(name) for item in group.get(method, ())))
         gain = None
-        if first is not None and evaluated and method != first:
-            gain = difference(evaluated, evaluations[first], ALL, "auc")
+        if first is not None and method in evaluations and method != first:
+            gain = difference(evaluations[method], evaluations[first], ALL, "auc")
         values = [format_interval(item and Estimate(item.value)) for item in shown]
         rows.append([method, len(runs_of_method), *values, format_interval(gain, sign="+")])
     header = ["network", "runs", _accuracy_title(runs), *map(metric_title, SHORT_METRICS)]
     return str(Table(title, [*header, "gain in AUC [95%]"], rows).without_unknown_columns)
-
-
-def _title_of_all(exclude: Sequence[str]) -> str:
-    """Return the title of the row of all images: "all", or "all but A, B" without these sources."""
-    return f"all but {', '.join(exclude)}" if exclude else "all"
-
-
-def _find_group(groups: Mapping[str, Scored], photographs: str) -> str:
-    """Find the title of the runs whose scores lie in a sub-folder of a given name.
-
-    A published or evaluated network has no such sub-folder: its scores are compared with those in
-    any. Without the usual sub-folder "photographs", it is the first group, or "" if there is none.
-    """
-    found = {}
-    for title, group in groups.items():
-        members = [scored for scored_runs in group.values() for scored in scored_runs]
-        lone = [item for item in members if item.run.seed is None and item.run.mode != INITIAL]
-        if lone or any(item.name == photographs for item in members):
-            found[title] = members[0].folder
-    if len(found) > 1:
-        first, second, *_ = found.values()
-        raise InputError(
-            f"{second} has other photographs or sources than {first}: "
-            "score both networks on the same folder with pnb-evaluate"
-        )
-    if not found and photographs != PHOTOGRAPHS:
-        raise InputError(
-            f"photos={photographs}: no run has a sub-folder of this name with scores: "
-            "give a name in the setting photos of the runs"
-        )
-    return next(iter(found or groups), "")

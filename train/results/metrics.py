@@ -5,7 +5,7 @@ pools of one evaluation: of all images, and of each label, source, mesh and clas
 name of a positive class. An image is a positive if it shows this class, and otherwise a negative.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
 from typing import Any
@@ -332,21 +332,17 @@ class Pooled(ShortRepr):
 
     Attributes:
         predictions: Predictions for one or several labels.
-        exclude: Names of sources that are left out of all groups except
-            `by_source`.
         thresholds: Threshold on the log-odds of each label. If it is empty, the
             metrics in `AT_THRESHOLD` are None.
     """
 
     predictions: Predictions
-    exclude: Sequence[str] = ()
     thresholds: Thresholds = field(default_factory=dict)
 
     @cached_property
     def all(self) -> Pool:
-        """Predictions that are scored together: all, except those of excluded sources."""
-        is_excluded = [source in self.exclude for source in self.predictions.source]
-        return Pool(self.predictions[~np.array(is_excluded, bool)], self.thresholds)
+        """All predictions, which are scored together."""
+        return Pool(self.predictions, self.thresholds)
 
     def groups(self, by: str) -> dict[str, Pool]:
         """Groups by a property: "label", "source", "mesh" or "class". "all" is one group, ""."""
@@ -355,14 +351,12 @@ class Pooled(ShortRepr):
     @cached_property
     def by_label(self) -> dict[str, Pool]:
         """For each label, its predictions, which are scored together."""
-        groups = group_rows(self.all.predictions, self.all.predictions.label)
+        groups = group_rows(self.predictions, self.predictions.label)
         return {label: Pool(group, self.thresholds) for label, group in groups.items()}
 
     @cached_property
     def by_source(self) -> dict[str, Pool]:
         """For each source, the predictions for its images, which are scored together.
-
-        Excluded sources are included here.
 
         The ROC curve compares the positives of a source with its negatives. A
         positive can name other sources in its `hard_negatives`. The negatives
@@ -388,12 +382,12 @@ class Pooled(ShortRepr):
     @cached_property
     def by_mesh(self) -> dict[str, Pool]:
         """For each known mesh, the predictions for its images, which are scored together."""
-        return self._by_content([item.mesh for item in self.all.predictions.photograph])
+        return self._by_content([item.mesh for item in self.predictions.photograph])
 
     @cached_property
     def by_class(self) -> dict[str, Pool]:
         """For each class, the predictions for its images, which are scored together."""
-        return self._by_content(self.all.predictions.shown)
+        return self._by_content(self.predictions.shown)
 
     def _by_content(self, names: Iterable[Any]) -> dict[str, Pool]:
         """Collect the predictions for the images of each mesh, or of each class.
@@ -402,7 +396,7 @@ class Pooled(ShortRepr):
         mesh all positives with its images. The same holds for classes.
         """
         pools = {}
-        for name, group in group_rows(self.all.predictions, names).items():
+        for name, group in group_rows(self.predictions, names).items():
             positives = group[group.positive]
             # Images of positive classes are left out. With the labels orange and lemon,
             # an image of an orange is also a negative for lemon, so oranges would be

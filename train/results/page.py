@@ -34,6 +34,8 @@ PAGE = "report.html"
 MAX_METHODS = 6
 # Largest number of runs of a method, with different seeds, in plots and comparisons.
 MAX_SEEDS = 5
+# Largest number of sources or classes of images in a table.
+MAX_GROUPS = 30
 # Largest number of unfinished runs in plots.
 MAX_UNFINISHED = 3
 # Largest number of attacks for which the page shows images.
@@ -52,7 +54,7 @@ SHEET_WIDTH = 1100
 BLOCKS = (
     *("screen", "networks", "recommendation", "lead", "attacks", "slider", "charts", "detections"),
     *("photographs", "methods", "unfinished", "curves", "relit", "renders", "examples", "worst"),
-    *("seconds", "configs", "shown"),
+    *("configs", "shown"),
 )
 # Titles of the plots of metrics by epoch.
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
@@ -81,11 +83,10 @@ def write_report(
         title=_title(found, methods),
         screen=screen,
         lead=[sentence for item in methods.items() for sentence in _accuracy_sentences(*item)],
-        tables=[table for table in compare.run_tables(methods, {}) if table.rows],
+        tables=[table for table in compare.run_tables(methods) if table.rows],
         captions=MODES,
         unfinished=[[str(run.folder), run.state, len(run.epochs)] for run in found.unfinished],
         curves=_plot_metrics(shown, found.unfinished),
-        seconds=compare.seconds_table(shown),
         photographs=[scores_section(title, group) for title, group in groups.items()],
         renders={method: _read_renders(run, "epoch", "Renders") for method, run in first.items()},
         examples={
@@ -357,10 +358,12 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
                 }
                 positive_classes = " or ".join(next(iter(pools.values()))[0].predictions.labels)
                 rocs.append(plot_roc(scores, f"{positive_classes}, {title.partition(':')[0]}"))
-            shown.append(compare.overall_differences(evaluations))
-            if len(first_evaluation.rows("source")) > 1:
-                shown.append(compare.group_table(evaluations))
-            shown.append(compare.class_table(evaluations))
+            shown.append(compare.difference_table(evaluations))
+            shown += [
+                compare.group_table(evaluations, by)
+                for by in ("source", "class")
+                if 1 < len(first_evaluation.pooled.groups(by)) <= MAX_GROUPS
+            ]
     except InputError as error:
         problem = str(error)
     return {

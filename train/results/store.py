@@ -152,23 +152,19 @@ class ScoredRun(NamedTuple):
         """Path of this sub-folder."""
         return self.run.folder / self.name
 
-    def pooled(self, exclude: Sequence[str] = ()) -> Pooled:
-        """Read the predictions, which are scored together without those of some sources."""
+    def pooled(self) -> Pooled:
+        """Read the predictions."""
         path = self.folder / PREDICTIONS
         labels, thresholds = tuple(self.scores.labels), tuple(self.scores.thresholds.items())
-        return _pool(path, path.stat().st_mtime_ns, labels, tuple(exclude), thresholds)
+        return _pool(path, path.stat().st_mtime_ns, labels, thresholds)
 
 
 @lru_cache(maxsize=64)
 def _pool(
-    path: Path,
-    modified: int,
-    labels: tuple[str, ...],
-    exclude: tuple[str, ...],
-    thresholds: tuple[tuple[str, float], ...],
+    path: Path, modified: int, labels: tuple[str, ...], thresholds: tuple[tuple[str, float], ...]
 ) -> Pooled:
     """Read predictions.csv once at a time of modification, for all tables and pages."""
-    return Pooled(read_predictions(path, labels), exclude, dict(thresholds))
+    return Pooled(read_predictions(path, labels), dict(thresholds))
 
 
 # The runs of each method with their scores on the same images.

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from renderer.errors import InputError
 from tests.train.helpers import read_markdown
 from train.data.photo import Photograph
 from train.results.compare import (
-    class_table,
     format_comparison,
     format_short_comparison,
-    format_table,
+    group_table,
     read_evaluations,
 )
 from train.results.metrics import Pool
@@ -73,23 +71,28 @@ def scored_run(tmp_path, made_up_run, monkeypatch) -> Callable[..., Path]:
     return make
 
 
-def compare(folders: list[Path], exclude=(), **options) -> dict[str, list[list[str]]]:
+def compare(folders: list[Path]) -> dict[str, list[list[str]]]:
     """Read the tables that compare the runs in some folders, by the title before the intervals."""
-    summaries = [summarize(folder) for folder in folders]
-    tables = read_markdown(format_comparison(summaries, exclude, **options))
+    tables = read_markdown(format_comparison([summarize(folder) for folder in folders]))
     return {title.partition(", 95%")[0]: rows for title, rows in tables.items()}
+
+
+def differences(folders: list[Path], name: str = "photographs") -> dict[str, list[list[str]]]:
+    """Read the differences on a folder of photographs by the pair of methods, without the pair."""
+    _, *rows = compare(folders)[f"{name}: differences on the same images"]
+    return {pair: [row[1:] for row in rows if row[0] == pair] for pair, *_ in rows}
 
 
 @pytest.fixture
 def compared_sources(scored_run, made_up_run, tmp_path) -> dict[str, list[list[str]]]:
-    """Compare two scored runs and one without scores, with the studio left out of the total."""
+    """Compare two scored runs and one without scores."""
     better_on_web = STUDIO_AND_WEB | {"web": ([4, 4, 4, -1, -1], [-2, 3])}
     folders = [
         scored_run("none", STUDIO_AND_WEB),
         scored_run("adversarial", better_on_web, "seed=1"),
         made_up_run(tmp_path / "without_scores", "random"),
     ]
-    return compare(folders, ["studio"])
+    return compare(folders)
 
 
 def test_a_report_has_top_1_by_class_of_each_network(scored_run):
@@ -102,56 +105,37 @@ def test_a_report_has_top_1_by_class_of_each_network(scored_run):
         folder = scored_run(method, STUDIO_AND_WEB)
         write_predictions(folder / "photographs" / "predictions.csv", with_pears(correct))
         group[method] = [ScoredRun(summarize(folder), "photographs")]
-    rows = class_table(read_evaluations(group)).rows
-    assert [row[:3] for row in rows] == [
-        ["orange", "11", "none"],
-        ["orange", "11", "random"],
-        ["pear", "10", "none"],
-        ["pear", "10", "random"],
-    ]
-    assert [row[3].partition(" ")[0] for row in rows] == ["0.545", "0.545", "0.300", "0.700"]
+    table = group_table(read_evaluations(group), "class")
+    column = table.header.index("top-1, mean over classes")
+    shown = {(row[0], row[1]): row[column].partition(" ")[0] for row in table.rows}
+    del shown["all", "none"], shown["all", "random"]
+    assert shown == {
+        ("orange", "none"): "0.545",
+        ("orange", "random"): "0.545",
+        ("pear", "none"): "0.300",
+        ("pear", "random"): "0.700",
+        ("other_lime", "none"): "-",
+        ("other_lime", "random"): "-",
+    }
 
 
-def test_a_comparison_shows_every_source_and_the_total_without_an_excluded_one(compared_sources):
-    assert "adversarial minus none (1 and 1 seeds)" in compared_sources  # The seeds make no pairs.
-    _, *rows = compared_sources["by source"]
+def test_a_comparison_shows_every_source_and_the_total(compared_sources):
+    _, first, *_ = compared_sources["photographs: differences on the same images"]
+    assert first[0] == "adversarial minus none (1 and 1 seeds)"  # The seeds make no pairs.
+    _, *rows = compared_sources["photographs: by source"]
     assert [row[:2] for row in rows] == [
-        ["all but studio", "none"],
-        ["all but studio", "adversarial"],
+        ["all", "none"],
+        ["all", "adversarial"],
         ["studio", "none"],
         ["studio", "adversarial"],
         ["web", "none"],
         ["web", "adversarial"],
     ]
     recalls = [row[2].partition(" ")[0] for row in rows]
-    assert recalls == ["0.286", "0.571", "1.000", "1.000", "0.200", "0.600"]
+    assert recalls == ["0.545", "0.727", "1.000", "1.000", "0.200", "0.600"]
     # The studio has nothing to rank oranges against.
     aucs = [row[4].partition(" ")[0] for row in rows]
-    assert aucs == ["0.500", "0.714", "-", "-", "0.500", "0.800"]
-
-
-def test_a_comparison_shows_the_mean_seconds_of_the_phases_of_an_epoch(compared_sources):
-    _, first, *_ = compared_sources["seconds per epoch"]
-    assert first == ["none", "7.50", "0.75", "4.50", "1.50", "0.75", "0.38", "7.00"]
-
-
-class TestAnotherFolderOfPhotographs:
-    @pytest.fixture
-    def folders(self, scored_run) -> list[Path]:
-        return [scored_run(method, STUDIO_AND_WEB, name="lab") for method in ("none", "random")]
-
-    def test_is_compared_by_its_name_or_if_it_is_the_only_one(self, folders):
-        title = "random minus none (1 and 1 seeds, paired)"
-        assert title in compare(folders, photographs="lab")
-        assert title in compare(folders)
-
-    def test_is_refused_if_no_run_has_it(self, folders):
-        with pytest.raises(InputError, match=r"^photos=lib: no run has"):
-            compare(folders, photographs="lib")
-
-    def test_excludes_only_sources_that_it_has(self, folders):
-        with pytest.raises(InputError, match=r"exclude: .*'stdio'.* studio, web"):
-            compare(folders, ["stdio"], photographs="lab")
+    assert aucs == ["0.500", "0.636", "-", "-", "0.500", "0.800"]
 
 
 @pytest.fixture
@@ -169,10 +153,10 @@ def test_only_scores_on_the_same_images_share_a_plot_and_a_table(runs_on_two_set
     assert plots == ["none 0.250, random 0.750", "adversarial 1.000"]
     assert re.findall(r"(\w+) minus (\w+)", text) == [("random", "none")]
     assert text.count("the network “none” recognizes") == 1
-    text = format_table([summarize(folder) for folder in runs_on_two_sets])
+    text = format_comparison([summarize(folder) for folder in runs_on_two_sets])
     methods = []
     for title, (_, *rows) in read_markdown(text).items():
-        if title.startswith("photographs"):
+        if title.startswith("photographs: ") and " images of orange" in title:
             methods.append([row[0] for row in rows])
     assert methods == [["none", "random"], ["adversarial"]]
 
@@ -212,7 +196,8 @@ class TestAHardenedNetwork:
         tables = compare(hardened)
         _, *rows = tables[""]
         assert [row[0].startswith("the initial network") for row in rows].count(True) == 2
-        pairs = [title.partition(" (")[0] for title in tables if "minus the initial" in title]
+        found = differences(hardened)
+        pairs = [pair.partition(" (")[0] for pair in found if "minus the initial" in pair]
         assert len(pairs) == 2
         assert all("weights=other.pth" in pair for pair in pairs if pair.startswith("adversarial"))
 
@@ -223,12 +208,8 @@ class TestAHardenedNetwork:
         assert [row[header.index("recall")] for row in rows] == ["0.250", "0.500"]
 
     def test_is_compared_with_the_network_it_started_from_and_with_the_other_run(self, hardened):
-        recall_differences = {}
-        for title, table in compare(hardened).items():
-            if "minus" in title:
-                pair = title.partition(" (")[0]
-                recall_differences[pair] = table[1][1][:6]
-        assert recall_differences == {
+        found = differences(hardened)
+        assert {pair.partition(" (")[0]: rows[0][1][:6] for pair, rows in found.items()} == {
             "random minus the initial network": "+0.250",
             "adversarial minus the initial network": "+0.750",
             "adversarial minus random": "+0.500",
@@ -242,23 +223,16 @@ class TestAHardenedNetwork:
         assert "after hardening" in format_short_comparison([summarize(hardened[1])])
         tables = compare(hardened)
         assert [row[0] for row in tables[""]].count("the initial network") == 1
-        assert "random minus the initial network (1 and 1 seeds, paired)" in tables
-        more = compare(hardened, photographs="more")
+        found = differences(hardened)
+        assert "random minus the initial network (1 and 1 seeds, paired)" in found
+        more = differences(hardened, "more")
         assert "adversarial minus the initial network (1 and 1 seeds, paired)" in more
 
     def test_is_compared_with_a_folder_of_scores(self, initial, hardened, tmp_path):
         folder = copytree(initial, tmp_path / "scores" / "base")
-        tables = compare([folder, hardened[1]])
-        first_row = tables["adversarial minus scores/base (1 and 1 seeds, paired)"][1]
-        assert first_row[1].startswith("+0.750")
-
-
-def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run):
-    first = scored_run("none", STUDIO_AND_WEB)
-    renamed = STUDIO_AND_WEB | {"wob": STUDIO_AND_WEB["web"], "web": ((), ())}
-    second = scored_run("random", renamed)
-    with pytest.raises(InputError, match=f"{second}/photographs has other .* than {first}"):
-        compare([first, second])
+        found = differences([folder, hardened[1]])
+        ((_, recall, *_), *_) = found["adversarial minus scores/base (1 and 1 seeds, paired)"]
+        assert recall.startswith("+0.750")
 
 
 def test_a_difference_of_three_seeds_is_that_of_their_means_and_paired(scored_run):
@@ -275,8 +249,7 @@ def test_a_difference_of_three_seeds_is_that_of_their_means_and_paired(scored_ru
         for seed in range(3):
             scores = {"web": (oranges[row, seed], others[row, seed])}
             folders.append(scored_run(method, scores, f"seed={seed}"))
-    header, total, web = compare(folders)["random minus none (3 and 3 seeds, paired)"]
-    assert header[:4] == ["source", "recall", "FPR", "AUC"]
+    total, web = differences(folders)["random minus none (3 and 3 seeds, paired)"]
     assert web[0] == "web"
     assert total == ["all", *web[1:]]
     # No two scores are equal.

@@ -158,7 +158,7 @@ def test_each_predictions_csv_is_parsed_once_for_tables_and_the_report(
     monkeypatch.setattr(csv, "DictReader", lambda file: parsed.append(file.name) or reader(file))
     folder = shutil.copytree(finished, tmp_path / "run")
     for _ in range(2):
-        format_comparison([summarize(folder)], [])
+        format_comparison([summarize(folder)])
         report_of([folder], tmp_path)
     tables = sorted(str(path) for path in folder.rglob("predictions.csv"))
     assert tables

@@ -7,7 +7,7 @@ import pytest
 
 from renderer.errors import InputError
 from tests.train.helpers import read_markdown
-from train.results.compare import format_table
+from train.results.compare import format_comparison
 from train.results.store import finished_runs, summarize
 from train.results.tables import format_interval, fraction
 
@@ -69,7 +69,7 @@ def tables(tmp_path, made_up_run) -> dict[str, list[list[str]]]:
         }
         folder = made_up_run(tmp_path / str(hits), "random", {"lab": summary}, *overrides)
         runs.append(summarize(folder))
-    return read_markdown(format_table(runs))
+    return read_markdown(format_comparison(runs))
 
 
 def test_seeds_are_rows_above_their_mean_and_standard_deviation(tables):
@@ -100,7 +100,7 @@ def test_scores_of_a_run_are_read_and_compared_without_torch(tables, tmp_path):
         "from train.results.compare import format_comparison, format_short_comparison\n"
         "from train.results.store import finished_runs\n"
         "runs = finished_runs([Path(sys.argv[1])])\n"
-        "assert len(format_short_comparison(runs)) < len(format_comparison(runs, []))\n"
+        "assert len(format_short_comparison(runs)) < len(format_comparison(runs))\n"
         "assert not {'torch', 'augment.attacks'} & {*sys.modules}"
     )
     subprocess.run([sys.executable, "-c", program, tmp_path], check=True, cwd=os.getcwd())
