@@ -155,10 +155,11 @@ def test(network: nn.Module, images: Tensor, targets: list[dict[str, Tensor]]) -
         Marked(item["boxes"].numpy(), item["labels"].numpy(), item["labels"].numpy() < 0)
         for item in targets
     ]
-    matches = match_images(found, marked, range(1, len(CLASSES)))
-    named = {CLASSES[label]: [item] for label, item in matches.items()}
-    scored = {"all": [*matches.values()], **named}
-    return {name: asdict(score(items, nb.Detection().threshold)) for name, items in scored.items()}
+    matches = match_images(found, marked)
+    every = range(1, len(CLASSES))
+    scored = {"all": [*every], **{CLASSES[label]: [label] for label in every}}
+    threshold = nb.Detection().threshold
+    return {name: asdict(score(matches, of, threshold)) for name, of in scored.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

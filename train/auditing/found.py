@@ -115,8 +115,9 @@ def find_in_lights(
     for title, numbered in groups.items():
         units, pairs = np.array([unit for unit, _ in numbered]), [pair for _, pair in numbered]
         if isinstance(task, Detection):
-            at_iou, at_half = ([_match(pairs, label, iou)] for iou in (task.iou, 0.5))
-            scores = detections.score(at_iou, task.threshold, at_half, units, over=VIEWS)
+            at_iou, at_half = (_match(pairs, iou) for iou in (task.iou, 0.5))
+            measured = at_iou, [label], task.threshold, at_half, units
+            scores = detections.score(*measured, over=VIEWS)
             metrics[title] = asdict(scores)
         else:
             miou, _ = detections.mean_iou(pairs, 2, units, VIEWS)
@@ -125,13 +126,13 @@ def find_in_lights(
         return {"metrics": metrics, "curve": []}
     not_attacked = ("plain light", "environments", "random light")
     every = [pair for title in not_attacked for _, pair in groups.get(title, [])]
-    return {"metrics": metrics, "curve": _curve(_match(every, label, task.iou))}
+    return {"metrics": metrics, "curve": _curve(_match(every, task.iou).of([label]))}
 
 
-def _match(pairs: Sequence[tuple[Found, Marked]], label: int, iou: float) -> Matches:
-    """Match the detections of one class."""
+def _match(pairs: Sequence[tuple[Found, Marked]], iou: float) -> Matches:
+    """Match the detections in all views."""
     found, marked = zip(*pairs, strict=True)
-    return detections.match_images(found, marked, [label], iou)[label]
+    return detections.match_images(found, marked, iou)
 
 
 def _curve(matches: Matches) -> list[tuple[float, ...]]:

@@ -304,34 +304,17 @@ class AuditedNetwork:
         return faults
 
     @property
-    def withstood(self) -> str:
-        """Sentence that names the kinds of lighting by which no attack succeeds.
-
-        Empty if attacks with each kind succeed, or if no view is recognized before them.
-        """
-        kinds = [kind for kind, part in self._lost.items() if not part]
-        titles = tables.join_words([KINDS[kind].title for kind in kinds], "or") if kinds else ""
-        return f"No attack on {self.name} succeeded with {titles}." if kinds else ""
-
-    @property
     def strongest_kind(self) -> str | None:
         """Kind of lighting by which the most views become misclassified.
 
         None if no view is recognized before the attacks.
         """
-        return max(self._lost, key=lambda kind: self._lost[kind], default=None)
-
-    @property
-    def _lost(self) -> dict[str, float]:
-        """Fraction of the views that attacks of the largest radius lose, by the kind of lighting.
-
-        A kind without a view that is recognized before the attack is left out.
-        """
-        return {
+        lost = {
             kind: counts["adversarial"][-1] / counts["correct"]
             for kind, counts in self.counts.items()
             if counts["correct"]
         }
+        return max(lost, key=lambda kind: lost[kind], default=None)
 
     def remaining(self, kind: str, method: str) -> list[Proportion]:
         """Return the fraction of the views that stay correct, of those correct before, by radius.

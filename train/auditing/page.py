@@ -33,10 +33,10 @@ from train.results.metrics import Metrics
 from train.results.page import scores_section, write_page
 from train.results.pictures import Picture, encode_picture, plot_by_radius, read_pictures
 from train.results.predictions import SUMMARY
-from train.results.tables import Estimate, Proportion, fraction
+from train.results.tables import Estimate, fraction
 from train.run_config import CONFIG, read_config
 from train.run_folder import read_json
-from train.settings import PHOTOGRAPHS, in_words
+from train.settings import in_words
 
 # Headline of the report, by the answer to the question whether the network is safe.
 VERDICTS = {
@@ -141,7 +141,6 @@ def write_audit_page(
         worst=_worst(networks, folders) if folders else {},
         screen=screen,
         lead=[*caveats, *unreadable],
-        agreement=_agreement(networks) if PHOTOGRAPHS in folders else Proportion(),
         detections=found.sections(results, in_words(label)),
         relit=relit_sections(results),
         configs={"configuration": read_config(out / CONFIG)},
@@ -245,13 +244,6 @@ def screen_of_one(
             )
     short, _ = network.verdict
     return first_screen.FirstScreen(VERDICTS.get(short, short), sentences, numbers, [network.name])
-
-
-def _agreement(networks: Sequence[AuditedNetwork]) -> Proportion:
-    """Compute the fraction of photographs for which all networks predict the same class."""
-    first, *others = (network.predictions(PHOTOGRAPHS).predicted for network in networks)
-    is_same = [all(names) for names in zip(*(first == other for other in others), strict=True)]
-    return fraction(sum(is_same), len(is_same))
 
 
 def attack_pictures(network: AuditedNetwork) -> list[first_screen.ComparedImage]:

@@ -278,19 +278,15 @@ def _score(
     task: Detection,
 ) -> tuple[DetectionMetrics, dict[str, DetectionMetrics], dict[str, dict[str, DetectionMetrics]]]:
     """Score all classes, each class, and both for the photographs of each source."""
-    matches = [
-        detections.match_images(found, marked, [*labels.values()], iou) for iou in (task.iou, 0.5)
-    ]
+    matches = [detections.match_images(found, marked, iou) for iou in (task.iou, 0.5)]
     groups = {ALL: [*labels.values()], **{name: [label] for name, label in labels.items()}}
 
     def score(is_chosen: Bool[np.ndarray, " N"]) -> dict[str, DetectionMetrics]:
-        scores = {}
-        for name, chosen in groups.items():
-            at_iou, at_half = (
-                [of_label[label].select(is_chosen) for label in chosen] for of_label in matches
-            )
-            scores[name] = detections.score(at_iou, task.threshold, at_half)
-        return scores
+        at_iou, at_half = (item.in_images(is_chosen) for item in matches)
+        return {
+            name: detections.score(at_iou, chosen, task.threshold, at_half)
+            for name, chosen in groups.items()
+        }
 
     by_source = {}
     names = sorted({*sources})

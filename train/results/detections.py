@@ -5,7 +5,7 @@ unit. Detections are matched as the evaluation of COCO does.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -76,36 +76,51 @@ def match(found: Found, marked: Marked, iou: float) -> Int[np.ndarray, " N"]:
 
 @dataclass(frozen=True)
 class Matches:
-    """Detections and objects of one class, or of several, in a number of images.
+    """Detections and objects in a number of images.
 
     Attributes:
         image_count: Number of images.
-        image: Index of the image of each detection. The detections are in descending order.
+        label: Class of each detection. The detections are in descending order of their scores.
+        image: Index of the image of each detection.
         score: Score of each detection.
         is_right: Whether a detection is of an object.
+        object_label: Class of each object.
         object_image: Index of the image of each object.
         object_score: Score of the detection of each object. −inf without one.
     """
 
     image_count: int
+    label: Int[np.ndarray, " N"]
     image: Int[np.ndarray, " N"]
     score: Float[np.ndarray, " N"]
     is_right: Bool[np.ndarray, " N"]
+    object_label: Int[np.ndarray, " M"]
     object_image: Int[np.ndarray, " M"]
     object_score: Float[np.ndarray, " M"]
 
-    def select(self, is_chosen: Bool[np.ndarray, " image_count"]) -> "Matches":
+    def of(self, labels: Sequence[int]) -> "Matches":
+        """Return the matches of some classes."""
+        return self._choose(np.isin(self.label, labels), np.isin(self.object_label, labels))
+
+    def in_images(self, is_chosen: Bool[np.ndarray, " image_count"]) -> "Matches":
         """Return the matches in some of the images, whose indices then count these alone."""
         index = np.cumsum(is_chosen) - 1
-        rows, objects = is_chosen[self.image], is_chosen[self.object_image]
-        return Matches(
-            int(is_chosen.sum()),
-            index[self.image[rows]],
-            self.score[rows],
-            self.is_right[rows],
-            index[self.object_image[objects]],
-            self.object_score[objects],
+        chosen = self._choose(is_chosen[self.image], is_chosen[self.object_image])
+        return replace(
+            chosen,
+            image_count=int(is_chosen.sum()),
+            image=index[chosen.image],
+            object_image=index[chosen.object_image],
         )
+
+    def _choose(
+        self, is_detection: Bool[np.ndarray, " N"], is_object: Bool[np.ndarray, " M"]
+    ) -> "Matches":
+        """Choose detections and objects."""
+        detections = self.label, self.image, self.score, self.is_right
+        objects = self.object_label, self.object_image, self.object_score
+        columns = [column[is_detection] for column in detections]
+        return Matches(self.image_count, *columns, *(column[is_object] for column in objects))
 
     def recall(self, threshold: float, counts: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
         """Compute the fraction of the objects that are detected with at least a score.
@@ -141,40 +156,30 @@ class Matches:
         return float(np.append(highest, 0)[places].mean())
 
 
-def match_images(
-    found: Sequence[Found], marked: Sequence[Marked], labels: Sequence[int], iou: float = 0.5
-) -> dict[int, Matches]:
-    """Match the detections in all images, and return the matches of each class."""
-    rows = [match(*pair, iou) for pair in zip(found, marked, strict=True)]
-    matches = {}
-    for label in labels:
-        detections, objects = [np.empty((3, 0))], [np.empty((2, 0))]
-        for image, (item, truth, of_image) in enumerate(zip(found, marked, rows, strict=True)):
-            is_counted = (item.labels == label) & (of_image != CROWD)
-            scores, own = item.scores[is_counted], of_image[is_counted]
-            is_right = own != NO_OBJECT
-            detections.append(np.stack([np.full(len(scores), image), scores, is_right]))
-            score_of_object = np.full(len(truth.labels), -np.inf)
-            score_of_object[own[is_right]] = scores[is_right]
-            is_object = (truth.labels == label) & ~truth.is_crowd
-            of_objects = score_of_object[is_object]
-            objects.append(np.stack([np.full(len(of_objects), image), of_objects]))
-        matches[label] = _sorted(len(found), np.hstack(detections), np.hstack(objects))
-    return matches
-
-
-def join(matches: Sequence[Matches]) -> Matches:
-    """Join the matches of several classes in the same images."""
-    detections = [np.stack([item.image, item.score, item.is_right]) for item in matches]
-    objects = [np.stack([item.object_image, item.object_score]) for item in matches]
-    return _sorted(matches[0].image_count, np.hstack(detections), np.hstack(objects))
-
-
-def _sorted(image_count: int, detections: np.ndarray, objects: np.ndarray) -> Matches:
-    """Sort detections by descending score. The rows of both arrays are those of `Matches`."""
-    image, score, is_right = detections[:, np.argsort(-detections[1], kind="stable")]
+def match_images(found: Sequence[Found], marked: Sequence[Marked], iou: float = 0.5) -> Matches:
+    """Match the detections in all images."""
+    # The columns of a detection and of an object are those of `Matches`.
+    detections, objects = [np.empty((4, 0))], [np.empty((3, 0))]
+    for image, (item, truth) in enumerate(zip(found, marked, strict=True)):
+        index = match(item, truth, iou)
+        is_counted, is_right = index != CROWD, index >= 0
+        columns = [item.labels, np.full(len(index), image), item.scores, is_right]
+        detections.append(np.stack(columns)[:, is_counted])
+        score_of_object = np.full(len(truth.labels), -np.inf)
+        score_of_object[index[is_right]] = item.scores[is_right]
+        columns = [truth.labels, np.full(len(truth.labels), image), score_of_object]
+        objects.append(np.stack(columns)[:, ~truth.is_crowd])
+    joined, of_objects = np.hstack(detections), np.hstack(objects)
+    joined = joined[:, np.argsort(-joined[2], kind="stable")]
     return Matches(
-        image_count, image.astype(int), score, is_right > 0, objects[0].astype(int), objects[1]
+        len(found),
+        label=joined[0].astype(int),
+        image=joined[1].astype(int),
+        score=joined[2],
+        is_right=joined[3] > 0,
+        object_label=of_objects[0].astype(int),
+        object_image=of_objects[1].astype(int),
+        object_score=of_objects[2],
     )
 
 
@@ -197,9 +202,10 @@ class DetectionMetrics:
 
 
 def score(
-    matches: Sequence[Matches],
+    matches: Matches,
+    labels: Sequence[int],
     threshold: float,
-    at_half: Sequence[Matches] | None = None,
+    at_half: Matches | None = None,
     units: Int[np.ndarray, " n"] | None = None,
     over: str = PHOTOGRAPHS,
 ) -> DetectionMetrics:
@@ -208,9 +214,10 @@ def score(
     `at_half` are the matches of the same detections at an IoU of 0.5, if others are at another.
     The intervals can be over units that have several images: `units` has that of each image.
     """
-    joined = join(matches)
+    joined = matches.of(labels)
     units = np.arange(joined.image_count) if units is None else units
-    shown = [item for item in at_half or matches if len(item.object_score)]
+    by_label = [(at_half or matches).of([label]) for label in labels]
+    shown = [item for item in by_label if len(item.object_score)]
 
     def mean_precision(counts: np.ndarray) -> np.ndarray:
         values = np.stack([item.average_precision(counts) for item in shown])

@@ -4,9 +4,8 @@ import base64
 import hashlib
 import shlex
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from datetime import datetime
 from itertools import islice
 from pathlib import Path
 from statistics import fmean
@@ -36,16 +35,12 @@ MAX_METHODS = 6
 MAX_SEEDS = 5
 # Largest number of sources or classes of images in a table.
 MAX_GROUPS = 30
-# Largest number of unfinished runs in plots.
-MAX_UNFINISHED = 3
 # Largest number of attacks for which the page shows images.
 MAX_ATTACKS = 12
 # Largest number of examples for which the page shows images, of each attack.
 ATTACK_EXAMPLES = 4
 # Largest number of epochs for which the page shows renders.
 SHOWN_EPOCHS = 3
-# The legend of a plot shows this number of characters from the end of a folder's name.
-FOLDER_NAME_LENGTH = 24
 # Largest width of an image with a grid of renders, in pixels.
 GRID_WIDTH = 720
 # Largest width of a contact sheet and of an image of an attack, in pixels.
@@ -56,8 +51,12 @@ BLOCKS = (
     *("photographs", "methods", "unfinished", "curves", "relit", "renders", "examples", "worst"),
     *("configs", "shown"),
 )
-# Titles of the plots of metrics by epoch.
-CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
+# Titles of the plots by epoch, and functions that read their values from the metrics of an epoch.
+CURVES: dict[str, Callable[[Mapping[str, float]], float | None]] = {
+    "training accuracy": lambda epoch: epoch.get("train/accuracy"),
+    "validation accuracy": lambda epoch: epoch.get("validation/accuracy"),
+    "attack success on clean-correct renders": lambda epoch: attack_success(epoch, "augment/"),
+}
 
 
 def write_report(
@@ -85,8 +84,8 @@ def write_report(
         lead=[sentence for item in methods.items() for sentence in _accuracy_sentences(*item)],
         tables=[table for table in compare.run_tables(methods) if table.rows],
         captions=MODES,
-        unfinished=[[str(run.folder), run.state, len(run.epochs)] for run in found.unfinished],
-        curves=_plot_metrics(shown, found.unfinished),
+        unfinished=found.unfinished,
+        curves=_plot_metrics(shown),
         photographs=[scores_section(title, group) for title, group in groups.items()],
         renders={method: _read_renders(run, "epoch", "Renders") for method, run in first.items()},
         examples={
@@ -102,21 +101,13 @@ def write_report(
 
 def _about(found: store.Findings, folders: Sequence[Path]) -> str:
     """Write the line below the title of the page."""
-    counts = []
-    if found.runs:
-        plural = "s" if len(found.runs) != 1 else ""
-        is_hardened = any(run.before for run in found.runs)
-        change = ", before and after hardening" if is_hardened else ""
-        counts.append(f"{len(found.runs)} run{plural}{change}")
-    if found.unfinished:
-        counts.append(f"{len(found.unfinished)} unfinished or unreadable")
-    if found.attacks:
-        counts.append(f"{len(found.attacks)} attacks")
-    about = f"{', '.join(counts)}; in {', '.join(map(str, folders))}"
-    shown = [run.folder for run in found.runs] + [attack.folder for attack in found.attacks]
-    files = [path for folder in shown for path in folder.iterdir()]
-    newest = max((file.stat().st_mtime for file in files if file.name != PAGE), default=None)
-    return about if newest is None else f"{about}, {datetime.fromtimestamp(newest):%Y-%m-%d %H:%M}"
+    counts = {
+        "finished runs": len(found.runs),
+        "unfinished or unreadable": len(found.unfinished),
+        "attacks": len(found.attacks),
+    }
+    shown = ", ".join(f"{count} {words}" for words, count in counts.items() if count)
+    return f"{shown}; in {', '.join(map(str, folders))}"
 
 
 def _title(found: store.Findings, methods: Methods) -> str:
@@ -185,50 +176,24 @@ def _shell_command(config: Mapping[str, Any]) -> str:
     return command
 
 
-def _plot_metrics(methods: Methods, unfinished: Sequence[store.Unfinished]) -> list[Picture]:
+def _plot_metrics(methods: Methods) -> list[Picture]:
     """Plot accuracies by epoch, and the success of attacks on renders in training."""
-    epochs = {method: [run.epochs for run in runs] for method, runs in methods.items()}
-    for run in [run for run in unfinished if run.epochs][:MAX_UNFINISHED]:
-        epochs[f"unfinished: {run.folder.name[-FOLDER_NAME_LENGTH:]}"] = [run.epochs]
     pictures = []
-    for name, title in CURVES.items():
+    for title, read in CURVES.items():
         # Each run of a method has a line, which is a list of pairs (epoch, metric).
         lines = {
-            method: [[(epoch["epoch"], epoch.get(name)) for epoch in run] for run in runs]
-            for method, runs in epochs.items()
+            method: [[(epoch["epoch"], read(epoch)) for epoch in run.epochs] for run in runs]
+            for method, runs in methods.items()
         }
         pictures.append(plot_curves(lines, title))
-    rates = {
-        method: [list(enumerate(_attack_success_by_round(run), 1)) for run in runs]
-        for method, runs in epochs.items()
-    }
-    title = "attack success on clean-correct renders"
-    pictures.append(plot_curves(rates, title, "round of renders"))
     return [picture for picture in pictures if picture is not None]
-
-
-def _attack_success_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | None]:
-    """Read the success rate of the attacks on training renders in each round of a run.
-
-    A round is a part of the training with the same renders. The metrics of the third round of an
-    epoch have names such as "round_3/attack_success". If an epoch has only one round, the names
-    begin with "augment/". A success is a render that is correct before the attack and not after it,
-    as a fraction of those correct before. None if no render is.
-    """
-    rates = []
-    for epoch in epochs:
-        numbers = {int(name[6:].partition("/")[0]) for name in epoch if name.startswith("round_")}
-        prefixes = [f"round_{number}/" for number in sorted(numbers)] or ["augment/"]
-        rates += [attack_success(epoch, prefix) for prefix in prefixes]
-    return rates
 
 
 def _read_renders(run: RunSummary, kind: str, title: str) -> list[Picture]:
     """Read images of the training renders of the first, the middle and the last epoch of a run."""
     path_of_epoch = {
-        int(path.stem.rpartition("_")[2]): path
-        for path in (run.folder / RENDERS).glob(f"{kind}_[0-9]*.png")
-        if path.stem.rpartition("_")[2].isdigit()
+        int(path.stem.removeprefix(f"{kind}_")): path
+        for path in (run.folder / RENDERS).glob(f"{kind}_*.png")
     }
     pictures = []
     for epoch in evenly_spaced(sorted(path_of_epoch), SHOWN_EPOCHS):
@@ -315,9 +280,7 @@ def images_folder(run: RunSummary, name: str) -> Path | None:
     None if the configuration does not name it, or if it has been moved.
     """
     photos = OmegaConf.select(run.config, "photos")
-    folder = photos.get(name) if isinstance(photos, Mapping) else photos
-    if not isinstance(photos, Mapping) and name != PHOTOGRAPHS:
-        folder = None
+    folder = (photos if isinstance(photos, Mapping) else {PHOTOGRAPHS: photos}).get(name)
     if not folder:
         # The run may have rendered the images itself.
         rendered = run.folder / KEPT_ASIDE

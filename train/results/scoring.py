@@ -55,6 +55,8 @@ Model = Callable[[torch.Tensor], torch.Tensor]
 # Number of wrong predictions that are listed for the images of each class: the 5 most
 # common ones.
 WRONG_CLASSES = 5
+# Keys of the groups of photographs in summary.json.
+SUMMARY_KEYS = {"source": "by_source", "mesh": "by_mesh", "class": "class_metrics"}
 # Metrics that depend on a ranking of images or classes.
 RANKING_METRICS = (*metrics.ROC_METRICS, *metrics.TOP_RANKS)
 # Metrics that `format_overall` leaves out, because they matter less.
@@ -197,18 +199,12 @@ class ClassScores:
         n: Number of photographs of the class.
         recall: Fraction of the photographs whose predicted class is right. It
             is unknown if the model lacks the class.
-        top5: Fraction of the photographs whose class is among the five most
-            probable classes. It is unknown if the model lacks the class.
-        predicted_label: Fraction of the photographs whose predicted class is a
-            positive class.
         most_common_wrong: For each of the most common wrong predictions, the
             number of photographs with this prediction.
     """
 
     n: int
     recall: Proportion
-    top5: Proportion
-    predicted_label: Proportion
     most_common_wrong: Mapping[str, int]
 
 
@@ -253,14 +249,9 @@ class Scores(ShortRepr):
         return self._metrics_by("source")
 
     @cached_property
-    def by_mesh(self) -> dict[str, Metrics] | None:
-        """Metrics of the photographs of each mesh. None without by="mesh"."""
-        return self._metrics_by("mesh") if self.by == "mesh" else None
-
-    @cached_property
-    def class_metrics(self) -> dict[str, Metrics] | None:
-        """Metrics of the photographs of each class. None without by="class"."""
-        return self._metrics_by("class") if self.by == "class" else None
+    def groups(self) -> dict[str, Metrics]:
+        """Metrics of the photographs of each source, mesh or class, as `by` says."""
+        return self._metrics_by(self.by)
 
     def _metrics_by(self, by: str) -> dict[str, Metrics]:
         """Compute the metrics of groups of photographs."""
@@ -270,8 +261,17 @@ class Scores(ShortRepr):
     def by_class(self) -> dict[str, ClassScores]:
         """Recall and wrong predictions for the photographs of each class."""
         photographs = self.predicted.predictions[: len(self.predicted.images)]
-        classes = metrics.group_rows(photographs, photographs.shown)
-        return {name: _score_class(rows, self.predicted.labels) for name, rows in classes.items()}
+        scores = {}
+        for name, rows in metrics.group_rows(photographs, photographs.shown).items():
+            # The rank is infinite for all photographs if the model lacks the class.
+            known = rows[np.isfinite(rows.true_rank)]
+            wrong_classes = Counter(sorted(rows.predicted[rows.true_rank != 1]))
+            scores[name] = ClassScores(
+                n=len(rows),
+                recall=Outcome(known, known.true_rank <= 1).proportion,
+                most_common_wrong=dict(wrong_classes.most_common(WRONG_CLASSES)),
+            )
+        return scores
 
     @property
     def point_entries(self) -> list[dict[str, Any]]:
@@ -287,6 +287,8 @@ class Scores(ShortRepr):
         """Convert the scores to the content of summary.json."""
         predicted = self.predicted
         has_labels = bool(self.by_label)
+        groups = {"by_label": self.by_label, "by_source": self.by_source}
+        groups[SUMMARY_KEYS[self.by]] = self.groups
         summary: dict[str, Any] = {
             "label": predicted.labels if has_labels else predicted.labels[0],
             "size": as_size("size", predicted.images.shape[-2:]),
@@ -302,11 +304,8 @@ class Scores(ShortRepr):
         }
         if self.points:
             summary["operating_point"] = self.point_entries if has_labels else self.point_entries[0]
-        by_label = self.by_label if has_labels else None
-        groups = {"by_label": by_label, "by_source": self.by_source, "by_mesh": self.by_mesh}
-        for key, found in (groups | {"by_class": {}, "class_metrics": self.class_metrics}).items():
-            if found is not None:
-                summary[key] = {name: item.to_summary() for name, item in found.items()}
+        for key, found in groups.items():
+            summary[key] = {name: item.to_summary() for name, item in found.items()}
         summary["by_class"] = {name: asdict(scores) for name, scores in self.by_class.items()}
         return summary | {"unreadable": predicted.unreadable, "left_out": predicted.left_out}
 
@@ -340,21 +339,6 @@ def score(
     thresholds_by_label = {point.label: point.threshold for point in points}
     pooled = Pooled(predicted.predictions, thresholds=thresholds_by_label)
     return Scores(predicted, pooled, points, by)
-
-
-def _score_class(photographs: Predictions, labels: Sequence[str]) -> ClassScores:
-    """Score the photographs of one class."""
-    # The rank is infinite for all photographs if the model lacks the class.
-    known = photographs[np.isfinite(photographs.true_rank)]
-    wrong_classes = Counter(sorted(photographs.predicted[photographs.true_rank != 1]))
-    is_predicted_label = np.isin(photographs.predicted, labels)
-    return ClassScores(
-        n=len(photographs),
-        recall=Outcome(known, known.true_rank <= 1).proportion,
-        top5=Outcome(known, known.true_rank <= 5).proportion,
-        predicted_label=Outcome(photographs, is_predicted_label).proportion,
-        most_common_wrong=dict(wrong_classes.most_common(WRONG_CLASSES)),
-    )
 
 
 def write(scores: Scores, out: Path) -> None:
@@ -408,11 +392,17 @@ def choose_operating_points(
 
 def format_scores(scores: Scores) -> str:
     """Format scores as Markdown tables, with a row for each label and each source or mesh."""
-    tables_of_metrics = [
-        _metric_table(scores, names) for names in (_fraction_metrics(scores), RANKING_METRICS)
-    ]
-    shown = [_count_images(scores), *tables_of_metrics, _class_table(scores), *_notes(scores)]
-    return "\n\n".join(map(str, shown))
+    names = [*_fraction_metrics(scores), *RANKING_METRICS]
+    rows = []
+    shown: list[Estimate | None] = []
+    groups = [("all", scores.overall), *scores.by_label.items(), *scores.groups.items()]
+    for title, of_group in groups:
+        estimates = [of_group.find(name) for name in names]
+        shown += estimates
+        rows.append([title, *map(_format_metric, estimates)])
+    table = Table(tables.describe_intervals(shown), ["", *map(metric_title, names)], rows)
+    parts = [_count_images(scores), table, _class_table(scores), *_notes(scores)]
+    return "\n\n".join(map(str, parts))
 
 
 def _count_images(scores: Scores) -> str:
@@ -450,27 +440,13 @@ def _format_metric(metric: Estimate | None) -> str:
     return tables.format_interval(metric)
 
 
-def _metric_table(scores: Scores, names: Sequence[str]) -> Table:
-    """Make a table of some metrics of all images, each label, and each mesh, class or source."""
-    rows = []
-    shown: list[Estimate | None] = []
-    groups = scores.by_mesh or scores.class_metrics or scores.by_source
-    for title, of_group in [("all", scores.overall), *scores.by_label.items(), *groups.items()]:
-        estimates = [of_group.find(name) for name in names]
-        shown += estimates
-        rows.append([title, *map(_format_metric, estimates)])
-    return Table(tables.describe_intervals(shown), ["", *map(metric_title, names)], rows)
-
-
 def _class_table(scores: Scores) -> Table:
     """Make a table of recall and wrong predictions with a row for each class of photographs."""
-    header = ["class", "recall", "top-5", f"predicted {scores.label}", "most common wrong classes"]
     rows = []
     for name, item in scores.by_class.items():
-        cells = map(tables.format_fraction, (item.recall, item.top5, item.predicted_label))
         wrong = ", ".join(f"{wrong} {count}" for wrong, count in item.most_common_wrong.items())
-        rows.append([name, *cells, wrong])
-    return Table("", header, rows)
+        rows.append([name, tables.format_fraction(item.recall), wrong])
+    return Table("", ["class", "recall", "most common wrong classes"], rows)
 
 
 def _notes(scores: Scores) -> Iterator[str]:

@@ -21,8 +21,6 @@ from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, PUBLISHED, read_json, read_metrics
 from train.settings import label_names, published_folder
 
-# Methods are named by numbers instead of by their settings if there are more than this.
-MAX_NAMED = 30
 # A method whose settings need a longer name than this is named by a number.
 LONGEST_NAME = 56
 # Name of the method of a network with whose weights other runs began.
@@ -328,7 +326,7 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
         varied = varied_settings([other for other in heads if other.mode == head.mode])
         values = [f"{words}={head.settings.get(key)}" for key, words in varied.items()]
         name = ", ".join([head.mode, *values])
-        if len(heads) > MAX_NAMED or len(name) > LONGEST_NAME or name in named:
+        if len(name) > LONGEST_NAME or name in named:
             name = f"{number}: {head.mode}"
         named[name] = group
     return named
@@ -426,12 +424,12 @@ class Unfinished(NamedTuple):
     Attributes:
         folder: The folder.
         state: State of the run in words, or why the folder cannot be read.
-        epochs: Metrics of each finished epoch by name.
+        epoch_count: Number of finished epochs.
     """
 
     folder: Path
     state: str
-    epochs: Sequence[dict[str, float]]
+    epoch_count: int
 
 
 @dataclass(frozen=True)
@@ -472,11 +470,11 @@ def find(folders: Sequence[Path]) -> Findings:
             elif is_finished(path) or any((path / name).is_file() for name in FILES_OF_NETWORK):
                 found.runs.append(summarize(path))
             else:
-                epochs = [line for line in read_metrics(path) if "epoch" in line]
-                found.unfinished.append(Unfinished(path, run_folder.state(path), epochs))
+                epoch_count = len(read_metrics(path))
+                found.unfinished.append(Unfinished(path, run_folder.state(path), epoch_count))
         except (InputError, OSError) as error:
             # OSError is raised if the folder belongs to another user.
-            found.unfinished.append(Unfinished(path, f"cannot be read: {error}", []))
+            found.unfinished.append(Unfinished(path, f"cannot be read: {error}", 0))
     order = {mode: number for number, mode in enumerate(MODES)}
     found.runs.sort(key=lambda run: order.get(run.mode, -1))
     return found

@@ -47,8 +47,8 @@ def test_scores_count_the_photographs_of_each_class(photographs):
     assert (scores.overall.recall.hits, scores.overall.recall.n) == (5, 7)
     # Top-1 accuracy is a mean over classes.
     assert scores.overall.class_top1.value == pytest.approx((3 / 4 + 2 / 3) / 2)
-    assert scores.class_metrics["dark"].class_top1.value == pytest.approx(3 / 4)
-    assert scores.class_metrics["bright"].class_top1.value == pytest.approx(2 / 3)
+    assert scores.groups["dark"].class_top1.value == pytest.approx(3 / 4)
+    assert scores.groups["bright"].class_top1.value == pytest.approx(2 / 3)
     assert scores.overall.class_top5.value == 1
 
 

@@ -199,8 +199,6 @@ class TestTheMetricsOfAKnownModel:
         assert summary["by_class"]["other_lemon"] == {
             "n": 2,
             "recall": wilson(0, 0),
-            "top5": wilson(0, 0),
-            "predicted_label": wilson(1, 2),
             "most_common_wrong": {"lime": 1, "orange": 1},
         }
 
