@@ -82,7 +82,12 @@ class AnnotatedScores(ShortRepr):
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""
-        raise NotImplementedError
+        return {
+            "size": self.size,
+            "fit": self.fit,
+            "n": {"photographs": self.photograph_count},
+            "missing": self.missing,
+        }
 
     def __str__(self) -> str:
         """Return the lines that pnb-evaluate prints."""
@@ -138,14 +143,12 @@ class DetectionScores(AnnotatedScores):
             "task": self.task.name,
             "threshold": self.task.threshold,
             "iou": self.task.iou,
-            "size": self.size,
-            "fit": self.fit,
             "label": self.labels,
-            "n": {"photographs": self.photograph_count, "objects": self.overall.n},
             **asdict(self.overall),
             "by_label": {name: asdict(metrics) for name, metrics in self.by_label.items()},
             "by_source": by_source,
-            "missing": self.missing,
+            **super().to_summary(),
+            "n": {"photographs": self.photograph_count, "objects": self.overall.n},
         }
 
 
@@ -170,15 +173,29 @@ class SegmentationScores(AnnotatedScores):
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""
-        return {
-            "task": "segmentation",
-            "size": self.size,
-            "fit": self.fit,
-            "n": {"photographs": self.photograph_count},
-            "miou": asdict(self.miou),
-            "by_class": self.by_class,
-            "missing": self.missing,
-        }
+        scores = {"miou": asdict(self.miou), "by_class": self.by_class}
+        return {"task": "segmentation", **scores, **super().to_summary()}
+
+
+def _outputs(
+    network: TaskNetwork,
+    photographs: Sequence[Annotated],
+    pictures: dict[str, Tensor],
+    how: str,
+    skip_unreadable: bool,
+    device: torch.device,
+) -> Iterator[tuple[Annotated, Fitted, Any]]:
+    """Yield photographs with the outputs of a network, and draw some of them into `pictures`."""
+    size = height_and_width(network.size)
+    shown = {item.name for item in evenly_spaced(photographs, SHOWN)}
+    for batch in filter(None, fit_batches(photographs, size, how, BATCH, skip_unreadable)):
+        images = torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch])).to(device)
+        outputs = compute_outputs(network, images, BATCH)
+        for (item, fitted), image, output in zip(batch, images, outputs, strict=True):
+            if item.name in shown:
+                drawn = network.task.draw(to_unit(image), output, network.classes)
+                pictures[item.name] = drawn.cpu()
+            yield item, fitted, output
 
 
 def evaluate_detector(
@@ -193,28 +210,14 @@ def evaluate_detector(
     label_of_class = _choose_labels(annotations, network.classes, labels)
     task = network.task
     assert isinstance(task, Detection)
-    size = height_and_width(network.size)
-    shown = {id(item) for item in evenly_spaced(annotations.photographs, SHOWN)}
-    read: list[tuple[Annotated, Fitted]] = []
-
-    def batches() -> Iterator[Tensor]:
-        for batch in fit_batches(annotations.photographs, size, how, BATCH, skip_unreadable):
-            # Only the pixels of pictures are kept.
-            none = np.empty((3, 0, 0), np.uint8)
-            for item, fitted in batch:
-                kept = fitted if id(item) in shown else fitted._replace(pixels=none)
-                read.append((item, kept))
-            yield torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch]))
-
-    outputs: Any = compute_outputs(network, batches(), BATCH, device)
     found: list[Found] = []
     marked: list[Marked] = []
+    sources: list[str] = []
     listed: list[dict[str, Any]] = []
-    pictures = {}
-    for (item, fitted), output in zip(read, outputs, strict=True):
-        if fitted.pixels.size:
-            image = to_unit(torch.from_numpy(fitted.pixels))
-            pictures[item.name] = task.draw(image, output, network.classes)
+    pictures: dict[str, Tensor] = {}
+    options = pictures, how, skip_unreadable, device
+    for item, fitted, output in _outputs(network, annotations.photographs, *options):
+        sources.append(item.source)
         boxes, own, scores = (output[key].cpu().numpy() for key in ("boxes", "labels", "scores"))
         boxes, scores = fitted.to_photograph(boxes.astype(float)), scores.astype(float)
         found.append(Found(boxes, own, scores))
@@ -229,14 +232,13 @@ def evaluate_detector(
             listed.append(entry | {"score": round(float(score), 4)})
         if not fitted.is_kept.all():
             console.warning("%s: a box without an area in the photograph is left out", item.name)
-    sources = [item.source for item, _ in read]
     overall, by_label, by_source = _score(found, marked, label_of_class, sources, task)
     missing = f" ({len(annotations.missing)} files are missing)" if annotations.missing else ""
     return DetectionScores(
         file=annotations.file,
-        size=size,
+        size=height_and_width(network.size),
         fit=how,
-        photograph_count=len(read),
+        photograph_count=len(found),
         missing=annotations.missing,
         contents=f"{missing} with {overall.n} objects",
         pictures=pictures,
@@ -305,32 +307,23 @@ def evaluate_segmenter(
         reason = f"{network.title} has {len(network.classes)} classes"
         raise InputError(f"{reason}: masks can have at most {UNSCORED}, as {UNSCORED} is no class")
     photographs, masks, missing = read_masks(folder)
-    size = height_and_width(network.size)
-    shown = {item.name for item in evenly_spaced(photographs, SHOWN)}
     pictures: dict[str, Tensor] = {}
     count = 0
 
     def pairs() -> Iterator[tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]]:
         nonlocal count
-        for batch in fit_batches(photographs, size, how, BATCH, skip_unreadable):
-            if not batch:
-                continue
-            images = torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch]))
-            outputs = compute_outputs(network, images.to(device), BATCH)
-            for (item, fitted), image, output in zip(batch, images, outputs, strict=True):
-                count += 1
-                if item.name in shown:
-                    drawn = network.task.draw(to_unit(image), output.cpu(), network.classes)
-                    pictures[item.name] = drawn
-                mask = fit_mask(masks[item.name], fitted, len(network.classes))
-                yield output.argmax(0).cpu().numpy(), mask
+        options = pictures, how, skip_unreadable, device
+        for item, fitted, output in _outputs(network, photographs, *options):
+            count += 1
+            mask = fit_mask(masks[item.name], fitted, len(network.classes))
+            yield output.argmax(0).cpu().numpy(), mask
 
     miou, by_class = mean_iou(pairs(), len(network.classes))
     named = zip(network.classes, by_class, strict=True)
     known = {name: iou for name, iou in named if np.isfinite(iou)}
     return SegmentationScores(
         file=folder,
-        size=size,
+        size=height_and_width(network.size),
         fit=how,
         photograph_count=count,
         missing=missing,

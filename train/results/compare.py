@@ -275,12 +275,10 @@ def score_table(title: str, group: Scored) -> Table:
     lines: dict[str, list[Line]] = {}
     points = set()
     for method, scored_runs in group.items():
-        for run, scores in ((scored.run, scored.scores) for scored in scored_runs):
-            points.add(scores.operating_point)
-            rows = {f"{method}, label={label}": item for label, item in scores.by_label.items()}
-            for name, metrics in {method: scores.overall, **rows}.items():
-                line = (run.seed, [*map(metrics.find, METRICS)])
-                lines.setdefault(name, []).append(line)
+        points |= {scored.scores.operating_point for scored in scored_runs}
+        lines[method] = [
+            (scored.run.seed, [*map(scored.scores.overall.find, METRICS)]) for scored in scored_runs
+        ]
     chosen = " or ".join(sorted(points - {""}))
     if chosen:
         title += f"; threshold for {chosen}"

@@ -356,10 +356,4 @@ def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:
         for name, value in attack.checks.items()
         if not isinstance(value, dict)
     ]
-    return {
-        "folder": attack.folder,
-        "rows": attack.rows,
-        "checks": checks,
-        "images": images,
-        "config": config,
-    }
+    return {**vars(attack), "checks": checks, "images": images, "config": config}

@@ -27,15 +27,12 @@ if TYPE_CHECKING:
 # and Ito (2008), who chose them for color-blind readers.
 COLORS = ("#7d8590", "#2f81f7", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 LINES = ("--", "-", ":", "-.")
-MARKERS = "osD^vP"
 # The size of a plot in inches, and its width on the page in CSS pixels.
 SIZE = (4.4, 3.3)
 WIDTH = 440
 # `encode_picture` writes images of at most this many pixels per side as PNG, and larger
 # ones as JPEG.
 SMALL = 192
-# Lines with fewer points than this have a marker at each point.
-MARKED = 30
 # Color of text and axes in the SVG that matplotlib writes. It stands for the text color
 # of the page, and is replaced by "currentColor".
 INK = "#123456"
@@ -136,8 +133,7 @@ def plot_curves(
         for index, (method, lines) in enumerate(lines_of_method.items()):
             for line in lines:
                 if len(line) > 1:
-                    marker = MARKERS[index % len(MARKERS)] if len(line) < MARKED else None
-                    axes.plot(*np.array(line).T, marker=marker, ms=4, label=method, **style(index))
+                    axes.plot(*np.array(line).T, label=method, **style(index))
         axes.set(xlabel=x_title)
         axes.locator_params(axis="x", integer=True, min_n_ticks=1)
 

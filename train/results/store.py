@@ -46,8 +46,6 @@ class StoredScores:
             photographs if the hashes are equal.
         labels: Positive classes.
         overall: Metrics of all photographs.
-        by_label: The metrics of each positive class by the name of the class.
-            Empty if there is only one positive class.
         thresholds: Threshold on the log-odds of each positive class. Empty if
             none was chosen.
         operating_point: How the thresholds were chosen, in words. Empty if none
@@ -57,7 +55,6 @@ class StoredScores:
     images: str
     labels: Sequence[str]
     overall: Metrics
-    by_label: Mapping[str, Metrics] = field(default_factory=dict)
     thresholds: Thresholds = field(default_factory=dict)
     operating_point: str = ""
 
@@ -70,25 +67,17 @@ class StoredScores:
         labels = label_names(summary.get("label", ""))
         points = summary.get("operating_point", [])
         points = points if isinstance(points, list) else [points]
-        several = labels if len(labels) > 1 else []
         return cls(
             images=str(summary.get("images") or summary),  # Unknown images: equal scores only.
             labels=labels,
             overall=Metrics.read(summary),
-            by_label={label: Metrics.read(summary["by_label"][label]) for label in several},
             thresholds={point["label"]: float(point["threshold"]) for point in points},
             operating_point=" or ".join(dict.fromkeys(map(describe_point, points))),
         )
 
     def to_published(self) -> dict[str, Any]:
         """Convert the scores to a mapping for the file of a published network."""
-        by_label = {name: metrics.to_summary() for name, metrics in self.by_label.items()}
-        return {
-            "images": self.images,
-            "label": [*self.labels] if by_label else self.labels[0],
-            **self.overall.to_summary(),
-            **({"by_label": by_label} if by_label else {}),
-        }
+        return {"images": self.images, "label": [*self.labels], **self.overall.to_summary()}
 
 
 @dataclass(frozen=True)
@@ -182,7 +171,7 @@ def summarize(folder: Path) -> RunSummary:
     """Read the settings and scores in the folder of a run, an evaluation or a published network."""
     folder = published_folder(folder)
     try:
-        summary = _read(folder)
+        return _read(folder)
     except InputError:
         raise
     except Exception as error:
@@ -192,12 +181,6 @@ def summarize(folder: Path) -> RunSummary:
         raise InputError(
             f"{folder}: {files} is not as `pnb-train` wrote it ({reason}): use another run"
         ) from error
-    if summary is None:
-        raise InputError(
-            f"{folder} holds no finished run: let its run finish or resume it, "
-            "or give another folder"
-        )
-    return summary
 
 
 def trained_labels(folder: Path) -> list[str]:
@@ -211,7 +194,7 @@ def trained_labels(folder: Path) -> list[str]:
     return next(([*scores.labels] for scores in run.photographs.values()), [])
 
 
-def _read(folder: Path) -> RunSummary | None:
+def _read(folder: Path) -> RunSummary:
     """Read the settings and scores in a folder."""
     if is_finished(folder):
         return _read_run(folder)
@@ -233,7 +216,8 @@ def _read(folder: Path) -> RunSummary | None:
         found = {key: value for key, value in stored.items() if isinstance(value, dict)}
         scores = {key: StoredScores.read(value) for key, value in found.items()}
         return RunSummary(folder, name, settings, scores, accuracy)
-    return None
+    advice = "let its run finish or resume it, or give another folder"
+    raise InputError(f"{folder} holds no finished run: {advice}")
 
 
 def _read_run(folder: Path) -> RunSummary:
@@ -305,11 +289,12 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     for before in filter(None, (run.before for run in runs)):
         first = initial.setdefault(repr(before.settings), before)
         known = {scores.images for scores in first.photographs.values()}
-        photographs = dict(first.photographs)
-        for name, scores in before.photographs.items():
-            if scores.images not in known:
-                photographs[str(before.folder.absolute() / name)] = scores
-        initial[repr(before.settings)] = replace(first, photographs=photographs)
+        more = {
+            str(before.folder.absolute() / name): scores
+            for name, scores in before.photographs.items()
+            if scores.images not in known
+        }
+        initial[repr(before.settings)] = replace(first, photographs={**first.photographs, **more})
     # The key of a group is the text of the settings without the seed.
     groups: dict[str, list[RunSummary]] = {}
     for run in (*initial.values(), *runs):
