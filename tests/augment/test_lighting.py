@@ -163,10 +163,10 @@ def test_autocast_changes_nothing(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("value", [-65504.0, 65504.0, 6e-8])
-def test_the_limits_of_half_precision_stay_finite(name, value):
-    image = torch.full((3, 4, 4), value, dtype=torch.float16)
-    assert nb.RandomLighting(name)(image).isfinite().all()
+def test_the_limits_of_half_precision_stay_finite(name):
+    for value in (-65504.0, 65504.0, 6e-8):
+        image = torch.full((3, 4, 4), value, dtype=torch.float16)
+        assert nb.RandomLighting(name)(image).isfinite().all()
 
 
 def test_an_image_without_memory_keeps_its_device():

@@ -76,8 +76,7 @@ def test_renders_are_shared_as_equally_as_possible(examples, meshes, backgrounds
     assert len(shown) == examples
 
 
-@pytest.mark.parametrize("encoding", ["linear", "srgb"])
-@pytest.mark.parametrize("light", ["grace", "st_peters"])
+@pytest.mark.parametrize(("light", "encoding"), [("grace", "linear"), ("st_peters", "srgb")])
 def test_the_automatic_exposure_makes_the_mean_of_an_object_two_fifths(light, encoding):
     meshes = [("solid:orange", "orange"), ("solid:cup", "cup")]
     options = {"light": light, "encoding": encoding, "backgrounds": [0.0], "exposure": "auto"}
@@ -217,8 +216,9 @@ def several(request) -> Iterator[Scene]:
         yield Scene(objects, examples, backgrounds, lights, SETTINGS, RASTERIZER)
 
 
-@pytest.mark.parametrize("changed", ["light", "vertices"])
-@pytest.mark.parametrize("examples", [[0, 1, 2, 3], [3, 0], [2, 2, 1]])
+@pytest.mark.parametrize(
+    ("examples", "changed"), [([0, 1, 2, 3], "light"), ([3, 0], "light"), ([2, 2, 1], "vertices")]
+)
 def test_several_meshes_are_rendered_as_each_is_alone(several, examples, changed):
     """Changed light goes through stacked operators, and changed vertices are rasterized anew.
 

@@ -186,20 +186,16 @@ def test_row_0_is_the_top_and_x_grows_to_the_right(rasterizer):
     np.testing.assert_array_equal(rectangle_of_sample, expected)
 
 
-@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
-@pytest.mark.parametrize(("order", "is_turned_away"), [([0, 1, 2], False), ([0, 2, 1], True)])
 @pytest.mark.parametrize("size", [1, 2, 100, 1e4])
-def test_a_face_fills_the_image_unless_it_turns_away_on_a_closed_mesh(
-    rasterizer, size, order, is_turned_away, closed
-):
+def test_a_face_fills_the_image_unless_it_turns_away_on_a_closed_mesh(rasterizer, size):
     points, _ = scene_of([-size, -size, 0], [3 * size, -size, 0], [-size, 3 * size, 0])
-    ids = rasterizer.rasterize(points, np.array([order]), 16, closed)
-    expected = NO_FACE if is_turned_away and closed else 0
-    assert (ids == expected).all()
+    for order, is_turned_away in (([0, 1, 2], False), ([0, 2, 1], True)):
+        for closed in (False, True):
+            ids = rasterizer.rasterize(points, np.array([order]), 16, closed)
+            assert (ids == (NO_FACE if is_turned_away and closed else 0)).all()
 
 
-@pytest.mark.parametrize(("closed", "lowest"), [(False, 0), (True, 1)], ids=["open", "closed"])
-@pytest.mark.parametrize("turn", range(3))
+@pytest.mark.parametrize(("turn", "closed", "lowest"), [(0, False, 0), (1, True, 1), (2, True, 1)])
 def test_the_lower_index_wins_ties_between_duplicate_faces(rasterizer, turn, closed, lowest):
     points, face = scene_of([-0.9, -0.7, 0.3], [0.8, -0.5, -0.4], [0.1, 0.9, 0.7])
     turned_away = face[:, ::-1]
@@ -209,13 +205,10 @@ def test_the_lower_index_wins_ties_between_duplicate_faces(rasterizer, turn, clo
     assert set(np.unique(ids)) == {NO_FACE, lowest}
 
 
-@pytest.mark.parametrize(
-    ("z", "is_drawn"),
-    [(-1e9, False), (-1.00001, False), (-1.0, True), (0.99999, True), (1.0, False)],
-)
-def test_faces_are_drawn_from_depth_minus_1_to_below_1(rasterizer, z, is_drawn):
-    points, faces = scene_of(*rectangle(-1, 1, -1, 1, z))
-    assert ((rasterizer.rasterize(points, faces, 8) >= 0) == is_drawn).all()
+def test_faces_are_drawn_from_depth_minus_1_to_below_1(rasterizer):
+    for z, is_drawn in ((-1e9, 0), (-1.00001, 0), (-1.0, 1), (0.99999, 1), (1.0, 0)):
+        points, faces = scene_of(*rectangle(-1, 1, -1, 1, z))
+        assert ((rasterizer.rasterize(points, faces, 8) >= 0) == is_drawn).all()
 
 
 def test_a_face_across_the_depth_range_is_clipped_to_it(rasterizer):
