@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from itertools import chain
 from typing import NamedTuple
 
@@ -91,12 +91,13 @@ def pixel_centers(size: Size) -> Float[Tensor, "2 1 height width"]:
     Row 0 is x to the right, row 1 is y down, in the same unit. The second axis is for several
     images.
     """
-    return torch.stack(torch.broadcast_tensors(*_centers(size)))
+    return torch.stack(torch.broadcast_tensors(*_centers(*height_and_width(size))))
 
 
-def _centers(size: Size) -> tuple[Float[Tensor, "1 1 W"], Float[Tensor, "1 H 1"]]:
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _centers(height: int, width: int) -> tuple[Float[Tensor, "1 1 W"], Float[Tensor, "1 H 1"]]:
     """Return x of the columns and y of the rows of `pixel_centers`."""
-    height, width = height_and_width(size)
     x, y = ((torch.arange(count) + 0.5) / width * 2 - count / width for count in (width, height))
     return x.view(1, 1, -1), y.view(1, -1, 1)
 
@@ -139,7 +140,7 @@ def draw_patterns(
     image, which spans [-1, 1].
     """
     # Without points, the coordinates of columns and rows are enough.
-    x, y = _centers(size) if points is None else points
+    x, y = _centers(*height_and_width(size)) if points is None else points
     drawn = [
         (
             torch.rand(4, generator=draws),
@@ -262,7 +263,7 @@ def draw_cells(count: int, size: Size, draws: Generator) -> Float[Tensor, "count
     hue, saturation, brightness = torch.rand(3, count * MAX_CELLS, generator=draws)
     colors = random_colors(torch.stack([hue, saturation], dim=1))[:, :, 0, 0] * brightness[:, None]
     colors = colors.view(count, MAX_CELLS, 3).transpose(1, 2)
-    x, y = _centers(size)
+    x, y = _centers(height, width)
     # Squared distances are whole numbers of 25 bits, before the index of the cell is added.
     unit = 4 * (1 + (height / width) ** 2) / 2**25
     pictures = []
