@@ -26,8 +26,8 @@ from renderer.io.gltf_file import QUANTIZATION, GltfFile, Material, ignored_feat
 from renderer.io.mesh_file import CPU, MeshFile, Part, colored_mesh, require_bounded
 from renderer.mesh import shared_edges
 
-# Kinds of primitives that consist of triangles (5.24.4).
-TRIANGLES, STRIP, FAN = 4, 5, 6
+# Kind of primitives that consist of triangles (5.24.4). Lower numbers are points and lines.
+TRIANGLES = 4
 # Alpha from which on a texel with 8 bits counts as opaque.
 ALMOST_ONE = 1 - 0.5 / 255
 # Beginnings of the names of attributes that joints use.
@@ -35,7 +35,6 @@ SKINNING = ("JOINTS", "WEIGHTS")
 # Widths of the attributes of vertices that are read (3.7.2.1), by the first part of their names.
 ATTRIBUTES = {"POSITION": (3,), "NORMAL": (3,), "TEXCOORD": (2,), "COLOR": (3, 4)}
 ATTRIBUTES |= dict.fromkeys(SKINNING, (4,))
-DRACO = "KHR_draco_mesh_compression"
 # Bytes that a face and a vertex take while the parts are read and joined.
 FACE_BYTES = 2000
 VERTEX_BYTES = 1000
@@ -93,7 +92,10 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
         mesh = file.entry("meshes", node["mesh"])
         weights = tuple(node.get("weights", mesh.get("weights", ())))
         for number, primitive in enumerate(mesh["primitives"]):
-            if primitive.get("mode", TRIANGLES) not in (TRIANGLES, STRIP, FAN):
+            mode = primitive.get("mode", TRIANGLES)
+            if mode > TRIANGLES:
+                raise ValueError("it has strips or fans of triangles: export single triangles")
+            if mode < TRIANGLES:
                 mesh_file.ignore("points and lines")
             else:
                 read = part(node["mesh"], number, weights)
@@ -140,10 +142,6 @@ def _attributes(
     file: GltfFile, primitive: dict[str, Any], weights: tuple[float, ...], uv_name: str
 ) -> dict[str, np.ndarray]:
     """Read the vertex attributes that are used of a primitive, with morph targets (3.7.2.2)."""
-    accessors = [file.entry("accessors", index) for index in primitive["attributes"].values()]
-    is_compressed = DRACO in primitive.get("extensions", {})
-    if is_compressed and not all("bufferView" in accessor for accessor in accessors):
-        raise ValueError(f"its arrays are compressed ({DRACO}): export it without compression")
     attributes = {}
     for name, index in primitive["attributes"].items():
         kind = name.partition("_")[0]
@@ -186,19 +184,7 @@ def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.n
         if indices.dtype.kind != "u" or indices.max(initial=0) >= vertex_count:
             raise ValueError(f"it has indices of faces beyond its {vertex_count} vertices")
         indices = indices.astype(np.int64)
-    mode = primitive.get("mode", TRIANGLES)
-    if mode == TRIANGLES or len(indices) < 3:
-        return indices[: len(indices) // 3 * 3].reshape(-1, 3)
-    if mode == FAN:
-        first = np.full(len(indices) - 2, indices[0])
-        faces = np.stack([indices[1:-1], indices[2:], first], axis=1)
-    else:
-        faces = np.lib.stride_tricks.sliding_window_view(indices, 3).copy()
-        # Every second face of a strip has the opposite orientation.
-        faces[1::2] = faces[1::2][:, [0, 2, 1]]
-    # Faces that only join the parts of a strip have the same vertex twice.
-    is_face = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    return faces[is_face]
+    return indices[: len(indices) // 3 * 3].reshape(-1, 3)
 
 
 def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
@@ -250,24 +236,18 @@ def _posed(
         if len(bind) < len(matrices):
             raise ValueError(f"a skin has {len(bind)} matrices for {len(matrices)} joints")
         matrices = matrices @ bind
-    names = [name for name in part.joints if name.startswith("JOINTS")]
-    none = np.zeros((len(part.surface.values), 0), np.int64)
-    joints = np.hstack([none, *(part.joints[name] for name in names)])
-    weights = np.hstack([none, *(part.joints[n.replace("JOINTS", "WEIGHTS")] for n in names)])
-    # A joint with the weight 0 may be any number, so it is replaced by joint 0.
-    joints = np.where(weights == 0, 0, joints)
-    if not 0 <= joints.min(initial=0) <= joints.max(initial=0) < len(matrices):
-        raise ValueError(f"a vertex has the joint {joints.max()}, but its skin has {len(matrices)}")
     # Weighted sum of the matrices of the joints, and of the weights, for each vertex.
     blended = np.zeros((len(part.surface.values), 4, 4))
-    for joint, weight in zip(joints.T, weights.T, strict=True):
-        blended += weight[:, None, None] * matrices[joint]
-    sums = weights.sum(axis=1)
-    deviations = np.abs(sums - 1)
+    sums = np.zeros(len(blended))
+    for name in (name for name in part.joints if name.startswith("JOINTS")):
+        weights = part.joints[name.replace("JOINTS", "WEIGHTS")]
+        for joint, weight in zip(part.joints[name].T, weights.T, strict=True):
+            # A joint with the weight 0 may be any number.
+            blended += weight[:, None, None] * matrices[np.where(weight == 0, 0, joint)]
+            sums += weight
     # A comparison with NaN is False, so `not` also finds NaN.
-    if not (deviations <= MAX_WEIGHT_ERROR).all():
-        worst = sums[deviations.argmax()]
-        raise ValueError(f"the weights of a vertex add up to {worst:g} instead of 1")
+    if not (np.abs(sums - 1) <= MAX_WEIGHT_ERROR).all():
+        raise ValueError("the weights of a vertex do not add up to 1: export the mesh again")
     blended /= sums[:, None, None]
     linear, shift = blended[:, :3, :3], blended[:, :3, 3]
     positions = part.surface.values[:, POSITION]

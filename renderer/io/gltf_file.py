@@ -32,7 +32,6 @@ TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<
 # Count of numbers in one element of an accessor (3.6.2.2).
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 WEBP = "EXT_texture_webp"
-INSTANCING = "EXT_mesh_gpu_instancing"
 VISIBILITY = "KHR_node_visibility"
 # Bytes that a number of an accessor takes while it is read.
 ARRAY_BYTES = 16
@@ -115,8 +114,6 @@ class GltfFile:
     def _view(self, index: int) -> memoryview:
         """Return the bytes of a buffer view."""
         view = self.entry("bufferViews", index)
-        if "EXT_meshopt_compression" in view.get("extensions", {}):
-            raise ValueError("its arrays are compressed (meshopt): export it without compression")
         start = view.get("byteOffset", 0)
         length = view["byteLength"]
         buffer = self._buffers[view["buffer"]]
@@ -227,6 +224,8 @@ IOR = "KHR_materials_ior"
 # Extensions that are read. SPECULAR and IOR are read only for the gloss.
 READ = {TRANSFORM, QUANTIZATION, SPECULAR_GLOSSINESS, SPECULAR, IOR}
 READ |= {WEBP, VISIBILITY}
+# Extensions by which a mesh has copies, or compressed arrays.
+REFUSED = {"EXT_mesh_gpu_instancing", "EXT_meshopt_compression", "KHR_draco_mesh_compression"}
 # Beginnings of the names of extensions that may be required by a
 # file but ignored, because they change neither shape nor color.
 HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation_")
@@ -364,7 +363,7 @@ def ignored_features(tree: dict[str, Any]) -> list[str]:
     if len(tree.get("scenes", ())) > 1:
         features.add("all scenes but the first" if "scene" not in tree else "other scenes")
     used = set(tree.get("extensionsUsed", ())) - READ
-    for name in {*tree.get("extensionsRequired", ()), *({INSTANCING} & used)} - READ:
+    for name in {*tree.get("extensionsRequired", ()), *(REFUSED & used)} - READ:
         if not name.startswith(HARMLESS):
             raise ValueError(f"it needs the extension {name}: export the mesh without it")
     return sorted(features | used)
