@@ -226,10 +226,8 @@ def colored_mesh(
     Colors are sRGB-encoded in [0, 1], and absent texture coordinates are NaN. Without
     `texture_ids`, all faces have the first texture.
     """
-    if not textures:
-        texture_ids = np.full(len(faces), NO_TEXTURE)
-    elif texture_ids is None:
-        texture_ids = np.zeros(len(faces), np.int64)
+    if texture_ids is None:
+        texture_ids = np.full(len(faces), 0 if textures else NO_TEXTURE)
     is_textured = texture_ids != NO_TEXTURE
     corner_uvs = np.zeros((len(faces), 3, 2), dtype=np.float32)
     if is_textured.any():

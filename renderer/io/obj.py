@@ -194,19 +194,12 @@ def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
     """Read the properties of all materials by name. None if the file names no library."""
     library: dict[str, _Definition] = {}
     for name in names:
-        try:
-            contents = {name: file.read(name)}
-        except ValueError:
-            # The line may name several files, or end with a comment.
-            parts = re.findall(r"\S.*?\.mtl(?!\S)", name, re.IGNORECASE) or name.split()
-            if parts in ([name], []):
-                raise
-            contents = {part: file.read(part) for part in parts}
-        for path, content in contents.items():
+        # The line may name several files, or end with a comment.
+        for path in re.findall(r"\S.*?\.mtl(?!\S)", name, re.IGNORECASE) or [name]:
             folder = "".join(path.replace("\\", "/").rpartition("/")[:2])
             own: dict[str, _Definition] = {}
             properties: list[tuple[str, str]] = []
-            for word, rest in _LINE.findall(_cleaned(content)):
+            for word, rest in _LINE.findall(_cleaned(file.read(path))):
                 keyword, text = word.decode(), rest.decode().strip()
                 if keyword.lower() != "newmtl":
                     properties.append((keyword, text))
