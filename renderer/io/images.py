@@ -170,8 +170,6 @@ def crop_center(image: Image.Image, size: Size) -> Image.Image:
 
 def eight_bits(image: Image.Image) -> Image.Image:
     """Convert an image to 8 bits per channel. If white is unknown, this raises a ValueError."""
-    if image.format not in (None, "MPO", *FORMATS):
-        raise ValueError(f"the format {image.format} of an image is not read: use PNG or JPEG")
     if image.mode == "F" or (image.mode == "I" and image.format == "TIFF"):
         kind = "floating-point numbers" if image.mode == "F" else "signed or 32-bit integers"
         raise ValueError(f"the pixels are {kind}, so their white is unknown: save 8 or 16 bits")

@@ -265,12 +265,6 @@ def unit_colors(colors: np.ndarray, file: MeshFile) -> np.ndarray:
     return colors.astype(np.float64).clip(0, 1)
 
 
-def require_opaque(alpha: np.ndarray) -> None:
-    """Refuse alpha in [0, 1] that is not 1 everywhere."""
-    if alpha.min(initial=1) < OPAQUE:
-        raise ValueError("the file has transparent colors, which are not supported")
-
-
 def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Multiply the linear values of sRGB-encoded colors, and encode the product."""
     factors = [decode(torch.from_numpy(colors), "srgb") for colors in (first, second)]

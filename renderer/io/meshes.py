@@ -1,7 +1,4 @@
-"""Read meshes with their colors and textures from files, and write them to .glb files.
-
-The library trimesh reads the formats for which there is no reader of our own.
-"""
+"""Read meshes with their colors and textures from files, and write them to .glb files."""
 
 import io
 import json
@@ -11,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,22 +19,17 @@ from renderer import errors
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import decode
-from renderer.io import mesh_file
 from renderer.io.files import atomic_write
 from renderer.io.gltf import read_gltf
-from renderer.io.images import eight_bits, identify
 from renderer.io.mesh_file import MeshFile, Part
 from renderer.io.obj import read_obj
 from renderer.io.ply_off_stl import read_off, read_ply, read_stl
 from renderer.mesh import Y_UP_TO_Z_UP, Mesh, by_material, concatenate, require_mesh, transformed
 from renderer.normals import normal_groups
 
-# Suffixes of archive files, which are not read. trimesh could read them,
-# but the names of the files inside an archive cannot be checked first.
-ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
 # Suffixes of glTF files.
 GLTF = ("glb", "gltf")
-# Readers of our own. trimesh reads the other formats.
+# Readers of other files.
 READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl}
 
 
@@ -62,8 +53,7 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     and a warning names it. Files beside the mesh are read only below its folder.
 
     Args:
-        path: A .glb, .gltf, .obj, .ply, .off or .stl file, or another format of
-            trimesh.
+        path: A .glb, .gltf, .obj, .ply, .off or .stl file.
         up: Axis that points up in the file. "y" rotates the y-axis to the
             z-axis, "z" leaves the mesh as it is, and "auto" means "y" for glTF
             files and "z" for other files.
@@ -123,10 +113,13 @@ def read_parts(path: Path, gloss: bool = False) -> list[Part]:
     errors.require_file(path, "give the path of a mesh file")
     suffix = path.suffix.lower().lstrip(".")
     readers = READERS | dict.fromkeys(GLTF, partial(read_gltf, gloss=gloss))
-    # trimesh and Pillow can raise almost any exception for a damaged file.
+    if suffix not in readers:
+        known = ", ".join(sorted(readers))
+        raise InputError(f"{path} is not of a mesh format that is read: convert it to {known}")
+    # NumPy and Pillow can raise almost any exception for a damaged file.
     try:
         file = MeshFile(path)
-        parts = readers[suffix](file) if suffix in readers else _read_with_trimesh(file, suffix)
+        parts = readers[suffix](file)
     except Exception as error:
         message = errors.single_line(error)
         # The message of a missing key is only this key.
@@ -135,71 +128,6 @@ def read_parts(path: Path, gloss: bool = False) -> list[Part]:
         raise InputError(f"{path} cannot be read as a mesh: {message}") from error
     file.warn(stacklevel=3)
     return parts
-
-
-def _read_with_trimesh(file: MeshFile, suffix: str) -> list[Part]:
-    """Read the parts of a mesh file, such as a .dae file, with trimesh."""
-    # Importing trimesh takes half a second.
-    import trimesh
-
-    formats = set(trimesh.available_formats()) - ARCHIVES
-    if suffix not in formats:
-        known = ", ".join(sorted(formats | READERS.keys()))
-        raise ValueError(f"the mesh format {suffix} is unknown: use one of {known}")
-    file.assume(f"trimesh reads the format {suffix}, and may leave out colors")
-    unreadable: list[Exception] = []
-
-    def get(name: str) -> bytes:
-        """Read an image below the folder of the mesh file, and keep errors."""
-        try:
-            content = file.read(name)
-            identify(io.BytesIO(content)).load()
-        # Pillow can raise almost any exception for a damaged file.
-        except Exception as error:
-            unreadable.append(error)
-            raise
-        return content
-
-    content = io.BytesIO(file.content)
-    files = SimpleNamespace(get=get)
-    scene = trimesh.load(content, file_type=suffix, resolver=files, force="scene", process=False)
-    # trimesh leaves out an image that it cannot read.
-    if unreadable:
-        raise unreadable[0]
-    parts = {
-        name: _as_part(geometry, file)
-        for name, geometry in scene.geometry.items()
-        # The geometry may also be points or lines, which are skipped.
-        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)
-    }
-    # Several nodes of the scene may show the same part at different places.
-    placements = [scene.graph[node] for node in scene.graph.nodes_geometry]
-    return [parts[name]._replace(matrix=matrix) for matrix, name in placements if name in parts]
-
-
-def _as_part(geometry: Any, file: MeshFile) -> Part:
-    """Convert a mesh of trimesh to a matte part in the same coordinates."""
-    faces = np.array(geometry.faces, dtype=np.int64)
-    mesh_file.require_bounded(coordinates=geometry.vertices)
-    visual = geometry.visual
-    colors = None
-    uvs = None
-    textures = []
-    if visual.kind == "vertex":
-        colors = visual.vertex_colors[faces]  # A color for each corner, shape (F, 3, 4).
-    elif visual.kind == "face":
-        colors = visual.face_colors[:, None]  # A color for each face, shape (F, 1, 4).
-    elif visual.kind == "texture":
-        colors = visual.material.baseColorFactor  # One for all, shape (4,), or None.
-        uvs = None if visual.uv is None else visual.uv[faces, :2]
-        if visual.material.baseColorTexture is not None:
-            textures = [np.array(eight_bits(visual.material.baseColorTexture).convert("RGB"))]
-    unit = mesh_file.unit_colors(np.ones(3) if colors is None else colors, file)
-    mesh_file.require_opaque(unit[..., 3:])
-    mesh = mesh_file.colored_mesh(geometry.vertices, faces, unit[..., :3], uvs, textures=textures)
-    # trimesh computes `vertex_normals` if the file has none, but not before they are used.
-    normals = geometry._cache.cache.get("vertex_normals")
-    return Part(mesh, None if normals is None else normals[faces])
 
 
 # Types of the numbers and kinds of the rows of arrays in glTF (3.6.2.2).

@@ -102,8 +102,8 @@ def _rgb(values: _Values, file: MeshFile) -> np.ndarray | None:
         raise ValueError("an element has two kinds of colors, such as red and diffuse_red")
     for name in ("alpha", "a"):
         alpha = _columns(values, (name,))
-        if alpha is not None:
-            mesh_file.require_opaque(mesh_file.unit_colors(alpha, file))
+        if alpha is not None and (mesh_file.unit_colors(alpha, file) < mesh_file.OPAQUE).any():
+            raise ValueError("the file has transparent colors, which are not supported")
     return mesh_file.unit_colors(found[0], file)
 
 
