@@ -1,5 +1,6 @@
 """Fixtures of tests of several packages."""
 
+import gc
 import logging
 import re
 import signal
@@ -21,6 +22,9 @@ from tests import shapes
 # others in each run.
 settings.register_profile("same", derandomize=True, max_examples=40, deadline=None)
 settings.register_profile("search", max_examples=1200, deadline=None)
+# Modules and tests stay until the end. Looking for garbage among them takes a tenth of the time of
+# their collection.
+gc.disable()
 # Other conftest.py, which are read after this one, already import the packages.
 shapes.install()
 
@@ -28,6 +32,12 @@ shapes.install()
 def pytest_configure(config: pytest.Config) -> None:
     """Choose how property tests draw their examples."""
     settings.load_profile("search" if config.option.markexpr == "slow" else "same")
+
+
+def pytest_collection_finish() -> None:
+    """Look for garbage among what the tests make, and not among what was collected."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
