@@ -109,10 +109,8 @@ def training_batches(
     row_of_image = rows[order.clamp(max=len(rows) - 1)]
     crops: Iterator[Tensor] = iter(())
     if isinstance(split.images, ImageFiles):
-        chosen = [~of_batch for of_batch in is_render]
-        shown_rows = [row[mask] for row, mask in zip(row_of_image, chosen, strict=True)]
-        shown_seeds = [seed[mask] for seed, mask in zip(seeds, chosen, strict=True)]
-        crops = split.images.crops(shown_rows, shown_seeds)
+        draws_of_batches = zip(row_of_image, seeds, ~is_render, strict=True)
+        crops = split.images.crops((row[mask], seed[mask]) for row, seed, mask in draws_of_batches)
     # All draws are copied before the first batch, since a GPU finishes earlier work before a copy.
     device = split.labels.device
     draws = (row_of_image, order - len(rows), shifts.transpose(0, 1), is_flipped, is_render)

@@ -77,10 +77,9 @@ class ImageFiles:
         """
         return self._read([(row, None) for row in batch.tolist()] for batch in rows)
 
-    def crops(self, rows: Iterable[Tensor], seeds: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Read random crops of images, batch by batch. A random half of the crops is flipped."""
-        pairs = zip(rows, seeds, strict=True)
-        return self._read([*zip(row.tolist(), seed.tolist(), strict=True)] for row, seed in pairs)
+    def crops(self, batches: Iterable[tuple[Tensor, Tensor]]) -> Iterator[Tensor]:
+        """Read random crops of images by indices and seeds. A random half of them is flipped."""
+        return self._read([*zip(row.tolist(), seed.tolist(), strict=True)] for row, seed in batches)
 
     def _read(self, batches: Iterable[list[Key]]) -> Iterator[Tensor]:
         """Read batches of images in worker processes.

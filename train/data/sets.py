@@ -203,11 +203,10 @@ def load_cifar100(path: str) -> DataSet:
     except (OSError, RuntimeError) as error:
         fault = f"path={path} does not contain CIFAR-100, and the download failed ({error})"
         raise InputError(f"{fault}: give a copy, or connect to the internet", "path") from error
-    splits = []
-    for cifar in both:
-        images = torch.from_numpy(cifar.data).permute(0, 3, 1, 2).contiguous()
-        splits.append(Split(images, torch.tensor(cifar.targets)))
-    return DataSet(tuple(both[0].classes), splits[0], splits[1])
+    images = [torch.from_numpy(cifar.data).permute(0, 3, 1, 2).contiguous() for cifar in both]
+    labels = [torch.tensor(cifar.targets) for cifar in both]
+    train, test = map(Split, images, labels)
+    return DataSet(tuple(both[0].classes), train, test)
 
 
 def load_npz(path: str) -> DataSet:

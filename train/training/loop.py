@@ -78,12 +78,14 @@ class EpochState:
         }
 
 
+@dataclass(eq=False)
 class Trainer:
     """Trainer of one network, which writes checkpoints to the folder of the run.
 
     `fit` trains the network. To continue a run, call `resume` before `fit`.
 
     Attributes:
+        has_initial: Whether the first weights of `model` are those of an initial network.
         initial: Copy of the network before the training. None if the run begins
             with random weights. The copy is the teacher of a distillation loss,
             and each epoch of a model soup begins with its weights.
@@ -94,27 +96,20 @@ class Trainer:
             end of the first epoch.
     """
 
-    def __init__(
-        self,
-        settings: TrainSettings,
-        model: MixedPrecision,
-        architecture: dict[str, Any],
-        service: AugmentationService,
-        folder: Path,
-        labeled: bool = True,
-        has_initial: bool = False,
-    ):
-        """Check the settings, and build the optimizer.
+    settings: TrainSettings
+    model: MixedPrecision
+    architecture: dict[str, Any]
+    service: AugmentationService
+    folder: Path
+    labeled: bool = True
+    has_initial: bool = False
 
-        With `has_initial`, the present weights are those of an initial network.
-        """
+    def __post_init__(self) -> None:
+        """Check the settings, and build the optimizer."""
+        settings, model, service = self.settings, self.model, self.service
         require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
             raise InputError("ranking_weight requires hard negatives: add some", "ranking_weight")
-        self.settings = settings
-        self.architecture = architecture
-        self.service = service
-        self.folder = folder
         # Largest numbers of images of the data set in an epoch and in a round.
         self._limits = settings.images_per_epoch, service.settings.regenerate_every
         self.phases = service.phases
@@ -133,15 +128,15 @@ class Trainer:
         # Time of the last checkpoint or, before that, of the start; and seconds that it took.
         self._saved_at, self._saving_took = time.perf_counter(), 0.0
 
-        self.model = model
         self.device = next(model.parameters()).device
-        self.initial = deepcopy(model).eval().requires_grad_(False) if has_initial else None
+        self.initial = deepcopy(model).eval().requires_grad_(False) if self.has_initial else None
         # The validation accuracy of data without labels is the agreement with the initial
         # network. It is highest before any training, and cannot choose an epoch.
-        self.averages = Averages(model, settings.ema_decay, settings.soup, keeps_latest=not labeled)
+        self.averages = Averages(model, settings.ema_decay, settings.soup, not self.labeled)
         has_teacher = settings.distillation_weight or settings.consistency_weight
         teacher = self.initial if has_teacher else None
-        self.step = TrainingStep(settings, model, teacher, service, architecture["size"], labeled)
+        options = service, self.architecture["size"], self.labeled
+        self.step = TrainingStep(settings, model, teacher, *options)
 
     @property
     def is_detector(self) -> bool:

@@ -2,7 +2,7 @@
 
 import json
 from copy import deepcopy
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -43,6 +43,7 @@ SAMPLED = 1000
 NORM_IMAGES = 16
 
 
+@dataclass(eq=False)
 class Run:
     """One training run, which trains a network and scores it.
 
@@ -50,24 +51,21 @@ class Run:
     the first one trains. Then `begin` and `train` are called.
 
     Attributes:
+        data: Data set. Its labels become indices into the classes of the network.
         scored_folders: Folders of photographs or renders on which the networks are scored, by name.
         held_out: Whether each training image validates the network.
     """
 
-    def __init__(
-        self,
-        settings: ExperimentSettings,
-        data: DataSet,
-        folder: Path,
-        initial: inputs.Initial | None = None,
-        command: str = "",
-    ):
+    settings: ExperimentSettings
+    data: DataSet
+    folder: Path
+    initial: inputs.Initial | None = None
+    command: str = ""
+
+    def __post_init__(self) -> None:
         """Check all inputs and build the network. If the run is resumed, restore its checkpoint."""
-        self.settings = settings
-        # Labels of the data become indices into the classes of the network.
-        self.data = inputs.relabel(settings, data, initial)
-        self.folder = folder
-        self.command = command
+        settings, folder, initial = self.settings, self.folder, self.initial
+        self.data = inputs.relabel(settings, self.data, initial)
         self._inputs = initial.inputs if initial else wrappers.FROM_DATA
         self.scored_folders = settings.scored_folders
         # Class that the initial network predicts for each test image, shape (N,). None
@@ -95,7 +93,7 @@ class Run:
         with keyed(fraction="data.validation"):
             self.held_out = held_out_rows(self.data.train, fraction)
         with keyed(**keys_of("train", settings.train)):
-            self.trainer = self._build_trainer(initial, record, threads)
+            self.trainer = self._build_trainer(record, threads)
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if earlier is not None:
@@ -104,15 +102,18 @@ class Run:
         elif settings.train.resume:
             console.info("nothing to resume in %s; starting at epoch 1", folder)
 
-    def _build_trainer(
-        self, initial: inputs.Initial | None, validation: dict[str, Any] | None, threads: int | None
-    ) -> Trainer:
+    def _build_trainer(self, validation: dict[str, Any] | None, threads: int | None) -> Trainer:
         """Build the network, the optimizer and the service of renders. No file is written.
 
         `validation` is the record of the validation images. Without `threads`, `choose_threads`
         chooses them.
         """
-        settings, data, recipe = self.settings, self.data, self.settings.train
+        settings, data, initial, recipe = (
+            self.settings,
+            self.data,
+            self.initial,
+            self.settings.train,
+        )
         shape = _network_shape(settings, initial)
         images = data.train.images
         if not isinstance(images, Tensor):

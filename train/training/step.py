@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -24,36 +25,36 @@ from train.training.detection import DetectionLoss
 from train.training.recipe import TrainingLoss, build_optimizer, learning_rate, share_layers
 
 
+@dataclass(eq=False)
 class TrainingStep:
-    """Loss, augmentation and optimizer of a network, with which it takes training steps."""
+    """Loss, augmentation and optimizer of a network, with which it takes training steps.
 
-    def __init__(
-        self,
-        settings: TrainSettings,
-        model: MixedPrecision,
-        teacher: MixedPrecision | None,
-        service: AugmentationService,
-        size: int,
-        labeled: bool,
-    ):
-        """Build the optimizer, the loss and the augmentation.
+    Attributes:
+        teacher: Network before the training. None without distillation.
+    """
 
-        `teacher` is the network before the training, or None without distillation.
-        """
-        self._settings = settings
-        self._model = model
-        self._device = next(model.parameters()).device
+    settings: TrainSettings
+    model: MixedPrecision
+    teacher: MixedPrecision | None
+    service: AugmentationService
+    size: int
+    labeled: bool
+
+    def __post_init__(self) -> None:
+        """Build the optimizer, the loss and the augmentation."""
+        settings, model, teacher, service = self.settings, self.model, self.teacher, self.service
+        device = next(model.parameters()).device
         # `wrap_ddp` may replace layers of the network. The optimizer is built
         # afterwards, so that it has the parameters of the new layers.
         replica = wrap_ddp(model)
         # The first optimizer of a process imports the compiler of torch, which takes seconds.
         with progress_message("loading the optimizer"):
             self.optimizer = build_optimizer(model, settings)
-        self.scaler = torch.amp.GradScaler(self._device.type, enabled=model.precision == "float16")
+        self.scaler = torch.amp.GradScaler(device.type, enabled=model.precision == "float16")
         classes = service.positive_classes
         self._augmentation = Augmentation(settings, model, teacher, service.seed, classes[1:])
         with keyed(choice="compile"):
-            is_compiled = compiles(settings.compile, self._device)
+            is_compiled = compiles(settings.compile, device)
         self._loss: Callable[..., tuple[Tensor, Tensor]]
         if isinstance(service.task, Detection):
             if settings.relight_steps:
@@ -65,8 +66,8 @@ class TrainingStep:
             # the network in training.
             pupil: nn.Module | None = teacher
             if teacher is not None and not is_compiled:
-                pupil = share_layers(settings, model, teacher, size)
-            self._loss = TrainingLoss(replica, settings, classes, pupil, labeled).compute
+                pupil = share_layers(settings, model, teacher, self.size)
+            self._loss = TrainingLoss(replica, settings, classes, pupil, self.labeled).compute
         if is_compiled:
             # torch limits the number of compiled functions in a process. Those of an
             # earlier run are removed.
@@ -80,7 +81,7 @@ class TrainingStep:
         steps of the run. Return the sum of the losses of the images, and the number of correct
         predictions.
         """
-        settings = self._settings
+        settings = self.settings
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(settings, done)
         images, labels, rendered = batch
@@ -94,7 +95,7 @@ class TrainingStep:
         self.scaler.scale(loss).backward()
         if settings.clip_gradient:
             self.scaler.unscale_(self.optimizer)
-            nn.utils.clip_grad_norm_(self._model.parameters(), settings.clip_gradient)
+            nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
         self.scaler.step(self.optimizer)
         self.scaler.update()
         return torch.stack([loss.detach() * len(images), hits])

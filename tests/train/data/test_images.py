@@ -51,9 +51,9 @@ def test_center_squares_are_those_of_images_in_memory_whatever_their_mode(files)
 def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_processes(files):
     rows = torch.zeros(200, dtype=torch.int64)
     seeds = torch.arange(200)
-    (crops,) = files.crops([rows], [seeds])
+    (crops,) = files.crops([(rows, seeds)])
     halves = ImageFiles(files.folder, files.paths, SIZE, workers=2, skip=False).crops(
-        rows.split(100), seeds.split(100)
+        zip(rows.split(100), seeds.split(100), strict=True)
     )
     assert torch.equal(crops, torch.cat(list(halves)))
     places = crops[:, :2].float() / 255
