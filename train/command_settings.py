@@ -55,14 +55,10 @@ class AttackCommandSettings(AttackSettings):
     shared: bool = setting(False, "One lighting, shape or color for all views.")
     force: bool = setting(False, "Also attack images that are misclassified before the attack.")
     checks: bool | None = setting(
-        None,
-        "Compare with random draws of as many passes, and with 3 and 10 times as many steps. "
-        "null: true, but false without gradients, because it takes 14 times as many queries.",
+        None, "Compare with random draws, and 3 and 10 times the steps. null: true with gradients."
     )
     radius_scales: list[float] = setting(
-        [],
-        "Factors of each radius at which success is measured, such as [0.5, 1, 2]. null: 1.",
-        within=SCALES,
+        [], "Factors of each radius, such as [0.5, 1, 2], to measure success.", within=SCALES
     )
     verify: str | None = setting("reload", "Render files again: reload, mitsuba, reload+mitsuba.")
 
@@ -118,14 +114,10 @@ class AttackExperimentSettings(TaskSettings):
     network: str = setting("efficientnet_lite0", f"The attacked network: {NETWORKS}.")
     label: Any = setting(None, LABEL, is_text=True)
     target: Any = setting(
-        None,
-        "Class to reach: null (any other), least_likely, a class, or one per view.",
-        is_text=True,
+        None, "Class to reach: least_likely, a class, or one per view. null: any.", is_text=True
     )
     goal: str | None = setting(
-        None,
-        "Goal for a detector: hide, or mislabel (a better box of another class). null: hide.",
-        choices=("hide", "mislabel"),
+        None, "hide or mislabel a detection. null: hide.", choices=("hide", "mislabel")
     )
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
@@ -175,9 +167,7 @@ class LabSettings(Settings):
 
     out: str = setting(REQUIRED, "A new folder, for photos= of pnb-evaluate.")
     label: Any = setting(
-        None,
-        "Positive class, or several, each beside one other object in a setup. null: orange.",
-        is_text=True,
+        None, "Positive class, or several, one in each render. null: orange.", is_text=True
     )
     meshes: list[Any] = setting(LAB_MESHES, "The objects: by default, 6 oranges and 10 others.")
     setups: int = setting(180, "Draws of lighting, camera and pose.", within=(1, common.MAX_IMAGES))
@@ -231,11 +221,7 @@ class AuditSettings(TaskSettings):
     hardened: str | None = setting(None, "Another network beside it, such as run:runs/harden.")
     label: Any = setting(None, LABEL, is_text=True)
     meshes: list[Any] = setting([], "Meshes of the class. []: only `unlabeled` is audited.")
-    unlabeled: str | None = setting(
-        None,
-        "Folder of photographs: which keep their predicted class in the light of a projector? "
-        "At most 100 times `budget` of them are attacked.",
-    )
+    unlabeled: str | None = setting(None, "Photographs to relight, at most 100 × `budget`.")
     hard_negatives: list[Any] = setting([], "Meshes of other classes. []: generated fruit, balls.")
     photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")
     laboratory: str | None = setting(None, "Folder of renders. null: made of meshes by Mitsuba.")
@@ -272,24 +258,16 @@ class EvaluateSettings(TaskSettings):
         "COCO, or a folder of images with labels of YOLO. Of a segmenter: images/ and masks/.",
     )
     fit: str = setting(
-        "letterbox",
-        "How photographs get the size of a detector or segmenter.",
-        choices=("letterbox", "stretch"),
+        "letterbox", "How photographs get the network's size.", choices=("letterbox", "stretch")
     )
     run: str | None = setting(
-        None,
-        "A run folder or a folder below pretrained/. Then `network` is not set, or is the "
-        "python:package.module:function that built the run's network.",
+        None, "A run, instead of `network`, which can only be the python: function that built it."
     )
     label: Any = setting(
-        None,
-        "Positive class, or several. null: that of the run, or each class with a sub-folder.",
-        is_text=True,
+        None, "Positive class, or several. null: the run's, or all with a folder.", is_text=True
     )
     out: str = setting(f"runs/photographs/{TIME_FOLDER}", "Folder of the scores.")
-    false_positive_rate: float | None = setting(
-        None, "Rate for which thresholds are chosen on calibrate.", within=PROBABILITY
-    )
+    false_positive_rate: float | None = setting(None, "Rate of the thresholds.", within=PROBABILITY)
     calibrate: str | None = setting(None, "Folder like photos. null: the stored threshold, if any.")
     by: str = setting("source", "Groups of the tables.", choices=common.GROUPS)
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
@@ -332,10 +310,7 @@ class FitSettings(Settings):
     mask: str | None = setting(None, "Image of the photograph's size, white where the object is.")
     box: list[int] = setting([], "Or [left, top, right, bottom] in pixels, for GrabCut.")
     fov: float | None = setting(
-        None,
-        "Angle across 1.6 widths of the object. null: orthographic.",
-        "degrees",
-        within=(0.1, 120),
+        None, "Angle across 1.6 object widths. null: orthographic.", "degrees", within=(0.1, 120)
     )
     albedo_scale: float = setting(1.0, "Factor of the albedo.", within=(1e-3, 1e3))
     encoding: str = setting("srgb", "Encoding of photograph and mesh.", choices=base.ENCODINGS)
@@ -361,9 +336,7 @@ class RenderSettings(TaskSettings):
 
     network: str | None = setting(None, f"Network that each render is to fool: {NETWORKS}.")
     size: Any = setting(
-        None,
-        "Pixels per side, or [height, width]. null: the network's, or 224.",
-        within=(1, base.MAX_SIZE),
+        None, "Pixels, or [height, width]. null: the network's, or 224.", within=(1, base.MAX_SIZE)
     )
     meshes: list[Any] = setting(
         ["solid:orange", "solid:apple", "solid:cup"], MESHES, is_filled=True

@@ -48,6 +48,7 @@ GROUPS = ("source", "mesh", "class")
 MIN_SIZE = 5
 MAX_IMAGES = 10**6
 PROBABILITY = (1e-6, 1 - 1e-6)
+TASKS = ("classification", "detection", "segmentation")
 # Number of renders if neither this number nor that of the views is set.
 RENDERS = 100
 # Explanation of a list of meshes in settings.
@@ -87,10 +88,7 @@ class DataSettings(Settings):
     )
     path: str = setting("", "File or folder of the data.", may_be_empty=True)
     test_fraction: float = setting(
-        0.1,
-        "Test fraction, if there is no sub-folder `test`. Without labels, at most 1,000 images.",
-        above=0,
-        below=1,
+        0.1, "Test fraction of a folder without a sub-folder `test`.", above=0, below=1
     )
     workers: int = setting(2, "Processes that read images above 64 pixels.", within=(0, 1024))
     train_per_class: int = setting(300, "Training images of each shape.", within=(1, MAX_IMAGES))
@@ -121,10 +119,7 @@ class EvaluationSettings(Settings):
 
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     laboratory_setups: int = setting(
-        0,
-        "Path-traced setups of other objects and patterns to score both networks on, if photos is "
-        "null. A multiple of 5. 0: none.",
-        within=(0, MAX_IMAGES),
+        0, "Path-traced setups to score if photos is null, a multiple of 5.", within=(0, MAX_IMAGES)
     )
 
     def __post_init__(self) -> None:
@@ -140,9 +135,7 @@ class NetworkSettings(Settings):
 
     network: str | None = setting(None, f"The network: {NETWORKS}.")
     size: Any = setting(
-        None,
-        "Pixels per side, or [height, width]. null: those of the network, or 224.",
-        within=(1, MAX_SIZE),
+        None, "Pixels, or [height, width]. null: the network's, or 224.", within=(1, MAX_SIZE)
     )
     weights: str | None = setting(None, "File of the network's weights. null: its own.")
     classes: Any = setting(
@@ -188,11 +181,7 @@ class NetworkSettings(Settings):
 class TaskSettings(NetworkSettings):
     """Settings that choose a network, and say what its outputs mean."""
 
-    task: str | None = setting(
-        None,
-        "What the outputs mean. null: what their type tells.",
-        choices=("classification", "detection", "segmentation"),
-    )
+    task: str | None = setting(None, "What outputs mean. null: their type tells.", choices=TASKS)
     threshold: float | None = setting(None, "Threshold of scores. null: 0.4.", within=PROBABILITY)
     iou: float | None = setting(None, "Least intersection over union. null: 0.5.", within=(0.01, 1))
     decode: str | None = setting(
@@ -206,12 +195,7 @@ class TaskSettings(NetworkSettings):
 class ExperimentSettings(NetworkSettings):
     """Settings of one training run: all settings of the command pnb-train."""
 
-    network: str | None = setting(
-        None,
-        "Network with whose weights the training starts: a run folder, a network's file, or a "
-        "classifier: efficientnet_lite0, torchvision:NAME, timm:NAME or "
-        "python:package.module:function. null: random weights.",
-    )
+    network: str | None = setting(None, f"Initial network: {NETWORKS}. null: random weights.")
     size: int | None = setting(
         None, "Pixels per side. null: the network's, or 32.", within=(MIN_SIZE, MAX_SIZE)
     )
@@ -223,9 +207,7 @@ class ExperimentSettings(NetworkSettings):
     )
     # The type is str | dict[str, str] | None, which OmegaConf does not support.
     photos: Any = setting(
-        None,
-        "Folder of photographs to score, or several: {photographs: A, lab: B}. null: none.",
-        is_text=True,
+        None, "Photographs to score: a folder, or {photographs: A, lab: B}.", is_text=True
     )
     unlabeled: str | None = setting(None, "Folder of photographs to train on, for data=unlabeled.")
     out: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
@@ -233,10 +215,7 @@ class ExperimentSettings(NetworkSettings):
     overwrite: bool = setting(False, "Start anew in a folder that holds a run or other results.")
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     label: Any = setting(
-        None,
-        "Positive class: the class of the meshes, or several, [orange, apple]. null: the classes "
-        "that meshes name or, without meshes, each class that has a sub-folder of photographs.",
-        is_text=True,
+        None, "Positive class, or several. null: those of meshes or photographs.", is_text=True
     )
     compare: list[str] = setting([], "Other kinds of renders to train first, for the same table.")
     photographs_first: bool = setting(

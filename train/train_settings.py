@@ -61,8 +61,7 @@ class TrainSettings(Settings):
     learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
     feature_norm: float | None = setting(
         None,
-        "Norm of the features for which learning_rate is meant, if only the last layer learns. "
-        "The rate is multiplied by it / the network's norm. null: it is not.",
+        "Norm of the features for which the rate of the last layer is meant. null: any norm.",
         above=0,
         maximum=MAX_SCALE,
     )
@@ -72,20 +71,17 @@ class TrainSettings(Settings):
         None, "Largest norm of the gradient of a batch. null: any.", above=0, maximum=MAX_SCALE
     )
     freeze: str | None = setting(
-        None,
-        "Name of the last module of the network that stays as it is. "
-        "all_but_last: only the last layer learns. null: all layers learn.",
+        None, "Last module that stays as is. all_but_last: only the last layer learns. null: none."
     )
     schedule: str = setting("step", "step: times 0.2 at 30%, 60% and 80%.", choices=SCHEDULES)
     flips: str = setting(
         "random",
-        "Flips of random images, or in every other epoch.",
+        "Flips of random images, or in alternate epochs.",
         choices=("random", "alternating"),
     )
     augmentation: str = setting(
         "none",
-        "Augmentation of every training image. relight: random light of a projector. low_light: "
-        "few photons and noise. relight+low_light: either, in turn.",
+        "relight: light of a projector. low_light: few photons. relight+low_light: both in turn.",
         choices=AUGMENTATIONS,
     )
     relight_gain: float = setting(
@@ -102,22 +98,14 @@ class TrainSettings(Settings):
     consistency_weight: float = setting(
         0.0, "Weight of the same divergence on augmented images.", within=(0, MAX_SCALE)
     )
-    interpolate: bool = setting(
-        False,
-        "At the end, interpolate between the weights of `network` and the trained weights, "
-        "by the factor with the lowest loss on unchanged and relit validation images (WiSE-FT).",
-    )
+    interpolate: bool = setting(False, "Mix weights before and after by validation (WiSE-FT).")
     ema_decay: float = setting(0.0, "Decay of averaged weights. 0: none.", minimum=0, below=1)
     soup: bool = setting(False, "Keep the mean of all epochs, which all start with `network`.")
     eval_mode: bool | None = setting(
         None,
-        "Train with the statistics of `network`, without dropout. null: a classifier of others.",
+        "Train with the statistics of `network`, without dropout. null: classifiers of others.",
     )
-    precision: str = setting(
-        "auto",
-        "Precision of the training. auto: bfloat16 if the hardware computes in it, otherwise "
-        "float16 on a GPU and float32 on a CPU, where depthwise convolutions always take float32.",
-    )
+    precision: str = setting("auto", "bfloat16, float16, float32, or auto: by the hardware.")
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
     threads: int | None = setting(
         None, "CPU threads. null: all cores, or one for small batches.", within=(1, 1024)
