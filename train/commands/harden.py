@@ -1,7 +1,7 @@
 """Hardening of any network in one call."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -236,11 +236,7 @@ def _read_settings(
 @contextmanager
 def _restores_torch() -> Iterator[None]:
     """Restore threads, random generators and cuDNN's choices, which training changes."""
-    threads = torch.get_num_threads()
-    is_benchmarked = torch.backends.cudnn.benchmark
-    try:
-        with torch.random.fork_rng():
-            yield
-    finally:
-        torch.set_num_threads(threads)
-        torch.backends.cudnn.benchmark = is_benchmarked
+    with ExitStack() as at_end, torch.random.fork_rng():
+        at_end.callback(torch.set_num_threads, torch.get_num_threads())
+        at_end.callback(setattr, torch.backends.cudnn, "benchmark", torch.backends.cudnn.benchmark)
+        yield

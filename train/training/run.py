@@ -108,12 +108,8 @@ class Run:
         `validation` is the record of the validation images. Without `threads`, `choose_threads`
         chooses them.
         """
-        settings, data, initial, recipe = (
-            self.settings,
-            self.data,
-            self.initial,
-            self.settings.train,
-        )
+        settings, data, initial = self.settings, self.data, self.initial
+        recipe = settings.train
         shape = _network_shape(settings, initial)
         images = data.train.images
         if not isinstance(images, Tensor):
