@@ -18,7 +18,7 @@ from renderer import settings as base
 from renderer.errors import MAX_SCALE, MAX_SEED, InputError, is_number, require_choice
 from renderer.settings import REQUIRED, Settings, pair, setting, setting_like
 from train import settings as common
-from train.settings import LABEL, MESHES, NETWORKS, PROBABILITY, TIME_FOLDER, TaskSettings
+from train.settings import LABEL, MESHES, NETWORKS, PROBABILITY, TIME_FOLDER, TaskSettings, text
 
 SCALES = (1 / MAX_SCALE, MAX_SCALE)
 # Default environment maps of an audit.
@@ -112,10 +112,8 @@ class AttackExperimentSettings(TaskSettings):
     """
 
     network: str = setting("efficientnet_lite0", f"The attacked network: {NETWORKS}.")
-    label: Any = setting(None, LABEL, is_text=True)
-    target: Any = setting(
-        None, "Class to reach: least_likely, a class, or one per view. null: any.", is_text=True
-    )
+    label: Any = text(LABEL)
+    target: Any = text("Class to reach: least_likely, a class, or one per view. null: any.")
     goal: str | None = setting(
         None, "hide or mislabel a detection. null: hide.", choices=("hide", "mislabel")
     )
@@ -166,9 +164,7 @@ class LabSettings(Settings):
     """
 
     out: str = setting(REQUIRED, "A new folder, for photos= of pnb-evaluate.")
-    label: Any = setting(
-        None, "Positive class, or several, one in each render. null: orange.", is_text=True
-    )
+    label: Any = text("Positive class, or several, one in each render. null: orange.")
     meshes: list[Any] = setting(LAB_MESHES, "The objects: by default, 6 oranges and 10 others.")
     setups: int = setting(180, "Draws of lighting, camera and pose.", within=(1, common.MAX_IMAGES))
     patterns: list[str] = setting(
@@ -219,7 +215,7 @@ class AuditSettings(TaskSettings):
 
     network: str = setting(REQUIRED, f"The audited network: {NETWORKS}.")
     hardened: str | None = setting(None, "Another network beside it, such as run:runs/harden.")
-    label: Any = setting(None, LABEL, is_text=True)
+    label: Any = text(LABEL)
     meshes: list[Any] = setting([], "Meshes of the class. []: only `unlabeled` is audited.")
     unlabeled: str | None = setting(None, "Photographs to relight, at most 100 × `budget`.")
     hard_negatives: list[Any] = setting([], "Meshes of other classes. []: generated fruit, balls.")
@@ -263,9 +259,7 @@ class EvaluateSettings(TaskSettings):
     run: str | None = setting(
         None, "A run, instead of `network`, which can only be the python: function that built it."
     )
-    label: Any = setting(
-        None, "Positive class, or several. null: the run's, or all with a folder.", is_text=True
-    )
+    label: Any = text("Positive class, or several. null: the run's, or all with a folder.")
     out: str = setting(f"runs/photographs/{TIME_FOLDER}", "Folder of the scores.")
     false_positive_rate: float | None = setting(None, "Rate of the thresholds.", within=PROBABILITY)
     calibrate: str | None = setting(None, "Folder like photos. null: the stored threshold, if any.")
@@ -341,7 +335,7 @@ class RenderSettings(TaskSettings):
     meshes: list[Any] = setting(
         ["solid:orange", "solid:apple", "solid:cup"], MESHES, is_filled=True
     )
-    label: Any = setting(None, "Class of the meshes. null: the names of the files.", is_text=True)
+    label: Any = text("Class of the meshes. null: the names of the files.")
     format: str = setting("imagefolder", "Layout of the data set.", choices=DATA_SET_FORMATS)
     count: int = setting(100, "Number of renders.", within=(1, MAX_SEED))
     splits: Any = setting({"train": 0.8, "val": 0.1, "test": 0.1}, "Fractions of the parts.")

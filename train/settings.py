@@ -78,6 +78,11 @@ CIRCUMSTANCES = (
 )
 
 
+def text(about: str) -> Any:
+    """Create a field, by default None, for one or several names, which may look like numbers."""
+    return setting(None, about, is_text=True)
+
+
 @dataclass
 class DataSettings(Settings):
     """Settings of the data set. Each kind of data set uses some of these settings."""
@@ -138,17 +143,13 @@ class NetworkSettings(Settings):
         None, "Pixels, or [height, width]. null: the network's, or 224.", within=(1, MAX_SIZE)
     )
     weights: str | None = setting(None, "File of the network's weights. null: its own.")
-    classes: Any = setting(
-        None,
+    classes: Any = text(
         "Names of the classes in the order of the outputs, [a,b], or a text file with a name in "
-        "each line. null: the names that the network knows, otherwise 0, 1 and so on.",
-        is_text=True,
+        "each line. null: the names that the network knows, otherwise 0, 1 and so on."
     )
-    normalization: Any = setting(
-        None,
+    normalization: Any = text(
         "Normalization before the classifier: imagenet, or [MEAN,STD] in units of [0, 1], such as "
-        "[[0,0,0],[1,1,1]] for none. null: that of the network, and none before a file's.",
-        is_text=True,
+        "[[0,0,0],[1,1,1]] for none. null: that of the network, and none before a file's."
     )
     prompt: str | None = setting(
         None, "Prompt of a zero-shot network, in which {} is the class. null: a photo of a {}."
@@ -206,17 +207,13 @@ class ExperimentSettings(NetworkSettings):
         "A mapping {mesh, label} names its class. A file alone is of no class.",
     )
     # The type is str | dict[str, str] | None, which OmegaConf does not support.
-    photos: Any = setting(
-        None, "Photographs to score: a folder, or {photographs: A, lab: B}.", is_text=True
-    )
+    photos: Any = text("Photographs to score: a folder, or {photographs: A, lab: B}.")
     unlabeled: str | None = setting(None, "Folder of photographs to train on, for data=unlabeled.")
     out: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
     sweep: str = setting("runs/sweep", "Folder of the runs of a --multirun.")
     overwrite: bool = setting(False, "Start anew in a folder that holds a run or other results.")
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
-    label: Any = setting(
-        None, "Positive class, or several. null: those of meshes or photographs.", is_text=True
-    )
+    label: Any = text("Positive class, or several. null: those of meshes or photographs.")
     compare: list[str] = setting([], "Other kinds of renders to train first, for the same table.")
     photographs_first: bool = setting(
         False, "First train with experiment=photographs in a sub-folder, and begin with its result."

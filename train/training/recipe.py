@@ -139,9 +139,7 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
         parameter.requires_grad_(False)
 
 
-def set_training_mode(
-    network: nn.Module, settings: TrainSettings, returns_losses: bool = False
-) -> None:
+def set_training_mode(network: nn.Module, settings: TrainSettings, returns_losses: bool) -> None:
     """Put a network in training mode, except the modules that should not change.
 
     Modules of frozen parameters stay in evaluation mode, so that the statistics
