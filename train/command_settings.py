@@ -261,7 +261,7 @@ class EvaluateSettings(TaskSettings):
     )
     label: Any = text("Positive class, or several. null: the run's, or all with a folder.")
     out: str = setting(f"runs/photographs/{TIME_FOLDER}", "Folder of the scores.")
-    false_positive_rate: float | None = setting(None, "Rate of the thresholds.", within=PROBABILITY)
+    false_positive_rate: float | None = setting(None, "Rate on `calibrate`.", within=PROBABILITY)
     calibrate: str | None = setting(None, "Folder like photos. null: the stored threshold, if any.")
     by: str = setting("source", "Groups of the tables.", choices=common.GROUPS)
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
