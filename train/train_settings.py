@@ -18,7 +18,9 @@ NEEDS_INITIAL_NETWORK = (
 # et al. (2023).
 ALL_BUT_LAST = "all_but_last"
 # Choices of train.augmentation that are transforms of torchvision.
-TRANSFORMS = ("color_jitter", "trivial_augment", "augmix", "color_jitter+augmix")
+TRANSFORMS = (
+    *("color_jitter", "exposure_jitter", "trivial_augment", "augmix", "color_jitter+augmix"),
+)
 # Augmentation by the light of a projector; see `train.training.augmentations`.
 RELIGHT = "relight"
 # Augmentation by low light with the noise of a camera, alone or for every second image.
