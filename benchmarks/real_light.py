@@ -1,0 +1,310 @@
+"""Score networks on photographs of the same kinds of objects in several lights.
+
+Run it as a module in the root of the repository:
+
+    python -m benchmarks.real_light score FOLDER pretrained/none pretrained/best --label orange
+
+FOLDER has a folder of photographs for each class, named LIGHT__NAME.jpg, and may have photos.csv
+with the columns path, source_tag and mesh (the object). A folder other_CLASS stands for a CLASS
+that some networks lack. With --crops, LIGHT__NAME_K.jpg is crop K of a photograph NAME, which may
+have crops in several folders. A network is a published name, the folder of a run, or a name that
+`pnb-evaluate` takes as network=. After "normalized:" it sees normalized light. TITLE=A,B,C is a
+training with three seeds. The first network and the first light are what others are compared with.
+
+    python -m benchmarks.real_light simulate PHOTOS FOLDER --lights low_light --classes orange apple
+
+writes such a folder with the photographs of PHOTOS as they are ("plain") and in simulated light.
+"""
+
+import argparse
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+import norm_balls as nb
+from augment.classifier import Classifier
+from renderer.io.images import write_image
+from train.checkpoints import is_classifier, load_network, load_run
+from train.data.photo import Photograph
+from train.data.photographs import find_photographs, load_photographs
+from train.results.intervals import auc_and_recalls, class_means, weighted_means
+from train.results.metrics import MIN_OBJECTS
+from train.results.predictions import Predictions
+from train.results.scoring import compute_logits, rank_classes
+from train.results.tables import (
+    NORMAL_QUANTILE,
+    Estimate,
+    Table,
+    format_interval,
+    wilson,
+    write_csv,
+)
+from train.settings import OTHER_PREFIX
+
+DRAWS = 2000
+METRICS = ("top-1", "recall", "recall at 5% FPR", "FPR", "AUC")
+NORMALIZED = "normalized:"
+PLAIN = "plain"
+# Statistics of a network in a light, shape (5, 1 + DRAWS): of all photographs, then of each draw.
+Statistics = np.ndarray
+
+
+def load(name: str) -> Classifier:
+    """Load a network by its name on the command line."""
+    if name.startswith(NORMALIZED):
+        return load(name.removeprefix(NORMALIZED)).normalizing_light()
+    return load_network(name) if is_classifier(name) else load_run(name)
+
+
+def light_of(photograph: Photograph) -> str:
+    """Return the light of a photograph, which its name states, or photos.csv."""
+    light, separator, _ = photograph.path.name.partition("__")
+    return light if separator else photograph.source or PLAIN
+
+
+@dataclass(frozen=True)
+class Folder:
+    """Photographs of class folders, and the units of the bootstrap.
+
+    Attributes:
+        path: The folder.
+        photographs: Its photographs.
+        has_crops: Whether the number after the last "_" of a name is that of a crop.
+    """
+
+    path: Path
+    photographs: Sequence[Photograph]
+    has_crops: bool = False
+
+    @cached_property
+    def lights(self) -> np.ndarray:
+        """Light of each photograph."""
+        return np.array([light_of(item) for item in self.photographs])
+
+    @cached_property
+    def objects(self) -> np.ndarray:
+        """Object of each photograph, or its class if photos.csv does not name it."""
+        return np.array([item.mesh or item.label for item in self.photographs])
+
+    def has_objects(self, label: str) -> bool:
+        """Return whether there are MIN_OBJECTS objects of a class, and of other classes."""
+        shown = np.array([item.label.removeprefix(OTHER_PREFIX) for item in self.photographs])
+        sides = [self.objects[shown == label], self.objects[shown != label]]
+        return min(len({*side}) for side in sides) >= MIN_OBJECTS
+
+    @cached_property
+    def names(self) -> np.ndarray:
+        """Name of the photograph without its light, so that it is the same in each light."""
+        names = []
+        for item in self.photographs:
+            name = item.path.stem.partition("__")[2] or item.path.stem
+            is_crop = self.has_crops
+            names.append(re.sub(r"_\d+$", "", name) if is_crop else f"{item.label}/{name}")
+        return np.array(names)
+
+    def units(self, label: str) -> np.ndarray:
+        """Return the unit of each photograph: its object, or else the photograph with its crops."""
+        return self.objects if self.has_objects(label) else self.names
+
+    def draw(self, label: str) -> np.ndarray:
+        """Draw how often each photograph counts, shape (1 + DRAWS, N); first, each counts once.
+
+        Units of the same objects that occur in the same lights are drawn together, so each light
+        keeps its number of photographs of each object. Objects as units differ in the lights alone.
+        """
+        unit_of_photograph = self.units(label)
+        units = np.unique(unit_of_photograph)
+        kinds: dict[object, list[int]] = {}
+        for index, unit in enumerate(units):
+            is_unit = unit_of_photograph == unit
+            objects = frozenset(() if self.has_objects(label) else self.objects[is_unit])
+            kinds.setdefault((frozenset(self.lights[is_unit]), objects), []).append(index)
+        counts = np.zeros((DRAWS, len(units)), int)
+        generator = np.random.default_rng(0)
+        for members in kinds.values():
+            share = np.full(len(members), 1 / len(members))
+            counts[:, members] = generator.multinomial(len(members), share, size=DRAWS)
+        return np.insert(counts, 0, 1, axis=0)[:, np.searchsorted(units, unit_of_photograph)]
+
+
+def predict(network: Classifier, folder: Folder, labels: Sequence[str]) -> Predictions:
+    """Predict the classes of all photographs, of which other_CLASS may show a CLASS."""
+    photographs, images, _ = load_photographs(folder.path, folder.photographs, network.size)
+    shown = []
+    for item in photographs:
+        name = item.label.removeprefix(OTHER_PREFIX)
+        known = name if name in network.classes else item.label
+        shown.append(Photograph(item.path, known, item.source, mesh=item.mesh))
+    logits = compute_logits(network, images, len(network.classes), "cpu")
+    return rank_classes(shown, logits, network.classes, labels)
+
+
+def measure(
+    predictions: Predictions, objects: np.ndarray, counts: np.ndarray, rows: np.ndarray
+) -> Statistics:
+    """Compute METRICS of some photographs for each draw. Unknown ones are NaN.
+
+    Top-1 is the mean over objects, of classes that the network has.
+    """
+    chosen = predictions[rows]
+    counts, objects = counts[:, rows], objects[rows]
+    hits = (chosen.predicted == chosen.label).astype(float)
+    is_positive, is_known = chosen.positive, np.isfinite(chosen.true_rank)
+    top1, recall, at_5, rate, auc = values = np.full((len(METRICS), len(counts)), np.nan)
+    with np.errstate(invalid="ignore"):
+        if is_known.any():
+            first = chosen.true_rank[is_known] <= 1
+            top1[:] = class_means(first, objects[is_known].tolist(), counts[:, is_known])
+        if is_positive.any():
+            recall[:] = weighted_means(hits[is_positive], counts[:, is_positive])
+        if not is_positive.all():
+            rate[:] = weighted_means(hits[~is_positive], counts[:, ~is_positive])
+        if is_positive.any() and not is_positive.all():
+            sides = [chosen.log_odds[side] for side in (is_positive, ~is_positive)]
+            drawn = [counts[:, side] for side in (is_positive, ~is_positive)]
+            auc[:], at_5[:], *_ = auc_and_recalls(*sides, *drawn)
+    return values
+
+
+def over_seeds(seeds: Sequence[Statistics]) -> Statistics:
+    """Average statistics over seeds, which are drawn anew with each draw of photographs."""
+    count = len(seeds)
+    drawn = np.random.default_rng(1).integers(count, size=(DRAWS, count))
+    drawn = np.insert(drawn, 0, np.arange(count), axis=0)
+    columns = np.arange(1 + DRAWS)[:, None]
+    return np.stack(seeds)[drawn, :, columns].mean(axis=1).T
+
+
+def estimate(draws: np.ndarray, units: int, is_change: bool = False) -> Estimate:
+    """Return the first value with the 95% interval of the other values, which may be NaN.
+
+    If no draw differs from it, the interval is Wilson's for so many units, or that of no change.
+    """
+    value = float(draws[0])
+    if np.isnan(value):
+        return Estimate()
+    low, high = np.nanquantile(draws[1:], [0.025, 0.975])
+    if np.nanmax(np.abs(draws - value)) < 1e-9:
+        margin = wilson(0.0, units, NORMAL_QUANTILE)[1]
+        low, high = wilson(value, units, NORMAL_QUANTILE)
+        if is_change:
+            low, high = np.clip([value - margin, value + margin], -1, 1)
+    return Estimate(value, float(low), float(high))
+
+
+def score(options: argparse.Namespace) -> None:
+    """Print tables of the metrics, of gains over the first network and of changes with light."""
+    networks = dict(map(split_title, options.networks))
+    names = [name for names in networks.values() for name in names]
+    loaded = {name: load(name) for name in names}
+    classes = next(iter(loaded.values())).classes
+    found = find_photographs(options.folder, classes, options.label)
+    folder = Folder(options.folder, found, options.crops)
+    groups = choose_lights(folder, options.lights)
+    counts = folder.draw(options.label)
+    results: dict[tuple[str, str], Statistics] = {}
+    for title, seeds in networks.items():
+        each = [predict(loaded[name], folder, [options.label]) for name in seeds]
+        for light, rows in groups.items():
+            measured = [measure(one, folder.objects, counts, rows) for one in each]
+            results[title, light] = over_seeds(measured)
+    first_network, first_light = next(iter(networks)), next(iter(groups))
+    gains, changes = {}, {}
+    for (title, light), values in results.items():
+        if title != first_network:
+            gains[title, light] = values - results[first_network, light]
+        if light != first_light:
+            changes[title, light] = values - results[title, first_light]
+    units = folder.units(options.label)
+    what = "objects" if folder.has_objects(options.label) else "photographs, for these objects"
+    unit_counts = {light: len({*units[rows]}) for light, rows in groups.items()}
+    header = ["network", "light", *METRICS]
+    scores: list[list[object]] = [header]
+    kinds = {"": results, f" minus {first_network}": gains, f" minus {first_light}": changes}
+    for suffix, table in kinds.items():
+        rows = []
+        for (title, light), values in table.items():
+            found_estimates = [estimate(row, unit_counts[light], bool(suffix)) for row in values]
+            cells = [format_interval(item, "+" if suffix else "") for item in found_estimates]
+            rows.append([title, light, *cells])
+        if rows:
+            heading = f"{options.label}{suffix}: 95% intervals over {what}"
+            print(Table(heading, header, rows), end="\n\n", flush=True)
+        scores += [] if suffix else rows
+    for light, rows in groups.items():
+        print(f"{light}: {rows.sum()} images, {unit_counts[light]} {what}")
+    if options.out:
+        write_csv(options.out, scores)
+
+
+def split_title(word: str) -> tuple[str, list[str]]:
+    """Split "TITLE=A,B" into the title and the names of the networks. One name is a title, too."""
+    title, separator, names = word.partition("=")
+    return (title, names.split(",")) if separator else (word, word.split(","))
+
+
+def choose_lights(folder: Folder, words: Sequence[str]) -> Mapping[str, np.ndarray]:
+    """Return which photographs are in each light. "TITLE=A+B" is several lights together.
+
+    Without words, these are all lights, of which "plain" is the first.
+    """
+    known = sorted({*folder.lights}, key=lambda name: (name != PLAIN, name))
+    groups = {}
+    for word in words or known:
+        title, separator, joined = word.partition("=")
+        lights = joined.split("+") if separator else [title]
+        if unknown := {*lights} - {*known}:
+            raise SystemExit(f"no photograph is in the light {min(unknown)}: choose among {known}")
+        groups[str(title)] = np.isin(folder.lights, lights)
+    return groups
+
+
+def simulate(options: argparse.Namespace) -> None:
+    """Write the photographs of some classes as they are, and in simulated light."""
+    found = find_photographs(options.photos, options.classes, options.classes[0])
+    names = {*options.classes, *(f"{OTHER_PREFIX}{name}" for name in options.classes)}
+    chosen = [item for item in found if item.label in names and item.source not in options.exclude]
+    photographs, images, _ = load_photographs(options.photos, chosen, options.size)
+    shown = {PLAIN: images}
+    for light in options.lights:
+        shown[light] = nb.relight_photographs(images, options.seed, lights=[light])
+    for light, relit in shown.items():
+        for item, image in zip(photographs, relit, strict=True):
+            path = options.folder / item.label / f"{light}__{item.path.stem}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_image(path, image.permute(1, 2, 0).numpy())
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(required=True)
+    scoring = commands.add_parser("score", help="score networks on a folder")
+    scoring.set_defaults(body=score)
+    scoring.add_argument("folder", type=Path)
+    scoring.add_argument("networks", nargs="+", help="NETWORK, or TITLE=NETWORK,NETWORK")
+    scoring.add_argument("--label", required=True, help="positive class")
+    scoring.add_argument("--lights", nargs="*", default=[], help="LIGHT, or TITLE=LIGHT+LIGHT")
+    scoring.add_argument("--crops", action="store_true", help="names end in the number of a crop")
+    scoring.add_argument("--out", type=Path, help="CSV file of the scores")
+    simulating = commands.add_parser("simulate", help="write photographs in simulated light")
+    simulating.set_defaults(body=simulate)
+    simulating.add_argument("photos", type=Path, help="folder of class folders")
+    simulating.add_argument("folder", type=Path, help="folder to write")
+    simulating.add_argument("--lights", nargs="+", required=True, help="names of nb.lights")
+    simulating.add_argument("--classes", nargs="+", required=True)
+    simulating.add_argument("--exclude", nargs="*", default=[], help="sources of photos.csv")
+    simulating.add_argument("--size", type=int, default=160, help="pixels per side")
+    simulating.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    options.body(options)
+
+
+if __name__ == "__main__":
+    main()

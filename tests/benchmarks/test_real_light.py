@@ -1,0 +1,112 @@
+"""Scores of photographs in several lights, with intervals over photographs or objects."""
+
+import csv
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks import real_light
+from tests.helpers import darker_than
+
+
+def save(path, level):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((8, 8, 3), level, np.uint8)).save(path)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Write oranges that are dark, and others that are bright, in two lights, as two crops each.
+
+    In plain light, the network that tells dark from bright is right. In low light, one of four
+    photographs of other objects is as dark as the oranges.
+    """
+    for number in range(4):
+        for crop in (1, 2):
+            name = f"p{number}_{crop}.png"
+            for light in ("plain", "low_light"):
+                save(tmp_path / f"orange/{light}__{name}", 40)
+                is_dark = light == "low_light" and number == 0
+                save(tmp_path / f"other_ball/{light}__{name}", 20 if is_dark else 200)
+    return tmp_path
+
+
+def score(folder, monkeypatch, *words):
+    """Score two networks, and return the rows of the table by network and light."""
+    networks = {"half": darker_than(0.5), "never": darker_than(-1.0)}
+    monkeypatch.setattr(real_light, "load", networks.__getitem__)
+    out = folder.parent / "scores.csv"
+    real_light.main(["score", str(folder), *words, "--label", "orange", "--out", str(out)])
+    with out.open() as file:
+        return {(row["network"], row["light"]): row for row in csv.DictReader(file)}
+
+
+def test_each_light_has_its_scores(folder, monkeypatch):
+    rows = score(folder, monkeypatch, "half", "never", "--crops")
+    values = {
+        key: [row[name].split()[0] for name in real_light.METRICS[1:]] for key, row in rows.items()
+    }
+    # One quarter of the others is darker than each orange. So three quarters of the pairs are
+    # ranked correctly. At 5% FPR, no negative of eight may exceed the threshold.
+    assert values["half", "plain"] == ["1.000", "1.000", "0.000", "1.000"]
+    assert values["half", "low_light"] == ["1.000", "0.000", "0.250", "0.750"]
+    assert values["never", "plain"][0] == "0.000"
+
+
+def test_crops_of_a_photograph_are_drawn_together(folder, monkeypatch):
+    found = real_light.find_photographs(folder, ["orange", "ball"], "orange")
+    counts = real_light.Folder(folder, found, has_crops=True).draw("orange")
+    names = [item.path.stem.partition("__")[2][:2] for item in found]
+    for name in {*names}:
+        columns = counts[:, np.array(names) == name]
+        assert (columns == columns[:, :1]).all()
+    # Four photographs in both lights are drawn, with two crops each of two classes.
+    assert (counts.sum(1) == len(found)).all()
+    draws = counts[1:, 0]
+    assert draws.var() == pytest.approx(3 / 4, abs=0.1)  # Multinomial: n p (1 - p).
+
+
+def test_five_objects_of_each_kind_are_the_units(folder):
+    lines = ["path,source_tag,mesh"]
+    for index in range(10):
+        label = ("orange", "other_ball")[index % 2]
+        for light in ("plain", "low_light"):
+            save(folder / label / f"{light}__{index}.png", 100)
+            lines.append(f"{label}/{light}__{index}.png,{light},object{index}")
+    (folder / "photos.csv").write_text("\n".join(lines))
+    found = real_light.find_photographs(folder, ["orange"], "orange")
+    folder_of = lambda chosen: real_light.Folder(folder, chosen)  # noqa: E731
+    assert folder_of([item for item in found if item.mesh]).has_objects("orange")
+    assert not folder_of([item for item in found if item.mesh != "object0"][:9]).has_objects(
+        "orange"
+    )
+
+
+def test_intervals_without_variation_are_those_of_wilson():
+    same = real_light.estimate(np.ones(11), 4)
+    # Wilson (1927): z² / (n + z²) for no misses.
+    z = 1.959964
+    assert (same.low, same.high) == pytest.approx((4 / (4 + z * z), 1))
+    change = real_light.estimate(np.zeros(11), 4, is_change=True)
+    assert (change.low, change.high) == pytest.approx((-z * z / (4 + z * z), z * z / (4 + z * z)))
+
+
+def test_seeds_are_averaged_and_drawn():
+    seeds = [np.full((5, 1 + real_light.DRAWS), value) for value in (0.0, 1.0)]
+    mean = real_light.over_seeds(seeds)
+    assert (mean[:, 0] == 0.5).all()
+    # The mean of two draws of 0 or 1 has the variance 1 / 8.
+    assert mean[0, 1:].var() == pytest.approx(1 / 8, abs=0.01)
+
+
+def test_photographs_are_written_in_each_light(folder, monkeypatch, tmp_path_factory):
+    out = tmp_path_factory.mktemp("simulated")
+    brighten = lambda images, seed, lights: images + 50  # noqa: E731
+    monkeypatch.setattr(real_light.nb, "relight_photographs", brighten)
+    words = ["--lights", "highlights", "--classes", "orange"]
+    real_light.main(["simulate", str(folder), str(out), *words])
+    assert {path.parent.name for path in out.rglob("*.png")} == {"orange"}
+    for light, level in (("plain", 40), ("highlights", 90)):
+        image = np.asarray(Image.open(out / f"orange/{light}__plain__p0_1.png"))
+        assert image.shape == (160, 160, 3) and (image == level).all()
