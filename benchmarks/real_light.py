@@ -223,18 +223,18 @@ def score(options: argparse.Namespace) -> None:
     what = "objects" if folder.has_objects(options.label) else "photographs, for these objects"
     unit_counts = {light: len({*units[rows]}) for light, rows in groups.items()}
     header = ["network", "light", *METRICS]
-    scores: list[list[object]] = [header]
+    scores: list[list[str]] = [header]
     kinds = {"": results, f" minus {first_network}": gains, f" minus {first_light}": changes}
     for suffix, table in kinds.items():
-        rows = []
+        lines = []
         for (title, light), values in table.items():
             found_estimates = [estimate(row, unit_counts[light], bool(suffix)) for row in values]
             cells = [format_interval(item, "+" if suffix else "") for item in found_estimates]
-            rows.append([title, light, *cells])
-        if rows:
+            lines.append([title, light, *cells])
+        if lines:
             heading = f"{options.label}{suffix}: 95% intervals over {what}"
-            print(Table(heading, header, rows), end="\n\n", flush=True)
-        scores += [] if suffix else rows
+            print(Table(heading, header, lines), end="\n\n", flush=True)
+        scores += [] if suffix else lines
     for light, rows in groups.items():
         print(f"{light}: {rows.sum()} images, {unit_counts[light]} {what}")
     if options.out:

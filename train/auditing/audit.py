@@ -76,6 +76,10 @@ NO_HARD_NEGATIVES = (
     "hard_negatives is empty, so false positives are measured on generated fruit and balls; "
     "name meshes of what the classifier may confuse with the class."
 )
+NO_PHOTOGRAPHS = (
+    "photos is not set, and a hardened network may take similar objects on real photographs for "
+    "the class, which renders do not show: give a folder with photographs of similar objects."
+)
 # Settings of pnb-audit that name the folders of test images, by the name of the images.
 FOLDER_KEYS = {LABORATORY: "laboratory", PHOTOGRAPHS: "photos"}
 # When a stopped audit continues, these settings may be set if they were not set before.
@@ -166,6 +170,8 @@ def _caveats(
         caveats.append(f"The networks take images of {listed} pixels, and differ by that, too.")
     if settings.meshes and not (settings.hard_negatives or settings.laboratory):
         caveats.append(NO_HARD_NEGATIVES)
+    if settings.meshes and HARDENED in networks and not settings.photos:
+        caveats.append(NO_PHOTOGRAPHS)
     for network in networks.values():
         render: Callable[[], Tensor] = partial(torch.empty, 0, device=device_of(network))
         if plan is not None:

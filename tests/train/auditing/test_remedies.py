@@ -6,6 +6,8 @@ import pytest
 import torch
 
 import augment
+from tests.helpers import darker_than
+from train.auditing import audit
 from train.auditing.network import (
     BOTH,
     HARDENING,
@@ -15,6 +17,7 @@ from train.auditing.network import (
     normalizing,
     recommend,
 )
+from train.command_settings import AuditSettings
 from train.data.photo import Photograph
 from train.results.compare import Evaluation
 from train.results.metrics import Pooled
@@ -98,3 +101,11 @@ def test_a_network_that_normalizes_light_itself_gets_no_second_normalization():
         LIGHT_ALONE: "classifier_normalized_light",
         BOTH: "hardened",
     }
+
+
+@pytest.mark.parametrize("photos", [None, "photographs"])
+def test_an_audit_of_a_hardened_network_warns_without_photographs(photos):
+    network = darker_than(0.5)
+    settings = AuditSettings(network="x", label="orange", meshes=["solid:orange"], photos=photos)
+    given = {audit.CLASSIFIER: network, audit.HARDENED: network}
+    assert (audit.NO_PHOTOGRAPHS in audit._caveats(settings, given, None)) == (photos is None)
