@@ -102,8 +102,9 @@ class Folder:
         names = []
         for item in self.photographs:
             name = item.path.stem.partition("__")[2] or item.path.stem
-            is_crop = self.has_crops
-            names.append(re.sub(r"_\d+$", "", name) if is_crop else f"{item.label}/{name}")
+            # Crops of a photograph may lie in folders of several classes.
+            photograph = re.sub(r"_\d+$", "", name) if self.has_crops else f"{item.label}/{name}"
+            names.append(photograph)
         return np.array(names)
 
     def units(self, label: str) -> np.ndarray:
