@@ -47,6 +47,7 @@ from train.settings import OTHER_PREFIX
 
 DRAWS = 2000
 METRICS = ("top-1", "recall", "recall at 5% FPR", "FPR", "AUC")
+HEADER = ["network", "light", *METRICS]
 NORMALIZED = "normalized:"
 PLAIN = "plain"
 # Statistics of a network in a light, shape (5, 1 + DRAWS): of all photographs, then of each draw.
@@ -198,48 +199,73 @@ def estimate(draws: np.ndarray, units: int, is_change: bool = False) -> Estimate
 
 
 def score(options: argparse.Namespace) -> None:
-    """Print tables of the metrics, of gains over the first network and of changes with light."""
+    """Print the tables of each label, and write one file of the scores."""
     networks = dict(map(split_title, options.networks))
-    names = [name for names in networks.values() for name in names]
-    loaded = {name: load(name) for name in names}
+    loaded = {name: load(name) for names in networks.values() for name in names}
     classes = next(iter(loaded.values())).classes
-    found = find_photographs(options.folder, classes, options.label)
+    found = find_photographs(options.folder, classes, options.label[0])
     folder = Folder(options.folder, found, options.crops)
     groups = choose_lights(folder, options.lights)
-    counts = folder.draw(options.label)
+    predictions = {
+        title: [predict(loaded[name], folder, options.label).by_label for name in names]
+        for title, names in networks.items()
+    }
+    scores = [["label", *HEADER]]
+    for label in options.label:
+        of_label = {title: [one[label] for one in each] for title, each in predictions.items()}
+        scores += [[label, *row] for row in print_tables(label, of_label, folder, groups)]
+    if options.out:
+        write_csv(options.out, scores)
+
+
+def print_tables(
+    label: str,
+    predictions: Mapping[str, Sequence[Predictions]],
+    folder: Folder,
+    groups: Mapping[str, np.ndarray],
+) -> list[list[str]]:
+    """Print the metrics, the gains over the first network and the changes from the first light.
+
+    Args:
+        label: Positive class.
+        predictions: Predictions of each seed by the title of the network.
+        folder: The photographs.
+        groups: Which photographs are in each light.
+
+    Returns:
+        Rows of the first table.
+    """
+    counts = folder.draw(label)
     results: dict[tuple[str, str], Statistics] = {}
-    for title, seeds in networks.items():
-        each = [predict(loaded[name], folder, [options.label]) for name in seeds]
+    for title, each in predictions.items():
         for light, rows in groups.items():
             measured = [measure(one, folder.objects, counts, rows) for one in each]
             results[title, light] = over_seeds(measured)
-    first_network, first_light = next(iter(networks)), next(iter(groups))
+    first_network, first_light = next(iter(results))
     gains, changes = {}, {}
     for (title, light), values in results.items():
         if title != first_network:
             gains[title, light] = values - results[first_network, light]
         if light != first_light:
             changes[title, light] = values - results[title, first_light]
-    units = folder.units(options.label)
-    what = "objects" if folder.has_objects(options.label) else "photographs, for these objects"
+    units = folder.units(label)
+    what = "objects" if folder.has_objects(label) else "photographs, for these objects"
     unit_counts = {light: len({*units[rows]}) for light, rows in groups.items()}
-    header = ["network", "light", *METRICS]
-    scores: list[list[str]] = [header]
+    absolute: list[list[str]] = []
     kinds = {"": results, f" minus {first_network}": gains, f" minus {first_light}": changes}
     for suffix, table in kinds.items():
         lines = []
         for (title, light), values in table.items():
-            found_estimates = [estimate(row, unit_counts[light], bool(suffix)) for row in values]
-            cells = [format_interval(item, "+" if suffix else "") for item in found_estimates]
+            estimates = [estimate(row, unit_counts[light], bool(suffix)) for row in values]
+            cells = [format_interval(item, "+" if suffix else "") for item in estimates]
             lines.append([title, light, *cells])
         if lines:
-            heading = f"{options.label}{suffix}: 95% intervals over {what}"
-            print(Table(heading, header, lines), end="\n\n", flush=True)
-        scores += [] if suffix else lines
+            heading = f"{label}{suffix}: 95% intervals over {what}"
+            print(Table(heading, HEADER, lines), end="\n\n", flush=True)
+        absolute = absolute or lines
     for light, rows in groups.items():
         print(f"{light}: {rows.sum()} images, {unit_counts[light]} {what}")
-    if options.out:
-        write_csv(options.out, scores)
+    return absolute
 
 
 def split_title(word: str) -> tuple[str, list[str]]:
@@ -290,7 +316,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scoring.set_defaults(body=score)
     scoring.add_argument("folder", type=Path)
     scoring.add_argument("networks", nargs="+", help="NETWORK, or TITLE=NETWORK,NETWORK")
-    scoring.add_argument("--label", required=True, help="positive class")
+    scoring.add_argument("--label", nargs="+", required=True, help="positive classes")
     scoring.add_argument("--lights", nargs="*", default=[], help="LIGHT, or TITLE=LIGHT+LIGHT")
     scoring.add_argument("--crops", action="store_true", help="names end in the number of a crop")
     scoring.add_argument("--out", type=Path, help="CSV file of the scores")
