@@ -200,6 +200,8 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
             relit = copy(sample)
             relit.update(self(sample.data))
             return relit
+        if type(sample) in (Tensor, tv_tensors.Image):  # Without the time of a search.
+            return self.transform(sample, self.make_params([sample]))
         paths, spec = tree_flatten_with_path(sample)
         leaves = [leaf for _, leaf in paths]
         keys = [getattr(path[-1], "key", None) if path else None for path, _ in paths]
@@ -364,8 +366,10 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         depth_of_rows = None if depths is None else depths[rows]
         with torch.autocast(plain.device.type, enabled=False) if is_mixed else nullcontext():
             parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
-    order = torch.tensor([row for rows in groups.values() for row in rows]).argsort()
-    relit = torch.cat(parts)[order.to(plain.device)] if len(parts) > 1 else parts[0]
+    relit = parts[0]
+    if len(parts) > 1:
+        order = torch.tensor([row for rows in groups.values() for row in rows]).argsort()
+        relit = torch.cat(parts)[order.to(plain.device)]
     if frames.is_contiguous(memory_format=torch.channels_last):
         relit = relit.contiguous(memory_format=torch.channels_last)
     return relit.reshape(plain.shape)
