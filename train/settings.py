@@ -12,7 +12,7 @@ from augment.augmentation_settings import MAX_EXAMPLES, AugmentationSettings, vi
 from augment.settings import ObjectSettings, RendererSettings, SceneSettings, read_normalized_light
 from renderer.errors import MAX_SEED, InputError, composed, is_whole, require_range
 from renderer.settings import MAX_SIZE, MAX_VIEWS, Settings, setting, setting_like, settings_from
-from train.train_settings import NEEDS_INITIAL_NETWORK, ModelSettings, TrainSettings
+from train.train_settings import NEEDS_INITIAL, ModelSettings, TrainSettings
 
 # Label of a hard negative (an object of another class than the positive class) for
 # which the classifier has no class.
@@ -233,7 +233,7 @@ class ExperimentSettings(NetworkSettings):
         if self.network == "":
             raise InputError("network is not set: give a run or torchvision:NAME", "network")
         super().__post_init__()
-        for name in NEEDS_INITIAL_NETWORK:
+        for name in NEEDS_INITIAL:
             value = getattr(self.train, name)
             if value and not self.network:
                 key = f"train.{name}"

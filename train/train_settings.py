@@ -11,9 +11,7 @@ from renderer.settings import Settings, setting
 # Default of model.name.
 WIDERESNET = "wideresnet"
 # Training settings that need a network with whose weights the training begins.
-NEEDS_INITIAL_NETWORK = (
-    *("distillation_weight", "soup", "eval_mode", "consistency_weight", "interpolate"),
-)
+NEEDS_INITIAL = ("distillation_weight", "soup", "eval_mode", "consistency_weight", "interpolate")
 # Value of train.freeze with which only the last layer is trained, as by Kirichenko
 # et al. (2023).
 ALL_BUT_LAST = "all_but_last"
