@@ -151,12 +151,10 @@ def run_audit(
         names = {key: network.name for key, network in networks.items()}
         if len({*names.values()}) < len(names):
             names[HARDENED] += " (hardened)"
-        if plan is not None:
-            remedies = name_remedies(networks)
-            folders = plan.image_folders
-            return page.write_audit_page(settings.label, names, remedies, folders, out, caveats)
-        results = {name: out / key for key, name in names.items()}
-        return page.Audited(*relit.write_photographs_page(results, out, caveats), "", {}, None)
+        if plan is None:
+            return page.write_audit_page("", names, {}, {}, out, caveats)
+        found_in = name_remedies(networks), plan.image_folders
+        return page.write_audit_page(settings.label, names, *found_in, out, caveats)
 
 
 def _caveats(

@@ -23,6 +23,7 @@ from renderer.image import to_unit
 from renderer.light.files import load_light
 from train.auditing import lights
 from train.auditing.lights import BATCH, KINDS, RANDOM, Views
+from train.auditing.network import NORMALIZED
 from train.data.annotations import LETTERBOX, Annotations
 from train.results import annotated_scores, detections
 from train.results.detections import Found, Marked, Matches
@@ -39,8 +40,6 @@ BOXED = "photographs_with_boxes"
 VIEWS = "views"
 # Number of points of the curve of recall against false detections.
 CURVE_POINTS = 50
-# End of the name of a folder of results with normalized light, and that of the title of a table.
-NORMALIZED, NORMAL = "_normalized_light", ", with normalized light"
 # Header of the table of metrics.
 HEADER = {
     "recall": "recall",
@@ -162,7 +161,8 @@ def sections(networks: Mapping[str, Path], label: str) -> list[dict[str, Any]]:
             continue
         content = read_json(folder / DETECTED)
         tables = [_table(content["metrics"], f"renders; 95% intervals over {VIEWS}", "light")]
-        for path, title in ((folder, ""), (folder.with_name(f"{folder.name}{NORMALIZED}"), NORMAL)):
+        normalized = folder.with_name(f"{folder.name}{NORMALIZED}")
+        for path, title in ((folder, ""), (normalized, ", with normalized light")):
             if (path / BOXED / SUMMARY).exists():
                 by_label = read_json(path / BOXED / SUMMARY)["by_label"]
                 tables.append(_table(by_label, f"photographs{title}", "class"))

@@ -326,10 +326,10 @@ class AuditedNetwork:
 
     def report(self) -> NetworkReport:
         """Collect the results as `nb.audit` returns them."""
-        scores = {}
-        for images, stored in self.run.photographs.items():
-            metrics = {name: stored.overall.find(name) for name in METRICS}
-            scores[images] = {name: item for name, item in metrics.items() if item is not None}
+        scores = {
+            images: {name: item for name in METRICS if (item := stored.overall.find(name))}
+            for images, stored in self.run.photographs.items()
+        }
         attacks = {
             kind: AttackCounts(
                 unit=KINDS[kind].unit,

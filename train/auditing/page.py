@@ -7,6 +7,7 @@ Plain light is ordinary light, before an attack changes it.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,12 +28,12 @@ from train.auditing.network import (
     Recommendation,
     recommend,
 )
-from train.auditing.relit import relit_sections
+from train.auditing.relit import relit_sections, screen_of_photographs
 from train.results import compare, first_screen
 from train.results.metrics import Metrics
 from train.results.page import scores_section, write_page
 from train.results.pictures import Picture, encode_picture, plot_by_radius, read_pictures
-from train.results.predictions import SUMMARY
+from train.results.predictions import SUMMARY, Predictions
 from train.results.tables import Estimate, fraction
 from train.run_config import CONFIG, read_config
 from train.run_folder import read_json
@@ -92,8 +93,20 @@ def write_audit_page(
 ) -> Audited:
     """Write report.html from the results in the folder of an audit.
 
-    Keys of `names` and values of `remedies` are subfolders of `out` with results.
+    Keys of `names` and values of `remedies` are subfolders of `out` with results. Without meshes,
+    `label` is empty.
     """
+    results = {name: out / key for key, name in names.items()}
+    content: dict[str, Any] = {
+        "about": " and ".join(results),
+        "relit": relit_sections(results),
+        "configs": {"configuration": read_config(out / CONFIG)},
+    }
+    if not label:
+        screen = screen_of_photographs(results)
+        title = "Audit: photographs in the light of a projector"
+        path = write_page(out, title=title, screen=screen, lead=caveats, **content)
+        return Audited(path, screen, label, {}, None)
     by_key = {key: AuditedNetwork(label, name, out / key) for key, name in names.items()}
     networks = [*by_key.values()]
     plain = plain_sentence(networks[0])
@@ -122,11 +135,9 @@ def write_audit_page(
         if files:
             text = f"{len(files)} of the {IN_WORDS[name]} cannot be read, such as {files[0]}."
             unreadable.append(text)
-    results = {network.name: network.folder for network in networks}
     path = write_page(
         out,
         title=f"Audit: {in_words(label)} under unusual lighting",
-        about=" and ".join(names.values()),
         label=in_words(label),
         kinds=KINDS,
         steps=(STEPS, ADDITIONAL_STEPS),
@@ -142,8 +153,7 @@ def write_audit_page(
         screen=screen,
         lead=[*caveats, *unreadable],
         detections=found.sections(results, in_words(label)),
-        relit=relit_sections(results),
-        configs={"configuration": read_config(out / CONFIG)},
+        **content,
     )
     return Audited(path, screen, label, by_key, recommendation)
 
@@ -292,34 +302,26 @@ def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:
 def _worst(
     networks: Sequence[AuditedNetwork], folders: Mapping[str, Path]
 ) -> dict[str, list[Picture]]:
-    """Make galleries of each network's WORST misses and false alarms, with all predictions."""
-
-    def draw(images: str, row: int) -> Picture:
-        predictions = [network.predictions(images) for network in networks]
-        texts = [
-            f"{network.name}: {first_screen.describe_prediction(of_network, row).text}"
-            for network, of_network in zip(networks, predictions, strict=True)
-        ]
-        photograph = predictions[0].photograph[row]
-        caption = f"{in_words(photograph.label)}, {photograph.source}: {'; '.join(texts)}"
-        image = Image.fromarray(read_center(folders[images] / photograph.path, SIDE))
-        return encode_picture(image, caption, caption)
-
+    """Make galleries of each network's WORST misses and false alarms in each folder."""
     galleries = {}
-    for network in networks:
-        # Log-odds, whether the image is a positive, and its folder and row.
-        items = []
-        for images in folders:
-            predictions = network.predictions(images)
-            columns = zip(predictions.log_odds, predictions.positive, strict=True)
-            items += [(*pair, images, row) for row, pair in enumerate(columns)]
-        items.sort(key=lambda item: item[0])
-        positives = [item[2:] for item in items if item[1]]
-        negatives = [item[2:] for item in reversed(items) if not item[1]]
+    for network, (images, folder) in product(networks, folders.items()):
+        predictions = network.predictions(images)
+        order = predictions.log_odds.argsort(kind="stable")
+        is_positive = predictions.positive[order]
         label = in_words(network.label)
-        misses, false_alarms = (
-            [draw(*item) for item in part[:WORST]] for part in (positives, negatives)
-        )
-        galleries[f"{label} that {network.name} doubts most"] = misses
-        galleries[f"what {network.name} most takes for {label}"] = false_alarms
+        for title, rows in (
+            (f"{label} that {network.name} doubts most", order[is_positive]),
+            (f"what {network.name} most takes for {label}", order[~is_positive][::-1]),
+        ):
+            shown = [_draw(predictions, row, folder) for row in rows[:WORST]]
+            galleries[f"{title}, of the {IN_WORDS[images]}"] = shown
     return galleries
+
+
+def _draw(predictions: Predictions, row: int, folder: Path) -> Picture:
+    """Draw an image of a folder over its class, its source and what a network predicts."""
+    photograph = predictions.photograph[row]
+    text = first_screen.describe_prediction(predictions, row).text
+    caption = f"{in_words(photograph.label)}, {photograph.source}: {text}"
+    image = Image.fromarray(read_center(folder / photograph.path, SIDE))
+    return encode_picture(image, caption, caption)

@@ -37,11 +37,9 @@ from renderer.io.images import write_image
 from train.data.photographs import find_unlabeled, load_photographs
 from train.results.first_screen import FirstScreen, ShownMetric
 from train.results.intervals import Units, leave_out
-from train.results.page import write_page
 from train.results.pictures import Picture, evenly_spaced, read_pictures
 from train.results.predictions import RELIT
 from train.results.tables import Proportion, Table, format_fraction, fraction, join_words
-from train.run_config import CONFIG, read_config
 from train.run_folder import read_json
 
 # Pictures are written for this many photographs.
@@ -290,10 +288,8 @@ def _drawn(result: PhotographAttackResult, image: UInt8[Tensor, "3 H W"]) -> Flo
     return network.task.draw(shown, network(shown[None])[0], network.classes).cpu()
 
 
-def write_photographs_page(
-    results: Mapping[str, Path], out: Path, caveats: Sequence[str]
-) -> tuple[Path, FirstScreen]:
-    """Write the report of an audit without meshes, and return its path and its top."""
+def screen_of_photographs(results: Mapping[str, Path]) -> FirstScreen:
+    """Make the top of the report of an audit without meshes."""
     scores = [read_relit(path / RELIT_FOLDER) for path in results.values()]
     first, last = scores[0], scores[-1]
     numbers = []
@@ -308,17 +304,7 @@ def write_photographs_page(
         answer = "Its predictions depend on the light."
     sentences = [item.sentence(name) for name, item in zip(results, scores, strict=True)]
     place = f"{first.shown} photographs of {first.folder}"
-    screen = FirstScreen(answer, [*sentences, MODELED], numbers, [*results], place)
-    path = write_page(
-        out,
-        title="Audit: photographs in the light of a projector",
-        about=" and ".join(results),
-        screen=screen,
-        relit=relit_sections(results),
-        lead=caveats,
-        configs={"configuration": read_config(out / CONFIG)},
-    )
-    return path, screen
+    return FirstScreen(answer, [*sentences, MODELED], numbers, [*results], place)
 
 
 def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:

@@ -17,7 +17,6 @@ from train.auditing.audit import run_audit
 from train.auditing.network import CLASSIFIER, HARDENED, AuditReport
 from train.class_names import MeshItem, as_mappings
 from train.command_settings import ENVIRONMENTS, AuditSettings
-from train.results.overwrite import require_replaceable
 from train.run_folder import folder_or_temporary
 
 
@@ -122,7 +121,6 @@ def audit(
             networks[HARDENED] = as_network(hardened, *options, argument="hardened", **named)
         classifier = networks[CLASSIFIER]
         with folder_or_temporary(out) as folder:
-            require_replaceable(folder, "out", overwrite)
             items = as_mappings("meshes", meshes, classifier)
             negatives = as_mappings("hard_negatives", hard_negatives, classifier)
             folders = {"photos": photos, "laboratory": laboratory, "out": folder}

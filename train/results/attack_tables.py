@@ -43,7 +43,6 @@ def format_attack(
     lines: Sequence[Mapping[str, Any]] = (),
 ) -> list[str]:
     """Describe the attack on one mesh in lines of text for the console. The first is a summary."""
-    has_noise = bool(result.settings.sensor_noise)
     parameters = "+".join(parameter.name for parameter in result.problem.parameters)
     heading = f"{name}: {parameters} against {result.classifier.name}: {_success(result)}"
     steps = result.steps[result.success & ~result.success_before].double()
@@ -54,10 +53,10 @@ def format_attack(
     queries = f"{int(result.queries.sum())} queries{backward}"
     text = [f"{heading}; {queries} ({result.seconds['attack']:.1f} s)"]
     if checks is not None:
-        text += _check_lines(checks, has_noise, result.settings.uses_gradients)
+        text += _check_lines(checks, result.settings.uses_gradients)
     adversaries = [line for line in lines if line["success"] and line["clean_correct"]]
     versions = adversaries[0]["versions"] if adversaries else ()
-    return text + [_version_line(version, adversaries, has_noise) for version in versions]
+    return text + [_version_line(version, adversaries) for version in versions]
 
 
 def _success(result: AttackResult) -> str:
@@ -80,16 +79,10 @@ def _success(result: AttackResult) -> str:
     return f"{text}; {wrong} wrong before, which do not count" if wrong else text
 
 
-def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: bool) -> list[str]:
+def _check_lines(checks: Mapping[str, Any], uses_gradients: bool) -> list[str]:
     """Describe the results of the checks of an attack in lines of text."""
-
-    def rate(name: str, steps: str | None = None) -> str:
-        values = [checks[name + end] for end in ("", WITHOUT_NOISE)]
-        with_noise, without = values if steps is None else [value[steps] for value in values]
-        return f"{with_noise:.0%}" + (f" ({without:.0%} without noise)" if has_noise else "")
-
     unit, units = ("step", "steps") if uses_gradients else ("query", "queries")
-    attacks = [f"{rate('success_by_steps', n)} in {n}" for n in checks["success_by_steps"]]
+    attacks = [f"{rate:.0%} in {count}" for count, rate in checks["success_by_steps"].items()]
     zero_gradient = ""
     if uses_gradients:
         zero_gradient = f", without a gradient at the start in {checks['zero_gradient']:.0%}"
@@ -98,25 +91,22 @@ def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: boo
         f"{checks['cost_before']:.2f} before, {checks['cost']:.2f} after; "
         f"lower in {checks['cost_fell']:.0%}{zero_gradient}",
         f"random changes of the same size, one for each {unit}, succeed on "
-        f"{rate('random_search')}; attacks of more {units}: {', '.join(attacks)}",
+        f"{checks['random_search']:.0%}; attacks of more {units}: {', '.join(attacks)}",
         *(f"warning: {warning}" for warning in warnings(checks)),
     ]
 
 
-def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_noise: bool) -> str:
+def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]]) -> str:
     """Write how often adversaries still succeed if their images are made in another way."""
     results = [line["versions"][version] for line in adversaries]
     # Adversaries that fooled the classifier by the margin that the settings ask for.
     with_margin = [line["versions"][version] for line in adversaries if line["success_with_margin"]]
     counts = [sum(item["success"] for item in group) for group in (results, with_margin)]
-    noise = ""
-    if has_noise:
-        noise = f" ({sum(item[f'success{WITHOUT_NOISE}'] for item in results)} without noise)"
     largest = 255 * max(item["largest_difference"] for item in results)
     mean = 255 * sum(item["mean_difference"] for item in results) / len(results)
     return (
         f"images as {VERSIONS.get(version, version)}: "
-        f"{counts[0]} of {len(results)} still succeed{noise}, "
+        f"{counts[0]} of {len(results)} still succeed, "
         f"{counts[1]} of the {len(with_margin)} with the margin; "
         f"pixels differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
     )

@@ -137,15 +137,18 @@ def compare_networks(
     names: tuple[str, str],
     folder: Path | None = None,
     name: str = PHOTOGRAPHS,
-    subjects: tuple[str, str] = NETWORKS,
-    change: str = "hardening",
+    is_hardening: bool = True,
 ) -> FirstScreen | None:
     """Make the first screen, which says whether hardening helped, and at what price.
 
     Both networks were scored on the images `name` in `folder`, which is None if it is unknown.
-    `names` of the networks stand in tables, and `subjects` in sentences. `change` turned the first
-    network into the second. None if recall, false-positive rate or AUC is unknown.
+    Without `is_hardening`, the networks are two trained ones, which sentences call by their names.
+    None if recall, false-positive rate or AUC is unknown.
     """
+    subjects, change = NETWORKS, "hardening"
+    if not is_hardening:
+        subjects = f"the network “{names[0]}”", f"the network “{names[1]}”"
+        change = f"“{names[1]}”"
     pool = after[0].pooled.all
     labels = pool.predictions.labels
     label = join_words([in_words(item) for item in labels], "or")

@@ -48,6 +48,7 @@ TITLES = {
     "false_positive_rate_at_threshold": "FPR at threshold",
     "class_top1": "top-1, mean over classes",
     "class_top5": "top-5, mean over classes",
+    **{f"recall_at/{rate}": f"recall at {float(rate):.0%} FPR" for rate in RATES},
 }
 
 # Words after the number of negatives, if there are several positive classes.
@@ -421,11 +422,7 @@ def group_rows(predictions: Predictions, names: Iterable[Any]) -> dict[str, Pred
 
 def metric_title(name: str) -> str:
     """Return the title of a metric in tables. An example is "recall at 10% FPR"."""
-    if name in TITLES:
-        return TITLES[name]
-    # All other names have the form "recall_at/RATE".
-    _, _, rate = name.partition("/")
-    return f"recall at {float(rate):.0%} FPR"
+    return TITLES[name]
 
 
 def describe_point(point: Mapping[str, Any]) -> str:

@@ -85,12 +85,9 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
     removal is stopped, what is left belongs to the run that config.yaml describes. The log stays.
     `with_others=False` keeps the first training and the baselines, which may be resumed.
     """
-    files = [folder / name for name in (*OF_RUN, run_folder.FAILURE, PAGE)]
-    files += [*folder.glob("events.out.tfevents.*"), *folder.glob(f"*/{SUMMARY}")]
-    for file in files:
-        file.unlink(missing_ok=True)
-    for name in (run_folder.RENDERS, BEFORE, KEPT_ASIDE):
-        shutil.rmtree(folder / name, ignore_errors=True)
+    names = (*OF_RUN, run_folder.FAILURE, PAGE, run_folder.RENDERS, BEFORE, KEPT_ASIDE)
+    logs = [*folder.glob("events.out.tfevents.*"), *folder.glob(f"*/{SUMMARY}")]
+    _remove(*(folder / name for name in names), *logs)
     with suppress(InputError):  # config.yaml may be missing.
         for name in (PHOTOGRAPHS_FIRST, *read_config(folder / CONFIG).get("compare", ())):
             if with_others and (folder / name / CONFIG).is_file():
@@ -100,13 +97,15 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
 
 def remove_attack(out: Path) -> None:
     """Remove the results of an earlier pnb-attack, so that no report shows them with new ones."""
-    for name in (PAGE, CONFIG, RELIT, SWEEP_TABLE, SWEEP_FIGURE):
-        (out / name).unlink(missing_ok=True)
+    _remove(*(out / name for name in (PAGE, CONFIG, RELIT, SWEEP_TABLE, SWEEP_FIGURE)))
     for lines in out.glob(f"*/{LINES}"):
-        for example in lines.parent.glob("example_*"):
-            if example.is_dir():
-                shutil.rmtree(example)
-            else:
-                example.unlink()
-        lines.with_name(TRANSFERS).unlink(missing_ok=True)
-        lines.unlink()
+        _remove(*lines.parent.glob("example_*"), lines.with_name(TRANSFERS), lines)
+
+
+def _remove(*paths: Path) -> None:
+    """Remove files and folders in this order, if they exist."""
+    for path in paths:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)

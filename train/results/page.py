@@ -210,8 +210,7 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
         return fmean(values) if values else None
 
     sentences = []
-    known = [run.before.accuracy for run in runs if run.before]
-    accuracies = [accuracy for accuracy in known if accuracy is not None]
+    accuracies = [run.before.accuracy or 0.0 for run in runs if run.before]
     if (agreement := mean("test/agreement")) is not None:
         sentences.append(
             f"{method}: on photographs that training did not use, the network predicts the "
@@ -253,22 +252,12 @@ def _first_screen(groups: Mapping[str, Scored]) -> first_screen.FirstScreen | No
             if not pairs:
                 continue
             method, base = (hardened or pairs)[-1]
-            words: tuple[Any, ...] = ("before hardening", "after hardening"), first_screen.NETWORKS
-            change = "hardening"
-            if not hardened:
-                words = (base, method), (f"the network “{base}”", f"the network “{method}”")
-                change = f"“{method}”"
+            names = (store.BEFORE_HARDENING, store.AFTER_HARDENING) if hardened else (base, method)
             # All runs of a method have the same images, so the first one stands for all.
             run, name = group[method][0]
-            screen = first_screen.compare_networks(
-                evaluations[base],
-                evaluations[method],
-                names=words[0],
-                folder=images_folder(run, name),
-                name=name,
-                subjects=words[1],
-                change=change,
-            )
+            compared = evaluations[base], evaluations[method], names
+            images = images_folder(run, name)
+            screen = first_screen.compare_networks(*compared, images, name, bool(hardened))
             if screen is not None:
                 return screen
     return None
