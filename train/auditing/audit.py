@@ -171,18 +171,14 @@ def _caveats(
     if settings.meshes and HARDENED in networks and not settings.photos:
         caveats.append(NO_PHOTOGRAPHS)
     for network in networks.values():
+        if plan is None and not isinstance(network, Classifier):
+            continue
         render: Callable[[], Tensor] = partial(torch.empty, 0, device=device_of(network))
         if plan is not None:
             # Only an image with an object tells whether a detector has gradients.
             render = partial(lights.plain_images, plan.attacked_views, network.size)
-        elif not isinstance(network, Classifier):
-            continue
         if not network.is_differentiable(render):
-            attack = "only random search attacks it"
-            if plan is not None:
-                queries = f"{lights.QUERIES} queries for each radius"
-                attack = f"random search attacks each view with {queries}"
-            caveats.append(f"{network.name} has no gradients: {attack}.")
+            caveats.append(f"{network.name} has no gradients: only random search attacks it.")
     return caveats
 
 
@@ -278,7 +274,7 @@ class _Plan:
                 _write_json(results / f"{kind}.json", lights.success_by_light, *arguments)
             for other in networks.values():
                 if other is not network:
-                    shown = (network, other, attacked_views, results)
+                    shown = (network, other, attacked_views)
                     _write_json(results / lights.TRANSFER, lights.transfer_success, *shown)
             if not self.has_classes:
                 negatives = replace(views, objects=self.negatives)

@@ -106,8 +106,7 @@ def find_in_lights(
             add(group if name else "plain light", first, pairs)
     truth = attacked_views.scene(network.size).truth(network.label)
     for kind, light_kind in KINDS.items():
-        with np.load(out / f"{kind}.npz") as saved:
-            images = to_unit(torch.from_numpy(saved["images"])).to(views.device)
+        images = to_unit(torch.from_numpy(np.load(out / f"{kind}.npy"))).to(views.device)
         add(f"attacked: {light_kind.title}", 0, _find(network, label, images, truth))
     task = network.task
     metrics: dict[str, Any] = {}

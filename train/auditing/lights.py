@@ -23,9 +23,7 @@ from torch import Tensor
 from augment import attack_settings
 from augment.attack_settings import AttackSettings
 from augment.attacks.attack import EXPOSURES, attack
-from augment.attacks.checks import success_by_radius
-from augment.attacks.objective import Objective
-from augment.attacks.problem import build_problem
+from augment.attacks.checks import success_by_radius, transfer
 from augment.attacks.result import AttackResult
 from augment.augmentation_settings import VariationSettings
 from augment.classifier import TaskNetwork
@@ -42,7 +40,6 @@ from renderer.camera import orbit_cameras
 from renderer.errors import MAX_SCALE
 from renderer.image import to_bytes
 from renderer.io.files import atomic_write
-from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, with_local_lights
 from renderer.light.files import UNIFORM, load_light, perturb
 from renderer.rendering import light_sphere
@@ -276,11 +273,10 @@ def adversaries(
 def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path) -> dict[str, Any]:
     """Attack one kind of lighting, and count the misclassified views for each radius.
 
-    The attacked lighting of the largest radius and its images are written to out/KIND.npz. If an
-    attack succeeds, a picture of the first success, before and after the attack, is written to
-    out/KIND.png. "adversarial" and "random" of the result count, for each radius, the "correct" of
-    "n" views that become wrong even with the noise of a camera. "predicted", "confidence" and
-    "slider" are missing if no attack succeeds.
+    The images in the attacked lighting of the largest radius are written to out/KIND.npy.
+    "adversarial" and "random" of the result count, for each radius, the "correct" of "n" views that
+    become wrong even with the noise of a camera. "predicted", "confidence" and "slider" are missing
+    if no attack succeeds.
     """
     result = adversaries(classifier, views, kind)
     radii = KINDS[kind].radii
@@ -297,9 +293,8 @@ def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path
         counts[random] = [int(row[random].sum()) for row in by_radius]
     is_wrong = clean & result.success
     content = io.BytesIO()
-    images = to_bytes(result.images_in_views.cpu())
-    np.savez(content, wrong=is_wrong.cpu(), values=result.minimum.values.cpu(), images=images)
-    atomic_write(out / f"{kind}.npz", content.getbuffer())
+    np.save(content, to_bytes(result.images_in_views.cpu()))
+    atomic_write(out / f"{kind}.npy", content.getbuffer())
     if is_wrong.any():
         example = int(is_wrong.nonzero()[0])
         evidence = (result.evidence_in_views_before, result.evidence_in_views)
@@ -308,47 +303,29 @@ def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path
         predicted = criterion.predicted(both_evidence)
         counts |= classifier.task.found(both_evidence, predicted, classifier.classes)
         counts["slider"] = frames_of(result, example)
-        shown = (result.images_before[example], result.images[example])
-        both = torch.cat([*map(result.drawn, shown)], dim=2)
-        pair = _as_picture(both)
-        # A small render is enlarged without smoothing, so that its pixels are visible.
-        is_enlarged = pair.height < SIDE
-        method = Image.Resampling.NEAREST if is_enlarged else Image.Resampling.LANCZOS
-        width = round(SIDE * pair.width / pair.height)
-        write_image(out / f"{kind}.png", pair.resize((width, SIDE), method))
     return counts
 
 
 def transfer_success(
-    attacked: TaskNetwork, other: TaskNetwork, views: Views, out: Path
-) -> dict[str, dict[str, list[int]]]:
+    attacked: TaskNetwork, other: TaskNetwork, views: Views
+) -> dict[str, list[int]]:
     """Test whether lighting that fools one classifier also fools another classifier.
 
-    There are two sets of attacked lighting. "first" is the lighting that `success_by_light` wrote,
-    whose attack ended at its first success. "further" comes from attacks that continue after their
-    success. The views are rendered again at the image size of the other classifier. A view is
-    tested if its attacked lighting fools the first classifier, and if the other classifier
-    recognizes it before the attack. The three numbers, for each kind of lighting and for "further"
-    and "first", are tested views that are misclassified even with the noise of a camera, tested
-    views, and tested views that are misclassified without noise.
+    The attacks continue after their success. The views are rendered again at the image size of the
+    other classifier. A view is tested if its attacked lighting fools the first classifier, and if
+    the other classifier recognizes it before the attack. The three numbers for each kind of
+    lighting are tested views that are misclassified even with the noise of a camera, tested views,
+    and tested views that are misclassified without noise.
     """
-    counts: dict[str, dict[str, list[int]]] = {}
+    counts = {}
     for kind in progress(KINDS, "transfer"):
         result = adversaries(attacked, views, kind, additional=True)
-        problem = build_problem(result.settings, views.scene(other.size, kind))
-        criterion = criterion_of(other, problem.scene)
-        objective = Objective(other, criterion, result.settings, result.seed)
-        recognized = is_found(other, criterion, problem.images(problem.start))
-        lights = {"further": (result.clean_correct & result.success, result.minimum.values)}
-        with np.load(out / f"{kind}.npz") as saved:
-            lights["first"] = torch.from_numpy(saved["wrong"]), torch.from_numpy(saved["values"])
-        counts[kind] = {}
-        for name, (is_wrong, values) in lights.items():
-            is_tested = is_wrong.to(recognized) & recognized
-            images = problem.images(values.to(problem.start))
-            _, fooled, without_noise = objective.judge(images, problem.all_examples)
-            masks = (is_tested & fooled.all(1), is_tested, is_tested & without_noise)
-            counts[kind][name] = [int(mask.sum()) for mask in masks]
+        counts[kind] = [0, 0, 0]
+        if (result.clean_correct & result.success).any():
+            (row,) = transfer(result, [other])
+            is_tested = np.array(row["clean_correct"])
+            masks = (row["success"], is_tested, row["success_without_noise"])
+            counts[kind] = [int((is_tested & mask).sum()) for mask in masks]
     return counts
 
 
@@ -387,15 +364,10 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
 def _encode_jpeg(image: Float[Tensor, "3 H W"], height: int) -> str:
     """Resize an image in [0, 1] to a height, and encode it as a JPEG file in base64."""
     file = io.BytesIO()
-    picture = _as_picture(image.clamp(0, 1))
+    picture = Image.fromarray(to_bytes(image.clamp(0, 1).cpu()).permute(1, 2, 0).numpy())
     width = round(height * picture.width / picture.height)
     picture.resize((width, height)).save(file, "JPEG", quality=85)
     return base64.b64encode(file.getvalue()).decode()
-
-
-def _as_picture(image: Float[Tensor, "3 H W"]) -> Image.Image:
-    """Quantize an image in [0, 1] to 8 bits."""
-    return Image.fromarray(to_bytes(image.cpu()).permute(1, 2, 0).numpy())
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ test images is either "laboratory", with path-traced renders, or "photographs".
 Plain light is ordinary light, before an attack changes it.
 """
 
+import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
@@ -32,7 +33,7 @@ from train.auditing.relit import relit_sections, screen_of_photographs
 from train.results import compare, first_screen
 from train.results.metrics import Metrics
 from train.results.page import scores_section, write_page
-from train.results.pictures import Picture, encode_picture, plot_by_radius, read_pictures
+from train.results.pictures import Picture, encode_picture, plot_by_radius
 from train.results.predictions import SUMMARY, Predictions
 from train.results.tables import Estimate, fraction
 from train.run_config import CONFIG, read_config
@@ -49,8 +50,6 @@ VERDICTS = {
 SLIDER_SCRIPT = (Path(__file__).parent / "slider.js").read_text(encoding="utf-8")
 # Number of images in a gallery of the worst predictions.
 WORST = 10
-# Width of the picture that shows a view before and after an attack, in pixels.
-PAIR_WIDTH = 400
 
 
 class Audited(NamedTuple):
@@ -257,25 +256,26 @@ def screen_of_one(
 
 
 def attack_pictures(network: AuditedNetwork) -> list[first_screen.ComparedImage]:
-    """Read a picture for each kind of lighting: one view before and after the attack.
+    """Make a pair of pictures for each kind of lighting: one view before and after the attack.
 
-    A kind of lighting by which no attack succeeds has no picture.
+    A kind of lighting by which no attack succeeds has no pictures.
     """
     compared = []
     for kind, counts in network.counts.items():
         if "predicted" not in counts:
             continue
         light = KINDS[kind]
-        texts = [
-            f"{in_words(label)} {probability:.0%}"
-            for label, probability in zip(counts["predicted"], counts["confidence"], strict=True)
-        ]
+        predicted = zip(counts["predicted"], counts["confidence"], strict=True)
+        texts = [f"{in_words(label)} {probability:.0%}" for label, probability in predicted]
         before, after = map(first_screen.ShownPrediction, texts, ("right", "wrong"))
-        alt_text = f"{light.title}: {before.text}, after the attack {after.text}"
+        first, *_, last = counts["slider"]["frames"]
+        pictures = [
+            Picture(base64.b64decode(frame["image"]), "jpeg", f"{light.title}: {text}", SIDE)
+            for frame, text in zip((first, last), texts, strict=True)
+        ]
         lost = f"{counts['adversarial'][-1]} of {counts['correct']} views lost"
         caption = f"{light.title}: {lost} at radius {light.radii[-1]:g}"
-        for picture in read_pictures(network.folder / f"{kind}.png", alt_text, PAIR_WIDTH):
-            compared.append(first_screen.ComparedImage(picture, caption, before, after))
+        compared.append(first_screen.ComparedImage(pictures, caption, before, after))
     return compared
 
 

@@ -93,9 +93,7 @@ def run(settings: AttackExperimentSettings) -> None:
             folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
             heading, lines = _write_attack(name, scene, result, folder, settings, targets)
             if settings.attack.radius_scales:
-                sweep = success_by_radius(result, settings.attack.radius_scales)
-                sweeps[folder.name] = sweep
-                lines += attack_tables.format_sweep(sweep).splitlines()
+                sweeps[folder.name] = success_by_radius(result, settings.attack.radius_scales)
             if is_verbose():
                 print("\n".join([heading, *lines, ""]))
             correct = result.clean_correct
@@ -113,8 +111,7 @@ def run(settings: AttackExperimentSettings) -> None:
         if sweeps:
             norms = {name: steps.norm for name, steps in settings.attack.parameters.items()}
             attack_tables.write_sweeps(sweeps, norms, out)
-            if is_verbose():
-                print(f"success against radius: {out / SWEEP_TABLE} and {out / SWEEP_FIGURE}")
+            print(f"success against radius: {out / SWEEP_TABLE} and {out / SWEEP_FIGURE}")
     print(f"images, adversaries and numbers: {out}")
 
 

@@ -132,19 +132,6 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
     return str(Table("", header, rows))
 
 
-def format_sweep(sweep: Sweep) -> str:
-    """Write the success of an attack and of a random search at each radius as a table."""
-    rows = []
-    for row in sweep:
-        cells = [" + ".join(f"{name} {radius:g}" for name, radius in row["radii"].items())]
-        for method in METHODS:
-            without_noise = int(row[method + WITHOUT_NOISE].sum())
-            cells += [format_fraction(_success_rate(row[method])), str(without_noise)]
-        rows.append(cells)
-    titles = [title for method in METHODS.values() for title in (method, "without noise")]
-    return str(Table("", ["radius", *titles], rows))
-
-
 def _success_rate(is_success: Bool[Tensor, " examples"]) -> Proportion:
     """Compute the fraction of examples on which an attack succeeds, with its interval."""
     return fraction(int(is_success.sum()), len(is_success))

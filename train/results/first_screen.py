@@ -73,9 +73,12 @@ class ShownPrediction(NamedTuple):
 
 
 class ComparedImage(NamedTuple):
-    """An image, what it shows in words, and what the original and the hardened network predict."""
+    """An image, what it shows in words, and what the original and the hardened network predict.
 
-    picture: Picture
+    An attack has two pictures of the image: before and after it.
+    """
+
+    pictures: Sequence[Picture]
     subject: str
     before: ShownPrediction
     after: ShownPrediction
@@ -320,7 +323,7 @@ def _draw_images(before: Predictions, after: Predictions, images: Path) -> list[
         original, hardened = (describe_prediction(item, row) for item in (before, after))
         alt = f"{subject}; original network: {original.text}; hardened network: {hardened.text}"
         pixels = Image.fromarray(read_center(images / photograph.path, SIDE))
-        drawn.append(ComparedImage(encode_picture(pixels, alt), subject, original, hardened))
+        drawn.append(ComparedImage([encode_picture(pixels, alt)], subject, original, hardened))
     return drawn
 
 

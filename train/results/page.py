@@ -300,16 +300,12 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         if evaluations:
             first_evaluation = next(iter(evaluations.values()))[0]
             for subset in first_evaluation.rows():
-                # Predictions for the images of the subset, of each seed of each method.
-                pools = {
-                    method: [pool for item in items if (pool := item.find(subset))]
+                scores = {
+                    method: [pool.scores for item in items if (pool := item.find(subset))]
                     for method, items in evaluations.items()
                 }
-                scores = {
-                    method: [pool.scores for pool in found] for method, found in pools.items()
-                }
-                positive_classes = " or ".join(next(iter(pools.values()))[0].predictions.labels)
-                rocs.append(plot_roc(scores, f"{positive_classes}, {title.partition(':')[0]}"))
+                label = subset.name or " or ".join(first_evaluation.pooled.predictions.labels)
+                rocs.append(plot_roc(scores, f"{label}, {title.partition(':')[0]}"))
             shown.append(compare.difference_table(evaluations))
             shown += [
                 compare.group_table(evaluations, by)

@@ -134,24 +134,12 @@ def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views, l
         np.testing.assert_allclose(probabilities, logits.softmax(0), atol=1e-4)
 
 
-def test_adversaries_that_were_kept_transfer_as_the_attack_itself_finds(
-    views, tmp_path, lamps_alone
-):
+def test_views_that_fool_a_network_are_counted_if_the_other_recognizes_them(views, lamps_alone):
+    """The other network errs in less light, and recognizes both views before the attack."""
     views = replace(views, count=2)
-    attacked = darker_than(0.5)
-    other = darker_than(0.515, size=12)
-    success_by_light(attacked, views, "lamps", tmp_path)
-
-    counts = transfer_success(attacked, other, views, tmp_path)["lamps"]
-
-    assert counts == {"first": [1, 2, 1], "further": [2, 2, 2]}
-    for name, is_further in (("first", False), ("further", True)):
-        found = adversaries(attacked, views, "lamps", is_further)
-        (row,) = augment.transfer(found, [other])
-        is_correct = np.array(row["clean_correct"])
-        lost = is_correct & np.array(row["success"])
-        lost_without_noise = is_correct & np.array(row["success_without_noise"])
-        assert counts[name] == [lost.sum(), is_correct.sum(), lost_without_noise.sum()]
+    counts = transfer_success(darker_than(0.5), darker_than(0.515, size=12), views)
+    assert counts == {"lamps": [2, 2, 2]}
+    assert transfer_success(guessing(), darker_than(0.5), views) == {"lamps": [0, 0, 0]}
 
 
 def test_classifiers_of_all_sizes_get_the_same_views_unlike_those_of_another_seed(views):
