@@ -33,17 +33,10 @@ from renderer.io.files import atomic_write
 from renderer.light.files import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
 from renderer.settings import Size, height_and_width
-from train import console
+from train import class_names, console
 from train.auditing import found, lights, page, relit
 from train.auditing.network import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
 from train.checkpoints import load_chosen, load_network
-from train.class_names import (
-    class_of_meshes,
-    class_of_name,
-    name_of_mesh,
-    require_others,
-    with_class_name,
-)
 from train.command_settings import AuditSettings, LabSettings
 from train.data.annotations import read_annotations
 from train.data.photographs import find_photographs, find_unlabeled
@@ -203,7 +196,7 @@ class _Plan:
         meshes = [*read_objects(settings.meshes, self.label, "meshes").values()]
         hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
         for item in hard_negatives:
-            item.label = item.label or OTHER_PREFIX + name_of_mesh(item.mesh)
+            item.label = item.label or OTHER_PREFIX + class_names.name_of_mesh(item.mesh)
         for item in meshes:
             if item.label != self.label:
                 raise InputError(
@@ -297,17 +290,21 @@ def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:
     The class is that of the meshes. Hard negatives are only filled in if test images must be
     rendered.
     """
-    label = class_of_meshes(settings.meshes, classes, "meshes", settings.label)
+    label = class_names.class_of_meshes(settings.meshes, classes, "meshes", settings.label)
     negatives = settings.hard_negatives
     if not (negatives or settings.laboratory):
         negatives = [
-            f"solid:{name}" for name in NEGATIVE_SOLIDS if class_of_name(name, [label]) is None
+            f"solid:{name}"
+            for name in NEGATIVE_SOLIDS
+            if class_names.class_of_name(name, [label]) is None
         ]
     items: dict[str, Any] = {
-        key: [with_class_name(item, classes, key) for item in given]
+        key: [class_names.with_class_name(item, classes, key) for item in given]
         for key, given in (("meshes", settings.meshes), ("hard_negatives", negatives))
     }
-    require_others(read_objects(items["hard_negatives"], "", "hard_negatives"), [label], classes)
+    class_names.require_others(
+        read_objects(items["hard_negatives"], "", "hard_negatives"), [label], classes
+    )
     return replace(settings, label=label, **items)
 
 

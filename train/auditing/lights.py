@@ -61,11 +61,9 @@ LIGHT = "grace"
 AMPLITUDE = 0.5
 # The names of random lights are "random 1", "random 2" and so on.
 RANDOM = "random "
-# The camera is this far from the origin, in world units.
-CAMERA_DISTANCE = 2.6
-# Polar angle, azimuth and field of view of the camera, in degrees.
-CAMERA_ANGLES = (60, 45, 40)
-CAMERA = orbit_cameras(1, CAMERA_DISTANCE, *CAMERA_ANGLES)
+# The camera is 2.6 world units from the origin. Its polar angle, azimuth and field of view are in
+# degrees.
+CAMERA = orbit_cameras(1, 2.6, 60, 45, 40)
 # Ranges of the random changes to the azimuth of the camera and to the rotation of the
 # object in degrees, and range of the random factor of its size.
 VARIATION = VariationSettings(azimuth=25, rotation=60, scale=[0.85, 1.15])

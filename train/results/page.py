@@ -336,9 +336,4 @@ def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:
     config: Mapping[str, Any] = {}
     with suppress(InputError):
         config = read_config(attack.folder.parent / CONFIG)
-    checks = [
-        (name.replace("_", " "), value)
-        for name, value in attack.checks.items()
-        if not isinstance(value, dict)
-    ]
-    return {**vars(attack), "checks": checks, "images": images, "config": config}
+    return {**vars(attack), "images": images, "config": config}

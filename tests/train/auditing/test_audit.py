@@ -135,11 +135,11 @@ def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views, l
 
 
 def test_views_that_fool_a_network_are_counted_if_the_other_recognizes_them(views, lamps_alone):
-    """The other network errs in less light, and recognizes both views before the attack."""
+    """The other network errs in less light. No light is bright enough for the last attack."""
     views = replace(views, count=2)
     counts = transfer_success(darker_than(0.5), darker_than(0.515, size=12), views)
     assert counts == {"lamps": [2, 2, 2]}
-    assert transfer_success(guessing(), darker_than(0.5), views) == {"lamps": [0, 0, 0]}
+    assert transfer_success(darker_than(2.0), darker_than(0.5), views) == {"lamps": [0, 0, 0]}
 
 
 def test_classifiers_of_all_sizes_get_the_same_views_unlike_those_of_another_seed(views):
