@@ -35,7 +35,7 @@ from renderer.mitsuba_scene import mitsuba
 from renderer.settings import Size, height_and_width
 from train import class_names, console
 from train.auditing import found, lights, page, relit
-from train.auditing.network import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
+from train.auditing.network import CLASSIFIER, HARDENED, name_remedies, normalizing
 from train.checkpoints import load_chosen, load_network
 from train.command_settings import AuditSettings, LabSettings
 from train.data.annotations import read_annotations
@@ -315,7 +315,7 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
     Otherwise an earlier audit in the folder must have the same settings.
     """
     if settings.overwrite:
-        networks = (CLASSIFIER, HARDENED, CLASSIFIER + NORMALIZED, HARDENED + NORMALIZED)
+        networks = (key + end for key in (CLASSIFIER, HARDENED) for end in ("", lights.NORMALIZED))
         (out / PAGE).unlink(missing_ok=True)
         for name in (*networks, renders.name):
             # A folder that exists counts as complete, so it loses its name first.

@@ -22,8 +22,7 @@ from augment.tasks.detection import Detection
 from renderer.image import to_unit
 from renderer.light.files import load_light
 from train.auditing import lights
-from train.auditing.lights import BATCH, KINDS, RANDOM, Views
-from train.auditing.network import NORMALIZED
+from train.auditing.lights import BATCH, KINDS, NORMALIZED, RANDOM, Views
 from train.data.annotations import LETTERBOX, Annotations
 from train.results import annotated_scores, detections
 from train.results.detections import Found, Marked, Matches

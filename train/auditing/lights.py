@@ -52,6 +52,8 @@ RECOGNIZED = "recognized.json"
 PLAIN = "plain_light.json"
 # Result file: how often attacks on a network also fool the other network.
 TRANSFER = "transfer.json"
+# End of the key of a network whose images are normalized before they are classified.
+NORMALIZED = "_normalized_light"
 # Number of images that a classifier classifies in one pass.
 BATCH = 16
 # Name of the environment lighting in which the views are rendered before an attack.

@@ -11,6 +11,7 @@ import numpy as np
 from augment.classifier import Classifier
 from renderer.errors import ShortRepr, as_path
 from renderer.io.files import atomic_write
+from train.auditing import lights
 from train.auditing.lights import KINDS, PLAIN, RANDOM, RECOGNIZED, TRANSFER, PlainViews
 from train.results import tables
 from train.results.compare import ALL, Difference, Evaluation, Evaluations, difference, mean_metric
@@ -36,8 +37,6 @@ PASS_THRESHOLD = 0.9
 # their results.
 CLASSIFIER = "classifier"
 HARDENED = "hardened"
-# End of the key of a network whose images are normalized before they are classified.
-NORMALIZED = "_normalized_light"
 # Name of the audited network in the comparison with the remedies.
 ORIGINAL = "the original network"
 # Names of the remedies, from the cheapest to the most expensive.
@@ -371,7 +370,7 @@ def normalizing(networks: Mapping[str, Classifier]) -> dict[str, Classifier]:
     as "hardened_normalized_light". Networks that normalize light already are left out.
     """
     return {
-        key + NORMALIZED: network.normalizing_light()
+        key + lights.NORMALIZED: network.normalizing_light()
         for key, network in networks.items()
         if network.normalized_light is None
     }

@@ -16,14 +16,13 @@ from PIL import Image
 
 from renderer.io.images import read_center
 from train.auditing import found
-from train.auditing.lights import ADDITIONAL_STEPS, KINDS, SIDE, STEPS
+from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS
 from train.auditing.network import (
     CLASSIFIER,
     HARDENED,
     HARDENING,
     IN_WORDS,
     NEXT_HARDENING,
-    NORMALIZED,
     AuditedNetwork,
     AuditReport,
     Recommendation,
