@@ -154,7 +154,9 @@ class Coco(DataSet):
                         "iscrowd": 0,
                     }
                     annotations.append(annotation)
-            content = {"images": images, "annotations": annotations, "categories": categories}
+            # Some versions of pycocotools demand "info" in evaluations.
+            content = {"info": {}, "licenses": [], "images": images, "annotations": annotations}
+            content["categories"] = categories
             path = self.folder / "annotations" / f"instances_{part}.json"
             path.parent.mkdir(exist_ok=True)
             atomic_write(path, json.dumps(content))
