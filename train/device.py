@@ -114,6 +114,9 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
         is_native = torch.cpu._is_avx512_bf16_supported()
     else:
         is_native = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    if precision == "bfloat16" and not is_native and not is_gpu:
+        slow = "this CPU emulates bfloat16, some 10 times slower than float32"
+        console.warning("%s: leave precision out", slow)
     if precision != "auto":
         return precision
     modules = [] if is_gpu or trained is None else trained.modules()
