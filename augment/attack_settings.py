@@ -5,8 +5,6 @@ quantity's class (see `augment.attacks.parameters`). This module imports neither
 see `renderer.settings`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self

@@ -3,8 +3,6 @@
 This module imports neither torch nor NumPy; see `renderer.settings`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

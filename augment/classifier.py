@@ -1,7 +1,5 @@
 """A classifier: a network whose outputs are logits, with the names of its classes."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

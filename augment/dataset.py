@@ -4,8 +4,6 @@ Renders are made in blocks of `BLOCK`, each with random numbers of its own. The 
 is therefore the same whichever others are made, in one process or in several.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby

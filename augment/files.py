@@ -7,7 +7,6 @@ code. They are loaded only if the user trusts them. ONNX is data.
 
 import argparse
 import importlib
-import importlib.util
 import io
 import json
 import math
@@ -337,20 +336,17 @@ class InBatches(Network):
 def _read_onnx(path: Path) -> Content:
     """Read a file of ONNX, with gradients if onnx2torch is installed and converts it exactly."""
     network, sizes = read_onnx(path)
-    if importlib.util.find_spec("onnx2torch") is None:
-        say_once(f"{path} has no gradients, since onnx2torch is not installed: attacks search")
-        return network, sizes
-    import onnx2torch
-
     shape = [size or default for size, default in zip(sizes, (2, 3, 224, 224), strict=True)]
     images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     try:
+        onnx2torch = importlib.import_module("onnx2torch")
         with torch.no_grad():
             converted = onnx2torch.convert(str(path)).eval()
             both = (tree_leaves(of(images)) for of in (converted, network))
             for own, expected in zip(*both, strict=True):
                 torch.testing.assert_close(own, expected, rtol=1e-3, atol=1e-3)
-    except Exception as error:  # onnx2torch lacks some operations, and fails in many ways.
+    # onnx2torch may be absent. It lacks some operations, and fails in many ways.
+    except Exception as error:
         reason = single_line(error)
         say_once(f"{path} has no gradients, since onnx2torch fails ({reason}): attacks search")
         return network, sizes

@@ -1,7 +1,5 @@
 """A callback that makes the renders of a service anew in each epoch of PyTorch Lightning."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from importlib import import_module
 from typing import Any

@@ -4,8 +4,6 @@
 network returns. What an output means, such as logits, is known where a task uses it.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

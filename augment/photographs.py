@@ -11,8 +11,6 @@ photograph is what the network predicts for it unchanged. What a detector or a s
 unchanged photographs is attacked one by one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Labeled renders for a training loop, and examples of attacks on them for figures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ in `augment.attack_settings`, those of random variation and training renders in
 `augment.augmentation_settings`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
@@ -62,7 +60,7 @@ class ObjectSettings(MeshSettings):
     1.0
     """
 
-    label: str = setting("", "Name of its class. Empty for no class.", may_be_empty=True)
+    label: str | int = setting("", "Name of its class. Empty for no class.", may_be_empty=True)
     albedo_scale: float = setting(1.0, "Factor of its albedo.", within=(1 / MAX_SCALE, MAX_SCALE))
     at: list[float] | None = setting(
         None,

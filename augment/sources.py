@@ -16,16 +16,14 @@ from pathlib import Path
 from runpy import run_path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
-from augment import files, huggingface, progress, tasks
+from augment import files, huggingface, progress
 from augment import network as wrappers
 from augment.classifier import Classifier, Normalization, as_network, mean_and_std, nearest
 from augment.files import NetworkFacts
 from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network, unwrapped
 from augment.settings import NormalizeLight
-from augment.tasks.classification import Classification
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
 from renderer.settings import Size, height_and_width
@@ -328,17 +326,9 @@ def _python(name: str, weights: Path | None, *_: object) -> Any:
         raise files.weights_error(weights, f"{reason}: leave weights out")
     network, size, classes = call_python(name)
     if isinstance(network, nn.Module):
-        wrappers.keep_text_vectors(network, len(classes))
+        wrappers.keep_text_vectors(network.eval(), len(classes))
     title = f"{PYTHON}{name}"
-    gray = torch.full((1, 3, size, size), 0.5)
-    try:
-        with torch.no_grad(), wrappers.eval_mode(network):
-            task = tasks.recognized_task(Network(network)(gray), title)
-    except Exception:  # A classifier reports its errors itself when it is used.
-        task = Classification()
-    if isinstance(task, Classification):
-        return Classifier(network, size, classes, title)
-    return as_network(network, size, classes, name=title)
+    return as_network(network, size, classes, argument=title, name=title, says=False)
 
 
 # Functions that make the classifiers of a source, such as torchvision. Their arguments are the

@@ -331,8 +331,8 @@ class ExperimentSettings(NetworkSettings):
         default_label = labels[0] if len(labels) == 1 else ""
         objects = read_objects(self.meshes, default_label, "meshes") | self.negative_objects
         for key, item in objects.items():
-            item.label = item.label or solid_name(item.mesh)
-            if not item.label:
+            item.label = solid_name(item.mesh) if item.label == "" else item.label
+            if item.label == "":
                 raise InputError(f"{key} has no class: give {{mesh, label: CLASS}}", key)
         missing = set(labels) - {item.label for item in objects.values()}
         if missing and len(labels) > 1:

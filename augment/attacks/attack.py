@@ -1,7 +1,5 @@
 """The function `attack`, which attacks a classifier through a scene, and a search for a scene."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence

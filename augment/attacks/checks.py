@@ -1,7 +1,5 @@
 """Checks of an attack: random search, more steps, success by radius, and transfer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import partial

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,15 +24,13 @@ from jaxtyping import Bool, Float, Int
 from PIL import Image
 from torch import Tensor, nn
 
+from augment.attack_settings import AttackSettings, EOTSettings
 from augment.network import BatchSize, Network, Quantization, eval_mode, straight_through
 from augment.progress import Phases
 from augment.random_streams import generator
 from augment.scene.truth import Rows
 from augment.tasks.task import Criterion
 from renderer.image import clamp, to_bytes, to_unit
-
-if TYPE_CHECKING:
-    from augment.attack_settings import AttackSettings, EOTSettings
 
 # Attack values of E examples, the indices of examples, and images of their V views.
 Values = Float[Tensor, "E D"]

@@ -7,28 +7,24 @@ A candidate is a vector of attack values that is evaluated next.
 - `CMAES`: covariance matrix adaptation (Hansen 2016).
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from augment.attack_settings import AttackSettings, StepSettings
 from augment.attacks.objective import Examples, Images, Score, Values
 from augment.random_streams import generator, stream_seed
 from augment.scene.truth import Truth
 from renderer.errors import InputError
 from renderer.vectors import Ball, nearest_in_box
-
-if TYPE_CHECKING:
-    from augment.attack_settings import AttackSettings, StepSettings
 
 # Random search multiplies the length of its random changes by GROWTH after an accepted candidate
 # and by SHRINKAGE after a rejected one. Four rejections undo one acceptance (the 1/5 success rule
@@ -81,9 +77,6 @@ def sample(
 
     Values outside of the mask `used` are those of the center. None draws all values.
     """
-    if settings.radius is None:
-        reason = "radius is None, but random values are drawn from the norm-ball"
-        raise InputError(f"{reason}: set radius")
     is_used = None if used is None else used.cpu()
     if settings.norm == "linf":
         offset = 2 * torch.rand(center.shape, generator=draws) - 1

@@ -5,8 +5,6 @@ are its highlights, and the higher is the degree that shows them. If the user gi
 chosen for the smoothest surface.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -204,23 +202,19 @@ def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
         )
         given = enumerate(member) if is_list else ()
         parts = [_as_object(f"{name}[{part}]", item) for part, item in given]
-        (first, label), *others = parts or [_as_object(name, member)]
-        together = replace(first, others=[*first.others, *(other for other, _ in others)])
+        first, *others = parts or [_as_object(name, member)]
+        together = replace(first, others=[*first.others, *others])
         item = placed.load_object(together, settings.vertices)
-        # An index remains a number, because a class may have this number as its name.
-        labels = [*item.labels[1 : 1 + len(first.others)], *(label for _, label in others)]
-        pairs = [(of, mesh) for of, (_, mesh) in zip(labels, item.others, strict=True)]
-        item = replace(item, label=label, others=pairs)
         objects.append(placed.add_table(item, settings.ground))
     return objects
 
 
-def _as_object(name: str, given: Any) -> tuple[ObjectSettings, str | int]:
-    """Convert settings, or a pair of a mesh and a label, to settings and the label."""
+def _as_object(name: str, given: Any) -> ObjectSettings:
+    """Convert settings, or a pair of a mesh and a label, to settings."""
     if isinstance(given, Mapping):
         given = settings_from(ObjectSettings, given, name)
     if isinstance(given, ObjectSettings):
-        return given, given.label
+        return given
     if not isinstance(given, tuple | list) or len(given) != 2:
         shown = errors.describe(given)
         raise InputError(f"{name} is {shown}: give a pair of a mesh and a label, {EXAMPLE}")
@@ -231,7 +225,8 @@ def _as_object(name: str, given: Any) -> tuple[ObjectSettings, str | int]:
     if not isinstance(mesh, str | Path):
         require_mesh(name, mesh)
         mesh = placed.name_mesh(mesh)
-    return ObjectSettings(str(mesh)), label if isinstance(label, str) else int(label)
+    # An index remains a number, because a class may have this number as its name.
+    return ObjectSettings(str(mesh), label=label if isinstance(label, str) else int(label))
 
 
 def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:

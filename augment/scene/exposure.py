@@ -1,7 +1,5 @@
 """The exposure of a scene: a factor for the light of each object, chosen as a camera does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

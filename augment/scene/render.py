@@ -11,8 +11,6 @@ vertices are within `NEAR` of this shape. The shadows of projector and lamps are
 the moved shape itself (`renderer.operators.rays`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

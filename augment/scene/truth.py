@@ -1,7 +1,5 @@
 """What the images of a scene show: the class, mask, box and visible fraction of each object."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self

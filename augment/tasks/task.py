@@ -5,8 +5,6 @@ an attack. It reduces the outputs of each image to its evidence, a row of number
 network finds each class. Loop, optimizers, checks and files of an attack know the criterion only.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

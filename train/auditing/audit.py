@@ -196,7 +196,8 @@ class _Plan:
         meshes = [*read_objects(settings.meshes, self.label, "meshes").values()]
         hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
         for item in hard_negatives:
-            item.label = item.label or OTHER_PREFIX + class_names.name_of_mesh(item.mesh)
+            if item.label == "":
+                item.label = OTHER_PREFIX + class_names.name_of_mesh(item.mesh)
         for item in meshes:
             if item.label != self.label:
                 raise InputError(

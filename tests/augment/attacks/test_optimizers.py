@@ -13,7 +13,6 @@ from torch import Tensor
 
 from augment.attack_settings import NORMS, StepSettings
 from augment.attacks.optimizers import NormBalls, sample
-from renderer.errors import InputError
 from renderer.vectors import Ball, nearest_in_box
 
 EPS = torch.finfo(torch.float32).eps
@@ -145,11 +144,6 @@ def test_draws_along_some_axes_are_uniform_in_the_ball_of_these_axes(name):
     assert not drawn[~is_used].any()
     lengths = norms(drawn, name)
     assert stats.kstest(lengths.numpy() ** 2, "uniform").pvalue > 0.01
-
-
-def test_a_ball_without_a_radius_has_no_uniform_draw():
-    with pytest.raises(InputError, match="radius is None"):
-        sample(StepSettings(), torch.zeros(1, 2), torch.Generator())
 
 
 @pytest.mark.parametrize(
