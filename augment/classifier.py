@@ -34,6 +34,8 @@ USUAL_SIZE = 224
 CHECKED_COUNT = 2
 # Names of module classes of torchvision, kornia and this library that normalize images.
 NORMALIZING = frozenset({"Normalize", "ChannelNormalization"})
+# Network or function from images to outputs.
+ImageFunction = Callable[[Tensor], Any]
 # Name of one positive class, or names of several.
 Label = str | Sequence[str]
 Normalization = str | tuple[Sequence[float], Sequence[float]] | None
@@ -82,7 +84,7 @@ class CheckedNetwork(wrappers.Network):
 
     def __init__(
         self,
-        network: Callable[[Tensor], Any],
+        network: ImageFunction,
         title: str,
         task: Task | None = None,
         class_count: int | None = None,
@@ -124,7 +126,7 @@ class TaskNetwork(CheckedNetwork):
 
     def __init__(
         self,
-        network: Callable[[Tensor], Any],
+        network: ImageFunction,
         size: Size,
         classes: Sequence[str],
         name: str = "callable",
@@ -399,7 +401,7 @@ def log_odds(logits: Float[Tensor, "N classes"], label: int) -> Float[Tensor, " 
 
 
 def as_network(
-    network: TaskNetwork | Callable[[Tensor], Any],
+    network: TaskNetwork | ImageFunction,
     size: Size | None = None,
     classes: Sequence[str] | None = None,
     normalization: Normalization = None,

@@ -37,6 +37,9 @@ from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 # images. None stands for any size, or an unknown one.
 Content = tuple[Callable[[Tensor], Tensor], Sequence[int | None]]
 
+# Weights of a network by their names.
+State = Mapping[str, Tensor]
+
 EXPORTED = ".pt2"
 ONNX = ".onnx"
 # Endings of the names of files that may be TorchScript.
@@ -372,7 +375,7 @@ def read_onnx(path: Path) -> Content:
     return Function(outputs, ARRAYS), sizes
 
 
-def read_weights(path: Path) -> Mapping[str, Tensor]:
+def read_weights(path: Path) -> State:
     """Read the weights of a network without running code from the file.
 
     Return the state dict on the CPU, without the prefixes of `DataParallel` and `torch.compile`.
@@ -396,7 +399,7 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
         raise weights_error(path, f"cannot be read ({reason}): {advice}") from error
 
 
-def _state_dict(content: Any) -> Mapping[str, Tensor]:
+def _state_dict(content: Any) -> State:
     """Find the state dict in the content of a file of weights."""
     # A mapping that has not only tensors is a checkpoint. Look under the usual keys.
     while isinstance(content, Mapping) and not all(
@@ -411,7 +414,7 @@ def _state_dict(content: Any) -> Mapping[str, Tensor]:
     return content
 
 
-def _without_prefixes(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+def _without_prefixes(state: State) -> State:
     """Remove prefixes such as "module." from the names of weights, if all names have them."""
     for prefix in _PREFIXES:
         if state and all(key.startswith(prefix) for key in state):
@@ -447,7 +450,7 @@ def is_torchscript(path: Path) -> bool:
         return any(name.endswith("/constants.pkl") for name in archive.namelist())
 
 
-def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path) -> Classifier:
+def fill(classifier: Classifier, state: State, source: str | Path) -> Classifier:
     """Load weights into the network of a classifier.
 
     The classifier is changed in place and returned.

@@ -23,7 +23,7 @@ from augment import attack_settings
 from augment import network as wrappers
 from augment.attack_settings import AttackSettings, RelightingSettings, StepSettings
 from augment.attacks.loop import minimize
-from augment.attacks.objective import Objective, preprocessed_model
+from augment.attacks.objective import Examples, Objective, preprocessed_model
 from augment.attacks.optimizers import Gradient, NormBalls, Optimizer, sample
 from augment.classifier import MAX_PROBED, UNIT_RANGE, Normalization, TaskNetwork, as_network
 from augment.progress import progress
@@ -82,12 +82,12 @@ class RelitPhotographs(NormBalls):
         """Return the logarithms of the factors of each channel in each cell."""
         return values.unflatten(1, (3, self._cells, self._cells))
 
-    def render(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Tensor:
+    def render(self, values: Float[Tensor, "A D"], examples: Examples) -> Tensor:
         """Show photographs in the light of the projector, each in one view."""
         light = ProjectedLight(*(values[examples] for values in self._light))
         return light.expose(self._albedo[examples], self.log_gain(values))[:, None]
 
-    def draw(self, examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
+    def draw(self, examples: Examples) -> Float[Tensor, "A D"]:
         """Draw random factors of some photographs, whose logarithms are uniform in the ball."""
         draws = [(self.start[[row]], self._generators[row]) for row in examples.tolist()]
         return torch.cat([sample(self.settings, *each) for each in draws])
@@ -325,8 +325,8 @@ def _attack(
 def _attack_slide(
     result: PhotographAttackResult,
     success: AttackSettings,
-    images: Float[Tensor, "B 3 height width"],
-    rows: Int[Tensor, " B"],
+    images: Tensor,
+    rows: Examples,
     slide: int,
 ) -> None:
     """Attack a batch of photographs with one slide each, and record what is found in the result.

@@ -8,7 +8,7 @@ import math
 import re
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from augment import files, huggingface, progress
 from augment import network as wrappers
 from augment.classifier import Classifier, Normalization, as_network, mean_and_std, nearest
-from augment.files import NetworkFacts
+from augment.files import NetworkFacts, State
 from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network, unwrapped
 from augment.settings import NormalizeLight
 from augment.tasks.task import Task
@@ -31,6 +31,8 @@ from renderer.settings import Size, height_and_width
 # Networks of torchvision that were trained with another normalization than that of ImageNet. They
 # convert their images if the argument `transform_input` is True.
 _TRANSFORMS_INPUT = ("googlenet", "inception_v3")
+# Function that makes a classifier with random weights.
+Build = Callable[[NetworkFacts], Classifier]
 # A classifier with this prefix is loaded by a Python function, as in python:my_module.load.
 PYTHON = "python:"
 SQUEEZENET_CAFFE = "squeezenet_caffe"
@@ -131,11 +133,7 @@ def _torchvision(
 
 
 def _with_weights(
-    build: Callable[[NetworkFacts], Classifier],
-    facts: NetworkFacts,
-    state: Mapping[str, Tensor],
-    source: str | Path,
-    is_published: bool,
+    build: Build, facts: NetworkFacts, state: State, source: str | Path, is_published: bool
 ) -> Classifier:
     """Build a classifier that fits weights, and fill it with them.
 
@@ -170,9 +168,7 @@ def _with_weights(
     return files.fill(classifier, state, source)
 
 
-def _size_for_positions(
-    own_size: int, own_state: Mapping[str, Tensor], state: Mapping[str, Tensor]
-) -> int | None:
+def _size_for_positions(own_size: int, own_state: State, state: State) -> int | None:
     """Return the pixels per side for which weights have position embeddings, or None.
 
     There is one token for each patch, and few others, which the whole part of the root leaves out.

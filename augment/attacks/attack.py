@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Generator, Tensor
 
 from augment import classifier as classifiers
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings, StepSettings
@@ -58,13 +58,15 @@ EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)
 # in all images.
 CONFIDENCE_TO_STOP = 0.5
 
+# Target class of an attack, or one for each view.
+Target = str | int | Sequence[str | int] | None
 Settings = TypeVar("Settings", bound=SceneSettings)
 
 
 def attack(
     classifier: Classifier | Callable[[Tensor], Any],
     scene: Scene,
-    target: str | int | Sequence[str | int] | None = None,
+    target: Target = None,
     settings: AttackSettings | None = None,
     *,
     task: Task | None = None,
@@ -154,7 +156,7 @@ def attack(
 def _attack(
     classifier: TaskNetwork,
     scene: Scene,
-    target: str | int | Sequence[str | int] | None,
+    target: Target,
     settings: AttackSettings,
     seed: int,
     force: bool,
@@ -255,10 +257,7 @@ def require_clean_correct(
 
 
 def target_labels(
-    target: str | int | Sequence[str | int] | None,
-    source: Int[Tensor, "E V"],
-    evidence: Float[Tensor, "E V K"],
-    classifier: TaskNetwork,
+    target: Target, source: Tensor, evidence: Tensor, classifier: TaskNetwork
 ) -> Int[Tensor, "E V"] | None:
     """Return the target class of each view as an index of the classifier.
 
@@ -291,7 +290,7 @@ def find_scene(
     attack_settings: AttackSettings,
     build: Callable[[Settings], Scene],
     cameras: int,
-    draws: torch.Generator,
+    draws: Generator,
 ) -> tuple[Settings, Scene]:
     """Search for settings of a scene, and the scene, that a classifier recognizes before an attack.
 
@@ -315,7 +314,7 @@ def find_scene(
     return best_settings, build(best_settings)
 
 
-def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Iterator[Settings]:
+def _candidates(settings: Settings, cameras: int, draws: Generator) -> Iterator[Settings]:
     """Yield settings with other cameras, each also on light gray if the only background is gray."""
     has_one_gray = len(settings.backgrounds) == 1 and not isinstance(settings.backgrounds[0], str)
     for index in range(cameras):

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from PIL import Image
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from augment.attack_settings import AttackSettings, EOTSettings
 from augment.network import BatchSize, Network, Quantization, eval_mode, straight_through
@@ -36,6 +36,7 @@ from renderer.image import clamp, to_bytes, to_unit
 Values = Float[Tensor, "E D"]
 Examples = Int[Tensor, " E"]
 Images = Float[Tensor, "E V _ H W"]
+SingleImages = Float[Tensor, "N _ H W"]
 
 # Function that puts the rows of all views of examples one after the other.
 of_single_images = partial(torch.flatten, start_dim=0, end_dim=1)
@@ -168,7 +169,7 @@ class Objective:
                 is_overconfident=criterion.is_overconfident(expected_evidence),
             )
 
-    def _outputs(self, batch: Float[Tensor, "N _ H W"]) -> Any:
+    def _outputs(self, batch: SingleImages) -> Any:
         """Compute the outputs of single images. The network may compute in half precision."""
         outputs = self.model(batch)
         return outputs.to(batch.dtype) if isinstance(outputs, Tensor) else outputs
@@ -266,7 +267,7 @@ class Objective:
         return is_fooled
 
 
-def _image_gradient(cost: Tensor, outputs: Any, batch: Float[Tensor, "N _ H W"]) -> Tensor:
+def _image_gradient(cost: Tensor, outputs: Any, batch: SingleImages) -> Tensor:
     """Compute the gradient of the costs with respect to the images."""
     if not cost.requires_grad:
         # A detector that finds nothing returns nothing that depends on the image.
@@ -306,10 +307,10 @@ def add_sensor_noise(
 
 def average_transformed(
     model: nn.Module,
-    images: Float[Tensor, "N _ H W"],
+    images: SingleImages,
     logits: Float[Tensor, "N C"],
     settings: EOTSettings,
-    draws: torch.Generator,
+    draws: Generator,
 ) -> Float[Tensor, "N C"]:
     """Average predictions over random transformations of images (EOT, Athalye et al. 2018).
 
@@ -321,9 +322,7 @@ def average_transformed(
     return torch.stack([version.log_softmax(1) for version in versions]).mean(0)
 
 
-def _transformed(
-    images: Float[Tensor, "N 3 H W"], settings: EOTSettings, draws: torch.Generator
-) -> Float[Tensor, "N 3 H W"]:
+def _transformed(images: SingleImages, settings: EOTSettings, draws: Generator) -> SingleImages:
     """Transform each image at random.
 
     A transformation shifts, rotates and scales the image, changes the exposure, adds noise and
@@ -357,7 +356,7 @@ def as_jpeg(images: Float[Tensor, "... 3 H W"], quality: int) -> Float[Tensor, "
     return to_unit(torch.stack(decompressed)).view(images.shape)
 
 
-def _moved(images: Tensor, movements: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 H W"]:
+def _moved(images: Tensor, movements: Float[Tensor, "N 4"]) -> SingleImages:
     """Shift, rotate and scale images. The pixels at the border are repeated beyond the border.
 
     Each new pixel takes its value from a position in the given image. The movement is that of these

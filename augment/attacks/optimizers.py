@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Generator, Tensor
 
 from augment.attack_settings import AttackSettings, StepSettings
 from augment.attacks.objective import Examples, Images, Score, Values
@@ -69,10 +69,10 @@ class Problem(Protocol):
 
 def sample(
     settings: StepSettings,
-    center: Float[Tensor, " ..."],
-    draws: torch.Generator,
+    center: Values,
+    draws: Generator,
     used: Bool[Tensor, "A D"] | None = None,
-) -> Float[Tensor, " ..."]:
+) -> Values:
     """Draw a vector of values uniformly from the norm-ball around each center.
 
     Values outside of the mask `used` are those of the center. None draws all values.
@@ -178,7 +178,7 @@ class NormBalls:
         ball = None if radius is None else Ball(center, radius, self.settings.norm)
         return self.project_feasible(values, ball)
 
-    def sample(self, draws: torch.Generator, reached: Values | None = None) -> Values:
+    def sample(self, draws: Generator, reached: Values | None = None) -> Values:
         """Draw random feasible values for all E examples.
 
         With a radius, values are drawn uniformly from the norm-balls and then

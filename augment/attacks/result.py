@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -405,12 +404,6 @@ class AttackResult(ShortRepr):
         conditions = self.problem.conditions(values[examples], examples)
         # `conditions` contain one example only, at index 0.
         return conditions.light[0], self.problem.scene.basis_under(conditions, 0)
-
-    def _repr_png_(self) -> bytes:
-        """Return `plot()` as a PNG file. Notebooks display it."""
-        content = BytesIO()
-        self.plot().savefig(content, format="png")
-        return content.getvalue()
 
 
 def require_result(result: object) -> None:

@@ -28,6 +28,11 @@ from renderer.errors import InputError
 from renderer.image import LUMINANCE, clamp, decode, encode, to_unit
 from renderer.settings import Size, height_and_width
 
+# x and y of points on the first axis, pictures in linear light, and logarithms of the factors of
+# each channel in cells of a slide.
+Points = Float[Tensor, "2 ..."]
+Pictures = Float[Tensor, "N 3 height width"]
+Gains = Float[Tensor, "N 3 cells cells"]
 # Radius of a disc in the pattern `spots`, which has one disc in each square cell of width 1. The
 # discs cover half of the area.
 DISC_RADIUS = 0.4
@@ -56,27 +61,27 @@ def stripes(
     return fraction((points + shift)[0]) < bright
 
 
-def checkers(points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]) -> Bool[Tensor, " ..."]:
+def checkers(points: Points, shift: Points) -> Bool[Tensor, " ..."]:
     """Find the points on the bright squares of a chessboard with period 1."""
     # A square is bright if exactly one of x and y is in the first half of its period.
     is_in_first_half = fraction(points + shift) < 0.5
     return is_in_first_half.sum(0) == 1
 
 
-def spots(points: Float[Tensor, "2 ..."], shift: Float[Tensor, "2 ..."]) -> Bool[Tensor, " ..."]:
+def spots(points: Points, shift: Points) -> Bool[Tensor, " ..."]:
     """Find the points in the discs of a square grid with period 1."""
     # Vector from the center of the disc in the same cell to each point, shape (2, ...).
     from_center = fraction(points + shift) - 0.5
     return from_center.square().sum(0) < DISC_RADIUS**2
 
 
-def half(points: Float[Tensor, "2 ..."], shift: Tensor | float) -> Bool[Tensor, " ..."]:
+def half(points: Points, shift: Tensor | float) -> Bool[Tensor, " ..."]:
     """Find the points to the right of the vertical line x = shift - 0.5."""
     # The line is vertical, so only the coordinate x counts, which is row 0.
     return (points > shift - 0.5)[0]
 
 
-def solid(points: Float[Tensor, "2 ..."], shift: Tensor | float = 0.0) -> Float[Tensor, " ..."]:
+def solid(points: Points, shift: Tensor | float = 0.0) -> Float[Tensor, " ..."]:
     """Return ones for all points, which makes a pattern of a single color."""
     return torch.ones_like(points[0])
 
@@ -103,10 +108,8 @@ def _centers(height: int, width: int) -> tuple[Float[Tensor, "1 1 W"], Float[Ten
 
 
 def turned(
-    points: Float[Tensor, "2 ..."] | tuple[Tensor, Tensor],
-    cosine: Tensor | float,
-    sine: Tensor | float,
-) -> Float[Tensor, "2 ..."]:
+    points: Points | tuple[Tensor, Tensor], cosine: Tensor | float, sine: Tensor | float
+) -> Points:
     """Rotate points about the center of the image.
 
     Positive angles are clockwise, since y points down.
@@ -128,11 +131,8 @@ def random_colors(draws: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3 1 1"]:
 
 
 def draw_patterns(
-    count: int,
-    size: Size,
-    draws: Generator,
-    points: Float[Tensor, "2 count height width"] | None = None,
-) -> Float[Tensor, "count 3 height width"]:
+    count: int, size: Size, draws: Generator, points: Points | None = None
+) -> Pictures:
     """Draw random patterns in two colors: stripes, squares, discs, halves or one color.
 
     Kind, colors, angle, period and position are random. The result is linear light. `points` has x
@@ -183,11 +183,7 @@ def by_kind(
     return torch.cat(parts)[order]
 
 
-def draw_photograph_patterns(
-    photographs: Float[Tensor, "N 3 H W"],
-    points: Float[Tensor, "2 _ height width"],
-    draws: Generator,
-) -> Float[Tensor, "N 3 height width"]:
+def draw_photograph_patterns(photographs: Pictures, points: Points, draws: Generator) -> Pictures:
     """Draw random patterns that are photographs, rotated, scaled and saturated at random.
 
     Beyond its border, a photograph is mirrored. Photographs are linear light. `points` has x and y
@@ -232,7 +228,7 @@ CELL_CODE = 32
 
 def draw_slides(
     count: int, size: Size, draws: Generator, photographs: UInt8[Tensor, "N 3 H W"] | None = None
-) -> Float[Tensor, "count 3 height width"]:
+) -> Pictures:
     """Draw random slides, which are pictures that a projector shows.
 
     A slide has a two-color pattern, Voronoi cells, a smooth field or a photograph. Slides are
@@ -249,7 +245,7 @@ def draw_slides(
     return by_kind(kinds, lambda kind, _: families[kind](kinds.count(kind), size, draws))
 
 
-def draw_cells(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 3 height width"]:
+def draw_cells(count: int, size: Size, draws: Generator) -> Pictures:
     """Draw pictures of Voronoi cells, each cell in a random color.
 
     The centers of the cells are random points. A pixel belongs to the cell whose center is nearest.
@@ -283,7 +279,7 @@ def draw_cells(count: int, size: Size, draws: Generator) -> Float[Tensor, "count
     return torch.stack(pictures)
 
 
-def draw_fields(count: int, size: Size, draws: Generator) -> Float[Tensor, "count 3 height width"]:
+def draw_fields(count: int, size: Size, draws: Generator) -> Pictures:
     """Draw pictures of smooth random light, which differs between the three channels.
 
     Pictures are linear light.
@@ -298,7 +294,7 @@ def draw_fields(count: int, size: Size, draws: Generator) -> Float[Tensor, "coun
 
 def draw_projected(
     photographs: UInt8[Tensor, "N 3 H W"], count: int, size: Size, draws: Generator
-) -> Float[Tensor, "count 3 height width"]:
+) -> Pictures:
     """Choose photographs, and rotate, scale and saturate them at random.
 
     Beyond its border, a photograph is mirrored. Pictures are linear light on the CPU.
@@ -350,9 +346,7 @@ class ProjectedLight(NamedTuple):
         """Return a copy whose tensors are on a device."""
         return ProjectedLight(*(values.to(device) for values in self))
 
-    def light(
-        self, log_gain: Float[Tensor, "B 3 cells cells"] | None = None
-    ) -> Float[Tensor, "B 3 H W"]:
+    def light(self, log_gain: Gains | None = None) -> Pictures:
         """Compute the light that falls on each pixel: slide · gain · shading + ambient.
 
         Logarithms of gains are interpolated linearly between the centers of the cells. None stands
@@ -363,11 +357,7 @@ class ProjectedLight(NamedTuple):
             slide = slide * F.interpolate(log_gain, slide.shape[-2:], mode="bilinear").exp()
         return slide * self.shading + self.ambient
 
-    def expose(
-        self,
-        albedo: Float[Tensor, "B 3 H W"],
-        log_gain: Float[Tensor, "B 3 cells cells"] | None = None,
-    ) -> Float[Tensor, "B 3 H W"]:
+    def expose(self, albedo: Pictures, log_gain: Gains | None = None) -> Pictures:
         """Compute images (sRGB) of linear photographs in the light of the projector.
 
         The camera exposes an image such that its mean luminance is 2^stops times that of the
@@ -423,7 +413,7 @@ def _stripes(
     return stripes(scaled, shift=rng.uniform(), bright=rng.uniform(0.3, 0.7))
 
 
-def _spots(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
+def _spots(points: Points, rng: np.random.Generator) -> Tensor:
     """Draw discs at random places. All have one size and cover about half of the image."""
     radius = rng.uniform(0.08, 0.25)
     count = round(TOTAL_AREA / (math.pi * radius**2))
@@ -433,13 +423,13 @@ def _spots(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     return is_lit
 
 
-def _rings(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
+def _rings(points: Points, rng: np.random.Generator) -> Tensor:
     """Draw concentric rings of the same width around a random center."""
     radius = (points - _pair(rng.uniform(-0.5, 0.5, 2))).norm(dim=0, keepdim=True)
     return _stripes(radius, rng, widest=0.4)
 
 
-def _window(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
+def _window(points: Points, rng: np.random.Generator) -> Tensor:
     """Draw the light that falls through the panes of a window into a dark room."""
     pane_counts = _pair(rng.integers(2, 5, 2))
     pane_size = _pair(rng.uniform(0.15, 0.4, 2))
@@ -451,7 +441,7 @@ def _window(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     return (is_in_window & is_in_pane).all(dim=0)
 
 
-def _leaves(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
+def _leaves(points: Points, rng: np.random.Generator) -> Tensor:
     """Draw the shadows of leaves: random ellipses that cover about half of the image."""
     half_length = rng.uniform(0.15, 0.35)
     is_lit = torch.ones(points.shape[1:], dtype=torch.bool)
@@ -465,7 +455,7 @@ def _leaves(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     return is_lit
 
 
-def _text(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
+def _text(points: Points, rng: np.random.Generator) -> Tensor:
     """Draw bright lines of random capital letters on a dark background."""
     from PIL import Image, ImageDraw, ImageFont
 
@@ -482,7 +472,7 @@ def _text(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Tensor:
     return _interpolate(weights, points, order=1)
 
 
-def _colors(points: Float[Tensor, "2 H W"], rng: np.random.Generator) -> Float[Tensor, "3 H W"]:
+def _colors(points: Points, rng: np.random.Generator) -> Float[Tensor, "3 H W"]:
     """Draw smooth colors: random values on a coarse grid, interpolated by cubic splines."""
     rows, columns = rng.integers(3, 6), rng.integers(3, 6)
     grid = rng.uniform(0, 1, (rows, columns, 3))
@@ -495,7 +485,7 @@ def _pair(values: np.ndarray) -> Shaped[Tensor, "2 1 1"]:
 
 
 def _interpolate(
-    image: Float[np.ndarray, "H W C"], points: Float[Tensor, "2 _ _"], order: int
+    image: Float[np.ndarray, "H W C"], points: Points, order: int
 ) -> Float[Tensor, "C _ _"]:
     """Interpolate an image at given positions with splines.
 

@@ -351,11 +351,6 @@ class DirectRenderer:
         item = self.objects[object_index]
         mesh, seen = self._seen(object_index, camera, vertices)
         pixel_count = self.settings.pixel_count
-        if item.own is None:  # All samples show the only object.
-            is_covered = torch.zeros(pixel_count, dtype=torch.bool)
-            is_covered[seen.pixels] = seen.coverage >= COVERED
-            is_seen = torch.tensor([float(len(seen.pixels) > 0)])
-            return is_covered.view(1, *self.settings.shape), is_seen
         # Index of the object that each sample shows. The table comes after the objects.
         owner_of_face = np.searchsorted(item.ends, seen.faces.numpy(), side="right")
         owner = torch.from_numpy(owner_of_face)[seen.sample_to_seen_face]
@@ -367,7 +362,9 @@ class DirectRenderer:
         ends = zip([0, *item.ends[:-1]], item.ends, strict=True)
         parts = [mesh.faces[start:end] for start, end in ends]
         shown = [camera], self.settings, self.rasterizer
-        alone = [build_fragments(mesh.vertices, faces, *shown)[0] for faces in parts]
+        alone = [seen]  # All samples show the only object.
+        if item.own is not None:
+            alone = [build_fragments(mesh.vertices, faces, *shown)[0] for faces in parts]
         counts_alone = torch.tensor([len(each.sample_numbers) for each in alone])
         visible = own_counts / counts_alone.clamp(min=1)
         return counts >= COVERED * self.settings.samples**2, visible

@@ -20,6 +20,9 @@ from augment.network import are_probabilities, plain_outputs
 from augment.tasks.task import NO_CLASS, Criterion, GetTruth, Task
 from renderer.errors import InputError, require_range
 
+# Logits of N images, and labels or predicted classes of them.
+Logits = Float[Tensor, "N C"]
+Labels = Int[Tensor, " N"]
 # A network is overconfident where its log-odds exceed this number. Networks rarely do so, unless
 # their logits are multiplied by a factor.
 OVERCONFIDENT = 50.0
@@ -102,7 +105,7 @@ class _LogitReader:
         self.class_count = class_count
         self.probability_rows: int | None = 0
 
-    def __call__(self, outputs: Any, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N C"]:
+    def __call__(self, outputs: Any, images: Float[Tensor, "N 3 H W"]) -> Logits:
         logits = plain_outputs(outputs)
         is_tensor = isinstance(logits, Tensor)
         has_row_per_image = is_tensor and logits.ndim == 2 and len(logits) == len(images)
@@ -129,7 +132,7 @@ class ClassCriterion(Criterion):
     class except its source.
     """
 
-    def evidence(self, outputs: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+    def evidence(self, outputs: Logits) -> Logits:
         """Return the logits themselves."""
         return outputs
 
@@ -142,7 +145,7 @@ class ClassCriterion(Criterion):
         lowest, highest = evidence.aminmax(dim=-1)
         return highest - lowest > OVERCONFIDENT
 
-    def cost(self, logits: Float[Tensor, "N C"]) -> Float[Tensor, " N"]:
+    def cost(self, logits: Logits) -> Float[Tensor, " N"]:
         """Compute the cost of single images, for a criterion that is flat.
 
         Without a target, the cost and its gradient round to 0 if the log-odds o of the source are
@@ -187,16 +190,13 @@ def complementary_label(label: int) -> int:
     return -1 - label
 
 
-def require_known(labels: Int[Tensor, " N"], logits: Float[Tensor, "_ classes"]) -> None:
+def require_known(labels: Labels, logits: Float[Tensor, "_ classes"]) -> None:
     """Check that every label has a logit. Labels may be complementary."""
     require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
 
 
 def label_loss(
-    logits: Float[Tensor, "N classes"],
-    labels: Int[Tensor, " N"],
-    label_smoothing: float = 0.0,
-    absent: Sequence[int] = (),
+    logits: Logits, labels: Labels, label_smoothing: float = 0.0, absent: Sequence[int] = ()
 ) -> Float[Tensor, " N"]:
     """Compute the loss of each image by its label.
 
@@ -215,9 +215,7 @@ def label_loss(
     return torch.where(labels < 0, complementary, entropy)
 
 
-def is_correct(
-    predicted: Int[Tensor, " N"], labels: Int[Tensor, " N"], absent: Sequence[int] = ()
-) -> Bool[Tensor, " N"]:
+def is_correct(predicted: Labels, labels: Labels, absent: Sequence[int] = ()) -> Bool[Tensor, " N"]:
     """Return a mask of the predictions that agree with the labels.
 
     A label that is a class demands the prediction of this class. The complementary label
