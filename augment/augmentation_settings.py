@@ -198,6 +198,4 @@ def views_of(examples: int, objects: int, backgrounds: int) -> int:
 
     For example, 100 renders of 2 meshes in front of 5 backgrounds need 10 views.
     """
-    if not objects or not backgrounds:
-        raise InputError("meshes and backgrounds must not be empty: name one of each", "meshes")
-    return max(1, math.ceil(examples / objects / backgrounds))
+    return max(1, math.ceil(examples / max(1, objects * backgrounds)))

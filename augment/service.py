@@ -178,7 +178,6 @@ class AugmentationService:
         """
         expected = "nb.AugmentationSettings(...) or None"
         require_kind("settings", settings, AugmentationSettings | None, expected)
-        require_whole("seed", seed)
         views = 1 if of_scene.get("cameras") else 10
         paper: dict[str, Any] = {"views": views, "samples": 8, "normals": "flat"}
         options = paper | {"backgrounds": [0.0, 0.25, 0.5, 0.75, 1.0]} | of_scene

@@ -219,10 +219,6 @@ class Detection(Task):
             given = errors.describe(target)
             raise InputError(f"target is {given}, and {self} hides objects: {advice}")
 
-    def confidences(self, evidence: Float[Tensor, "... K"]) -> Float[Tensor, "... C"]:
-        """Return the score of the best box of each class at the object."""
-        return evidence[..., :-1].sigmoid()
-
     def draw(self, image: Tensor, output: Detections, classes: Sequence[str]) -> Tensor:
         """Draw the boxes whose scores reach the threshold, with their classes and scores."""
         from torchvision.utils import draw_bounding_boxes  # torchvision takes half a second.
@@ -432,12 +428,10 @@ class _Reader:
 
 
 def _iou(boxes: Float[Tensor, "K 4"], box: Float[Tensor, " 4"]) -> Float[Tensor, " K"]:
-    """Compute the intersection over union of boxes with a box, which is 0 without an area."""
-    boxes, box = boxes.detach(), box.to(boxes)
-    sides = torch.minimum(boxes[:, 2:], box[2:]) - torch.maximum(boxes[:, :2], box[:2])
-    common = sides.clamp(min=0).prod(1)
-    area = (boxes[:, 2:] - boxes[:, :2]).prod(1) + (box[2:] - box[:2]).prod()
-    return common / (area - common).clamp(min=torch.finfo(boxes.dtype).tiny)
+    """Compute the intersection over union of boxes with a box. It is NaN without an area."""
+    from torchvision.ops import box_iou  # torchvision takes half a second.
+
+    return box_iou(boxes.detach(), box.to(boxes)[None])[:, 0]
 
 
 def log_odds_of(scores: Tensor) -> Tensor:

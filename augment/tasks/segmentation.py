@@ -123,10 +123,6 @@ class Segmentation(Task):
         """Refuse a target, because an attack on a segmenter hides an object."""
         raise InputError(f"target is {describe(target)}, and {self} hides objects: leave it out")
 
-    def confidences(self, evidence: Float[Tensor, "... K"]) -> Float[Tensor, "... C"]:
-        """Return the IoU of each class with the object."""
-        return evidence[..., :-1].sigmoid()
-
     def draw(self, image: Tensor, output: Tensor, classes: Sequence[str]) -> Tensor:
         """Draw the classes of the pixels as colors, except the first, over the image."""
         label = output.argmax(0)

@@ -207,9 +207,12 @@ class Task(ABC):
     def require_target(self, target: Any) -> None:
         """Check that an attack of this task can have a target class."""
 
-    @abstractmethod
     def confidences(self, evidence: Float[Tensor, "... K"]) -> Float[Tensor, "... C"]:
-        """Return how surely each class is found, from 0 to 1."""
+        """Return how surely each class is found, from 0 to 1.
+
+        By default, the evidence is log-odds, and its last column is a limit (`ObjectCriterion`).
+        """
+        return evidence[..., :-1].sigmoid()
 
     def found(
         self, evidence: Tensor, predicted: Tensor, classes: Sequence[str], when: str = ""
