@@ -388,7 +388,8 @@ def measure_attack(render_count: int, mesh_count: int, steps: int) -> Row:
     precomputed = time.process_time()
     service.regenerate(network, 0)
     attack_seconds = time.process_time() - precomputed
-    transfer_bytes = sum(stack.transfer.nbytes for stack in service.scene.stacks)
+    built = service.scene._operator_renderer.built.values()
+    transfer_bytes = sum(stack.operators.transfer.nbytes for stack in built)
     estimated_bytes = service.scene.attack_bytes + transfer_bytes
     return {
         "renders": render_count,
@@ -405,7 +406,9 @@ def measure_attack(render_count: int, mesh_count: int, steps: int) -> Row:
 
 def precompute(scene: Scene) -> None:
     """Compute the transfer matrices of all views of a scene, which it keeps."""
-    _ = scene.stacks
+    every = torch.arange(len(scene))
+    with torch.no_grad():
+        scene.render(scene.conditions(every), every)
 
 
 def measure_renders(options: argparse.Namespace) -> Iterator[Row]:

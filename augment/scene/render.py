@@ -122,13 +122,7 @@ class OperatorRenderer:
         self._stack_of_image = self._operator_of_image // self._operators_per_stack
         self._stack_count = math.ceil(len(self._views_of_operators) / self._operators_per_stack)
         # Stacks of transfer operators that were built so far, by their indices.
-        self._built: dict[int, _BuiltStack] = {}
-
-    @property
-    def stacks(self) -> list[OperatorStack]:
-        """Return all stacks of transfer operators. Build those that were not needed so far."""
-        self._build_missing(range(self._stack_count))
-        return [self._built[index].operators for index in range(self._stack_count)]
+        self.built: dict[int, _BuiltStack] = {}
 
     def layers(self, light: Float[Tensor, "A _ 3"], images: Int[Tensor, " A"]) -> Iterator[Layer]:
         """Compute the radiance of a batch of images, differentiable in the light."""
@@ -139,7 +133,7 @@ class OperatorRenderer:
         needed_stacks = row_to_stack.unique().tolist()
         self._build_missing(needed_stacks)
         for index in needed_stacks:
-            built = self._built[index]
+            built = self.built[index]
             row_indices = torch.nonzero(row_to_stack == index).squeeze(1)
             rows: Rows = row_indices.to(light.device, non_blocking=True)
             first, end = int(row_indices[0]), int(row_indices[-1]) + 1
@@ -155,10 +149,10 @@ class OperatorRenderer:
 
     def _build_missing(self, indices: Iterable[int]) -> None:
         """Build the stacks of transfer operators with the given indices that do not exist yet."""
-        missing = [index for index in indices if index not in self._built]
+        missing = [index for index in indices if index not in self.built]
         for index in progress(missing, "rendering views") if missing else ():
-            built = self._built[index] = self._build_stack(index)
-            if len(self._built) == 1:
+            built = self.built[index] = self._build_stack(index)
+            if len(self.built) == 1:
                 # All other stacks must fit in memory, if each is as large as the first one.
                 tensors = (built.operators.transfer, built.operators.albedo, built.background_terms)
                 stack_bytes = sum(tensor.nbytes for tensor in tensors)

@@ -24,7 +24,7 @@ from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
 from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
-from renderer.operators.stack import OperatorStack, ScatterLayers
+from renderer.operators.stack import ScatterLayers
 from renderer.settings import ImageSettings
 from renderer.visibility import Rasterizer
 
@@ -264,11 +264,6 @@ class Scene:
         N is the number of vertices of the largest mesh. Smaller meshes are padded with zeros.
         """
         return torch.nn.utils.rnn.pad_sequence(self._direct_renderer.vertices, batch_first=True)
-
-    @property
-    def stacks(self) -> list[OperatorStack]:
-        """Return the transfer operators (matrices from light to image) of all views, in stacks."""
-        return self._operator_renderer.stacks
 
     def mesh(self, example: int) -> Mesh:
         """Return the mesh of the example with the given index."""

@@ -103,4 +103,5 @@ def test_views_need_their_memory_before_any_is_made(monkeypatch):
     shown = build_scene(ORANGE, 64, 100, rasterizer="numpy", samples=1)
     monkeypatch.setattr(errors, "free_memory", lambda device: 10**6)
     with pytest.raises(InputError, match=r"^100 views of 64 × 64 pixels"):
-        _ = shown.stacks
+        first = torch.arange(1)
+        shown.render(shown.conditions(first), first)

@@ -186,7 +186,8 @@ def test_attacked_light_of_a_higher_degree_is_read_back_to_its_image(glossy, tmp
 def test_each_mesh_is_rasterized_once_in_all_views_when_it_is_needed(rasterized):
     scene = built("plate", "cup", views=4)
     assert rasterized == []
-    assert scene.stacks
+    every = torch.arange(len(scene))
+    scene.render(scene.conditions(every), every)
     assert rasterized == [4, 4]
 
 
