@@ -19,8 +19,7 @@ from augment.attacks.problem import SceneProblem, source_labels
 from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import TaskNetwork
 from augment.progress import Phases
-from augment.scene.build import MeshItem, build_scene
-from augment.scene.exposure import warn_of_exposure
+from augment.scene.build import MeshItem, build_scene, warn_of_exposure
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT

@@ -23,8 +23,7 @@ from augment.augmentation_settings import AugmentationSettings, views_of
 from augment.classifier import CheckedNetwork, class_index
 from augment.progress import Phases
 from augment.renders import Renders, select_examples_to_log
-from augment.scene.build import MeshItem, build_scene, with_needed_degree
-from augment.scene.exposure import warn_of_exposure
+from augment.scene.build import MeshItem, build_scene, warn_of_exposure, with_needed_degree
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT, Truth

@@ -23,8 +23,7 @@ from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwor
 from augment.network import gradient_flags_kept
 from augment.progress import Phases, progress
 from augment.random_streams import generator
-from augment.scene.build import with_needed_degree
-from augment.scene.exposure import warn_of_exposure
+from augment.scene.build import warn_of_exposure, with_needed_degree
 from augment.scene.scene import Scene
 from augment.settings import NormalizeLight, SceneSettings
 from augment.tasks.classification import Classification

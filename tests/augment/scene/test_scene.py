@@ -19,8 +19,7 @@ from augment.attacks.problem import SceneProblem
 from augment.augmentation_settings import views_of
 from augment.network import say_once
 from augment.scene import render
-from augment.scene.build import build_scene
-from augment.scene.exposure import warn_of_exposure
+from augment.scene.build import build_scene, warn_of_exposure
 from augment.scene.objects import Conditions, Example, load_object
 from augment.scene.render import NEAR
 from augment.scene.scene import Scene
