@@ -77,6 +77,7 @@ def sample(
 
     Values outside of the mask `used` are those of the center. None draws all values.
     """
+    assert settings.radius is not None
     is_used = None if used is None else used.cpu()
     if settings.norm == "linf":
         offset = 2 * torch.rand(center.shape, generator=draws) - 1

@@ -223,7 +223,7 @@ class _Plan:
         self.image_folders = {
             name: published_folder(Path(folder)) for name, folder in folders.items() if folder
         }
-        labels = {item.label for item in self.items if not item.label.startswith(OTHER_PREFIX)}
+        labels = {of.label for of in self.items if not str(of.label).startswith(OTHER_PREFIX)}
         for network in networks.values():
             for name in labels:
                 network.label(name)
