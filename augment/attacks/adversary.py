@@ -22,7 +22,7 @@ from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import MAX_SCALE, InputError, ShortRepr
 from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.io.images import gray_or_image, write_image
-from renderer.io.meshes import export_mesh
+from renderer.io.meshes import export_mesh, load_mesh
 from renderer.light import environment, files, lamps
 from renderer.light.basis import Basis, with_local_lights
 from renderer.mesh import select_faces
@@ -306,8 +306,6 @@ def reload(folder: str | Path) -> Adversary:
 
 def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     """Read the files of an adversary."""
-    from renderer.io.meshes import load_mesh  # Importing trimesh takes half a second.
-
     settings = ImageSettings(**description["image"])
     cameras: list[Camera] = []
     for fields in description["cameras"]:

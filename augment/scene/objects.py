@@ -22,6 +22,7 @@ from torch import Tensor
 from augment.settings import MeshSettings, ObjectSettings
 from renderer.camera import Camera
 from renderer.errors import InputError, ShortRepr, as_tensor
+from renderer.io.meshes import load_mesh
 from renderer.mesh import Mesh, center_and_extent, concatenate, normalize, select_faces, subdivide
 from renderer.solids import solid
 from renderer.surface.gloss import Gloss
@@ -301,9 +302,6 @@ def _load(item: MeshSettings) -> Mesh:
         except ValueError as error:
             raise InputError(f"{item.mesh}: {error}") from error
     else:
-        # Importing trimesh takes half a second.
-        from renderer.io.meshes import load_mesh
-
         mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
     has_colors = bool(mesh.textures) or bool((mesh.corner_colors != 1).any())
     if item.color is not None:

@@ -1,9 +1,8 @@
 """Read meshes from glTF 2.0 files, and cut out the parts of a surface whose alpha is too small.
 
-Shape (with the default weights of morph targets and the default pose of
-joints), color, alpha and gloss are read. A feature that changes neither the
-shape nor the base color is ignored and named in a warning. A file that has any
-other feature is refused.
+Shape (with the default weights of morph targets), color, alpha and gloss are
+read. A feature that changes neither the shape nor the base color is ignored and
+named in a warning. A file that has any other feature, such as joints, is refused.
 
 A part is a mesh with one material (a primitive of glTF). The renderer has no
 transparency, so holes are cut into the faces. Faces that the border of a hole
@@ -30,18 +29,11 @@ from renderer.mesh import shared_edges
 TRIANGLES = 4
 # Alpha from which on a texel with 8 bits counts as opaque.
 ALMOST_ONE = 1 - 0.5 / 255
-# Beginnings of the names of attributes that joints use.
-SKINNING = ("JOINTS", "WEIGHTS")
 # Widths of the attributes of vertices that are read (3.7.2.1), by the first part of their names.
 ATTRIBUTES = {"POSITION": (3,), "NORMAL": (3,), "TEXCOORD": (2,), "COLOR": (3, 4)}
-ATTRIBUTES |= dict.fromkeys(SKINNING, (4,))
 # Bytes that a face and a vertex take while the parts are read and joined.
 FACE_BYTES = 2000
 VERTEX_BYTES = 1000
-# The weights of the joints of a vertex should add up to 1. Their sum may
-# differ from 1 by at most this much, because weights with 8 bits are rounded.
-MAX_WEIGHT_ERROR = 0.01
-
 
 # Columns of the values of vertices.
 POSITION = slice(0, 3)
@@ -69,12 +61,10 @@ class _Primitive(NamedTuple):
     Attributes:
         surface: Surface in its own axes.
         material: Material of the part.
-        joints: Attributes JOINTS_n and WEIGHTS_n of the vertices.
     """
 
     surface: _Surface
     material: Material
-    joints: dict[str, np.ndarray]
 
 
 def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
@@ -89,6 +79,10 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     needed = 0
     for index in nodes:
         node = file.tree["nodes"][index]
+        if "skin" in node:
+            raise ValueError(
+                "joints move its vertices: apply the armature, and export it"
+            )
         mesh = file.entry("meshes", node["mesh"])
         weights = tuple(node.get("weights", mesh.get("weights", ())))
         for number, primitive in enumerate(mesh["primitives"]):
@@ -103,7 +97,7 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
                 needed += FACE_BYTES * len(read.surface.faces)
                 needed += VERTEX_BYTES * len(read.surface.values)
                 require_memory("its faces", needed, CPU)
-                placed_parts += _place(file, index, read)
+                placed_parts += _place(read, file.poses[index])
     modes = {material.get("alphaMode") for material in file.tree.get("materials", ())}
     if not placed_parts and "MASK" in modes:
         raise ValueError("its alpha cuts out all faces (alphaMode MASK): use OPAQUE")
@@ -134,8 +128,7 @@ def _read_part(
     material, uvs = material.placed(uvs)
     normals = attributes.get("NORMAL", np.zeros_like(positions))
     values = np.column_stack([positions, uvs, colors[:, 3], colors[:, :3], normals])
-    joints = {key: v for key, v in attributes.items() if key.startswith(SKINNING)}
-    return _Primitive(_Surface(values, faces), material, joints)
+    return _Primitive(_Surface(values, faces), material)
 
 
 def _attributes(
@@ -145,19 +138,18 @@ def _attributes(
     attributes = {}
     for name, index in primitive["attributes"].items():
         kind = name.partition("_")[0]
-        if name not in ("POSITION", "NORMAL", "COLOR_0", uv_name) and kind not in SKINNING:
+        if name not in ("POSITION", "NORMAL", "COLOR_0", uv_name):
             continue
         values = file.array(index)
         if values.ndim != 2 or values.shape[1] not in ATTRIBUTES[kind]:
             raise ValueError(f"{name} has a wrong number of values for each vertex")
-        is_vector = kind != "JOINTS"
-        if is_vector and values.dtype.kind in "iu":
-            # Colors and weights must be normalized. Files that forget to say so are common.
-            if kind in ("COLOR", "WEIGHTS"):
+        if values.dtype.kind in "iu":
+            # Colors must be normalized. Files that forget to say so are common.
+            if kind == "COLOR":
                 values = values / np.iinfo(values.dtype).max
             elif QUANTIZATION not in file.tree.get("extensionsUsed", ()):
                 raise ValueError(f"{name} has integers without {QUANTIZATION}: export it again")
-        attributes[name] = values.astype(np.float64) if is_vector else values
+        attributes[name] = values.astype(np.float64)
     targets = primitive.get("targets", [])
     if weights and len(weights) != len(targets):
         raise ValueError(f"it has {len(weights)} weights for {len(targets)} morph targets")
@@ -187,16 +179,9 @@ def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.n
     return indices[: len(indices) // 3 * 3].reshape(-1, 3)
 
 
-def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
-    """Cut holes out of a part of a node, and place it in the scene: none if no face is left."""
-    pose = file.poses[index]
-    surface = part.surface
-    node = file.tree["nodes"][index]
-    if "skin" in node:
-        positions, pose = _posed(file, file.entry("skins", node["skin"]), part)
-        values = np.column_stack([positions, surface.values[:, 3:]])
-        surface = surface._replace(values=values)
-    values, faces = _visible(part.material, surface)
+def _place(part: _Primitive, pose: Float[np.ndarray, "4 4"]) -> list[Part]:
+    """Cut holes out of a part, and place it in the scene by a matrix: none if no face is left."""
+    values, faces = _visible(part.material, part.surface)
     if not len(faces):
         return []
     vertices = values[:, POSITION]
@@ -214,44 +199,7 @@ def _place(file: GltfFile, index: int, part: _Primitive) -> list[Part]:
         texture = material.gloss_texture
         mesh = replace(mesh, gloss=gloss, gloss_textures=() if texture is None else (texture,))
     normals = corners[..., NORMAL] if corners[..., NORMAL].any() else None
-    if "skin" not in node:
-        return [Part(mesh, normals, pose)]
-    # The values of the normals are only compared, so they need not follow the joints.
-    posed, normals = Part(mesh, normals, pose).placed()
-    return [Part(replace(posed, vertices=vertices), normals)]
-
-
-def _posed(
-    file: GltfFile, skin: dict[str, Any], part: _Primitive
-) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "4 4"]]:
-    """Move the vertices of a part by the joints of its skin, in the pose of the nodes (3.7.3.3).
-
-    The result is the positions in the scene, and the matrix of the first joint, which tells
-    whether the part is mirrored.
-    """
-    matrices = np.stack([file.poses[joint] for joint in skin["joints"]])
-    if "inverseBindMatrices" in skin:
-        # There may be more matrices than joints.
-        bind = file.array(skin["inverseBindMatrices"])[: len(matrices)]
-        if len(bind) < len(matrices):
-            raise ValueError(f"a skin has {len(bind)} matrices for {len(matrices)} joints")
-        matrices = matrices @ bind
-    # Weighted sum of the matrices of the joints, and of the weights, for each vertex.
-    blended = np.zeros((len(part.surface.values), 4, 4))
-    sums = np.zeros(len(blended))
-    for name in (name for name in part.joints if name.startswith("JOINTS")):
-        weights = part.joints[name.replace("JOINTS", "WEIGHTS")]
-        for joint, weight in zip(part.joints[name].T, weights.T, strict=True):
-            # A joint with the weight 0 may be any number.
-            blended += weight[:, None, None] * matrices[np.where(weight == 0, 0, joint)]
-            sums += weight
-    # A comparison with NaN is False, so `not` also finds NaN.
-    if not (np.abs(sums - 1) <= MAX_WEIGHT_ERROR).all():
-        raise ValueError("the weights of a vertex do not add up to 1: export the mesh again")
-    blended /= sums[:, None, None]
-    linear, shift = blended[:, :3, :3], blended[:, :3, 3]
-    positions = part.surface.values[:, POSITION]
-    return np.einsum("vij,vj->vi", linear, positions) + shift, matrices[0]
+    return [Part(mesh, normals, pose)]
 
 
 def _visible(material: Material, surface: _Surface) -> _Surface:

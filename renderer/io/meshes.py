@@ -48,7 +48,7 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     the vertex or face colors, as far as the file has them, as linear values.
     Without any of them, the color is white. A glTF file with transparent parts is cut out where its
     material says so (alphaMode MASK), or refused (BLEND). It has the shape of its
-    default morph weights, and the pose of its skins. What changes neither
+    default morph weights, and is refused if it has joints. What changes neither
     the shape nor the base color, such as a normal texture, is ignored,
     and a warning names it. Files beside the mesh are read only below its folder.
 
@@ -69,8 +69,7 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
         InputError: If the file does not exist, is damaged or has an unknown
             format. If a material or an image of the file is missing or
             unreadable. If the mesh has no faces, no area, coordinates that are
-            not finite, or indices of missing vertices. If a skin has no weights,
-            weights that do not add up to 1, or missing joints.
+            not finite, or indices of missing vertices.
 
     Example:
         >>> import norm_balls as nb

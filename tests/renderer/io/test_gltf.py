@@ -640,7 +640,7 @@ REFUSED = {
     "strips or fans": with_strips(),
     "EXT_mesh_gpu_instancing": with_entries(plain(), extensionsUsed=["EXT_mesh_gpu_instancing"]),
     "COLOR_0": with_colors_of_two_numbers(),
-    "number 0 of 0 skins": with_entries(plain(), nodes=[{"mesh": 0, "skin": 0}]),
+    "armature": with_entries(plain(), nodes=[{"mesh": 0, "skin": 0}]),
     "leaves its buffer view": changed("accessors", byteOffset=-4),
     "KHR_draco_mesh_compression": with_entries(
         plain(), extensionsUsed=["KHR_draco_mesh_compression"]
