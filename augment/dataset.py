@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from augment.attacks.objective import Examples, Values
+from augment.attacks.objective import Values
 from augment.attacks.problem import SceneProblem, source_labels
 from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import TaskNetwork
@@ -211,7 +211,7 @@ def _show_all(camera: Camera, item: SceneObject, size: Size) -> Camera:
 
 
 def _renders(
-    problem: SceneProblem, values: Values, rows: Examples, start: int, maps: bool
+    problem: SceneProblem, values: Values, rows: Int[Tensor, " A"], start: int, maps: bool
 ) -> Iterator[LabeledRender]:
     """Yield the renders of some examples of a problem, with indices from `start`."""
     scene = problem.scene

@@ -183,7 +183,9 @@ def by_kind(
     return torch.cat(parts)[order]
 
 
-def draw_photograph_patterns(photographs: Pictures, points: Points, draws: Generator) -> Pictures:
+def draw_photograph_patterns(
+    photographs: Float[Tensor, "N 3 H W"], points: Points, draws: Generator
+) -> Pictures:
     """Draw random patterns that are photographs, rotated, scaled and saturated at random.
 
     Beyond its border, a photograph is mirrored. Photographs are linear light. `points` has x and y
