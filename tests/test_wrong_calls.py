@@ -249,7 +249,7 @@ SCENES = [
     *calls_of("positions", lambda x: scene(lamps=augment.LampsSettings(x)), 3, [], [[1, 2]]),
     *calls_of("start", lambda x: scene(lamps=augment.LampsSettings(start=x)), [1, 2], None),
     *calls_of("mesh", lambda x: augment.ObjectSettings(x, "orange"), None, ""),
-    *calls_of("label", lambda x: scene([augment.ObjectSettings("solid:orange", x)]), None, 3),
+    *calls_of("label", lambda x: scene([augment.ObjectSettings("solid:orange", x)]), None, 0.5),
     *by_name(object_of_cup, albedo_scale=[0], color=[0.5, [255, 0, 0], [0, 0]], gloss=["shiny"]),
     *by_name(object_of_cup, others=[["solid:cup"], 3], at=[3, [1], [NAN, 0]], scale=[0]),
     *by_name(augment.VariationSettings, shift=[2.0], scale=[2.0, [2, 1]], fov=[30.0, [50, 60]]),

@@ -5,9 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 import trimesh
 from numpy.typing import ArrayLike
+from torch import Tensor
 
+from renderer.camera import Points
 from renderer.mesh import Mesh, concatenate
 from renderer.settings import Size, height_and_width
 from renderer.visibility import Rasterizer
@@ -23,12 +26,13 @@ class Chart(Rasterizer):
     description: str = "a chart of the faces"
 
     def rasterize(
-        self, points: np.ndarray, faces: np.ndarray, resolution: Size, closed: bool = False
-    ) -> np.ndarray:
+        self, points: Points, faces: np.ndarray, resolution: Size, closed: bool = False
+    ) -> Points:
         shape = height_and_width(resolution)
         ids = np.full((len(points), math.prod(shape)), NO_FACE, dtype=np.int32)
         ids[:, : len(faces)] = np.arange(len(faces))
-        return ids.reshape(-1, *shape)
+        ids = ids.reshape(-1, *shape)
+        return torch.from_numpy(ids) if isinstance(points, Tensor) else ids
 
 
 def painted(vertices: ArrayLike, faces: Sequence[Sequence[int]] | np.ndarray) -> Mesh:
