@@ -80,9 +80,7 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     for index in nodes:
         node = file.tree["nodes"][index]
         if "skin" in node:
-            raise ValueError(
-                "joints move its vertices: apply the armature, and export it"
-            )
+            raise ValueError("joints move its vertices: apply the armature, and export it")
         mesh = file.entry("meshes", node["mesh"])
         weights = tuple(node.get("weights", mesh.get("weights", ())))
         for number, primitive in enumerate(mesh["primitives"]):

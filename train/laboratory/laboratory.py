@@ -305,7 +305,7 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
     that serves as a hard negative gets the label "other_NAME".
     """
     settings = read_object(item, "", f"meshes[{index}]")
-    label = settings.label
+    label = str(settings.label)
     name = solid_name(settings.mesh)
     if not label and name:
         label = OTHER_PREFIX + name if name in HARD_NEGATIVES else name
