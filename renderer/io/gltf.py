@@ -73,6 +73,7 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     for feature in ignored_features(file.tree):
         mesh_file.ignore(feature)
     nodes = [node for node in file.scene_nodes() if "mesh" in file.tree["nodes"][node]]
+    # Nodes may share a mesh, and meshes a material. Each is read once and cached.
     material = cache(lambda index: read_material(file, index, gloss))
     part = cache(lambda *key: _read_part(file, material, *key))
     placed_parts = []
@@ -82,6 +83,7 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
         if "skin" in node:
             raise ValueError("joints move its vertices: apply the armature, and export it")
         mesh = file.entry("meshes", node["mesh"])
+        # Weights of the morph targets. Those of the node replace those of the mesh.
         weights = tuple(node.get("weights", mesh.get("weights", ())))
         for number, primitive in enumerate(mesh["primitives"]):
             mode = primitive.get("mode", TRIANGLES)
@@ -108,12 +110,16 @@ def _read_part(
     """Read a primitive of a mesh, with its morph targets at the given weights."""
     primitive = file.tree["meshes"][mesh]["primitives"][number]
     material: Material = material_of(primitive.get("material"))
+    # Name of the attribute with the texture coordinates that the textures use.
     uv_name = "" if material.placement is None else f"TEXCOORD_{material.placement.uv_set}"
+    # Arrays of the file by name, such as "POSITION", with one row for each vertex.
     attributes = _attributes(file, primitive, weights, uv_name)
     positions = attributes["POSITION"]
     faces = _faces(file, primitive, len(positions))
+    # Linear red, green, blue and alpha of each vertex. Without COLOR_0, they are 1.
     colors = np.ones((len(positions), 4))
     if "COLOR_0" in attributes:
+        # The file may leave out alpha, the fourth column.
         given = attributes["COLOR_0"]
         colors[:, : given.shape[1]] = np.clip(given, 0, 1)
     colors *= material.color
@@ -123,8 +129,10 @@ def _read_part(
             raise ValueError("the mesh has a texture, but no texture coordinates")
         uvs = attributes[uv_name]
     require_bounded(coordinates=positions, colors=colors, **{"texture coordinates": uvs})
+    # From here on, texture coordinates are those of `Mesh`: textures repeat, and v points up.
     material, uvs = material.placed(uvs)
     normals = attributes.get("NORMAL", np.zeros_like(positions))
+    # The columns have the order of `_Surface.values`.
     values = np.column_stack([positions, uvs, colors[:, 3], colors[:, :3], normals])
     return _Primitive(_Surface(values, faces), material)
 
@@ -135,6 +143,7 @@ def _attributes(
     """Read the vertex attributes that are used of a primitive, with morph targets (3.7.2.2)."""
     attributes = {}
     for name, index in primitive["attributes"].items():
+        # "TEXCOORD" for the name "TEXCOORD_1".
         kind = name.partition("_")[0]
         if name not in ("POSITION", "NORMAL", "COLOR_0", uv_name):
             continue
@@ -148,6 +157,7 @@ def _attributes(
             elif QUANTIZATION not in file.tree.get("extensionsUsed", ()):
                 raise ValueError(f"{name} has integers without {QUANTIZATION}: export it again")
         attributes[name] = values.astype(np.float64)
+    # Each morph target has changes of attributes, which are added with a weight each.
     targets = primitive.get("targets", [])
     if weights and len(weights) != len(targets):
         raise ValueError(f"it has {len(weights)} weights for {len(targets)} morph targets")
@@ -183,6 +193,7 @@ def _place(part: _Primitive, pose: Float[np.ndarray, "4 4"]) -> list[Part]:
     if not len(faces):
         return []
     vertices = values[:, POSITION]
+    # Axes: face, corner, column of the values.
     corners = values[faces]
     material = part.material
     mesh = colored_mesh(
@@ -193,9 +204,11 @@ def _place(part: _Primitive, pose: Float[np.ndarray, "4 4"]) -> list[Part]:
         textures=[] if material.texture is None else [material.texture],
     )
     if material.gloss is not None:
+        # All faces have the same roughness, metallic and specular factor.
         gloss = np.tile(material.gloss.astype(np.float32), (len(faces), 1))
         texture = material.gloss_texture
         mesh = replace(mesh, gloss=gloss, gloss_textures=() if texture is None else (texture,))
+    # Normals of 0 mean that the file has none.
     normals = corners[..., NORMAL] if corners[..., NORMAL].any() else None
     return [Part(mesh, normals, pose)]
 
@@ -223,10 +236,13 @@ class _AlphaTexture:
     def __init__(self, texels: UInt8[np.ndarray, "H W"]) -> None:
         """Compute the minimum and the maximum of the 2^n × 2^n texels from each texel on."""
         self.texels = texels
+        # Each level has the axes: minimum or maximum, row, column. On level 0, both are the texel.
         self._levels = [np.stack([texels, texels])]
         while 2 ** (len(self._levels) - 1) < max(texels.shape):
             low, high = self._levels[-1]
             for axis in (0, 1):
+                # Two neighboring squares of half the size, first along rows and then along columns,
+                # make one of the next level. The texture repeats, so `roll` wraps around.
                 step = -(2 ** (len(self._levels) - 1))
                 low = np.minimum(low, np.roll(low, step, axis))
                 high = np.maximum(high, np.roll(high, step, axis))
@@ -239,9 +255,11 @@ class _AlphaTexture:
 
     def ranges(self, positions: np.ndarray) -> np.ndarray:
         """Return bounds (2, F) of alpha within F faces with corners at positions (F, 3, 2)."""
+        # First texel, and number of columns and rows, of the rectangle around each face.
         start = np.floor(positions.min(axis=1)).astype(np.int64)
         extent = np.floor(positions.max(axis=1)).astype(np.int64) + 2 - start
         # From the last level on, a square holds all texels.
+        # Level n has the ranges of squares of 2^n texels, so this is the smallest that fits.
         levels = np.ceil(np.log2(extent.max(axis=1))).astype(np.int64)
         levels = np.minimum(levels, len(self._levels) - 1)
         column, row = (start % self.texels.shape[::-1]).T
@@ -265,10 +283,14 @@ def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: f
         values, faces = surface
         positions = texture.positions(values)
         corners = positions[faces]
+        # Smallest and largest alpha of the texture within each face, shape (F,).
         low, high = texture.ranges(corners)
         alphas = values[faces, ALPHA]
+        # A face is shown if its alpha may reach the cutoff, and crossed if its alpha may also be
+        # below.
         is_shown = high * alphas.max(axis=1) >= cutoff
         is_crossed = is_shown & (low * alphas.min(axis=1) < cutoff)
+        # Lengths, in texels, of the sides 0-1, 1-2 and 2-0 of each face.
         lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
         is_large = is_crossed & (lengths.max(axis=1) > 1)
         # Without a texture, alpha is linear in each face, so faces need not be divided.
@@ -282,6 +304,7 @@ def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: f
     # SciPy has rows first.
     places = positions.T[::-1]
     flat_alpha = map_coordinates(texture.texels, places, np.float64, order=1, mode="grid-wrap")
+    # Alpha of each vertex minus the cutoff. It is 0 at the border of a hole.
     excess = flat_alpha / FULL * values[:, ALPHA] - cutoff
     crossed = faces[is_crossed]
     if is_shown.all() and not (excess[crossed] < 0).any():
@@ -298,22 +321,27 @@ def _halve(
     Such an edge is at the end of a path from each large face over the longest edge to the next
     face (Rivara 1984). `lengths` are those of the sides 0-1, 1-2 and 2-0, shape (F, 3).
     """
+    # Ends (E, 2) of the E edges, and the edge of each side of each face, shape (F, 3).
     ends, edge_of_side = shared_edges(faces)
     edge_length = np.zeros(len(ends))
     edge_length[edge_of_side] = lengths
     # Edges of one length are ordered by their numbers.
     rank = np.argsort(np.argsort(edge_length, kind="stable"))
+    # Number of the longest side of each face, 0 to 2.
     longest = rank[edge_of_side].argmax(axis=1)
     longest_edge = np.take_along_axis(edge_of_side, longest[:, None], axis=1)[:, 0]
+    # Also mark the longest edge of each face that has a marked edge, until none is new.
     is_halved = np.zeros(len(ends), dtype=bool)
     touched = is_large
     while not is_halved[longest_edge[touched]].all():
         is_halved[longest_edge[touched]] = True
         touched = is_halved[edge_of_side].any(axis=1)
+    # Keep only edges that are the longest side of all faces around them.
     is_halved[edge_of_side[edge_of_side != longest_edge[:, None]]] = False
     divided = is_halved[longest_edge]
     # Corners 0 and 1 are the ends of the longest side, and point 3 is its middle.
     order = (longest[divided, None] + np.arange(3)) % 3
+    # Middles become new vertices behind the present ones, in the order of their edges.
     middle = len(values) + (np.cumsum(is_halved) - 1)[longest_edge[divided]]
     points = np.column_stack([np.take_along_axis(faces[divided], order, axis=1), middle])
     return _Surface(
@@ -324,6 +352,7 @@ def _halve(
 
 def _cut(values: np.ndarray, faces: np.ndarray, excess: Float[np.ndarray, " V"]) -> _Surface:
     """Keep the parts of faces where `excess`, which is linear in each face, is not negative."""
+    # For each corner, True if it lies on the part that stays.
     is_kept = excess[faces] >= 0
     count = is_kept.sum(axis=1)
     is_whole, is_cut = count == 3, (count == 1) | (count == 2)
@@ -332,11 +361,14 @@ def _cut(values: np.ndarray, faces: np.ndarray, excess: Float[np.ndarray, " V"])
     turned = np.take_along_axis(faces[is_cut], (odd[:, None] + np.arange(3)) % 3, axis=1)
     # Points 3 and 4 lie on the sides 0-1 and 0-2.
     sides = np.sort(turned[:, [[0, 1], [0, 2]]].reshape(-1, 2), axis=1)
+    # One integer for both ends of a side, so that faces with a common side share the new vertex.
     keys, point_of_side = np.unique(sides @ [len(values), 1], return_inverse=True)
     low, high = np.divmod(keys, len(values))
+    # The excess is linear along the side, and 0 at this fraction of the way.
     share = excess[low] / (excess[low] - excess[high])
     points = values[low] + share[:, None] * (values[high] - values[low])
     ids = np.column_stack([turned, len(values) + point_of_side.reshape(-1, 2)])
+    # One kept corner leaves a triangle. Two leave a quadrilateral, that is, two triangles.
     one = count[is_cut] == 1
     pieces = [ids[one][:, [0, 3, 4]], ids[~one][:, [3, 1, 2]], ids[~one][:, [3, 2, 4]]]
     return _Surface(np.concatenate([values, points]), np.concatenate([faces[is_whole], *pieces]))

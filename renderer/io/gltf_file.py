@@ -83,8 +83,10 @@ class GltfFile:
         shape = (accessor["count"], width)
         require_memory("arrays", ARRAY_BYTES * math.prod(shape), CPU)
         values = np.zeros(shape, dtype)
+        # Without a buffer view, all numbers are 0.
         if "bufferView" in accessor:
             values = self._elements(accessor, accessor["count"], dtype, width)
+        # A sparse accessor replaces single elements. `rows` are their indices.
         if "sparse" in accessor:
             values = values.copy()
             sparse = accessor["sparse"]
@@ -104,6 +106,7 @@ class GltfFile:
         view = self._view(index)
         row_size = width * dtype.itemsize
         stride = self.entry("bufferViews", index).get("byteStride", row_size)
+        # `stride` is the distance in bytes from one element to the next.
         offset = location.get("byteOffset", 0)
         end = offset + stride * (count - 1) + row_size
         # NumPy would read bytes before the buffer at a negative offset.
@@ -165,11 +168,13 @@ class GltfFile:
             raise ValueError("a node has two parents: the file is damaged")
         roots = sorted(set(range(len(nodes))) - set(children))
         poses = {root: _local_matrix(nodes[root]) for root in roots}
+        # The loop extends the queue while it runs, so every node comes after its parent.
         queue = roots[:]
         for parent in queue:
             for child in nodes[parent].get("children", []):
                 poses[child] = poses[parent] @ _local_matrix(self.entry("nodes", child))
                 queue.append(child)
+        # Nodes of a cycle have no root above them, so the loop never reaches them.
         if len(poses) < len(nodes):
             raise ValueError("a node is a child of itself: the file is damaged")
         return roots, poses
@@ -286,6 +291,7 @@ class Material:
         """
         if self.placement is None or self.texture is None:
             return self, np.zeros((len(uvs), 2))
+        # Transform texture coordinates by the matrix (2, 3) of the file.
         matrix = np.array(self.placement.transform)
         uvs = uvs @ matrix[:, :2].T + matrix[:, 2]
         textures: dict[str, Any] = {
@@ -293,12 +299,14 @@ class Material:
             for name in ("texture", "alpha", "gloss_texture")
             if getattr(self, name) is not None
         }
+        # Axis 0 is u, which runs along columns, and axis 1 is v, which runs along rows.
         for axis, wrap in enumerate(self.placement.wraps):
             shape = textures["texture"].shape[:2]
             size = shape[1 - axis]
             coordinates = uvs[:, axis]
             mode: Any = "edge"
             if wrap == MIRROR:
+                # Texels are added before the first and after the last one.
                 before, after, mode = 0, size, "symmetric"
             elif wrap == CLAMP:
                 # Interpolation needs one texel more than the surface covers.
@@ -312,6 +320,7 @@ class Material:
                 padding = [(0, 0)] * texels.ndim
                 padding[1 - axis] = (before, after)
                 textures[name] = np.pad(texels, padding, mode)
+            # The same texel has another coordinate in the larger texture.
             uvs[:, axis] = (coordinates * size + before) / new_size
         # v points down in glTF, and up in `Mesh`.
         uvs[:, 1] = 1 - uvs[:, 1]
@@ -328,6 +337,8 @@ class Material:
 
     def with_gloss_texture(self, texels: np.ndarray, placement: Placement) -> "Material":
         """Return a copy with factors of roughness and metallic (H, W, 2)."""
+        # A material without a texture gets a white one, because each `gloss_texture` of `Mesh`
+        # belongs to a texture.
         material = self.with_placement(placement, (1, 1))
         assert material.texture is not None
         # Textures that will be extended need the same size.
@@ -362,6 +373,8 @@ def ignored_features(tree: dict[str, Any]) -> list[str]:
         features.add("animations")
     if len(tree.get("scenes", ())) > 1:
         features.add("all scenes but the first" if "scene" not in tree else "other scenes")
+    # Names of extensions that are not read. An error is raised for one that may change shape or
+    # color.
     used = set(tree.get("extensionsUsed", ())) - READ
     for name in {*tree.get("extensionsRequired", ()), *(REFUSED & used)} - READ:
         if not name.startswith(HARMLESS):
@@ -389,6 +402,7 @@ def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:
     material = _with_color(material, file, model, "baseColor")
     if not gloss:
         return material
+    # Roughness, metallic and specular factor.
     factors = [model.get("roughnessFactor", 1), model.get("metallicFactor", 1)]
     factors = [*factors, _specular_factor(extensions)]
     material = replace(material, gloss=np.clip(factors, 0.0, 1.0))
@@ -407,6 +421,7 @@ def _specular_factor(extensions: dict[str, Any]) -> float:
     if textures or np.ptp(colors) > 0:
         raise ValueError("a material has a specular color or texture: read it without gloss")
     ior = extensions.get(IOR, {}).get("ior", 1.5)
+    # Reflectance at normal incidence (Fresnel) for the index of refraction, 1.5 by default.
     reflectance = ((ior - 1) / (ior + 1)) ** 2
     factor: float = specular.get("specularFactor", 1.0) * colors[0] * reflectance / DIELECTRIC
     return factor
@@ -417,6 +432,7 @@ def _specular_glossiness(
 ) -> Material:
     """Read KHR_materials_pbrSpecularGlossiness: its albedo is diffuse · (1 - max(specular))."""
     material = _with_color(material, file, model, "diffuse")
+    # Specular color and glossiness become arrays (H, W, 3) and (H, W) if there is a texture.
     specular = _factor(model, "specularFactor", 3)
     glossiness = np.array(model.get("glossinessFactor", 1.0))
     placement = None
@@ -425,6 +441,7 @@ def _specular_glossiness(
         texels = torch.from_numpy(np.array(image.convert("RGBA"), dtype=np.float32) / 255)
         specular = specular * decode(texels[..., :3], "srgb").numpy()
         glossiness = glossiness * texels[..., 3].numpy()
+    # The strongest channel of the specular color is the fraction of light that is not diffuse.
     reflectance = np.clip(specular, 0, 1).max(axis=-1)
     if placement is None:
         material = replace(material, color=material.color * [*[1 - reflectance] * 3, 1])
@@ -432,17 +449,20 @@ def _specular_glossiness(
         material = material.with_placement(placement, reflectance.shape)
         assert material.texture is not None
         kept = _resized((1 - reflectance).astype(np.float32), material.texture)
+        # Colors are multiplied as linear light and encoded again.
         linear = decode(torch.from_numpy(material.texture).float() / 255, "srgb")
         dimmed = to_bytes(encode(linear * torch.from_numpy(kept)[..., None], "srgb"))
         material = replace(material, texture=dimmed.numpy())
     if not gloss:
         return material
+    # The renderer has one specular factor without a color, so the mean replaces the texture.
     factor = min(float(reflectance.mean()) / DIELECTRIC, 1.0)
     if np.abs(specular - factor * DIELECTRIC).max() > 1e-3:
         file.file.assume(f"the specular factor {factor:.2g} stands for a specular color")
     roughness = np.clip(1 - glossiness, 0, 1)
     if placement is None:
         return replace(material, gloss=np.array([float(roughness), 0, factor]))
+    # The gloss texture has roughness and metallic. Metallic is multiplied by 0 below.
     factors = np.stack([np.rint(255 * roughness), np.full(roughness.shape, 255)], axis=-1)
     material = replace(material, gloss=np.array([1.0, 0, factor]))
     return material.with_gloss_texture(factors.astype(np.uint8), placement)
@@ -463,6 +483,7 @@ def _with_color(material: Material, file: GltfFile, model: dict[str, Any], name:
         return material
     image, placement = _image(file, model[f"{name}Texture"])
     texels = np.array(image.convert("RGBA"))
+    # None stands for an alpha of 1 everywhere.
     alpha = texels[..., 3] if texels[..., 3].min() < 255 else None
     texture = np.ascontiguousarray(texels[..., :3])
     return replace(material, placement=placement, texture=texture, alpha=alpha)
@@ -477,6 +498,7 @@ def _image(file: GltfFile, info: dict[str, Any]) -> tuple[Image.Image, Placement
     # matrix in the text of the extension has another sign, which is an error
     # (github.com/KhronosGroup/glTF/issues/1563).
     rotation = np.array([[cosine, sine], [-sine, cosine]])
+    # Scaling comes first, then the rotation, then the offset.
     linear = rotation * transform.get("scale", (1, 1))
     rows = np.column_stack([linear, transform.get("offset", (0, 0))])
     sampler_index = file.entry("textures", info["index"]).get("sampler")

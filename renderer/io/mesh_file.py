@@ -206,6 +206,7 @@ def triangles_of(
     is_face = sizes >= 3
     if not is_face.all():
         file.ignore("faces with fewer than 3 corners")
+    # Places in `indices` of the corners of polygons with at least 3 corners.
     places = np.flatnonzero(is_face.repeat(sizes))
     corners, polygons, crossing_count = triangulate(vertices[indices[places]], sizes[is_face])
     if crossing_count:
@@ -229,6 +230,7 @@ def colored_mesh(
     if texture_ids is None:
         texture_ids = np.full(len(faces), 0 if textures else NO_TEXTURE)
     is_textured = texture_ids != NO_TEXTURE
+    # Faces without a texture keep texture coordinates of 0.
     corner_uvs = np.zeros((len(faces), 3, 2), dtype=np.float32)
     if is_textured.any():
         if uvs is None or np.isnan(uvs[is_textured]).any():
@@ -288,15 +290,18 @@ def triangulate(
     the corners of the triangles, the ascending polygon of each triangle, and the number of
     polygons that intersect themselves, whose area is unclear.
     """
+    # First corner of each polygon. A polygon with n corners has n - 2 triangles.
     starts = np.cumsum(sizes) - sizes
     triangle_counts = sizes - 2
     polygons = np.arange(len(sizes)).repeat(triangle_counts)
     first_triangles = np.cumsum(triangle_counts) - triangle_counts
+    # Number of each triangle within its polygon.
     steps = np.arange(len(polygons)) - first_triangles[polygons]
     # Each fan of triangles is around the first corner of the polygon.
     triangles = starts[polygons, None] + np.stack([0 * steps, steps + 1, steps + 2], axis=1)
     if (sizes == 3).all():
         return triangles, polygons, 0
+    # Corners in the plane of their polygon, in which it is counter-clockwise, shape (C, 2).
     points = _projected(corners, starts, sizes)
     # A fan of counter-clockwise triangles covers the polygon.
     is_fan = np.minimum.reduceat(_doubled_areas(points, triangles), first_triangles) >= 0
@@ -311,6 +316,7 @@ def triangulate(
         parts.append(starts[polygon] + clipped)
         owners.append(np.full(len(clipped), polygon))
     polygons = np.concatenate(owners)
+    # Triangles of fans come before clipped ones. Sort them by polygon.
     order = np.argsort(polygons, kind="stable")
     return np.concatenate(parts)[order], polygons[order], crossing_count
 
@@ -342,6 +348,7 @@ def _clip_ears(points: Num[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], 
     """Divide a counter-clockwise polygon into triangles, and tell whether it intersects itself."""
     count = len(points)
     ends = np.array([count], dtype=np.uint32)
+    # Earcut cuts triangles (ears) off the polygon until nothing is left.
     indices = mapbox_earcut.triangulate_float64(points, ends).astype(np.int64)
     triangles = indices.reshape(-1, 3)
     if not len(triangles):  # The polygon has no area.
@@ -355,14 +362,18 @@ def _clip_ears(points: Num[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], 
     for start, end in pairwise([*kept, kept[0] + count]):
         if end == start + 1:
             continue
+        # Corners that were left out, with the corners before and behind them.
         chain = np.arange(start, end + 1) % count
         is_at_edge = (triangles == chain[0]) & (np.roll(triangles, -1, axis=1) == chain[-1])
         if not is_at_edge.any():
             continue
         row, column = np.argwhere(is_at_edge)[0]
+        # Replace the triangle by a fan around the corner opposite to the edge.
         opposite = np.full(len(chain) - 1, triangles[row, column - 1])
         fan = np.stack([chain[:-1], chain[1:], opposite], axis=1)
         triangles = np.concatenate([np.delete(triangles, row, axis=0), fan])
+    # Twice the area of the polygon (shoelace formula). Triangles of a polygon that intersects
+    # itself cover another area.
     following = np.roll(points, -1, axis=0)
     area = (points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum()
     covered = np.abs(_doubled_areas(points, triangles)).sum()

@@ -54,9 +54,11 @@ def read_ply(file: MeshFile) -> list[Part]:
 
 def _parts(file: MeshFile, elements: dict[str, _Values], texture_names: list[str]) -> list[Part]:
     """Create a part from the elements of a file, or none if the file has no faces."""
+    # `pop` removes what is read. What remains in the end is ignored or refused by name.
     vertex, face = elements.pop("vertex", {}), elements.pop("face", {})
     vertices = _columns(vertex, ("x", "y", "z"))
     faces = face.pop("vertex_indices", face.pop("vertex_index", None))
+    # A file without faces is read like one with an empty list of them.
     if not isinstance(faces, _Lists):
         faces = _Lists(np.zeros(0, np.int64), np.zeros(0))
     faces = faces._replace(numbers=_cast(faces.numbers, "i8"))
@@ -73,6 +75,7 @@ def _parts(file: MeshFile, elements: dict[str, _Values], texture_names: list[str
         file.ignore(name)
     if vertices is None:
         return []
+    # Places of the corners of each triangle in `faces.numbers`, and its face in the file.
     corners, polygons = mesh_file.triangles_of(file, vertices, faces.numbers, faces.lengths)
     if not len(corners):
         return []
@@ -130,6 +133,7 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
     header = re.match(rb"ply[ \t]*(\r\n|\n|\r)(.*?\1)[ \t]*end_header[ \t]*\1", content, re.DOTALL)
     if header is None:
         raise ValueError("the file has no header of PLY that ends with end_header")
+    # Kind of the numbers: text, or binary with the low or the high byte first.
     form = ""
     texture_names = []
     # Number of rows and properties of each element.
@@ -144,7 +148,10 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
             case ["element", name, count] if name not in layouts:
                 items = []
                 layouts[name] = int(count), items
+            # "property list uchar int vertex_indices" has a type of its length, "property float x"
+            # none.
             case ["property", *length, type_, name] if {type_, *length[1:]} <= _TYPES.keys():
+                # Type of the numbers, then type of the length, if any.
                 types = [_TYPES[key] for key in (type_, *length[1:])]
                 items.append(_Property(re.sub("^(diffuse|texture)_", "", name.lower()), *types))
             case [] | ["comment" | "obj_info", *_]:
@@ -154,6 +161,7 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
     if form not in _BYTE_ORDERS:
         raise ValueError(f"the format is {form}: choose {', '.join(_BYTE_ORDERS)}")
     body = content[header.end() :]
+    # Text becomes float64 numbers, which are then read like a binary file.
     if form == _ASCII:
         body = mesh_file.parse_numbers(body, np.float64).tobytes()
     offset = 0
@@ -209,11 +217,13 @@ def _first_row(body: bytes, offset: int, properties: list[_Property], form: str)
     """Return the type of the first row, in which the length of a list is a field of its own."""
     fields: list[tuple[str, str, tuple[int, ...]]] = []
     for name, *types in properties:
+        # Text was converted to float64 (f8). A property that is no list has no type of a length.
         number_type, length_type = (
             type_ and _BYTE_ORDERS[form] + ("f8" if form == _ASCII else type_) for type_ in types
         )
         shape: tuple[int, ...] = ()
         if length_type:
+            # The length of the list is stored in front of its numbers.
             start = offset + np.dtype(fields).itemsize
             fields.append((_LENGTH + name, length_type, ()))
             shape = (int(np.frombuffer(body, length_type, 1, start)[0]),)
@@ -251,6 +261,7 @@ def read_off(file: MeshFile) -> list[Part]:
     # What follows the header is the same as in a .ply file.
     rows = b"".join(lines[: vertex_count + face_count])
     sizes = [int(line.split()[0]) for line in lines[vertex_count : vertex_count + face_count]]
+    # Three words for each vertex. For each face, the number of its corners, and their indices.
     word_counts = [*[3] * vertex_count, *(1 + size for size in sizes)]
     if mesh_file.words_per_line(rows).tolist() != word_counts:
         raise ValueError("a vertex or a face has colors or other numbers: export the mesh as .ply")
@@ -292,5 +303,6 @@ def read_stl(file: MeshFile) -> list[Part]:
         raise ValueError("colors in .stl files are not supported: export the mesh as .ply")
     vertices = coordinates.reshape(-1, 3)
     mesh_file.require_bounded(coordinates=vertices)
+    # Files have no shared vertices: each face has three of its own.
     vertex_ids = np.arange(len(vertices)).reshape(-1, 3)
     return [Part(mesh_file.colored_mesh(vertices, vertex_ids, np.ones((1, 3))))][:face_count]

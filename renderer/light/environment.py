@@ -75,6 +75,7 @@ def light_radiance(
 ) -> Float[Tensor, " ..."]:
     """Compute the radiance of environment light from directions (toward the light, any length)."""
     degree = math.isqrt(len(coefficients)) - 1
+    # Each block is a list of directions, shape (N, 3). The leading axes are restored at the end.
     blocks = directions.flatten(0, -2).split(BLOCK)
     radiance = torch.cat([basis(block, degree) @ coefficients.to(block) for block in blocks])
     return radiance.unflatten(0, directions.shape[:-1])
@@ -210,6 +211,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]
     # The orientation 1 of EXIF means that the top row is stored first.
     if spec.roi != spec.roi_full or image.orientation != 1:
         raise InputError("the image is stored cropped or rotated: save the whole, upright image")
+    # CIE x and y of red, green, blue and white.
     chromaticities = spec.getattribute("chromaticities") or REC_709
     if image.file_format_name == "hdr":
         factors, chromaticities = _radiance_header(path)
@@ -248,16 +250,19 @@ def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
 def _in_rec709(radiance: Float[np.ndarray, "H W 3"], chromaticities: Sequence[float]) -> np.ndarray:
     """Convert radiance of any primaries to Rec. 709.
 
-    A negative channel that this makes becomes 0. Chromaticities are CIE x and y of red, green, blue
-    and white.
+    Channels that the conversion makes negative become 0. Chromaticities are CIE x and y of red,
+    green, blue and white.
     """
+    # The matrix is None if the map has the primaries of Rec. 709 already.
     matrix = to_rec709(chromaticities, adapt=False)
     if matrix is None:
         return radiance
     # Infinite radiance gives NaN, which `read_map` refuses.
     with np.errstate(invalid="ignore", over="ignore"):
         converted: np.ndarray = radiance @ matrix.T.astype(np.float32)
+    # True for negative channels of texels that had no negative channel before the conversion.
     is_beyond = (converted < 0) & (radiance >= 0).all(axis=-1, keepdims=True)
+    # Fraction of all radiance that setting these channels to 0 changes.
     lost = -converted[is_beyond].sum() / max(np.abs(converted).sum(), np.finfo(np.float32).tiny)
     if lost > NEGATIVE:
         warnings.warn(
@@ -280,6 +285,7 @@ def _to_rgbe_precision(radiance: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3
 
 def _color_channels(names: Sequence[str]) -> list[int]:
     """Find red, green and blue by names such as "R" or "LAYER.R"; gray repeats its index."""
+    # Pairs (layer, color) in lower case, such as ("layer", "r"). The layer is "" without a dot.
     keys = [name.casefold().rpartition(".")[::2] for name in names]
     # OpenImageIO lists the layer without a name first. The loop therefore prefers it.
     for layer, _ in keys:
@@ -287,6 +293,8 @@ def _color_channels(names: Sequence[str]) -> list[int]:
             channels = [(layer, color_name) for color_name in color_names]
             if set(channels) <= set(keys):
                 return [keys.index(channel) for channel in channels]
+    # No layer has three colors. A gray channel is the only one of which no part of the name says
+    # that it is no light.
     words = [name.casefold().split(".") for name in names]
     gray_channels = [i for i, parts in enumerate(words) if _OTHER_NAMES.isdisjoint(parts)]
     if len(gray_channels) == 1:

@@ -156,6 +156,8 @@ def shortest(
     # Only imported when it is needed, because scipy.linalg takes 0.1 s.
     from scipy.linalg import cho_factor, cho_solve
 
+    # Scaling the bounds to a maximum of 1 makes the tolerances relative. y is scaled back at the
+    # end.
     scale = np.abs(lower_bounds).max()
     bounds = lower_bounds / scale
     y = np.zeros(matrix.shape[1])
@@ -170,6 +172,7 @@ def shortest(
         is_stationary = np.linalg.norm(dual_residual) < _STATIONARITY_TOLERANCE * np.linalg.norm(y)
         if is_gap_closed and is_stationary and np.abs(primal_residual).max() < _TOLERANCE:
             break
+        # The matrix of the linear system is matrixᵀ diag(μ / s) matrix + identity.
         weighted_rows = matrix * np.sqrt(multipliers / slacks)[:, None]
         system = weighted_rows.T @ weighted_rows + np.eye(len(y))
         try:
@@ -199,6 +202,7 @@ def shortest(
                 predicted_gap = predicted_slacks @ (multipliers + longest * multiplier_change)
                 target_product = (predicted_gap / gap) ** 3 * gap / len(matrix)
                 reductions = products + slack_change * multiplier_change - target_product
+        # Slacks and multipliers stay positive, and a step is never longer than a Newton step.
         length = min(_FRACTION_TO_BOUNDARY * longest, 1)
         y = y + length * y_change
         slacks = slacks + length * slack_change
@@ -256,6 +260,7 @@ def window_without_ringing(
     narrow_amplitudes = torch.from_numpy(_amplitudes(narrow_roughness, degree))
     narrow_lobe = narrow_amplitudes[bands(degree)]
     window = torch.ones(len(coefficients), dtype=torch.float64)
+    # Number of rows of the map on which the sign of the highlight is tested.
     rows = max(FEWEST_ROWS, 2 * degree)
     for width in (1.0, NARROWER):
         # Radiance of the narrower highlight for cameras in all directions.
@@ -279,6 +284,8 @@ def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
     # The first harmonic of degree l has the index l².
     first_of_degree = torch.arange(degree + 1) ** 2
     irradiance = lambertian_factors(degree)[first_of_degree].numpy() / math.pi
+    # The squared errors of the highlight and of the irradiance add up, so the squared weights do,
+    # too.
     weight = np.hypot(highlight, IRRADIANCE_WEIGHT * irradiance)
     harmonics_per_degree = 2 * np.arange(degree + 1) + 1
     return best_window(highlight, np.sqrt(harmonics_per_degree) * weight)
@@ -301,6 +308,8 @@ def highlight_error(degree: int, roughness: float) -> float:
     # Factor of each degree in the approximation. Degrees that are cut off have 0.
     factors = np.zeros_like(amplitudes)
     factors[: degree + 1] = window[first_of_degree].numpy()
+    # Sum of the 2l + 1 squared coefficients of degree l of the highlight of a point light, up to a
+    # constant factor.
     power = (2 * np.arange(len(amplitudes)) + 1) * amplitudes**2
     relative_squared_error = float(power @ (1 - factors) ** 2 / power.sum())
     return math.sqrt(relative_squared_error)
@@ -313,15 +322,20 @@ def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degrees"]:
     the integral of the lobe times the Legendre polynomial P_l, relative to degree 0, and at least
     MIN_AMPLITUDE.
     """
+    # The camera looks along the normal, so the result depends only on the angle of the light.
     normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    # Polynomials of higher degrees oscillate faster and need more nodes.
     node_count = 2**9 + 4 * degree
     # Gauss-Legendre nodes in [-1, 1]. They are mapped to the cosines of angles to the
     # normal in [0, 1], because the lobe is 0 below the surface.
     nodes, weights = legendre.leggauss(node_count)
     cosine = torch.from_numpy((nodes + 1) / 2)
     sine = (1 - cosine**2).sqrt()
+    # Directions to the light, one for each node, in the plane y = 0.
     light = torch.stack([sine, 0 * cosine, cosine], 1)
     roughness_tensor = torch.tensor(roughness, dtype=torch.float64)
+    # SCHLICK is the term of the reflectance that is multiplied by the color of a metal. The cosine
+    # converts the radiance of the light to irradiance.
     lobe = reflectance(normal, normal, light, roughness_tensor)[SCHLICK] * cosine
     # Legendre polynomials P_0 to P_degree (columns) at each node (rows).
     polynomials = legendre.legvander(cosine.numpy(), degree)

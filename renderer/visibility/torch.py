@@ -27,6 +27,7 @@ def rasterize(
     Samples without a face get -1. The program waits for a GPU once for FACES_PER_TILE faces.
     """
     keys = torch.full((len(points), *shape), EMPTY_KEY, device=points.device)
+    # Number of views that are drawn at once.
     step = max(1, FACES_PER_TILE // max(1, len(faces)))
     for some_keys, some_points in zip(keys.split(step), points.split(step), strict=True):
         _draw(some_keys, some_points, faces, closed)
@@ -49,6 +50,7 @@ def _draw(
     positions = (window.float() * SUBSAMPLES).round().long() - SUBSAMPLES // 2
     depths = (points[..., 2] + 1) / 2 * FAR
     # Counter-clockwise triangles have negative areas, since y points down.
+    # A mesh that is not closed is drawn from both sides, except for faces without an area.
     areas = _doubled_areas(positions[:, faces])
     is_drawn = (areas < 0 if closed else areas != 0).flatten()
     # Corners are sorted, so that two faces with the same corners get exactly the same depth. Axes
@@ -57,14 +59,19 @@ def _draw(
     triangles = positions[:, corners].flatten(0, 1)
     x, y = triangles.permute(2, 1, 0)
     depth = depths[:, corners].flatten(0, 1).T
+    # Bounding box of each triangle, in samples.
     first_column, widths = _covered_range(x, columns)
     first_row, heights = _covered_range(y, rows)
     counts = widths * heights * is_drawn
+    # Pairs of a triangle and a sample are numbered triangle by triangle. `ends` has the first
+    # number behind the pairs of each triangle.
     ends = counts.cumsum(0)
     # The edge function is by_column · column + by_row · row + constant.
     areas = _doubled_areas(triangles)
+    # The sign of the area makes functions positive inside, whatever the orientation.
     to_x, to_y = x.roll(-1, 0) - x, y.roll(-1, 0) - y
     by_column, by_row = -SUBSAMPLES * to_y * areas.sign(), SUBSAMPLES * to_x * areas.sign()
+    # A sample exactly on a common edge belongs to one face only (the top-left rule).
     is_owner = (by_column > 0) | ((by_column == 0) & (by_row > 0))
     constant = (x * to_y - y * to_x) * areas.sign() - (~is_owner).long()
     edges = torch.stack([by_column, by_row, constant])
@@ -79,6 +86,7 @@ def _draw(
     pair_count = int(ends[-1:].sum())  # The only wait for a GPU.
     for begin in range(0, pair_count, PAIRS_PER_TILE):
         pair = torch.arange(begin, min(begin + PAIRS_PER_TILE, pair_count), device=points.device)
+        # Triangle of each pair, and the sample from the place of the pair in the bounding box.
         triangle = torch.searchsorted(ends, pair, right=True)
         column, row, width, first_pair = boxes[:, triangle]
         step = pair - first_pair
@@ -86,8 +94,11 @@ def _draw(
         by_column, by_row, constant = edges[..., triangle]
         is_inside = (by_column * column + by_row * row + constant >= 0).all(0)
         x_a, y_a, depth_a, slope_x, slope_y = planes[:, triangle]
+        # Depths are rounded to integers, as in the other rasterizers.
         rounded = (depth_a + (row - y_a) * slope_y + slope_x * (column - x_a)).round()
         is_seen = is_inside & (rounded >= 0) & (rounded < FAR)
+        # A key has the depth in its high bits and the face in its low bits. The smallest key of a
+        # sample is therefore the nearest face, or the first of equally near faces.
         view, face = triangle // len(faces), triangle % len(faces)
         key = torch.where(is_seen, (rounded.long() << FACE_BITS) | face, EMPTY_KEY)
         keys.view(-1).scatter_reduce_(0, (view * rows + row) * columns + column, key, "amin")
@@ -101,6 +112,7 @@ def _doubled_areas(triangles: Int[Tensor, "... 3 2"]) -> Int[Tensor, "..."]:
 
 def _covered_range(positions: Int[Tensor, "3 M"], count: int) -> tuple[Tensor, Tensor]:
     """Find the first row, or column, that each triangle can cover, and the number of them."""
+    # Dividing by `SUBSAMPLES` and rounding up gives the first sample at or behind a position.
     low, high = (-(-ends >> SUBSAMPLE_BITS) for ends in positions.aminmax(dim=0))
     first = low.clamp(min=0)
     return first, (high.clamp(max=count) - first).clamp(min=0)
