@@ -272,6 +272,7 @@ class Camera(ABC):
               points. On a plane, it is a linear function of the image position.
         """
         right, up, back = self._camera_coordinates(points)
+        # `back` points from the pivot to the camera, so the depth is distance - back.
         w = 1 - back / self.distance if self.has_perspective else torch.ones_like(back)
         nearness = 1 / w if self.has_perspective else back
         scale = 2 / self.width
@@ -285,12 +286,14 @@ class Camera(ABC):
         polar, azimuth, roll = (tensor_like(in_radians(angle), points) for angle in angles)
         center = [self.center_x, self.center_y, self.center_z]
         pivot = torch.stack([tensor_like(coordinate, points) for coordinate in center])
+        # Axes right, up and back in world coordinates, without roll.
         axes = (
             [-azimuth.sin(), azimuth.cos(), 0 * azimuth],
             [-polar.cos() * azimuth.cos(), -polar.cos() * azimuth.sin(), polar.sin()],
             [polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()],
         )
         right, up, back = torch.stack([torch.stack(axis) for axis in axes]) @ (points - pivot).T
+        # The roll turns right and up about the axis back.
         cosine, sine = roll.cos(), roll.sin()
         return torch.stack([cosine * right + sine * up, cosine * up - sine * right, back])
 

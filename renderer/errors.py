@@ -253,6 +253,7 @@ def as_tensor(name: str, value: object) -> Tensor:
         if not value.is_complex() and value.dtype != torch.bool:
             return value.to(torch.get_default_dtype())
     elif is_sequence and all(isinstance(item, torch.Tensor) for item in cast(Any, value)):
+        # Tensors are stacked in the dtype and on the device of the first.
         rows = [as_tensor(name, item) for item in cast(Any, value)]
         first = rows[0]
         if all(row.shape == first.shape for row in rows):
@@ -362,6 +363,7 @@ def require_shape(name: str, values: Any, *expected: int | str) -> None:
     A name stands for a dimension of any size, and a first "..." for any number of dimensions.
     """
     shape = tuple(values.shape)
+    # With "...", only the last dimensions are compared.
     sizes = expected[1:] if expected[0] == "..." else expected
     checked = shape[-len(sizes) :] if expected[0] == "..." else shape
     if len(checked) != len(sizes) or any(

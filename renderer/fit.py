@@ -388,6 +388,7 @@ class _Target(NamedTuple):
                 columns.append(difference / (2 * step.sum()))
             return np.stack(columns, axis=1)
 
+        # Parameters of the first camera, and the range of each parameter.
         shift = [first.right / first.width, first.up / first.width]
         lowest = [MIN_POLE_ANGLE, -np.inf, 0.5, -1.0, -1.0]
         highest = [math.pi - MIN_POLE_ANGLE, np.inf, 2.0, 1.0, 1.0]
@@ -412,6 +413,7 @@ class _Target(NamedTuple):
         is_inside = self.mask > WHOLE_PIXEL
         error = (rendered - self.image)[:, is_inside].norm() / self.image[:, is_inside].norm()
         union = torch.maximum(coverage, self.mask).sum()
+        # Fraction of the union of the render and the mask that both cover.
         overlap = torch.minimum(coverage, self.mask).sum() / union
         return FittedScene(camera, light, float(error), float(overlap))
 
@@ -482,6 +484,8 @@ def _nearest_in_cone(point: NDArray[Any], constraints: NDArray[Any]) -> NDArray[
     nearest = point
     is_negative = point @ constraints < 0
     while is_negative.any():
+        # The nearest point is the shortest sum of the given point and of the vectors, each times a
+        # multiplier of at least 0.
         used = constraints[:, is_used]
         multipliers, _ = nnls(used, -point, maxiter=MAX_NNLS_ITERATIONS * constraint_count)
         nearest = point + used @ multipliers

@@ -79,6 +79,7 @@ def as_background(
     shape = height_and_width(size)
     values = as_tensor("background", background).to(like)
     if values.ndim < 2:
+        # A gray value or a color becomes an image of equal pixels.
         values = values.view(-1, 1, 1).expand(-1, *shape)
     expected = f"a gray value, a color (3,) or images {(3, *shape)}, in [0, 1]"
     if values.ndim < 3 or values.shape[-3:] not in ((1, *shape), (3, *shape)):
@@ -195,12 +196,15 @@ def to_rec709(chromaticities: Sequence[float], adapt: bool) -> Float[np.ndarray,
     None stands for Rec. 709.
     """
     given = np.asarray(chromaticities, dtype=np.float64)
+    # Files round chromaticities, so small differences from Rec. 709 do not count.
     if given.shape == (8,) and np.abs(given - REC_709).max() <= ROUNDING:
         return None
     error = ValueError(f"the primaries {given.tolist()} span no colors")
     if np.abs(given).max(initial=0) > LARGEST:
         raise error
     try:
+        # Matrices from linear RGB to the responses of the cones of the eye, for both kinds of
+        # primaries.
         theirs = BRADFORD @ _to_xyz(given)
     except (ValueError, np.linalg.LinAlgError):
         raise error from None
@@ -209,6 +213,7 @@ def to_rec709(chromaticities: Sequence[float], adapt: bool) -> Float[np.ndarray,
         # The sum over the primaries is the response of the cones to white.
         theirs = np.diag(ours.sum(axis=1) / theirs.sum(axis=1)) @ theirs
     matrix: np.ndarray = np.linalg.inv(ours) @ theirs
+    # Primaries that nearly lie on a line give huge numbers.
     if not (np.abs(matrix) < 100).all():
         raise error
     return matrix
@@ -218,6 +223,8 @@ def _to_xyz(chromaticities: np.ndarray) -> np.ndarray:
     """Compute the matrix from linear RGB to XYZ, in which white has Y = 1."""
     x, y = chromaticities.reshape(4, 2).T
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Columns are red, green, blue and white, of which only the ratio X : Y : Z is known.
         xyz = np.stack([x, y, 1 - x - y])
         white = xyz[:, 3] / y[3]
+    # Scale the primaries, so that they add up to white.
     return xyz[:, :3] * np.linalg.solve(xyz[:, :3], white)

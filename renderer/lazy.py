@@ -27,6 +27,7 @@ def attach(
     with open(f"{file}i", encoding="utf-8") as stub:
         statements = ast.parse(stub.read()).body
     imports = [statement for statement in statements if isinstance(statement, ast.ImportFrom)]
+    # Module that defines each public name.
     modules = {alias.name: str(item.module) for item in imports for alias in item.names}
     names = sorted(modules)
 

@@ -111,12 +111,15 @@ class Mesh:
 
     def __post_init__(self) -> None:
         """Convert lists to arrays, check all fields, and find sharp edges."""
+        # Permitted kinds of numbers of each array, and the shape of one of its rows.
         for name, (kinds, row) in _ARRAYS.items():
             if getattr(self, name) is None and name in ("gloss", "normal_ids"):
                 continue
             array = errors.as_array(name, getattr(self, name), kinds)
             # A frozen dataclass forbids assignments, so fields are set by object.__setattr__.
             object.__setattr__(self, name, array)
+            # Arrays per face have as many rows as `faces`. Other arrays may have any number of
+            # rows.
             shape = (*(self.faces if name in PER_FACE else array).shape[:1], *row)
             if array.shape != shape:
                 raise InputError(f"{name} has the shape {array.shape}: give the shape {shape}")
@@ -182,6 +185,7 @@ class Mesh:
             raise InputError(f"color={given} is not a color: give red, green and blue from 0 to 1")
         try:
             # Vertex indices out of range are clipped, because `Mesh(...)` raises a better error.
+            # Give each corner the color of its vertex, or the single color.
             corner_colors = np.broadcast_to(color, vertices.shape).take(faces, axis=0, mode="clip")
         except (TypeError, ValueError, OverflowError, IndexError) as error:
             raise InputError(
@@ -331,6 +335,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         normal_count += mesh.normal_ids.max() + 1
         # The last entry belongs to the index -1, which is NO_TEXTURE.
         new_ids = [NO_TEXTURE]
+        # A mesh without gloss textures has a factor of 1 for each of its textures.
         neutral = (_NEUTRAL_GLOSS,) * len(mesh.textures)
         for pair in zip(mesh.textures, mesh.gloss_textures or neutral, strict=True):
             key = (id(pair[0]), id(pair[1]))
@@ -340,6 +345,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
             new_ids.insert(-1, numbers[key])
         texture_ids.append(np.array(new_ids, dtype=np.int32)[mesh.texture_ids])
     has_gloss_textures = any(mesh.gloss_textures for mesh in meshes)
+    # Rows of gloss for meshes without any, if another mesh has gloss.
     matte = [_MATTE.repeat(len(mesh.faces), 0) for mesh in meshes]
     gloss = [m if mesh.gloss is None else mesh.gloss for mesh, m in zip(meshes, matte, strict=True)]
     return Mesh(

@@ -198,6 +198,7 @@ def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) 
         mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
     parts = []
+    # A mask of the faces of the part, its texture or NO_TEXTURE, and its gloss, empty if matte.
     for is_in_part, texture_id, gloss in by_material(mesh):
         has_texture = texture_id >= 0
         has_factors = has_texture and mesh.gloss_textures
@@ -231,6 +232,7 @@ def shape(
     properties = module.Properties()
     properties["bsdf"] = load(module, surface)
     properties["face_normals"] = normals is None
+    # Mitsuba creates empty buffers of these sizes, which are filled below.
     mesh = module.Mesh(
         "mesh",
         len(positions),
@@ -305,6 +307,7 @@ def _append(parent: xml.Element, name: str, value: Any) -> None:
     else:
         plugin = value["type"]
         element = xml.SubElement(parent, PLUGIN_TAGS[plugin], attributes, type=plugin)
+        # The type is an attribute. All other entries become elements inside.
         for key, item in value.items():
             if key != "type":
                 _append(element, key, item)

@@ -125,6 +125,8 @@ class _AreaVectors(torch.autograd.Function):
         squared_u, squared_v = edges.square().sum(0)
         # The length |u × v| is |u| |v| times the
         # sine of the angle between u and v.
+        # Rounding errors are large for nearly parallel edges (slivers), so these are computed
+        # exactly.
         max_squared_length = MAX_SLIVER_SINE**2 * squared_u * squared_v
         is_sliver = area_vectors.square().sum(0) <= max_squared_length
         slivers = torch.nonzero(is_sliver).squeeze(1)
@@ -260,6 +262,7 @@ def normal_groups(
         lengths = np.linalg.norm(area_vectors, axis=1)
         has_area = lengths > 0
         unit_normals = area_vectors / np.where(has_area, lengths, 1)[:, None]
+        # Pairs of corners 3 f + c at one vertex, of faces f that share an edge there.
         first, second = _neighbors(faces)
         cosines = np.einsum("ni,ni->n", unit_normals[first // 3], unit_normals[second // 3])
         is_smooth = cosines >= np.cos(np.radians(min(crease + ROUNDING_ANGLE, 180)))
@@ -267,15 +270,19 @@ def normal_groups(
     groups = by_crease
     if file_normals is not None:
         by_file, is_given = _groups_of_file(faces, file_normals, first, second)
+        # Groups by crease have numbers behind those of the groups of the file.
         groups = np.where(is_given, by_file, by_crease + by_file.max() + 1)
     separate = np.arange(faces.size).reshape(-1, 3)
     for finer in (by_crease, separate):
+        # The area vectors of these groups add up to zero. Their corners move to the finer groups.
         is_canceled = _cancels(groups, area_vectors, lengths) & has_area[:, None]
         groups = np.where(is_canceled, finer + groups.max() + 1, groups)
     # A corner of a face without area belongs to any other group of its vertex.
+    # Without another group, each vertex has a new group of its own.
     group_of_vertex = groups.max() + 1 + np.arange(len(vertices))
     group_of_vertex[faces[has_area]] = groups[has_area]
     groups = np.where(has_area[:, None], groups, group_of_vertex[faces])
+    # Number the groups without gaps.
     return np.unique(groups, return_inverse=True)[1].reshape(-1, 3)
 
 
@@ -294,6 +301,8 @@ def _groups_of_file(
     vertex = faces.ravel()
     # One integer is sorted much faster than four numbers.
     rounded = np.rint(1000 * unit_normals).astype(int)
+    # Corners of one vertex with similar normals become neighbors in this order. Each pair of
+    # neighbors is compared.
     order = np.argsort(vertex * 2**33 + rounded @ [2**22, 2**11, 1])
     is_same_vertex = vertex[order[1:]] == vertex[order[:-1]]
     first = np.concatenate([first, order[:-1][is_same_vertex]])
@@ -310,6 +319,8 @@ def _neighbors(faces: np.ndarray) -> Int[np.ndarray, "2 N"]:
     end = faces[:, [1, 2, 0]].ravel()
     next_corner = np.arange(faces.size).reshape(-1, 3)[:, [1, 2, 0]].ravel()
     edge = np.minimum(start, end) * (start.max() + 1) + np.maximum(start, end)
+    # Sides of the same edge follow each other in this order. All pairs of up to MAX_FACES_AT_EDGE
+    # sides are found by their distance in the order.
     sides = np.argsort(edge, kind="stable")
     sorted_edges = edge[sides]
     pairs = [np.zeros((2, 0), np.int64)]
@@ -320,6 +331,8 @@ def _neighbors(faces: np.ndarray) -> Int[np.ndarray, "2 N"]:
         first = sides[:-distance][is_shared]
         second = sides[distance:][is_shared]
         # The corners of both faces at the start and at the end of the first side.
+        # True if both sides start at the same vertex. Sides of neighbors usually run in opposite
+        # directions.
         is_parallel = start[first] == start[second]
         pairs.append(np.stack([first, np.where(is_parallel, second, next_corner[second])]))
         at_end = np.where(is_parallel, next_corner[second], second)

@@ -252,11 +252,13 @@ def _turned_to_mesh(camera: Camera) -> Camera:
     if not isinstance(camera, PerspectiveCamera):
         return replace(camera, right=0.0, up=0.0)
     x, y, z = camera.eye()[:3].tolist()
+    # Polar angle, azimuth and distance of the position of the camera, seen from the mesh.
     distance = math.hypot(x, y, z)
     return replace(
         camera,
         polar=math.degrees(math.acos(z / distance)),
         azimuth=math.degrees(math.atan2(y, x)),
+        # The field of view stays the same.
         width=camera.width * distance / camera.distance,
         right=0.0,
         up=0.0,

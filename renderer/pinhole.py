@@ -285,6 +285,7 @@ def _read_colmap(folder: Path, whole: bool) -> dict[str, PinholeCamera]:
                 may_be_points = False
                 continue
             may_be_points = True
+            # A line has the number of the image, a quaternion, a translation, a camera and a name.
             _, *numbers, camera_id, image_name = line.split(maxsplit=9)
             pose = np.array(numbers, dtype=float)
             rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
@@ -370,7 +371,9 @@ def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
     matrix = errors.as_array("view", view).astype(np.float64)
     if matrix.shape in ((4, 4), (3, 4)):
         rotation = matrix[:3, :3]
+        # A rotation times its transpose is the identity. A mirror has the determinant -1.
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        # The last row must be (0, 0, 0, 1). A matrix (3, 4) has none.
         is_affine = np.array_equal(matrix[3:], np.eye(4)[3 : len(matrix)])
         if error <= MATRIX_TOLERANCE and np.linalg.det(rotation) > 0 and is_affine:
             return rotation, matrix[:3, 3]

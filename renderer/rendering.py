@@ -391,6 +391,7 @@ def _as_albedo(albedo: object, mesh: Mesh) -> Tensor:
             f"albedo has values from {values.min().item():g} to {values.max().item():g}: "
             "give values from 0 to 1, and set albedo_scale for brighter surfaces"
         )
+    # A texture of any resolution may replace the only texture of the mesh.
     is_texture = values.ndim == 3 and values.shape[2] == 3 and len(mesh.textures) == 1
     if values.shape != mesh.faces.shape and not is_texture:
         raise InputError(
@@ -411,6 +412,7 @@ def _recolored(mesh: Mesh, albedo: Float[Tensor, " ..."], encoding: str) -> Mesh
     mesh = replace(mesh, gloss=None, gloss_textures=())
     if albedo.ndim == 3:
         return replace(mesh, textures=(np.rint(255 * colors).astype(np.uint8),))
+    # All three corners of a face get its color, and no face keeps a texture.
     corner_colors = colors[:, None].repeat(3, axis=1).astype(np.float32)
     untextured = np.full_like(mesh.texture_ids, NO_TEXTURE)
     return replace(mesh, corner_colors=corner_colors, texture_ids=untextured, textures=())

@@ -217,6 +217,7 @@ def settings_from(kind: type[Kind], values: object, argument: str) -> Kind:
         if name not in names:
             unknown = f"{argument}.{name}"
             raise InputError(f"{unknown} is not a setting: choose from {', '.join(names)}", unknown)
+    # A setting without a default must be given.
     for item in fields(cast(Any, kind)):
         if item.name not in values and item.default is item.default_factory is MISSING:
             missing = f"{argument}.{item.name}"
@@ -249,6 +250,7 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
     items = list(value) if _is_list(value) else [value]
     if facts.length not in (None, len(items)):
         raise InputError(f"{name}={items}: give {facts.length} numbers", name)
+    # Words for the error, sign, comparison and number of each limit.
     limits = facts.limits
     for item in items:
         if facts.choices:

@@ -104,6 +104,7 @@ class ShadedView:
         or (1, height · width).
         """
         if self.settings.silhouettes and self.is_moved:
+            # Silhouettes move between the mesh and the background, whose linear values are needed.
             linear_background = decode(background, self.settings.encoding).expand(3, -1)
             return self._radiance_with_silhouettes(camera, linear_background)
         pixel_radiance = self.radiance()
@@ -133,6 +134,7 @@ class ShadedView:
                 summands.append(radiance(*arguments, self._normals))
             else:
                 summands.append(glossy_radiance(*arguments, self._normals, gloss))
+        # Change of the radiance by shadows and bounces.
         if has_indirect:
             summands.append(self._indirect_radiance())
         for basis, coefficients in self.light.local_lights:

@@ -133,6 +133,8 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
         has_more_bits = re.search(";1[26]", str(getattr(image, "tile", "")))
         color, alpha = color_and_alpha(image)
     if convert is not None:
+        # Two pixels with the levels 0 and 1. If they differ much after the conversion, 8 bits are
+        # too few for dark areas.
         levels = Image.new(color.mode, (2, 1))
         levels.putpixel((1, 0), (1,) * len(color.getbands()))
         darkest, next_level = np.asarray(convert(levels), dtype=int)[0]
@@ -153,6 +155,7 @@ def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None
     image = eight_bits(image)
     if image.mode == "La":
         image = image.convert("LA")
+    # Pillow names images by channels. "1" has one bit, and "La" is gray multiplied by its opacity.
     is_gray = image.mode in ("1", "L", "LA", "La")
     if image.has_transparency_data:
         rgba = image.convert("RGBA")
@@ -184,6 +187,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
         is_white_zero = tags.get(PHOTOMETRIC_INTERPRETATION) == 0
         scaled = Image.fromarray(255 - values if is_white_zero else values)
         key = image.info.get("transparency")
+        # Pixels of the transparent color of a 16-bit image get an opacity of 0.
         if key is not None:
             scaled.putalpha(Image.fromarray(np.where(pixels == key, 0, 255).astype(np.uint8)))
         return scaled
@@ -291,6 +295,7 @@ def draw_grid(
     Each column is as wide as its widest tile or title. Each row is as high as its
     highest tile. The last row may be shorter.
     """
+    # Sizes of the grid first, because the sheet is created in its final size.
     row_heights = [max(tile.height for tile in row) for row in rows]
     column_widths = []
     # zip_longest fills up with None: a tile, a column or a title may be missing.
@@ -364,6 +369,7 @@ def conversion_to_srgb(image: Image.Image, path: str | Path) -> Conversion | Non
     if "srgb" in image.info:
         return None
     if "gamma" in image.info or "chromaticity" in image.info:
+        # Pillow gives the exponent of the encoding, such as 1 / 2.2.
         gamma = 1 / (image.info.get("gamma") or 1 / 2.2)
         x_and_y = image.info.get("chromaticity", (*REC_709[6:], *REC_709[:6]))
         # A PNG file lists the white first.
@@ -371,6 +377,7 @@ def conversion_to_srgb(image: Image.Image, path: str | Path) -> Conversion | Non
         return _conversion(None if is_srgb_curve else gamma, (*x_and_y[2:], *x_and_y[:2]))
     # Damaged EXIF data raises errors of many types, and does not change the pixels.
     with suppress(Exception):
+        # "R03" is the mark of Adobe RGB.
         if image.getexif().get_ifd(ExifTags.IFD.Interop).get(1) == "R03":
             return _conversion(ADOBE_GAMMA, ADOBE_PRIMARIES)
     return None
@@ -379,6 +386,8 @@ def conversion_to_srgb(image: Image.Image, path: str | Path) -> Conversion | Non
 def _coded_colors(path: Path) -> tuple[int, int] | None:
     """Read the codes of the primaries and of the curve from the chunk cICP of a PNG file."""
     with path.open("rb") as file:
+        # The signature of PNG has 8 bytes. Each chunk begins with its length and its name, 4 bytes
+        # each.
         file.seek(8)
         while len(header := file.read(8)) == 8 and header[4:] != b"IDAT":
             length = int.from_bytes(header[:4], "big")
@@ -406,6 +415,7 @@ def _conversion(gamma: float | None, primaries: Sequence[float]) -> Conversion |
     def convert(image: Image.Image) -> Image.Image:
         import torch
 
+        # Linear value of each of the 256 levels, as a table.
         levels = torch.arange(256) / 255
         curve = decode(levels, "srgb") if gamma is None else levels**gamma
         linear = curve.numpy()[np.asarray(image.convert("RGB"))]
@@ -419,6 +429,7 @@ def _conversion(gamma: float | None, primaries: Sequence[float]) -> Conversion |
 
 def _apply_profile(profile: bytes, image: Image.Image) -> Image.Image:
     """Convert an image by an ICC profile. An image whose profile is damaged is in sRGB."""
+    # A gray image may have an RGB profile. Bytes 16 to 19 of a profile name its color space.
     if profile[16:20] == b"RGB " and image.mode == "L":
         image = image.convert("RGB")
     transform = _transform(profile, image.mode)
@@ -440,6 +451,7 @@ def _transform(profile: bytes, mode: str) -> ImageCms.ImageCmsTransform | None:
         transform = ImageCms.buildTransform(opened, srgb, mode, "RGB", flags=flags)
         if mode == "CMYK":
             return transform
+        # 16³ colors that cover all, to compare the transform with no change.
         levels = np.linspace(0, 255, 16).round().astype(np.uint8)
         grid = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(64, 64, 3)
         samples = Image.fromarray(grid if mode == "RGB" else grid[..., 0])

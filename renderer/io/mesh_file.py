@@ -183,6 +183,7 @@ def parse_numbers(text: bytes, dtype: type) -> np.ndarray:
 def words_per_line(text: bytes) -> np.ndarray:
     """Count the words of each line of a text that ends with a line break."""
     characters = np.frombuffer(b"\n" + text, dtype=np.uint8)
+    # A word begins where a character follows a blank or a line break.
     is_blank = characters <= ord(" ")
     lines = np.cumsum(characters == ord("\n"))[1:][is_blank[:-1] & ~is_blank[1:]] - 1
     return np.bincount(lines, minlength=text.count(b"\n"))
@@ -257,6 +258,7 @@ def unit_colors(colors: np.ndarray, file: MeshFile) -> np.ndarray:
     """
     if colors.dtype in (np.uint8, np.uint16):
         return colors / np.iinfo(colors.dtype).max
+    # A color of 2 or more cannot be in [0, 1], and whole numbers look like bytes.
     is_whole = (colors == np.round(colors)).all()
     if colors.dtype.kind in "iu" or (is_whole and 1 + TOLERANCE < colors.max(initial=0) <= 255):
         file.assume("colors are taken as values from 0 to 255")
@@ -327,6 +329,7 @@ def _projected(corners: np.ndarray, starts: np.ndarray, sizes: np.ndarray) -> np
     The coordinates are relative to the first corner of the polygon, shape (C, 2).
     """
     relative = corners - corners[starts].repeat(sizes, axis=0)
+    # Index of the next corner of the same polygon.
     following = np.arange(1, len(corners) + 1)
     following[starts + sizes - 1] = starts
     # Newell's normal, whose length is twice the area of a planar polygon.
@@ -334,6 +337,7 @@ def _projected(corners: np.ndarray, starts: np.ndarray, sizes: np.ndarray) -> np
     axes = np.abs(normals).argmax(axis=1)
     remaining = _REMAINING_AXES[axes]
     is_clockwise = np.take_along_axis(normals, axes[:, None], axis=1)[:, 0] < 0
+    # Swapping both axes mirrors a polygon, so that it is counter-clockwise.
     remaining[is_clockwise] = remaining[is_clockwise, ::-1]
     return np.take_along_axis(relative, remaining.repeat(sizes, axis=0), axis=1)
 

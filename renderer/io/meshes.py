@@ -84,6 +84,7 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     parts = read_parts(path, gloss)
     if not parts:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
+    # Meshes in the axes of the scene, and the normals of their corners.
     placed_meshes, normals = zip(*(part.placed() for part in parts), strict=True)
     mesh = concatenate(placed_meshes)
     # Vertices at the same position are merged, and vertices without faces are dropped.
@@ -201,6 +202,7 @@ class _Tree(dict[str, Any]):
     def add_bytes(self, content: bytes) -> int:
         """Append bytes to the buffer, and return the index of their view."""
         view = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": len(content)}
+        # glTF needs multiples of 4 bytes, so zeros are appended.
         self.buffer += content + bytes(-len(content) % 4)
         return self.add("bufferViews", view)
 
@@ -228,6 +230,7 @@ class _Tree(dict[str, Any]):
         """Return the content of the file (4.4)."""
         self["buffers"] = [{"byteLength": len(self.buffer)}]
         text = json.dumps(self).encode()
+        # Both chunks have a length of a multiple of 4 bytes. Text is filled up with blanks.
         text += b" " * (-len(text) % 4)
         chunks = struct.pack("<I4s", len(text), b"JSON") + text
         chunks += struct.pack("<I4s", len(self.buffer), b"BIN\0") + self.buffer
@@ -300,7 +303,8 @@ def _gltf_camera(camera: Camera, aspect: float) -> dict[str, Any]:
     planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):
         # Half of the width and of the height that the image shows at a depth
-        # of 1. Both grow with the distance of the principal point from the center.
+        # of 1. Both grow with the distance of the principal point from the center, because an
+        # image of glTF is symmetric around its principal point.
         half_width = math.tan(math.radians(camera.angle) / 2)
         half_height = half_width / camera.pixel_aspect * (1 / aspect + abs(camera.principal_up))
         half_width *= 1 + abs(camera.principal_right)

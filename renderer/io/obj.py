@@ -76,7 +76,9 @@ def read_obj(file: MeshFile) -> list[Part]:
     uvs, _ = _table(lines["vt"], (1, 2, 3))
     normals, _ = _table(lines["vn"], (3,))
     mesh_file.require_bounded(texture_coordinates=uvs)
+    # Indices of position, texture coordinates and normal of each corner, and corners of each face.
     indices, sizes = _polygons(lines)
+    # Places of the corners of each triangle in `indices`, and the line "f" of the triangle.
     corners, polygons = mesh_file.triangles_of(file, vertices, indices[:, 0], sizes)
     if not len(corners):
         return []
@@ -143,10 +145,12 @@ def _polygons(lines: dict[str, _Lines]) -> tuple[np.ndarray, np.ndarray]:
     sizes, text = lines["f"].words()
     indices = _corners(text.split())
     for column, keyword in enumerate(("v", "vt", "vn")):
+        # Indices as they stand in the file.
         written = indices[:, column]
         numbers = lines[keyword].numbers
         # A negative index counts backward from the line of the face.
         counts_before = np.searchsorted(numbers, lines["f"].numbers).repeat(sizes)
+        # The file counts from 1, and backward from -1.
         resolved = np.where(written < 0, counts_before + written, written - 1)
         is_given = written != _LEFT_OUT
         wrong = written[is_given & ((resolved < 0) | (resolved >= len(numbers)))]
@@ -161,6 +165,7 @@ def _corners(words: list[bytes]) -> np.ndarray:
     if not words:
         return np.zeros((0, 3), dtype=np.int64)
     text = b" ".join(words) + b" "
+    # Write a number for each index that is left out, so that all corners read alike.
     absent = b"/%d" % _LEFT_OUT
     text = text.replace(b"//", absent + b"/").replace(b"/ ", absent + b" ")
     characters = np.frombuffer(text, dtype=np.uint8)
@@ -168,7 +173,9 @@ def _corners(words: list[bytes]) -> np.ndarray:
     separators = characters[(characters == ord(" ")) | (characters == ord("/"))]
     is_last = separators == ord(" ")
     firsts = np.flatnonzero(np.append(True, is_last[:-1]))
+    # Number of the corner to which each number belongs.
     corners = np.cumsum(is_last) - is_last
+    # Place of each number in its corner: 0 for v, 1 for vt and 2 for vn.
     columns = np.arange(len(is_last)) - firsts[corners]
     numbers = mesh_file.parse_numbers(text.replace(b"/", b" "), np.int64)
     if columns.max() > 2 or len(numbers) != len(columns):
@@ -183,6 +190,7 @@ def _materials(lines: dict[str, _Lines], file: MeshFile) -> tuple[list[_Material
     library = _library(lines["mtllib"].names(), file)
     # Name of the material of each line "usemtl", after None for faces before these lines.
     names = [None, *lines["usemtl"].names()]
+    # Each face has the material of the last line "usemtl" before it.
     choice_of_face = np.searchsorted(lines["usemtl"].numbers, lines["f"].numbers)
     used = list(dict.fromkeys([None, *(names[choice] for choice in np.unique(choice_of_face))]))
     materials = [_Material() if name is None else _material(name, library, file) for name in used]
@@ -197,6 +205,7 @@ def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
         # The line may name several files, or end with a comment.
         for path in re.findall(r"\S.*?\.mtl(?!\S)", name, re.IGNORECASE) or [name]:
             folder = "".join(path.replace("\\", "/").rpartition("/")[:2])
+            # Materials of this .mtl file by name.
             own: dict[str, _Definition] = {}
             properties: list[tuple[str, str]] = []
             for word, rest in _LINE.findall(_cleaned(file.read(path))):
@@ -224,6 +233,7 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
         raise ValueError(f"no .mtl file defines the material {name}")
     folder, properties = definition
     material = _Material()
+    # Opacity ("d") or transparency ("tr"), of which "d" counts if a material has both.
     opacities = {}
     for keyword, text in properties:
         match keyword.lower():

@@ -103,6 +103,7 @@ def _rgb(values: _Values, file: MeshFile) -> np.ndarray | None:
         return None
     if len(found) > 1:
         raise ValueError("an element has two kinds of colors, such as red and diffuse_red")
+    # Opacity must be 1, because the renderer has no transparency.
     for name in ("alpha", "a"):
         alpha = _columns(values, (name,))
         if alpha is not None and (mesh_file.unit_colors(alpha, file) < mesh_file.OPAQUE).any():
@@ -121,6 +122,7 @@ def _corner_uvs(vertex: _Values, face: _Values, faces: _Lists) -> np.ndarray:
     # differ on both sides of a seam. They therefore replace those of vertices.
     face_uvs = face.pop("texcoord", None)
     if isinstance(face_uvs, _Lists):
+        # A face without texture coordinates has an empty list. Others have u and v for each corner.
         is_given = face_uvs.lengths > 0
         if not (face_uvs.lengths == 2 * faces.lengths * is_given).all():
             raise ValueError("a face has a texcoord without two numbers for each corner")
@@ -190,12 +192,15 @@ def _rows(
         most = min(count, 2 * len(blocks[-1]) if blocks else 1)
         try:
             row = _first_row(body, offset, properties, form)
+            # Number of complete rows that the rest of the file can hold.
             most = min(most, (len(body) - offset) // row.itemsize)
             rows = np.frombuffer(body, row, max(1, most), offset)
         # NumPy refuses a list of negative length, or longer than the file.
         except ValueError as error:
             raise ValueError(_TRUNCATED) from error
         lengths = [rows[name] for name in row.names or () if name.startswith(_LENGTH)]
+        # True for rows in which a list has another length than in the first row. They start the
+        # next block.
         is_other = np.any([column != column[0] for column in lengths], axis=0)
         blocks.append(rows[: is_other.argmax()] if is_other.any() else rows)
         count -= len(blocks[-1])

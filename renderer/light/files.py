@@ -90,6 +90,7 @@ def save_light(
     errors.require_shape("coefficients", coefficients, basis.size, 3)
     if isinstance(basis, Harmonics) and is_map:
         errors.require_whole("height", height, 1, MAX_MAP_HEIGHT)
+        # A map cannot have negative radiance, so a light without it is written.
         physical = basis.project_nonnegative(coefficients)
         write_map(path, to_map(physical, height).clamp(min=0))
         return float(harmonics.irradiance_error(physical, coefficients))
@@ -113,6 +114,7 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
     """
     path = Path(path)
     errors.require_file(path, "give the path of a .json file of coefficients")
+    # Classes by the names that files have under "basis".
     kind_of_name = {kind.name: kind for kind in kinds}
     try:
         description = json.loads(path.read_text(encoding="utf-8-sig"))
@@ -123,6 +125,7 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
         if name not in kind_of_name:
             known = " or ".join(kind_of_name)
             raise InputError(f"basis is {name!r}: give a light with the basis {known}")
+        # All other entries are the fields of the class.
         basis = kind_of_name[name](**description)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -197,6 +200,7 @@ def load_light(
     if light in _PUBLISHED_PROBES:
         coefficients = probe(light)
     elif light == UNIFORM:
+        # Light of irradiance 1 has the radiance 1 / π.
         coefficients = ambient(torch.full((3,), 1 / math.pi))
     elif suffix == ".json":
         _, coefficients = read_light(Path(light), Harmonics)
@@ -264,6 +268,7 @@ def perturb(
     norm to which a change is scaled, only coefficients that change the irradiance of a
     diffuse surface are changed. None changes all and does not scale.
     """
+    # Axes: light, coefficient, color.
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
     if radius is not None:
         diffuse_indices = harmonics.nonzero_coefficients(harmonics.degree_of(light))

@@ -355,6 +355,7 @@ def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
     """
     factors = [math.pi, 2 * math.pi / 3, *[0.0] * (degree - 1)]
     for l in range(2, min(degree, DIFFUSE_DEGREE) + 1, 2):
+        # A_l = 2π (-1)^(l/2 - 1) / ((l + 2) (l - 1)) · l! / (2^l (l/2)!²) for even l.
         sign = (-1) ** (l // 2 - 1)
         binomial = math.comb(l, l // 2) / 2.0**l
         factors[l] = 2 * math.pi * sign / ((l + 2) * (l - 1)) * binomial
@@ -432,6 +433,7 @@ def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N
     x = radius * np.cos(azimuth)
     y = radius * np.sin(azimuth)
     directions = np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], axis=-1)
+    # Each direction has the weight of its z, times the step in azimuth.
     weights = np.repeat(z_weights * 2 * np.pi / len(azimuth), len(azimuth))
     return torch.from_numpy(directions.reshape(-1, 3)), torch.from_numpy(weights)
 

@@ -190,6 +190,7 @@ def _mix_to_nonnegative(light: Array, filler: Array, harmonics: Array) -> Array:
     radiance = harmonics @ light
     difference = harmonics @ (filler - light)
     is_negative = radiance < 0
+    # Each negative direction needs the fraction -radiance / difference. The largest one serves all.
     filler_fraction = (-radiance[is_negative] / difference[is_negative]).max(initial=0)
     return light + (filler - light) * filler_fraction
 
@@ -229,6 +230,7 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
 def _exchange(programs: "list[_QuadraticProgram]", starts: float) -> None:
     """Solve programs until no negative minimum is found, see `_find_negative_minima`."""
     for _ in range(_MAX_ROUNDS):
+        # Channels of all programs that are still negative somewhere, one below the other.
         nearest = np.concatenate([program.nearest for program in programs])
         original = np.concatenate([program.original for program in programs])
         channel_of_minimum, harmonics = _find_negative_minima(
@@ -351,6 +353,7 @@ class _QuadraticProgram:
         `velocity` is the derivative of x with respect to t, `displacement` is x - c, and
         `missing_squared` is r² - |x - c|².
         """
+        # s solves the quadratic equation s² |velocity|² + 2 s slope = missing_squared.
         squared_speed = float((velocity * velocity).sum())
         slope = float((velocity * displacement).sum())
         root = math.sqrt(max(slope**2 + squared_speed * missing_squared, 0))

@@ -114,6 +114,8 @@ class _FittedSky(torch.autograd.Function):
         # its derivative with respect to the turbidity, along the first axis.
         zenith_factors = torch.stack([zenith_values, zenith_slopes, zenith_values])
         turbidity_factors = torch.stack([haze_values, haze_values, haze_slopes])
+        # Each product of two polynomials, with the axes: sky and its two derivatives, shape of the
+        # parameters, polynomial of the zenith angle, polynomial of 1 / turbidity.
         products = zenith_factors[..., :, None] * turbidity_factors[..., None, :]
         polynomials = fit.to(products).flatten(2).flatten(0, 1)
         # Coefficients with m ≥ 0 for a sun at azimuth 0, with the axes: sky and its two
@@ -124,6 +126,7 @@ class _FittedSky(torch.autograd.Function):
         # cos(mφ) for m ≥ 0, and sin(|m| φ) for m < 0, shape (..., 49, 1).
         rotation = torch.where(orders < 0, angles.sin(), angles.cos())[..., None]
         value, by_zenith, by_turbidity = at_azimuth_zero[..., _ROW_IN_FIT, :] * rotation
+        # The derivative of cos mφ is -m sin mφ, which belongs to the harmonic of order -m.
         by_azimuth = -orders[:, None] * value[..., _OPPOSITE_ORDER, :]
         ctx.save_for_backward(by_zenith, by_azimuth, by_turbidity)
         return value
@@ -172,6 +175,7 @@ def _as_parameters(
         "zenith": (*ZENITH, "0 to 90 degrees, with the sun above the horizon"),
         "turbidity": (*TURBIDITY, "2 to 10"),
     }
+    # A value at a limit may lie outside of it after rounding, and still counts as inside.
     rounding = 4 * torch.finfo(like.dtype).eps
     for name, (low, high, expected) in ranges.items():
         value = tensors[name].to(like.dtype)

@@ -270,6 +270,7 @@ class TransferOperator:
         is_unclamped = unclamped.eq_(clamped_values)
         encoded = encode(clamped_values, self.settings.encoding)
         batch_shape = lights.shape[:-2]
+        # Copy the background, and write the covered pixels over it.
         canvas = background_images.expand(*batch_shape, -1, -1)
         images = canvas.clone(memory_format=torch.contiguous_format)
         # `scatter_` takes half the time of `index_copy_` on a CPU.
@@ -322,6 +323,7 @@ class TransferOperator:
         """Compute `radiance` without checks."""
         # Coefficients that change a pixel. All other coefficients have no row in the matrix.
         used_lights = lights.index_select(-2, self.nonzero).to(self.transfer.dtype)
+        # See `_channels`: one channel, two with specular reflection, or three colors.
         shared, *white = self._channels
         if len(self._channels) == COLORS:
             radiance = torch.einsum("...kc,ckp->...cp", used_lights, self.transfer)
@@ -349,6 +351,7 @@ class TransferOperator:
             used_gradient = linear(upstream * self.albedo, shared)
             if white:
                 used_gradient = used_gradient + linear(upstream, white[0])
+        # The gradient of unused coefficients is 0.
         gradient = self._placement @ used_gradient.mT
         if self.sparse is not None:
             gradient_of_entry = upstream.mT.index_select(-2, self.sparse.pixel)
@@ -372,6 +375,7 @@ class TransferOperator:
         if is_kept and last is not None and last_key == key:
             return last
         images = as_background(background, self.settings.size, lights).flatten(-2)
+        # Background of the P covered pixels. Only these mix with the mesh.
         at_pixels = images.index_select(-1, self.pixels)
         if self.settings.encoding != "linear":
             # Repeat the background for each light before it is decoded, as `composite` does.
@@ -409,6 +413,8 @@ class TransferOperator:
         """`transfer` in three color channels, which include the albedo, shape (3, K, P)."""
         if len(self.transfer) == COLORS:
             return self.transfer
+        # Specular reflection does not have the color of the surface, so it is added behind the
+        # product.
         shared, *white = self.transfer
         colored = shared * self.albedo[:, None]
         return colored + white[0] if white else colored

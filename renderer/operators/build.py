@@ -95,6 +95,7 @@ def _build(
         dense_size = len(functions) * pixel_count
         if dense_size > SMALL_MATRIX_SIZE and len(entries.weight) < SPARSE_FRACTION * dense_size:
             weight = (entries.weight * pixel_albedo[entries.pixel]).to(dtype)
+            # Number of the basis function among those of all lights.
             function = local_rows.start + entries.function
             sparse.append(SparseTransfer(function, entries.pixel, weight))
             continue
@@ -110,6 +111,7 @@ def _build(
         dense.append((rows.start + coefficients, transfer))
     if len(dense) != 1:
         # The rows of a single light are used as they are, because `cat` copies them.
+        # Sort by the first coefficient of each part, and join the parts along the coefficients.
         dense.sort(key=lambda part: part[0][:1].tolist())
         channel_count = 2 if is_glossy and albedo.shape[1] == 1 else albedo.shape[1]
         empty = torch.empty(channel_count, 0, pixel_count, dtype=dtype)
@@ -208,6 +210,7 @@ def _box_filter(
         if albedo.shape[1] == 1:
             weights = sample_count.double()[:, None] / fragments.samples**2
         else:
+            # Sum of the albedo of the samples of an entry, divided by the samples of a pixel.
             weights = fragments.merge(albedo)[2]
     else:
         entry_to_pixel = fragments.sample_to_pixel

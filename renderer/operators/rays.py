@@ -215,6 +215,8 @@ class Rays:
             # pixels use different samples for the same direction.
             rank_in_pixel = (_shuffled(len(directions)) + block[:, None]) % samples_in_pixel
             sample_of_ray = first_sample[block, None] + rank_in_pixel
+            # Cosine between each direction and the shading normal, and height of the direction above
+            # the plane of the face, shape (pixels of the block, D).
             cosine = dot(surface.normals[sample_of_ray], directions).clamp(min=0)
             height = dot(plane_normals[sample_of_ray], directions)
             # Pairs of a pixel and a direction that need a ray: the direction is above the
@@ -277,6 +279,7 @@ class Rays:
         # Largest coordinate of a hull vertex along the normal of each seen face.
         highest = torch.cat([(block @ hull_vertices.T).amax(1) for block in blocks])
         first_corner = surface.vertices[fragments.corners[:, 0]]
+        # Height of the face itself along its normal.
         height_of_face = (plane_normals * first_corner).sum(1)
         is_below_a_vertex = highest - height_of_face > self.offset
         cosine_of_normals = (surface.normals * surface.planes).sum(1)
@@ -395,6 +398,7 @@ def unoccluded(
     # Whether a path is blocked has no gradient, so no operations are recorded.
     with torch.no_grad():
         plane_of_path = planes[paths.point]
+        # A ray starts above the surface, so that it does not hit its own face.
         origins = points[paths.point] + rays.offset * plane_of_path
         directions, lengths = unit_vectors((paths.source - origins).T)
         is_above_plane = (directions.T * plane_of_path).sum(1) > 0
@@ -439,6 +443,8 @@ class LocalLightView:
         to `positions`, and `fragments` may assign the samples to other pixels.
         """
         surface = self.surface
+        # None if the lights stay in place. Their paths to the samples are then kept for later
+        # renders.
         moved = positions.cpu().double() if basis.is_movable and positions is not None else None
         paths = self.fixed_paths.get(basis) if moved is None else None
         if paths is None:

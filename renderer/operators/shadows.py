@@ -93,6 +93,7 @@ class Patches:
         group of neighboring pieces. The fronts and the backs of the same pieces are
         different patches. The backs of a closed mesh are left out.
         """
+        # Area of a side of the cells below, so that there are about PATCHES patches.
         patch_area = float(mesh.face_areas().sum()) / PATCHES
         pieces = refine(mesh, patch_area)
         piece_count = len(pieces.faces)
@@ -344,6 +345,7 @@ def _radiosity(
     channel_count = 3 if has_colors else 1
     # Sent radiance per irradiance ρ_i / π. Axes: patch, one of size 1, color.
     reflectance = patch_albedo[:, None, :channel_count] / math.pi
+    # Irradiance from the sky (N, K, 1), the patches that see others, and F (M, N) for these.
     from_sky, receiving, factors = _link_patches(patches, rays, basis)
     sent = from_sky * reflectance
     for _ in range(settings.bounces - 1):

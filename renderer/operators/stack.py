@@ -330,6 +330,7 @@ class OperatorStack:
 
         `shown` is the index of the operator of each image.
         """
+        # Pixels and coefficients that any of the operators uses, ascending.
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
         nonzero = torch.cat([operator.nonzero for operator in operators]).unique()
         # If the number of coefficients is odd, append coefficient 0 once more. Its additional
@@ -387,6 +388,7 @@ class OperatorStack:
         # Cell of each image in the table. The cells are numbered row by row.
         cell = row * slot_count + slot
         cell_count = len(operators) * slot_count
+        # True if each cell holds one image in order, so that no image has to be moved.
         is_ordered = torch.equal(cell, torch.arange(cell_count))
         operators = operators.to(lights.device, non_blocking=True)
         cell = cell.to(lights.device, non_blocking=True)

@@ -82,6 +82,7 @@ class Rasterizer:
         given = as_tensor(points).clamp(-SPAN / columns, SPAN / columns)
         needed = (4 * len(points) + SHADED_BYTES) * rows * columns
         require_memory(f"{len(points)} views of {rows} × {columns} samples", needed, given.device)
+        # A rasterizer that was named by the user is kept, also on a GPU.
         name = "torch" if self.is_automatic and given.is_cuda else self.name
         rasterize = import_module(f"renderer.visibility.{name}").rasterize
         if name == "torch":

@@ -387,10 +387,12 @@ def _fragments_of_view(
     settings: ImageSettings,
 ) -> Fragments:
     """Create fragments from face indices (-1: no face) and depths (None: no perspective)."""
+    # Order in which the samples of a pixel follow each other.
     order = _samples_by_pixel(settings.shape, settings.samples, face_ids.device)
     ids_by_pixel = face_ids.flatten().index_select(0, order)
     is_covered = ids_by_pixel >= 0
     covered = is_covered.nonzero().squeeze(1)
+    # Number of covered samples of each pixel.
     counts_of_all_pixels = is_covered.view(-1, settings.samples**2).sum(1)
     pixels = counts_of_all_pixels.nonzero().squeeze(1)
     sample_count = counts_of_all_pixels.index_select(0, pixels)

@@ -62,6 +62,7 @@ def rasterize(
     ids = np.empty((len(points), *shape), dtype=np.int32)
     for view, view_ids in zip(points, ids, strict=True):
         positions, depths = to_fixed_point(view, shape)
+        # Smallest key of each sample: the depth of its nearest face, and the face in the low bits.
         keys = np.full(shape, EMPTY_KEY)
         for begin in range(0, len(faces), FACES_PER_BLOCK):
             block = np.ascontiguousarray(faces[begin : begin + FACES_PER_BLOCK].T)
@@ -225,6 +226,8 @@ def _planes(
     """
     (ax, bx, cx), (ay, by, cy) = triangles
     depth_a, depth_b, depth_c = depths
+    # Differences of depth along the edges from a to b and c. The slopes solve two linear equations
+    # (Cramer's rule).
     to_b = depth_b - depth_a
     to_c = depth_c - depth_a
     scale = SUBSAMPLES / _doubled_areas(triangles)
