@@ -215,7 +215,7 @@ class Rays:
             # pixels use different samples for the same direction.
             rank_in_pixel = (_shuffled(len(directions)) + block[:, None]) % samples_in_pixel
             sample_of_ray = first_sample[block, None] + rank_in_pixel
-            # Cosine between each direction and the shading normal, and height of the direction above
+            # Cosine of each direction to the shading normal, and height of the direction above
             # the plane of the face, shape (pixels of the block, D).
             cosine = dot(surface.normals[sample_of_ray], directions).clamp(min=0)
             height = dot(plane_normals[sample_of_ray], directions)
