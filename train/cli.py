@@ -123,7 +123,9 @@ class Command:
         """Start the command with the arguments of this process."""
         with self.handle_errors():
             system.set_up_process()
+            # `take_flag` removes --verbose, which no settings class has.
             words = system.take_flag(sys.argv[1:])
+            # Settings that are given beside --help appear in its text.
             if not HELP_FLAGS.isdisjoint(words):
                 print(self.format_help([word for word in words if word not in HELP_FLAGS]))
                 system.skip_last_collection()
@@ -133,6 +135,7 @@ class Command:
             # `self.run` with it.
             sys.argv[1:] = self.to_overrides(words)
             start = hydra.main("pkg://conf", self.name, version_base="1.3")(self.run)
+            # With --multirun, the function `sweep` of this command starts several runs.
             if SWEEP_FLAGS.isdisjoint(words):
                 start()
             else:
@@ -208,6 +211,7 @@ class Command:
         else:
             # Hydra is not needed for the default values, and is slow.
             config = OmegaConf.structured(self.kind)
+        # The line about each setting, by its dotted key.
         lines = dict(_setting_lines(config))
         sections = {
             "Examples:": [f"  {example}" for example in self.examples],
@@ -259,6 +263,7 @@ def _setting_lines(node: DictConfig, prefix: str = "") -> Iterator[tuple[str, st
     for name, value in cast(dict[str, Any], OmegaConf.to_container(node)).items():
         key = f"{prefix}{name}"
         child = node._get_node(name)
+        # A group of settings has a line of its own before those of its settings.
         if value is not None and is_dataclass(OmegaConf.get_type(child)):
             yield key, _format_line(f"{key}.", facts_of(kind, name).about)
             yield from _setting_lines(cast(DictConfig, child), f"{key}.")
@@ -305,6 +310,7 @@ def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
 def _read_node(node: DictConfig, key: str) -> Any:
     """Convert the group of settings with a dotted key ("" for all) to its settings class."""
     kind = cast(type, OmegaConf.get_type(node))
+    # The values of the settings in this group. Groups inside it become settings classes first.
     values: dict[str, Any] = {}
     for name in [item.name for item in fields(cast(Any, kind))]:
         inner = f"{key}.{name}" if key else name
@@ -318,6 +324,7 @@ def _read_node(node: DictConfig, key: str) -> Any:
         values[name] = value
     try:
         return kind(**values)
+    # The class knows only its own names, so the message gets the key of the group.
     except InputError as error:
         raise error.within(key, values) from None
 

@@ -132,13 +132,16 @@ class AttackExperimentSettings(TaskSettings):
     def __post_init__(self) -> None:
         """Check all values, and add to the scene the lights that are attacked."""
         super().__post_init__()
+        # Several views can have a target each.
         names = self.target if isinstance(self.target, list) else [self.target]
         if any(isinstance(name, dict | list) for name in names):
             raise self.wrong("target", "is no class: give one, least_likely, or one per view")
         # The name of a class can be a number, which YAML reads as one.
         if isinstance(self.target, int | float):
             self.target = str(self.target)
+        # Names of the attacked parameters, such as "lighting" and "pose".
         attacked = self.attack.parameters
+        # Relighting attacks photographs, so it needs a folder of them.
         if (self.attack.relighting is None) != (self.unlabeled is None):
             raise InputError("attack=relighting and unlabeled=FOLDER: set both, or neither")
         if self.unlabeled is not None and (attacked or self.reload):
@@ -193,11 +196,13 @@ class LabSettings(Settings):
         if self.label is None and self.meshes != LAB_MESHES:
             raise InputError("label is not set: give the class of the meshes, label=CLASS", "label")
         self.label = "orange" if self.label is None else self.label
+        # A pattern such as "leaves+text" needs two projectors, with a family of patterns each.
         families = {family for pattern in self.patterns for family in pattern.split("+")}
         for family in sorted(families):
             require_choice("patterns", family, PATTERNS)
         if SLIDES in families and not self.slides:
             raise self.wrong("patterns", "need image files: set slides to them")
+        # Each pattern and each environment lights the same number of setups, and names files.
         sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
         if not sources or self.setups % len(sources):
             raise self.wrong("setups", f"is no multiple of the {len(sources)} lights")

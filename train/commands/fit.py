@@ -51,6 +51,7 @@ def run(settings: FitSettings) -> None:
     image = read_file(settings.photograph)
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
+    # The mask is 255 where the object is, shape (H, W).
     if settings.mask:
         mask = read_mask(settings.mask, *image.shape[:2])
     else:
@@ -64,15 +65,18 @@ def run(settings: FitSettings) -> None:
     # The window is the square of the photograph that the found camera shows.
     background = found.window.cut(image, BACKGROUND_SIZE, settings.encoding)
     write_image(out / "background.png", encode(background, settings.encoding))
+    # Outside of the photograph, there is no object.
     coverage = found.window.cut(mask[..., None], BACKGROUND_SIZE, beyond=0)
     write_image(out / "mask.png", coverage.expand(3, -1, -1))
     save_light(out / "light.json", found.scene.light)
+    # The result is checked in the picture that pnb-attack will render from the written files.
     scene, renderer = attacked_scene(settings, found.scene.camera, out)
     photograph, rendered = render_attacked(settings, scene, renderer)
     write_image(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
     # The three channels of the mask are equal, so the first one is enough.
     is_object = read_image(out / "mask.png", ATTACKED_SIZE)[0] > MIN_COVERAGE
     # Relative root mean square error in linear RGB.
+    # Both have the shape (3, n), with the n pixels of the object.
     linear = decode(photograph[:, is_object].double(), settings.encoding)
     difference = decode(rendered[:, is_object].double(), settings.encoding) - linear
     error = float(difference.norm() / linear.norm())
@@ -80,6 +84,7 @@ def run(settings: FitSettings) -> None:
     print(f"outlines overlap by {overlap:.1%}; the object's pixels differ by {error:.1%}")
     if overlap < MIN_OVERLAP or error > MAX_ERROR:
         print("warning: the mesh hardly fits; see comparison.png, and check mask, mesh and fov")
+    # The command that is printed.
     words = ["pnb-attack", "attack=lighting"]
     if settings.label is not None:
         words.append(f"label={settings.label}")
@@ -103,6 +108,7 @@ def attacked_scene(
         "width": round(camera.width, 4),
         "light": str(out / "light.json"),
         "backgrounds": [str(out / "background.png")],
+        # The found scene is kept, even if the network does not recognize the object in it.
         "search": 0,
     }
     if isinstance(camera, PerspectiveCamera):
@@ -161,14 +167,17 @@ def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height w
 def _levels(path: str) -> np.ndarray:
     """Read the coverage of each pixel by the object, uint8. Raises ValueError if it is unknown."""
     pixels = _pixels(path)
+    # Opacity and gray images have one channel. Equal channels are a gray image, too.
     is_colored = pixels.ndim == 3 and np.ptp(pixels, axis=-1).max() > TINT
     if is_colored:
         pixels = pixels @ np.array([2**16, 2**8, 1])  # One number for each color.
     elif pixels.ndim == 3:
         pixels = pixels[..., 0]
+    # Now `pixels` has the shape (H, W), with a number for each gray value or color.
     values = np.unique(pixels)
     if len(values) == 1:
         raise ValueError(f"all of its pixels have the value {values[0]}")
+    # In an image of two values or colors, all that is not black is the object.
     if len(values) == 2 and values[0] == 0 and values[1] > 0:
         if values[1] not in (1, 255):
             print(f"mask={path}: all that is not black is the object")
@@ -178,7 +187,7 @@ def _levels(path: str) -> np.ndarray:
     # NaN, which sorts last, is not white.
     if not values[-1] >= WHITE or values[0] > 255 - WHITE:
         raise ValueError(f"its values are from {values[0]} to {values[-1]} of 255")
-    # A pixel at the edge of the object has a neighbor of another value.
+    # Edges of the object may be gray, but have a neighbor of another value. Gray areas are unclear.
     neighbors = sliding_window_view(pixels, (3, 3))
     is_flat = neighbors.min(axis=(2, 3)) == neighbors.max(axis=(2, 3))
     areas = np.unique(pixels[1:-1, 1:-1][is_flat])
@@ -195,14 +204,18 @@ def _pixels(path: str) -> np.ndarray:
         if image.has_transparency_data:
             rgba = np.asarray(eight_bits(image).convert("RGBA"))
             alpha = rgba[..., 3]
+            # Constant opacity says nothing, so the colors do.
             if alpha.min() == alpha.max():
                 return rgba[..., :3]
+            # Either the opaque part or its white part could be the object.
             if {*np.unique(rgba[..., :3][alpha >= WHITE]).tolist()} == {0, 255}:
                 raise ValueError("it is black and white, and a part is transparent")
             print(f"mask={path}: the opaque part is the object")
             return alpha
+        # The modes of images with one channel: bits, 8-bit, integers, floats and 16-bit.
         if image.mode not in ("1", "L", "I", "F") and not image.mode.startswith("I;16"):
             return np.asarray(image.convert("RGB"))
+        # Two values stay as they are, because 8 bits could make both black.
         values = np.asarray(image)
         return values if len(np.unique(values)) <= 2 else np.asarray(eight_bits(image))
 

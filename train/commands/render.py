@@ -30,6 +30,7 @@ DEFAULT_SIZE = 224
 def run(settings: RenderSettings) -> None:
     """Render a data set, or what a stopped command left to do, and print a summary."""
     objects = read_objects(settings.meshes, "", "meshes")
+    # An object without a label gets the first label, or else the class that its mesh is named by.
     default = None if settings.label is None else label_names(settings.label)[0]
     for item in objects.values():
         item.label = item.label or default or name_of_mesh(item.mesh)
@@ -37,28 +38,37 @@ def run(settings: RenderSettings) -> None:
     classes = [*dict.fromkeys(label for label in labels if label)]
     folder = writable_folder(settings.out, "out")
     for name in classes if settings.format == "imagefolder" else ():
+        # A name such as "a/b" or ".." would be another folder.
         if (folder / name).resolve().parent != folder.resolve():
             raise InputError(f"the class {name} is no name of a folder: rename it", "format")
     device = choose_device(settings.device)
+    # Each render is attacked to fool this network. Without one, renders are random.
     network = load_chosen(settings).to(device) if settings.network else None
     if settings.size is None:
         settings.size = DEFAULT_SIZE if network is None else network.size or DEFAULT_SIZE
     shards = shard_indices(settings)
+    # Classes of `FORMATS` write the files of a data set, whose parts are such as "train".
     data = FORMATS[settings.format](folder, classes, settings.split_counts, shards, settings.maps)
     _describe(settings, folder, classes)
-    own = shards[settings.shard]
-    finished = {index for index in own if data.last_file(index).exists()}
-    missing = len(own) - len(finished)
+    # Indices of the renders of this process, and of those that a stopped command has finished.
+    indices = shards[settings.shard]
+    finished = {index for index in indices if data.last_file(index).exists()}
+    missing = len(indices) - len(finished)
     print(f"{folder}: {missing} of {settings.count} renders to do")
     options: dict[str, Any] = {"settings": settings.augment, "network": network, "device": device}
     options |= {"scene": settings.scene, "renderer": settings.renderer, "seed": settings.seed}
-    options |= {"first": own.start, "skip": finished, "views": settings.scene.views}
+    options |= {"first": indices.start, "skip": finished, "views": settings.scene.views}
     options["rasterizer"] = choose_rasterizer(settings.renderer)
+    # Depth and normals are computed only if files of them are asked for.
     options["maps"] = not {"depth", "normals"}.isdisjoint(settings.maps)
+    # An error names an argument by its setting, such as scene.views.
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
-        renders = dataset.render_dataset([*objects.values()], settings.size, len(own), **options)
+        renders = dataset.render_dataset(
+            [*objects.values()], settings.size, len(indices), **options
+        )
     data.write(progress(renders, "renders", missing))
+    # Of several processes, the one that finishes last writes the files about all renders.
     if data.is_finished():
         data.finish()
         parts = ", ".join(f"{count} {name}" for name, count in data.splits.items())
@@ -79,6 +89,7 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
     facts = {key: value for key, value in asdict(settings).items() if key not in CIRCUMSTANCES}
     if settings.format == "webdataset":
         facts["shards"] = settings.shards  # A tar file has renders of one shard.
+    # JSON makes the settings comparable with those in the file: tuples become lists.
     facts = json.loads(json.dumps(facts | {"classes": classes}, default=str))
     if path.exists():
         found = read_json(path)

@@ -78,17 +78,21 @@ class Jackknife:
         """
         value = np.asarray(self.value)
         if self.at_ends is not None:
+            # The second group, the negatives, only moves the threshold. `at_ends` has its effect.
             positives, _, *seeds = self.without
             fixed = replace(self, without=[positives, *seeds], at_ends=None).interval
             down, up = np.hypot(fixed - value, self.at_ends - value)
             return np.clip([value - down, value + up], 0, 1)
+        # With a single unit, no variance is known, so the interval is [0, 1].
         if min((item.shape[-1] for item in self.without), default=0) < 2:
             return np.stack([np.zeros_like(value), np.ones_like(value)])
+        # The logit of 0 or 1 is infinite, so 0.5 stands for such a value until the last line.
         is_inner = (value > 0) & (value < 1)
         inner = np.where(is_inner, value, 0.5)
         errors = [_keep_errors(item, inner[..., None]) for item in self.without]
         spread = _Spread.of([np.where(is_inner[..., None], _logit(item), 0.0) for item in errors])
         half_width = spread.quantile * spread.variance**0.5
+        # The logistic function turns logit(value) ∓ half width back into fractions.
         ends = 1 / (1 + np.exp(np.stack([half_width, -half_width]) - _logit(inner)))
         without_variance = wilson(value, self.unit_count, spread.quantile)
         return np.where(spread.variance > 0, ends, without_variance)
@@ -113,22 +117,26 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
     networks on the same images are therefore paired. `statistic` takes, for each group, how often
     each of its n images counts, shape (k, n), and returns an array of shape (M, ..., k).
     """
+    # Each image counts once at first. The axis of length 1 is for what is left out, as in `kept`.
     counts = [np.ones((1, len(unit_of_image)), int) for unit_of_image in units.groups]
     values = statistic(*counts)
     unit_counts = [int(unit_of_image.max()) + 1 for unit_of_image in units.groups]
     without = []
     for group, unit_of_image in enumerate(units.groups):
         unit_count = unit_counts[group]
-        if unit_count == 1:
+        if unit_count == 1:  # The only unit cannot be left out.
             without.append(values)
             continue
         part_count = min(unit_count, MAX_PARTS)
         # A random order divides the units into parts of about equal size.
         order = np.random.default_rng(0).permutation(unit_count)
         part_of_image = (order * part_count // unit_count)[unit_of_image]
+        # Row p leaves out the images of part p, shape (k, n).
         is_kept = part_of_image != np.arange(part_count)[:, None]
+        # The images of all other groups remain.
         kept = [*counts[:group], is_kept.astype(int), *counts[group + 1 :]]
         without.append(statistic(*kept))
+    # One row for each of the M statistics.
     rows = zip(values[..., 0], *without, strict=True)
     return [Jackknife(value, others, min(unit_counts), units.over) for value, *others in rows]
 
@@ -146,6 +154,7 @@ def leave_out_of_roc(
     statistic = partial(auc_and_recalls, positives[..., None, :], negatives[..., None, :])
     auc, *recalls = leave_out(statistic, units)
     count = negatives.shape[-1]
+    # Exactly i negatives score above entry i, if no scores are equal.
     descending = -np.sort(-negatives, axis=-1)
     results = [auc]
     levels = thresholds(negatives, np.ones(count, int))
@@ -154,11 +163,14 @@ def leave_out_of_roc(
         is_tied = negatives == threshold[..., None]
         # Negatives at the threshold count in part, so that the rate is the nominal one.
         missing = float(rate) * count - is_above.sum(axis=-1, keepdims=True)
+        # `hits` says which part of each negative counts as above the threshold.
         hits = is_above + is_tied * missing / is_tied.sum(axis=-1, keepdims=True)
         (rates,) = leave_out(partial(weighted_means, hits[None]), Units(units.groups[1:], ""))
+        # Numbers of negatives above both ends of the interval of the threshold, shape (2, ...).
         exceeding = rates.interval * count
         places = exceeding.astype(int).clip(max=count - 1)[..., None]
         is_detected = positives > _take(descending, places)
+        # Nothing is detected if the threshold may be above all scores.
         at_ends = np.where(exceeding < 0.5, 0.0, is_detected.mean(axis=-1))
         results.append(replace(recall, at_ends=at_ends))
     return results
@@ -198,22 +210,27 @@ def change(
 def change_ends(one: Jackknife, other: Jackknife, is_paired: bool = True) -> np.ndarray:
     """Compute the ends of the interval of `change` from averages over runs, shape (2, ...)."""
     value = one.value - other.value
+    # With a single unit, no variance is known, so the interval is all possible changes.
     if min((item.shape[-1] for item in [*one.without, *other.without]), default=0) < 2:
         return np.stack([np.full_like(value, -1), np.full_like(value, 1)])
     # The last group of several runs is that of the runs (`average`). It may not be paired.
     group_count = None if is_paired or not one.over.startswith(SEEDS) else -1
     pairs = list(zip(one.without[:group_count], other.without, strict=False))
+    # correlation = covariance / sqrt(variance · other variance). Without variance, it is 0.
     product = _Spread.of(one.without).variance * _Spread.of(other.without).variance
     covariance = np.sum([_covariance(*pair) for pair in pairs], axis=0)
     correlation = np.where(product > 0, covariance / np.where(product > 0, product, 1) ** 0.5, 0)
     low, high = one.interval
     other_low, other_high = other.interval
+    # The change is lowest if `one` is at its lower end and `other` at its upper end.
     down = _half_width(one.value - low, other_high - other.value, correlation, one.is_open)
     up = _half_width(high - one.value, other.value - other_low, correlation, other.is_open)
     ends = np.clip([value - down, value + up], -1, 1)
+    # The values are the same on all images, and also without each unit.
     is_same = (value == 0) & np.all([(a == b).all(axis=-1) for a, b in pairs], axis=0)
     if one.at_ends is not None and other.at_ends is not None:
         is_same &= (one.at_ends == other.at_ends).all(axis=0)
+    # The upper end of Wilson's interval for 0 of `unit_count` units.
     margin = fraction(0, one.unit_count).high
     assert margin is not None
     return np.where(is_same, np.multiply.outer([-margin, margin], np.ones_like(value)), ends)
@@ -250,10 +267,12 @@ class _Spread(NamedTuple):
         # This import is here because it takes a second.
         from scipy.special import stdtrit
 
+        # A group of k units has k - 1 degrees of freedom.
         degrees = np.array([item.shape[-1] - 1 for item in without])
         variances = np.stack([_covariance(values, values) for values in without], axis=-1)
         total = variances.sum(axis=-1)
         terms = (variances / degrees).sum(axis=-1)
+        # Harmonic mean of the degrees, weighted by variance. Without variance, the smallest.
         freedom = np.where(total > 0, total / np.where(total > 0, terms, 1), degrees.min())
         return cls(total, stdtrit(freedom, 0.975))
 

@@ -142,6 +142,7 @@ class Metrics:
         # summary.json has all rates under one name. A published network has a name for each.
         nested = entries.get("recall_at") or {}
         rates = {rate: entries.get(f"recall_at/{rate}") or nested.get(rate) for rate in RATES}
+        # Entries are missing for metrics that were not computed.
         found: dict[str, Any] = {
             name: _read_estimate(entries[name], kinds.get(name, Estimate))
             for name in (*kinds, *TOP_RANKS)
@@ -236,6 +237,7 @@ class Pool(ShortRepr):
         }
         if self.thresholds:
             for name, group in zip(AT_THRESHOLD, (positives, negatives), strict=True):
+                # The threshold on the log-odds of each prediction, shape (n,).
                 limits = as_column([self.thresholds[label] for label in group.label])
                 outcomes[name] = Outcome(group, group.log_odds > limits)
         return outcomes
@@ -246,6 +248,7 @@ class Pool(ShortRepr):
         proportions: dict[str, Any] = {
             name: outcome.proportion for name, outcome in self.outcomes.items()
         }
+        # ROC metrics are missing without positives or without negatives. They are then unknown.
         known = {name: jackknife.estimate for name, jackknife in self._rankings.items()}
         auc, *recalls = (known.get(name, Estimate()) for name in ROC_METRICS)
         positives, negatives = self.ranked
@@ -282,9 +285,11 @@ class Pool(ShortRepr):
     def _rankings(self) -> dict[str, Jackknife]:
         """Values without each unit of the known metrics that depend on a ranking."""
         jackknives: dict[str, Jackknife] = {}
+        # A ROC curve needs positives and negatives.
         if all(map(len, self.ranked)):
             of_roc = intervals.leave_out_of_roc(*self.scores, choose_units(*self.ranked))
             jackknives.update(zip(ROC_METRICS, of_roc, strict=True))
+        # One prediction for each image of a class of the network.
         images = self.classified
         if len(images):
             # One row for top-1 and one for top-5, shape (2, n).
@@ -367,12 +372,14 @@ class Pooled(ShortRepr):
         pools = {}
         for source, group in group_rows(everything, everything.source).items():
             positives = group[group.positive]
+            # Labels and other sources whose negatives the positives of this source name.
             wanted = {
                 (label, other)
                 for label, photograph in zip(positives.label, positives.photograph, strict=True)
                 for other in photograph.hard_negatives
                 if other != source
             }
+            # The prediction for a label counts only for the positives of this label.
             keys = zip(everything.label, everything.source, strict=True)
             is_hard = np.array([key in wanted for key in keys]) & ~everything.positive
             is_own = (everything.source == source) & ~everything.positive

@@ -260,6 +260,7 @@ class Scores(ShortRepr):
     @cached_property
     def by_class(self) -> dict[str, ClassScores]:
         """Recall and wrong predictions for the photographs of each class."""
+        # The predictions for the first label come first, one for each photograph.
         photographs = self.predicted.predictions[: len(self.predicted.images)]
         scores = {}
         for name, rows in metrics.group_rows(photographs, photographs.shown).items():
@@ -377,6 +378,7 @@ def choose_operating_points(
     for name, predictions in predicted.predictions.by_label.items():
         log_odds = predictions.log_odds[~predictions.positive]
         count = len(log_odds)
+        # With fewer than 1 / rate negatives, not even one may score above the threshold.
         if count * exact_rate < 1:
             min_count = math.ceil(1 / exact_rate)
             raise InputError(
@@ -394,6 +396,7 @@ def format_scores(scores: Scores) -> str:
     """Format scores as Markdown tables, with a row for each label and each source or mesh."""
     names = [*_fraction_metrics(scores), *RANKING_METRICS]
     rows = []
+    # All estimates of the table. Its title says over what their intervals are.
     shown: list[Estimate | None] = []
     groups = [("all", scores.overall), *scores.by_label.items(), *scores.groups.items()]
     for title, of_group in groups:

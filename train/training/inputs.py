@@ -102,24 +102,29 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     name = settings.network
     if not name:
         return None
+    # A classifier comes from a library or a file. Any other name is the folder of a training run.
     if checkpoints.is_classifier(name):
         return _load_classifier(settings, name)
     source = Path(name.removeprefix(checkpoints.RUN))
+    # A file of weights alone does not say which network they belong to.
     if checkpoints.is_state_dict(source):
         advice = f"give both, as in network=torchvision:resnet50 weights={source}"
         raise InputError(f"network={name} has weights, but no architecture: {advice}", "network")
     if settings.weights is not None:
         raise InputError(f"weights: network={name} has its own: leave weights out", "weights")
     # The network of a run has its own classes and its own normalization.
-    given = as_facts(settings.classes, None, settings.normalization, settings.prompt)
-    require_no_facts(f"network={name}", given)
+    stated_facts = as_facts(settings.classes, None, settings.normalization, settings.prompt)
+    require_no_facts(f"network={name}", stated_facts)
     with keyed(run="network"):
         path, state = checkpoints.load_selected(source)
+    # A run of a network that a Python function built names this function. To call it means to run
+    # code, which the user must allow.
     built_by = str(state["architecture"].get("name"))
     if built_by.startswith(PYTHON) and settings.model.name != built_by and not settings.trust:
         advice = f"give model.name={built_by} to run that code"
         raise InputError(f"the network in {path} is built by {built_by}: {advice}", "network")
     architecture = state["architecture"]
+    # Who stated size and normalization of the network: its file, or nobody.
     stated = checkpoints.stated_inputs(architecture)
     return Initial(path, architecture, checkpoints.plain_weights(state), inputs=stated)
 
@@ -171,11 +176,13 @@ def initial_of(classifier: TaskNetwork, size: int | None) -> Initial:
 
     `size` is None for the size that the network takes.
     """
+    # The wrapper that normalizes light is described by its settings, and built again by the run.
     network = without_normalized_light(classifier.network)
     shape: dict[str, Any] = {"name": name_from_anywhere(classifier.name), CLASSIFIER: True}
     if classifier.normalized_light is not None:
         shape[checkpoints.NORMALIZE_LIGHT] = asdict(classifier.normalized_light)
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
+    # A size that the caller gives is said to be stated by the user.
     inputs = classifier.inputs if size is None else replace(classifier.inputs, size=YOU)
     facts = Path(classifier.name), architecture, network.state_dict(), network
     return Initial(*facts, inputs, classifier.task)
@@ -229,6 +236,7 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> s
     """
     data = settings.data
     size = settings.size or (initial.size if initial else SIZE)
+    # The images without labels have a setting of their own outside of data.
     group = UNLABELED if data.name == UNLABELED else ""
     with main_process_first(), keyed(group, **keys_of("data", data)):
         if data.name == "cifar100":
@@ -253,6 +261,7 @@ def require_label(settings: ExperimentSettings, data: sets.DataSet) -> None:
 
     The sub-folders of photographs have names of classes, and no indices.
     """
+    # Renders and the ranking loss are of a positive class.
     needs_label = settings.augment.renders or settings.train.ranking_weight > 0
     if settings.label is None and needs_label:
         choices = ", ".join(data.classes[:5]) + (", ..." if len(data.classes) > 5 else "")
@@ -305,6 +314,7 @@ def build_service(
     It has no images if the run trains without renders.
     """
     is_classifier = isinstance(task, Classification)
+    # Renders come from a scene, or as images from a folder. Both are None without renders.
     scene: Scene | None = None
     images: Tensor | None = None
     labels = torch.zeros(0, dtype=torch.int64)
@@ -332,12 +342,14 @@ def build_service(
                 label_of_class[item.label] = index
         scene = _build_scene(settings, data.size, device, phases)
         labels = torch.tensor([label_of_class[name] for name in scene.labels])
+    # If all classes are positive, a render of no positive class shows no class at all.
     has_all = is_classifier and len(positive_classes) == len(data.classes)
     if has_all and (labels < 0).any():
         fault = f"label={settings.label} has all classes of the network, but some renders none"
         raise InputError(f"{fault}: give all objects a label")
     rendered = (settings.augment, scene, labels.to(device), settings.seed, phases)
     ranked = positive_classes if is_ranked else ()
+    # Each process of a run renders its own share.
     processes = (distributed.rank(), distributed.world_size())
     return AugmentationService(*rendered, ranked, *processes, images, task, data.classes)
 
@@ -351,7 +363,9 @@ def _build_scene(
     objects = [*settings.objects.values()]
     options: dict[str, Any] = {"attack": settings.augment.attack, "vary": settings.augment.vary}
     options |= {"scene": settings.scene, "renderer": settings.renderer, "rasterizer": rasterizer}
+    # An error names an argument by its setting, such as scene.views.
     keys = keys_of("scene", settings.scene)
+    # The first process comes first, so that the others find what it downloads or caches.
     with phases("operators"), main_process_first(), keyed("scene", **keys):
         scene = build_scene(objects, size, settings.views, device=device, **options)
         return scene.with_count(settings.render_count)
@@ -368,8 +382,10 @@ def load_renders(settings: ExperimentSettings, data: sets.DataSet) -> tuple[Tens
     label_of_negative = complementary_label(label_of_class[positive_classes[0]])
     skip = settings.evaluate.skip_unreadable
     with keyed("augment.folder"):
+        # Photographs with the names of their subfolders as labels.
         found = find_photographs(folder, data.classes, positive_classes)
         found, images, _ = load_photographs(folder, found, data.size, skip)
+        # Training needs renders of each positive class.
         for name in sorted(set(positive_classes) - {item.label for item in found}):
             raise InputError(f"{folder} has no image of label={name}: add a sub-folder {name}")
     labels = [label_of_class.get(item.label, label_of_negative) for item in found]
