@@ -57,6 +57,7 @@ def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str 
     to Hydra are replaced by "_". `fixed` settings count in the hash, but are not shown. A folder in
     `parent` with the same hash keeps its name.
     """
+    # Settings of Hydra itself, such as hydra.job, and CIRCUMSTANCES do not change the result.
     words = [override for override in overrides if not HYDRAS_OWN.match(override)]
     pairs = sorted((key, value) for key, _, value in (word.partition("=") for word in words))
     pairs = [(key, value) for key, value in pairs if key not in CIRCUMSTANCES]

@@ -202,6 +202,7 @@ def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
     if settings.task not in (None, own.name):
         fault = f"task={settings.task}, but {network.title} returns {own.returns}"
         raise InputError(f"{fault}: leave the task out", "task")
+    # None stands for a setting that the user leaves as it is.
     values = {name: getattr(settings, name, None) for name in ("threshold", "iou", "goal")}
     given = {name: value for name, value in values.items() if value is not None}
     for name, value in given.items():
@@ -211,6 +212,7 @@ def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
         return network
     options = network.network, network.size, network.classes, network.name
     changed = TaskNetwork(*options, task=replace(own, **given))
+    # It stays the same who stated the facts about the images.
     changed.inputs = network.inputs
     return changed
 

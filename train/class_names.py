@@ -155,6 +155,7 @@ def as_mappings(name: str, items: Sequence[MeshItem], network: TaskNetwork) -> l
     mappings = []
     for index, item in enumerate(as_list(name, items, kinds, EXPECTED)):
         key = f"{name}[{index}]"
+        # A list of objects is one mesh with others around it, which are in the same render.
         if isinstance(item, list) and any(isinstance(of, tuple | ObjectSettings) for of in item):
             mapping, *others = as_mappings(key, item, network)
             mappings.append(mapping | {"others": [*mapping.get("others", ()), *others]})
@@ -162,6 +163,7 @@ def as_mappings(name: str, items: Sequence[MeshItem], network: TaskNetwork) -> l
         if isinstance(item, ObjectSettings):
             mapping = asdict(item)
         else:
+            # Other items are a source, or a pair of a source and a class.
             source, *label = [item] if isinstance(item, MeshSource) else item or [None]
             if not isinstance(source, MeshSource) or len(label) > 1:
                 raise InputError(f"{key} is {describe(item)}: give {EXPECTED}")

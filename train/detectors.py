@@ -27,6 +27,7 @@ def small_detector(class_count: int, size: int) -> SSD:
     for inputs, outputs in pairwise(CHANNELS):
         shortcut = Conv2dNormActivation(inputs, outputs, 1, stride=2, activation_layer=None)
         layers.append(BasicBlock(inputs, outputs, 2, shortcut))
+    # The names of the last SEEN layers, from whose features boxes are found.
     seen = {str(index): str(index) for index in range(len(layers))[-SEEN:]}
     low, high = BOX_SIZES
     boxes = DefaultBoxGenerator([[2, 3]] * SEEN, min_ratio=low, max_ratio=high)

@@ -119,6 +119,7 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
         console.warning("%s: leave precision out", slow)
     if precision != "auto":
         return precision
+    # Only the training on a CPU depends on the kinds of layers.
     modules = [] if is_gpu or trained is None else trained.modules()
     layers = [module for module in modules if isinstance(module, nn.Conv2d)]
     # A depthwise convolution has as many groups as input channels, and more than one.

@@ -76,9 +76,11 @@ class WideResNet(nn.Module):
         self.stem = nn.Conv2d(3, 16, 3, padding=1, bias=False)
         self.groups = nn.Sequential()
         inputs = 16
+        # The first group keeps the resolution, and each other group halves it.
         for outputs in (16 * width, 32 * width, 64 * width):
             stride = 1 if outputs == 16 * width else 2
             blocks = [_Block(inputs, outputs, stride, dropout)]
+            # A network of depth 6n + 4 has n blocks in each group.
             blocks += [_Block(outputs, outputs, 1, dropout) for _ in range((depth - 4) // 6 - 1)]
             self.groups.append(nn.Sequential(*blocks))
             inputs = outputs
@@ -197,6 +199,7 @@ def build_network(
             built = _build_architecture(architecture, len(classes), size)
             network = Network(built, [ChannelNormalization(mean, std)])
         with eval_mode(network), torch.no_grad():
+            # The network is tried on two images, since a wrong number of classes is found only here.
             shape_of_two = tuple(plain_outputs(network(torch.zeros(2, 3, size, size))).shape)
         if shape_of_two != (2, len(classes)):
             raise ValueError(f"it returned {shape_of_two} for 2 images")

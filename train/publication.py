@@ -77,6 +77,7 @@ def load(name: str) -> PublishedNetwork | PublishedDetector:
     folder = published_folder(PRETRAINED / name)
     loaded = load_run(folder)
     _, state = load_selected(folder)
+    # The scores of a classifier are metrics by name, those of a detector are in groups of images.
     scores = state["scores"]
     facts = loaded.network, loaded.size, loaded.classes, name
     if isinstance(loaded, Classifier):

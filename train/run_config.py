@@ -259,6 +259,7 @@ def _fingerprint(path: Path) -> str:
     names = sorted(map(str, visible_files(path)))
     files = {name: path / name for name in names if (path / name).is_file()}
     statuses = [file.stat() for file in files.values()]
+    # A large folder is compared by the sizes and times of its files, not by their contents.
     if sum(status.st_size for status in statuses) > MAX_FOLDER_BYTES:
         times = [(status.st_size, status.st_mtime_ns) for status in statuses]
         return _hash([*zip(names, times, strict=False)])

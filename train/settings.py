@@ -329,6 +329,7 @@ class ExperimentSettings(NetworkSettings):
         """
         labels = label_names(self.label)
         default_label = labels[0] if len(labels) == 1 else ""
+        # An empty label is unknown, and follows from the name of a solid.
         objects = read_objects(self.meshes, default_label, "meshes") | self.negative_objects
         for key, item in objects.items():
             item.label = solid_name(item.mesh) if item.label == "" else item.label

@@ -154,6 +154,7 @@ def program(name: str, as_called: bool = False) -> list[str]:
     installed_name = f"{PREFIX}{name}"
     is_installed = bool(sys.flags.safe_path) or called.stem.startswith(PREFIX)
     python = sys.executable if as_called else "python"
+    # The module has a file of its own in scripts/, except pnb-train, which is `python -m train`.
     words = ["-m", "train" if name == "train" else f"scripts.{name}"]
     if is_installed:
         has_path = as_called and called.stem == installed_name

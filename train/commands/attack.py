@@ -87,6 +87,7 @@ def run(settings: AttackExperimentSettings) -> None:
         rows: list[tuple[str, int, int, int]] = []
         details = []
         sweeps: dict[str, attack_tables.Sweep] = {}
+        # Attacks on one mesh after the other, each with its scene and its result.
         found = attacks(settings, classifier, device, adversary)
         for index, (name, scene, result) in enumerate(found):
             # The name of a solid has colons, which Windows does not allow in file names.
@@ -96,6 +97,7 @@ def run(settings: AttackExperimentSettings) -> None:
                 sweeps[folder.name] = success_by_radius(result, settings.attack.radius_scales)
             if is_verbose():
                 print("\n".join([heading, *lines, ""]))
+            # Only examples that were classified correctly before the attack count.
             correct = result.clean_correct
             hits = int(result.success[correct].sum())
             rows.append((name, len(correct), int(correct.sum()), hits))
@@ -143,11 +145,13 @@ def _write_attack(
 ) -> tuple[str, list[str]]:
     """Check and write the attack on one mesh, and return its success and further lines."""
     details = []
+    # The search chose another scene than the given one, in which the network was wrong already.
     if scene != settings.scene:
         before = vars(settings.scene)
         changed = [item for item in vars(scene).items() if item[1] != before[item[0]]]
         changes = shlex.join(f"scene.{key}={value}" for key, value in changed)
         details.append(f"{name} is misclassified in the given scene, but not with {changes}")
+    # With None, only attacks that use gradients are checked.
     has_checks = settings.attack.checks
     if has_checks is None:
         has_checks = result.settings.uses_gradients
@@ -158,6 +162,7 @@ def _write_attack(
         details += [*more_lines, f"images, adversaries and numbers: {folder}"]
     elif checks:
         details += [f"warning about {name}: {text}" for text in warnings(checks)]
+    # Adversaries are shown to other networks, from other sides and on other meshes.
     if any(targets.values()):
         table = attack_tables.write_transfers(transfer(result, **targets), folder / TRANSFERS)
         details += table.splitlines()
@@ -186,6 +191,7 @@ def attacks(
     if adversary is not None:
         if adversary.pixels is not None:
             raise InputError(f"reload={settings.reload} has changed pixels: give another")
+        # The saved adversary has its own scene, which may be misclassified already.
         scene = adversary.scene(_start_rasterizer(settings), device)
         yield adversary.shown.name, settings.scene, start(scene, force=True)
         return
@@ -196,6 +202,7 @@ def attacks(
         mesh.label = class_of_meshes([item], classifier.classes, key, label)
         build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
         chosen = settings.scene
+        # `search` is the number of cameras that the search for a recognized view tries.
         if chosen.search and not settings.attack.force:
             draws = generator(settings.seed, mesh.mesh, "search")
             found = classifier, chosen, settings.attack, build, chosen.search, draws
@@ -291,6 +298,7 @@ def _attack_photographs(settings: AttackExperimentSettings, relighting: Relighti
     options["sensor_noise"] = settings.attack.sensor_noise
     with _results_of(settings, classifier) as out, keyed("unlabeled"):
         found = attack_folder(classifier, photographs, relighting, out, **options)
+    # The first table is about all photographs, and the second about each predicted class.
     print(f"{found.tables()[0]}\n\n{MODELED}\n")
     unreadable = [f"warning: {path} cannot be read" for path in found.unreadable]
     for line in shortened(unreadable, MAX_UNREADABLE):

@@ -106,6 +106,7 @@ def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
             raise InputError("out= is the folder of a single run: name that of a sweep with sweep=")
         if key == "launcher" and override.value() == "slurm" and not shutil.which("sbatch"):
             raise InputError("launcher=slurm needs the command sbatch: start on the cluster")
+        # A sweep lists several values of a key. Any other override has one value.
         if override.is_sweep_override():
             values = list(override.sweep_string_iterator())
         else:
@@ -122,6 +123,7 @@ def run_in_sweep(config: DictConfig) -> None:
     sweep.
     """
     folder = Path(config.out)
+    # Several processes can share a sweep: the one that has the lock trains the run.
     with locked(folder) as has_lock:
         is_over = is_finished(folder)
         doing = "training" if not is_over else "finished before"

@@ -125,6 +125,7 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
     A mask has the path of its photograph with another folder, as in `MASK_FOLDERS`, and is a PNG
     file.
     """
+    # The first pair of folders that exist has the photographs and the masks.
     for names in MASK_FOLDERS:
         images, masks = (folder / name for name in names)
         if images.is_dir() and masks.is_dir():
@@ -172,9 +173,11 @@ def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, 
     if highest >= class_count:
         advice = f"use 0 to {class_count - 1}, and {UNSCORED} for pixels that do not count"
         raise InputError(f"{path} has the value {highest}: {advice}")
+    # Width and height of the photograph in the image of the network, without borders.
     shown = (fitted.scale * fitted.size).round().astype(int)
     reduced = Image.fromarray(labels.astype(np.uint8)).resize((*shown,), Image.Resampling.NEAREST)
     result = np.full(fitted.pixels.shape[1:], UNSCORED, np.uint8)
+    # The photograph begins at `shift`, after the border.
     left, top = fitted.shift.astype(int)
     result[top : top + shown[1], left : left + shown[0]] = np.array(reduced)
     return result
@@ -201,6 +204,7 @@ def _read_coco(file: Path) -> Annotations:
     """Read a COCO file. Its images lie beside it or, from a folder annotations, beside that."""
     try:
         content = json.loads(file.read_text(encoding="utf-8-sig"))
+        # Name of each category by its id. Indices of `classes` are in the order of the ids.
         names = {item["id"]: str(item["name"]) for item in content["categories"]}
         classes = tuple(dict.fromkeys(names[key] for key in sorted(names)))
         images = {item["id"]: item for item in content["images"]}
@@ -208,6 +212,7 @@ def _read_coco(file: Path) -> Annotations:
         for key, found in (("images", images), ("images", names_of_images), ("categories", names)):
             if len(found) < len(content[key]):
                 raise ValueError(f"two of the {key} have the same id or file_name")
+        # For each image id, the rows that `_annotated` takes: label, four sides and `is_crowd`.
         rows: dict[Any, list[Sequence[float]]] = defaultdict(list)
         for item in content["annotations"]:
             for key, known in (("image_id", images), ("category_id", names)):
@@ -217,6 +222,7 @@ def _read_coco(file: Path) -> Annotations:
             if box.shape != (4,) or not (np.isfinite(box).all() and (box[2:] >= 0).all()):
                 raise ValueError(f"an annotation has the bbox {item['bbox']}")
             label = classes.index(names[item["category_id"]])
+            # COCO gives left, top, width and height. The result is left, top, right and bottom.
             corners = (*box[:2], *(box[:2] + box[2:]))
             rows[item["image_id"]].append((label, *corners, bool(item.get("iscrowd"))))
         find = _Finder(file)
@@ -280,9 +286,11 @@ def _read_yolo(folder: Path) -> Annotations:
     label_count = 0
     for photograph in find_unlabeled(folder):
         path = folder / photograph.path
+        # A photograph can have a label file in several places. The first that exists counts.
         file = next(filter(Path.is_file, _label_files(path)), None)
         label_count += file is not None
         rows = [] if file is None else [*_yolo_rows(file, len(classes))]
+        # Coordinates are fractions, so the image has the width and height 1.
         photographs.append(_annotated(path, str(photograph.path), (1, 1), rows))
     if not label_count:
         first = _label_files(photographs[0].path.absolute())[0]
@@ -304,11 +312,13 @@ def _label_files(path: Path) -> list[Path]:
 
 def _yolo_classes(folder: Path) -> tuple[str, ...]:
     """Read the names of the classes from data.yaml or classes.txt in a folder or above it."""
+    # The folder itself, and the two above it.
     for parent in [folder, *list(folder.absolute().parents)[:2]]:
         for file in sorted([*parent.glob("*.yaml"), *parent.glob("*.yml")]):
             try:
                 content = yaml.safe_load(file.read_text(encoding="utf-8-sig"))
                 names = content.get("names") if isinstance(content, dict) else None
+                # Names are a list, or a mapping from index to name.
                 listed = enumerate(names) if isinstance(names, list) else dict(names or {}).items()
                 known = {int(key): str(name) for key, name in listed}
             except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
@@ -334,6 +344,7 @@ def _yolo_rows(file: Path, class_count: int) -> Iterator[Sequence[float]]:
             continue
         try:
             label, *values = map(float, line.split())
+            # Four numbers are a box, and at least three pairs are a polygon.
             if len(values) != 4 and (len(values) < 6 or len(values) % 2):
                 raise ValueError(f"it has {1 + len(values)} numbers")
             if label not in range(class_count):
@@ -347,6 +358,7 @@ def _yolo_rows(file: Path, class_count: int) -> Iterator[Sequence[float]]:
             x, y, width, height = values
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
         else:
+            # The box around the polygon x1 y1 x2 y2 and so on.
             box = (min(values[::2]), min(values[1::2]), max(values[::2]), max(values[1::2]))
         yield (label, *box, False)
 
@@ -355,10 +367,13 @@ def fit(photograph: Annotated, size: tuple[int, int], how: str) -> Fitted:
     """Read a photograph, and bring it to a height and width as `FITS` says."""
     image = read_rgb(photograph.path, FULL_SIZE)
     upright = np.array(image.size, float)
+    # Boxes are cut off at the borders of the photograph. Empty ones are left out.
     boxes = _upright_boxes(photograph, upright).clip(0, np.tile(upright, 2))
     is_kept = np.all(boxes[:, 2:] > boxes[:, :2], axis=1)
+    # Width and height of the image, and the factors of both sides.
     available = np.array(size[::-1])
     scale = available / upright
+    # The smaller factor of both keeps the aspect ratio, and leaves borders at two sides.
     if how == LETTERBOX:
         scale = np.repeat(scale.min(), 2)
     shown = (upright * scale).round().clip(1).astype(int)
@@ -378,6 +393,7 @@ def _upright_boxes(photograph: Annotated, upright: Float[np.ndarray, "2"]) -> np
     if photograph.size is None:
         return photograph.boxes
     marked = np.array(photograph.size, float)
+    # Two opposite corners (M, 2, 2) of each box, as fractions of the sides.
     corners = photograph.boxes.reshape(-1, 2, 2) / marked
     if photograph.size != (1, 1) and not _is_similar(marked, upright):
         with open_image(photograph.path) as image:
@@ -386,6 +402,7 @@ def _upright_boxes(photograph: Annotated, upright: Float[np.ndarray, "2"]) -> np
             fault = f"{photograph.path} has {upright[0]:g} × {upright[1]:g} pixels"
             raise InputError(f"{fault}, but its boxes are for {marked[0]:g} × {marked[1]:g}")
         corners = np.stack(turn(corners[..., 0], corners[..., 1]), axis=-1)
+    # A turn exchanges corners, so the sides are the smaller and larger coordinates.
     corners = np.concatenate([corners.min(1), corners.max(1)], axis=-1)
     return corners * np.tile(upright, 2)
 
@@ -417,6 +434,7 @@ def fit_batches(
         for start in range(0, len(photographs), batch_size):
             batch = photographs[start : start + batch_size]
             fitted = []
+            # `read` returns errors instead of raising them, so that a damaged file can be skipped.
             for item, result in zip(batch, pool.map(read, batch), strict=True):
                 if isinstance(result, Fitted):
                     fitted.append((item, result))

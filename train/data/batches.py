@@ -74,10 +74,12 @@ def rounds_of_epoch(
     images_per_epoch, images_per_round = limits
     draws = generator(seed, epoch, "rounds")
     shown_images = torch.randperm(image_count, generator=draws)[:images_per_epoch]
+    # Renders are numbered after the images of the data set.
     render_numbers = torch.arange(image_count, image_count + render_count)
     parts = shown_images.split(images_per_round or len(shown_images))
     rounds = []
     for index, part in enumerate(parts):
+        # Numbers of the images and renders of a round, in ascending order.
         rows = torch.cat([part.sort().values, render_numbers])
         rounds.append(Round(epoch * len(parts) + index, epoch, rows))
     return rounds
@@ -101,6 +103,7 @@ def training_batches(
     split, rows, renders = images
     own_size = batch_size // distributed.world_size()
     begin = distributed.rank() * own_size
+    # The batches from `first` on, and in each the places of this process.
     own = (..., slice(first, None), slice(begin, begin + own_size))
     drawn = _draw(images, batch_size, seed, this_round, flips)
     order, shifts, is_flipped, seeds = (draws[own] for draws in drawn)

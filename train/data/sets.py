@@ -165,6 +165,7 @@ def held_out_rows(split: Split, fraction: float, argument: str = "fraction") -> 
         if not 0 < count < class_size:
             fault = f"{argument}={fraction} selects {count} of the {class_size} images of a class"
             raise InputError(f"{fault}: choose one that leaves some in both splits", argument)
+        # A larger fraction takes more of the same random order.
         order = torch.randperm(class_size, generator=draws)
         is_held_out[indices_of_class[order[:count]]] = True
     return is_held_out
@@ -181,6 +182,7 @@ def channel_statistics(images: UInt8[Tensor, "N 3 H W"]) -> tuple[list[float], l
     means = []
     deviations = []
     for channel in range(3):
+        # Number of pixels with each of the 256 values.
         histogram = torch.bincount(images[:, channel].flatten(), minlength=256).double()
         mean = float(histogram @ values / histogram.sum())
         variance = histogram @ (values - mean) ** 2 / histogram.sum()

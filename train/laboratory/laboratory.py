@@ -122,6 +122,7 @@ def path_traced(
     with mitsuba() as module:
         scene = {
             "type": "scene",
+            # Depth 1 shows only the light sources themselves, and each bounce adds 1.
             "integrator": {"type": "path", "max_depth": bounces + 1},
             "sensor": sensor(look_at(shot.camera, shot.aim), size, lens, "rgb"),
             "table": _plane(np.eye(4), shot.table),
@@ -170,6 +171,7 @@ def _plane(pose: Float[np.ndarray, "4 4"], color: Float[np.ndarray, " 3"]) -> di
 
 def _object_shapes(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
     """Create a Mitsuba shape for each part of an object in the pose of a shot."""
+    # Positions (3 · faces, 3) of the vertices of the faces, in the pose of the shot.
     turned = [(shot.scale * part.positions @ shot.rotation.T).reshape(-1, 3) for part in parts]
     min_height = min(positions[:, 2].min() for positions in turned)
     shapes = []
@@ -179,6 +181,7 @@ def _object_shapes(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
             albedo = {"type": "bitmap", "bitmap": part.texture, "raw": True}
         surface = {"type": "principled", "base_color": albedo, "roughness": shot.roughness}
         two_sided = {"type": "twosided", "surface": surface}
+        # The lowest vertex touches the table, which has the height 0.
         placed = positions - [0, 0, min_height]
         # Faces share no vertices: face i has the vertices 3i, 3i + 1 and 3i + 2.
         faces = np.arange(len(positions)).reshape(-1, 3)
@@ -314,6 +317,7 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
             f"meshes[{index}] has no label: write {{mesh: {settings.mesh}, label: CLASS}}, "
             f"or label: {OTHER_PREFIX}NAME for an object of another class"
         )
+    # The label is the name of the folder of the images.
     if Path(label).name != label or label == "..":
         raise InputError(
             f"meshes[{index}] has the label {label!r}, which cannot be the name of a folder: "

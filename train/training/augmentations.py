@@ -94,6 +94,7 @@ class Augmentation:
 
         jitter = v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
         transforms = {"color_jitter": jitter, "trivial_augment": v2.TrivialAugmentWide()}
+        # Brightness from 0.05 to 2 times, also contrast, saturation and hue.
         transforms["exposure_jitter"] = v2.ColorJitter((0.05, 2.0), 0.4, 0.4, 0.1)
         transforms["augmix"] = v2.AugMix()
         transforms["color_jitter+augmix"] = v2.Compose([jitter, v2.AugMix()])

@@ -77,11 +77,13 @@ class Averages:
         """
         self._model = model
         self._ema = MovingAverage(model, decay) if decay else None
+        # The function updates the equal-weight mean of all networks so far, as for SWA.
         mean = get_swa_avg_fn()
         self._soup = AveragedModel(model, avg_fn=mean, use_buffers=True) if soup else None
         self._keeps_latest = soup or keeps_latest
         self._best_accuracy = -1.0
         average = self._soup or self._ema
+        # The average is selected if there is one, and otherwise the trained network.
         self.selected = cast(MixedPrecision, average.module) if average else model
 
     def begin_epoch(self, initial: nn.Module | None, optimizer: torch.optim.Optimizer) -> None:
@@ -155,6 +157,7 @@ def interpolate(
     device = next(initial.parameters()).device
     initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
     targets = predict(initial, validation, device)
+    # The loss at each factor: 0 gives the initial weights, and 1 the trained ones.
     losses = {}
     for factor in FACTORS:
         selected.network.load_state_dict(mix(initial_weights, trained, factor))
@@ -195,6 +198,7 @@ def predict(
         # This import takes a second, and most runs need no light.
         from augment.lighting import relight_photographs
 
+        # Each photograph is also the slide that is projected onto it.
         shown = (
             relight_photographs(images, stream_seed(*light_key, index, "relit"), slides=images)
             for index, images in enumerate(shown)

@@ -80,6 +80,7 @@ def require_losses(network: TaskNetwork, needs_boxes: bool) -> None:
     copy = deepcopy(network.network).train()
     # Batch normalization in training mode needs two images.
     images = torch.full((2, 3, *height_and_width(network.size)), 0.5, device=device_of(copy))
+    # Maps without objects, shape (2, 1, H, W).
     nothing = torch.full_like(images[:, :1], NO_OBJECT, dtype=torch.int32)
     try:
         losses_of(copy, images, [*map(target_of, nothing)])
@@ -118,6 +119,7 @@ class DetectionLoss:
         correct predictions, NaN: a detector in training mode predicts nothing.
         """
         is_photograph = ~rendered
+        # Weight, images, and what they are compared with: targets or the teacher's detections.
         terms: list[tuple[float, Tensor, Any]] = []
         if rendered.any():
             terms.append((1.0, images[rendered], [*map(target_of, labels[rendered])]))
@@ -131,6 +133,7 @@ class DetectionLoss:
         loss = images.new_zeros((), dtype=torch.float32)
         for weight, shown, found in terms:
             if weight:
+                # Each term counts in proportion to its share of the images of the batch.
                 loss = loss + weight * len(shown) / len(images) * self._loss(shown, found)
         return loss, torch.full_like(loss, torch.nan).detach()
 
@@ -166,9 +169,11 @@ def candidate_loss(found: Candidates, expected: Candidates) -> Float[Tensor, ""]
         if boxes.shape != old_boxes.shape:
             reason = f"decode returned {len(old_boxes)} and {len(boxes)} boxes for two images"
             raise InputError(f"{reason}: return all candidates, whose number is always the same")
+        # The entropy of the teacher is subtracted, so that equal scores have the loss 0.
         old = old_scores.clamp(SMALLEST_SCORE, 1 - SMALLEST_SCORE)
         entropy = binary_cross_entropy(old, old, reduction="sum")
         changes.append(binary_cross_entropy(scores, old, reduction="sum") - entropy)
+        # The best score of each candidate over the classes is the weight of its box.
         changes.append((old_scores.amax(1) * generalized_box_iou_loss(boxes, old_boxes)).sum())
     return torch.stack(changes).sum() / len(found)
 
@@ -185,8 +190,10 @@ def detected(network: nn.Module, images: UInt8[Tensor, "N 3 H W"], task: Detecti
     targets = []
     for index, item in enumerate(task.reader("network")(raw, unit)):
         width, height = (item["boxes"][:, 2:] - item["boxes"][:, :2]).unbind(1)
+        # A box without an area cannot be learned.
         is_kept = (item["scores"] >= task.threshold) & (width > 0) & (height > 0)
         target = {key: item[key][is_kept] for key in ("boxes", "labels")}
+        # A raw network has no masks, since `decode` makes boxes only.
         if task.decode is None and isinstance(raw, list) and "masks" in raw[index]:
             target["masks"] = (raw[index]["masks"][is_kept, 0] >= 0.5).byte()
         targets.append(target)
@@ -202,6 +209,7 @@ def validate(
     """
     device = split.labels.device
     own_rows = rows.to(device)[distributed.rank() :: distributed.world_size()]
+    # Boxes of the teacher that the network finds, too, and all boxes of the teacher.
     counts = torch.zeros(2, device=device)
     for images in split.squares(own_rows.split(BATCH)):
         pair = (detected(one, images.to(device), task) for one in (teacher, network))
@@ -209,7 +217,9 @@ def validate(
             boxes, labels, old_boxes, old_labels = (
                 item[key].cpu().numpy() for item in (found, expected) for key in ("boxes", "labels")
             )
+            # The labels of a teacher are never below 0, so no box is a crowd.
             marked = Marked(old_boxes, old_labels, is_crowd=old_labels < 0)
+            # The scores are 0 for all, since only the overlap with a box of the teacher decides.
             objects = match(Found(boxes, labels, scores=labels * 0.0), marked, task.iou)
             counts += torch.tensor([(objects >= 0).sum(), len(old_labels)], device=device)
     kept, total = all_reduce_sum(counts).tolist()

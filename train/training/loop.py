@@ -164,12 +164,14 @@ class Trainer:
         batch_size = fitting_batch_size(self.settings, self.model, in_round, split.images.shape[-1])
         self.settings = replace(self.settings, batch_size=batch_size)
         with SignalHandler() as signals:
+            # `_train_epoch` returns False if a signal stopped it, and the epoch is then not ended.
             while self.epoch < self.settings.epochs:
                 if self._train_epoch(split, train, signals):
                     self._end_epoch(split, validation)
                 is_stopping = signals.requested()
                 is_last = self.epoch == self.settings.epochs
                 is_due = self.epoch % self.settings.checkpoint_every == 0
+                # After an epoch that was not finished, only a stop needs a checkpoint.
                 if is_stopping or is_last or (is_due and self._epoch_state is None):
                     self._save()
                 if is_stopping:
@@ -184,6 +186,7 @@ class Trainer:
         settings = self.settings
         counts = (len(rows), len(self.service))
         rounds = rounds_of_epoch(*counts, self.seed, self.epoch, *self._limits)
+        # Number of training steps in each round.
         steps = [math.ceil(len(one.rows) / settings.batch_size) for one in rounds]
         if self._epoch_state:
             # A resumed run continues within an epoch, with the random numbers of the first attempt.
@@ -213,6 +216,7 @@ class Trainer:
                 options = settings.batch_size, self.seed, now, settings.flips, first
                 batches = training_batches(images, *options)
                 for batch in progress(batches, title, steps[index], first):
+                    # Fraction of the training that is done, on which the learning rate depends.
                     done = state.step / sum(steps)
                     # Each epoch of a soup runs through the whole schedule of the learning rate.
                     if not settings.soup:
@@ -221,6 +225,7 @@ class Trainer:
                     state.sums += self.step.take(batch, done, number)
                     self.averages.end_step()
                     state.step += 1
+                    # After its last step, the epoch counts as trained, even if a signal came.
                     if signals.requested():
                         return state.step == sum(steps)
                     if state.step < sum(steps) and self._saving_is_due():
@@ -289,9 +294,11 @@ class Trainer:
 
     def _save(self) -> None:
         """Write last.pt (the former becomes previous.pt), and best.pt, in the first process."""
+        # A checkpoint with an infinite loss could not be continued.
         if self._epoch_state:
             self._require_finite(float(self._epoch_state.sums[0]), self.epoch + 1)
         with self.phases("input_output"):
+            # All processes add to the sums in the state, but only the first one writes it.
             state = self.state_dict()
             if distributed.rank() > 0:
                 return
@@ -405,5 +412,6 @@ def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict
     labels = split.labels[own_rows]
     loss_sum = F.cross_entropy(logits, labels, reduction="sum")
     hits = (logits.argmax(1) == labels).sum()
+    # Sums over all processes.
     loss_sum, hits = all_reduce_sum(torch.stack([loss_sum, hits])).tolist()
     return {"loss": loss_sum / len(rows), "accuracy": hits / len(rows)}

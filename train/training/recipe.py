@@ -47,6 +47,7 @@ def learning_rate(settings: TrainSettings, done: float) -> float:
         factor = STEP_FACTOR ** sum(done >= milestone for milestone in MILESTONES)
     elif settings.schedule == "cosine":
         factor = (1 + math.cos(math.pi * done)) / 2
+    # The schedule "one_cycle": a linear rise, and then a linear fall to 0.
     elif done < WARMUP:
         factor = START_FACTOR + (1 - START_FACTOR) * done / WARMUP
     else:
@@ -94,15 +95,18 @@ def _last_called_layer(network: nn.Module, size: int) -> tuple[str, int]:
     hooks = []
     for name, module in network.named_modules():
         own = list(module.parameters(recurse=False))
+        # A layer has parameters itself, and contains no module with others.
         is_layer = own and len(own) == len(list(module.parameters()))
         if is_layer and not isinstance(module, torch.jit.ScriptModule):
             call = (any(parameter.ndim > 1 for parameter in own), name)
             hooks.append(module.register_forward_hook(lambda *_, call=call: called.append(call)))
     device = next(network.parameters()).device
+    # The hooks note the layers that are called for a gray image.
     with eval_mode(network), torch.no_grad():
         logits = plain_outputs(network(torch.full((1, 3, size, size), 0.5, device=device)))
     for hook in hooks:
         hook.remove()
+    # Layers with a matrix, or else all layers, in the order of their calls.
     names = [name for has_matrix, name in called if has_matrix] or [name for _, name in called]
     return names[-1] if names else last_layer(network), logits.shape[1]
 
@@ -122,8 +126,10 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
         last, class_count = _last_called_layer(network, size)
         named = network.named_parameters()
         weights = [weight for name, weight in named if _module_of(name) == last]
+        # The last layer of a classifier has a row for each class. That of a zero-shot network has none.
         is_zero_shot = not any(class_count in weight.shape for weight in weights)
         texts = text_vectors(network, class_count)[-1:] if is_zero_shot else []
+        # The vectors of the texts become parameters, which can learn.
         if texts:
             keep_text_vectors(network, class_count, nn.Parameter)
         for name, parameter in network.named_parameters():
@@ -134,6 +140,7 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
     if not chosen:
         examples = nearest(stage, sorted({_module_of(name) for name in names}))
         raise InputError(f"stage={stage} is no module: choose one, such as {examples}", "stage")
+    # All parameters up to the last one of the stage are frozen.
     frozen_count = names.index(chosen[-1]) + 1
     for parameter in list(network.parameters())[:frozen_count]:
         parameter.requires_grad_(False)
@@ -189,6 +196,7 @@ def feature_norm(network: nn.Module, images: Float[Tensor, "N 3 H W"]) -> float:
     squares = []
     with eval_mode(network):
         for image in images.split(1):
+            # The logit of the predicted class is the largest one.
             logit = network(image).max()
             if not (weights and logit.requires_grad):
                 fault = f"freeze={ALL_BUT_LAST}: the last layer, {name!r}, has no gradient"
@@ -247,9 +255,11 @@ class TrainingLoss:
         other_positives = self.positive_classes[1:]
         losses = label_loss(logits, labels, settings.label_smoothing, other_positives)
         if not self.labeled:
+            # Photographs without labels have no label loss, only the divergence from the teacher.
             losses = losses * rendered
         loss = losses.mean()
         if teacher_logits is not None:
+            # On photographs, all logits stay close to those of the teacher.
             divergences = kl_divergence(logits, teacher_logits) * ~rendered
             if self.positive_classes:
                 # The training should change the scores of the positive classes of renders.
@@ -259,6 +269,7 @@ class TrainingLoss:
                 divergences = divergences + kl_divergence(others, targets) * rendered
             loss = loss + settings.distillation_weight * divergences.mean()
         if teacher_logits is not None and augmented is not None:
+            # Also augmented photographs should get the predictions for the originals.
             divergences = kl_divergence(self.model(to_unit(augmented)), teacher_logits) * ~rendered
             loss = loss + settings.consistency_weight * divergences.mean()
         if self.positive_classes and settings.ranking_weight:

@@ -116,6 +116,7 @@ class Run:
             images = data.train.sample(SAMPLED)
         mean, std = channel_statistics(images)
         torch.manual_seed(stream_seed(settings.seed, "weights"))
+        # A network in memory is copied, since the caller's must not change.
         if initial and initial.network is not None:
             network = deepcopy(initial.network).requires_grad_(True)
         else:
@@ -128,6 +129,7 @@ class Run:
         facts = {"classes": list(data.classes), "size": data.size, "encoding": encoding, **shape}
         light = settings.normalize_light
         if initial:
+            # The weights of the initial network, and its description in the checkpoint.
             initial.copy_to(network, facts)
             if initial.network is None:
                 wrappers.say_inputs(str(settings.network), network, data.size, initial.inputs)
@@ -142,12 +144,14 @@ class Run:
                 freeze(wrappers.unwrapped(network), recipe.freeze, data.size)
         model = place(network, recipe, data.size, threads)
         device = wrappers.device_of(model)
+        # By default, pretrained classifiers keep the statistics of their normalizations.
         if recipe.eval_mode is None:
             recipe = replace(recipe, eval_mode=bool(initial and initial.is_classifier))
         rate = scale_learning_rate(recipe, model, to_unit(images[:NORM_IMAGES].to(device)))
         if rate != recipe.learning_rate:
             console.info("learning rate %.3g, by the norm of the features of the network", rate)
             recipe = replace(recipe, learning_rate=rate)
+        # The checkpoint describes the network without the wrapper, and the wrapper by its settings.
         inner = wrappers.without_normalized_light(network)
         description = describe(inner, **facts, validation=validation)
         task = initial.task if initial else Classification()
@@ -192,6 +196,7 @@ class Run:
         split = self.data.train.to(trainer.device)  # `_score_initial` may have replaced its labels.
         with keyed(**keys_of("train", self.settings.train)):
             trainer.fit(split, self.held_out, log)
+        # A detector is scored by the photographs alone.
         scores |= self._score() if has_labels else {}
         if log:  # Only the first process has a log.
             scores |= self._score_photographs(trainer.selected, self.folder)
@@ -210,6 +215,7 @@ class Run:
         path = self.folder / WEIGHTS
         checkpoints.export(path, self.trainer.selected.network)
         console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
+        # Settings of the wrapper that normalizes the light of images. None without one.
         light = wrappers.light_settings(self.trainer.selected.network)
         if light is not None:
             given = json.dumps(asdict(light))
@@ -239,6 +245,7 @@ class Run:
             self.data = replace(self.data, train=train, test=test)
         if distributed.rank() > 0:
             return {}
+        # For data without labels, this is 1, as the labels are these predictions.
         accuracy = (predictions == self.data.test.labels).float().mean().item()
         self._score_photographs(model, self.folder / BEFORE)
         return {"test/accuracy_before": accuracy}
@@ -301,6 +308,7 @@ class Run:
         recipe = self.settings.train
         networks = (trainer.initial, trainer.selected, trainer.best["model"])
         validation = self.data.train[self.held_out]
+        # Weights of the losses of unchanged and of relit images.
         losses = (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0)
         weights, factor = interpolate(*networks, validation, self.settings.seed, losses)
         trainer.best |= {"model": weights, INTERPOLATION: factor}

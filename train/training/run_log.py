@@ -72,6 +72,7 @@ class RunLog:
             file.write(json.dumps(line) + "\n")
         if epoch is not None:
             self._epoch_count = epoch
+        # The final scores have the step after the last epoch.
         step = epoch or self._epoch_count + 1
         if self._logger is not None:
             self._logger.log(dict(values), step=step)

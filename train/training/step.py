@@ -93,6 +93,7 @@ class TrainingStep:
         self.optimizer.zero_grad(set_to_none=True)
         loss, hits = self._loss(*tensors)
         self.scaler.scale(loss).backward()
+        # The gradient is scaled for float16, and its true norm is clipped.
         if settings.clip_gradient:
             self.scaler.unscale_(self.optimizer)
             nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
@@ -123,6 +124,7 @@ def fitting_batch_size(settings: TrainSettings, model: nn.Module, in_round: int,
     A larger batch would only hold copies of the images.
     """
     shares = distributed.world_size()
+    # The images of a round, rounded up to a multiple of the number of processes.
     batch_size = min(settings.batch_size, math.ceil(in_round / shares) * shares)
     if batch_size < settings.batch_size:
         fault = "batch_size=%d is more than the %d images that a round shows: it is %d"
