@@ -199,7 +199,7 @@ def build_network(
             built = _build_architecture(architecture, len(classes), size)
             network = Network(built, [ChannelNormalization(mean, std)])
         with eval_mode(network), torch.no_grad():
-            # The network is tried on two images, since a wrong number of classes is found only here.
+            # Two images are tried, since a wrong number of classes is found only here.
             shape_of_two = tuple(plain_outputs(network(torch.zeros(2, 3, size, size))).shape)
         if shape_of_two != (2, len(classes)):
             raise ValueError(f"it returned {shape_of_two} for 2 images")

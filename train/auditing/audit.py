@@ -95,6 +95,7 @@ def run_audit(
                 networks[HARDENED] = load_network(settings.hardened, trust_code=settings.trust)
     device = choose_device(settings.device)
     networks = {key: network.to(device) for key, network in networks.items()}
+    # Without meshes, only photographs are attacked, and there is no plan.
     plan, given = None, settings
     if settings.meshes:
         settings = complete(settings, networks[CLASSIFIER].classes)
@@ -112,6 +113,7 @@ def run_audit(
         is_continued = is_named and "hard_negatives" in read_config(out / CONFIG)
     require_replaceable(out, "out", settings.overwrite or is_continued)
     renders = out / "renders"
+    # Renders of an earlier, stopped audit are used again, and need no Mitsuba.
     has_renders = renders.exists() and not settings.overwrite
     if plan is not None and plan.has_classes and LABORATORY not in plan.image_folders:
         try:
@@ -130,6 +132,7 @@ def run_audit(
             (out / key).mkdir(exist_ok=True)
         if plan is not None:
             if plan.image_folders.get(LABORATORY) == renders:
+                # The test images are rendered for the network with the largest images.
                 sizes = [network.size for network in networks.values()]
                 size = max(sizes, key=lambda size: math.prod(height_and_width(size)))
                 _write_folder(renders, partial(_write_renders, settings, plan, size))
@@ -139,9 +142,11 @@ def run_audit(
             count = settings.scale(relit.PHOTOGRAPH_COUNT)
             options: dict[str, Any] = {"seed": settings.seed, "limit": count}
             for key, network in networks.items():
+                # The folder is written in one step, so a folder that exists is complete.
                 write = partial(relit.attack_folder, network, photographs, attack, **options)
                 _write_folder(out / key / relit.RELIT_FOLDER, write)
         names = {key: network.name for key, network in networks.items()}
+        # Both networks can have the same name.
         if len({*names.values()}) < len(names):
             names[HARDENED] += " (hardened)"
         if plan is None:
@@ -208,6 +213,7 @@ class _Plan:
         self.items = [*meshes, *hard_negatives]
         folders = {LABORATORY: settings.laboratory, PHOTOGRAPHS: settings.photos}
         self.has_classes = all(isinstance(network, Classifier) for network in networks.values())
+        # Boxes of objects in photographs, which only a detector needs.
         self.annotations = None
         if not self.has_classes:
             tasks = {network.task.name for network in networks.values()}
@@ -223,6 +229,7 @@ class _Plan:
         self.image_folders = {
             name: published_folder(Path(folder)) for name, folder in folders.items() if folder
         }
+        # A network that lacks a class raises an InputError.
         labels = {of.label for of in self.items if not str(of.label).startswith(OTHER_PREFIX)}
         for network in networks.values():
             for name in labels:
@@ -239,6 +246,7 @@ class _Plan:
         self.random_light_count = settings.scale(RANDOM_LIGHT_COUNT)
         positives = objects[: len(meshes)]
         self.negatives = objects[len(meshes) :]
+        # Most views are only shown in other light, and few are attacked, since this takes longer.
         self.views, self.attacked_views = (
             lights.Views(positives, settings.scale(count), settings.seed, device)
             for count in (VIEW_COUNT, ATTACKED_COUNT)
@@ -258,6 +266,7 @@ class _Plan:
             replace(views, light=plain.light, exposure=plain.exposure, size=plain.size)
             for views in (self.views, self.attacked_views)
         )
+        # Arguments of the functions that show views in all lights of the audit.
         environments = (views, self.environments, self.random_light_count)
         for key, network in networks.items():
             results = out / key
@@ -266,6 +275,7 @@ class _Plan:
             for kind in lights.KINDS:
                 arguments = (network, attacked_views, kind, results)
                 _write_json(results / f"{kind}.json", lights.success_by_light, *arguments)
+            # Light that fools one network is shown to the other network.
             for other in networks.values():
                 if other is not network:
                     shown = (network, other, attacked_views)
@@ -294,6 +304,7 @@ def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:
     label = class_names.class_of_meshes(settings.meshes, classes, "meshes", settings.label)
     negatives = settings.hard_negatives
     if not (negatives or settings.laboratory):
+        # Solids of the class itself are no negatives.
         negatives = [
             f"solid:{name}"
             for name in NEGATIVE_SOLIDS
@@ -339,6 +350,7 @@ def _write_renders(settings: AuditSettings, plan: _Plan, size: Size, out: Path) 
     They show the meshes and the hard negatives under each pattern of PATTERNS,
     and in each environment map of the audit.
     """
+    # Each lighting gets the same number of setups.
     lighting_count = len(PATTERNS) + len(settings.environments)
     lab_settings = LabSettings(
         out=str(out),

@@ -60,11 +60,13 @@ def _find(
     """Pair what is found in renders with the truth. Without one, nothing is of the class."""
     pairs: list[tuple[Any, Any]] = []
     for row, output in enumerate(compute_outputs(network, images[:, 0], BATCH)):
+        # The mask of the class in a segmentation, and the true mask: 1 on the object, otherwise 0.
         if not isinstance(network.task, Detection):
             shown = (output.argmax(0) == label).long()
             mask = torch.zeros_like(shown) if truth is None else truth.masks[row, 0, 0].long()
             pairs.append((shown.cpu().numpy(), mask.cpu().numpy()))
             continue
+        # The detections, and the true boxes of the view.
         arrays = [output[name].cpu().numpy() for name in ("boxes", "labels", "scores")]
         boxes, labels = np.zeros((0, 4)), np.zeros(0, int)
         if truth is not None:
@@ -94,6 +96,7 @@ def find_in_lights(
 
     plain = load_light(views.light).to(views.device) * views.exposure
     unusual = lights.environment_lights(views, environments, random_light_count)
+    # The hard negatives have no truth: all that is found in them is false.
     for shown, title in ((views, ""), (negatives, "hard negatives, ")):
         scene = shown.scene(network.size)
         truth = None if title else scene.truth(network.label)
@@ -110,6 +113,7 @@ def find_in_lights(
     task = network.task
     metrics: dict[str, Any] = {}
     for title, numbered in groups.items():
+        # Lights of the same view are no independent units, so the interval is over the views.
         units, pairs = np.array([unit for unit, _ in numbered]), [pair for _, pair in numbered]
         if isinstance(task, Detection):
             at_iou, at_half = (_match(pairs, iou) for iou in (task.iou, 0.5))
@@ -119,6 +123,7 @@ def find_in_lights(
         else:
             miou, _ = detections.mean_iou(pairs, 2, units, VIEWS)
             metrics[title] = {"n": len(pairs), "miou": asdict(miou)}
+    # Only detections have scores, and so a curve of recall against false detections.
     if not isinstance(task, Detection):
         return {"metrics": metrics, "curve": []}
     not_attacked = ("plain light", "environments", "random light")

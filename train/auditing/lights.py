@@ -321,6 +321,7 @@ def transfer_success(
     for kind in progress(KINDS, "transfer"):
         result = adversaries(attacked, views, kind, additional=True)
         counts[kind] = [0, 0, 0]
+        # Without a success, there is no lighting to test.
         if (result.clean_correct & result.success).any():
             (row,) = transfer(result, [other])
             is_tested = np.array(row["clean_correct"])
@@ -338,8 +339,10 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     same light), both JPEG in base64, and "probabilities" of these classes.
     """
     start, end = result.problem.start[example], result.minimum.values[example]
+    # Shape (FRAME_COUNT, 1): 0 is the start and 1 the end of the attack.
     weights = torch.linspace(0, 1, FRAME_COUNT).to(start)[:, None]
     values = start + weights * (end - start)
+    # All frames are of the same example.
     examples = torch.full((FRAME_COUNT,), example, device=start.device)
     with torch.no_grad():
         images = result.problem.render(values, examples)
@@ -347,6 +350,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
         evidence = result.objective().select(examples).evidence(images)[:, 0]
     probabilities = result.classifier.task.confidences(evidence).cpu()
     label = int(result.criterion.source[example, 0])
+    # Classes by their highest probability in any frame.
     ranked = probabilities.amax(dim=0).argsort(descending=True).tolist()
     shown_classes = [label, *(index for index in ranked if index != label)][:CLASS_COUNT]
     frames = []
@@ -405,6 +409,7 @@ def find_plain_views(classifier: TaskNetwork, views: Views) -> PlainViews:
         for exposure, name in product(EXPOSURES, PLAIN_LIGHTS):
             images = render_in(scene, load_light(name).to(scene.lights) * exposure)
             recognized = int(is_found(classifier, criterion, images).sum())
+            # The first combination is the light as it is given, before any search.
             as_given = tried[0].recognized if tried else recognized
             tried.append(PlainViews(name, exposure, size, recognized, views.count, as_given))
             if recognized >= ENOUGH * views.count:

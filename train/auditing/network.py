@@ -259,6 +259,7 @@ class AuditedNetwork:
         faults += self._attack_faults()
         view_count = max(counts["correct"] for counts in self.counts.values())
         rests_on_images = any(item.right < PASS_THRESHOLD for item in of_images)
+        # Faults in renders of few views may be chance.
         if faults and not rests_on_images and view_count < MIN_VIEWS:
             reasons = "; ".join(faults)
             return "Perhaps not", f"Perhaps not: {reasons}. Only {view_count} views were attacked."
@@ -296,6 +297,7 @@ class AuditedNetwork:
         for kind, counts in self.counts.items():
             light = KINDS[kind]
             for radius, fooled_count in zip(light.radii, counts["adversarial"], strict=True):
+                # At least half of the views that were correct before are lost.
                 if 0 < counts["correct"] <= 2 * fooled_count:
                     attack = f"an attack with {light.title} of radius {radius:g}"
                     faults.append(f"{attack} loses {fooled_count} of {counts['correct']} views")
@@ -384,6 +386,7 @@ def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
     """
     subfolders = {}
     for key, network in {**normalizing(networks), **networks}.items():
+        # The original network has one remedy, normalized light. A hardened network has one or both.
         name = HARDENING if network.normalized_light is None else BOTH
         name = name if key.startswith(HARDENED) else LIGHT_ALONE
         subfolders[ORIGINAL if key == CLASSIFIER else name] = key
@@ -410,6 +413,7 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     gains = {name: gain_over(name, original) for name in remedies}
     if any(gain is None for gain in gains.values()):
         return None
+    # Remedies follow by price, so a later one must gain over the cheaper one that is chosen.
     chosen = original
     for name in remedies:
         # Of a network over itself, there is no gain.

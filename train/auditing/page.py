@@ -94,6 +94,7 @@ def write_audit_page(
     Keys of `names` and values of `remedies` are subfolders of `out` with results. Without meshes,
     `label` is empty.
     """
+    # The folder with the results of each network, by its name.
     results = {name: out / key for key, name in names.items()}
     content: dict[str, Any] = {
         "about": " and ".join(results),
@@ -108,10 +109,12 @@ def write_audit_page(
     by_key = {key: AuditedNetwork(label, name, out / key) for key, name in names.items()}
     networks = [*by_key.values()]
     plain = plain_sentence(networks[0])
+    # The first kind of test images decides the top of the page and the recommendation.
     images = next(iter(folders), None)
     screen = _first_screen(networks, images, folders, plain)
     recommendation = None
     if images is not None and len(remedies) > 1:
+        # One evaluation of each remedy, since an audit has no seeds.
         recommendation = recommend(
             {
                 name: [AuditedNetwork("", name, out / key).evaluation(images)]
@@ -234,6 +237,7 @@ def screen_of_one(
     kind = network.strongest_kind
     if kind is not None:
         light = KINDS[kind]
+        # Views that are still recognized at the largest radius.
         kept = network.remaining(kind, "adversarial")[-1]
         show(f"Of these, under attack by {light.title}", kept)
         sentences.append(
@@ -261,6 +265,7 @@ def attack_pictures(network: AuditedNetwork) -> list[first_screen.ComparedImage]
     """
     compared = []
     for kind, counts in network.counts.items():
+        # Only a successful attack has an example to show.
         if "predicted" not in counts:
             continue
         light = KINDS[kind]
@@ -305,6 +310,7 @@ def _worst(
     galleries = {}
     for network, (images, folder) in product(networks, folders.items()):
         predictions = network.predictions(images)
+        # Log-odds in ascending order: missed positives come first, and false alarms last.
         order = predictions.log_odds.argsort(kind="stable")
         is_positive = predictions.positive[order]
         label = in_words(network.label)

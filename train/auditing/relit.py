@@ -152,9 +152,11 @@ class RelitScores(ShortRepr):
 
         The interval of what is found in photographs is over the photographs.
         """
+        # A photograph counts if all slides leave its class.
         is_kept = np.array([item.kept[light] == self.slides for item in self.photographs])
         kept = fraction(int(is_kept.sum()), len(is_kept))
         _, unit = np.unique([item.path for item in self.photographs], return_inverse=True)
+        # Each photograph has one prediction, so Wilson's interval holds.
         if self.shown == len(unit):
             return kept
 
@@ -180,6 +182,7 @@ class RelitScores(ShortRepr):
                 sum(item.kept[light] == self.slides for item in group) for light in self.lights
             ]
             rows.append([name, len(group), *counts])
+        # The class that loses the largest part comes first.
         rows.sort(key=lambda row: sum(row[2:]) / row[1])
         titles = [f"kept: {WORDS[light].title}" for light in self.lights]
         subject, _ = self.finds
@@ -220,11 +223,13 @@ def attack_folder(
     out.mkdir(parents=True, exist_ok=True)
     classes = [*result.classifier.classes, NOTHING]
     photographs = []
+    # `row` is the photograph of each attacked object.
     for index, row in enumerate(result.index.tolist()):
         becomes = {
             light: [classes[label] for label in result.predicted[light][index].tolist()]
             for light in result.changed
         }
+        # Number of slides that do not change the prediction.
         kept = {light: int((~item[index]).sum()) for light, item in result.changed.items()}
         predicted = classes[int(result.source[index])]
         photographs.append(RelitPhotograph(str(readable[row].path), predicted, kept, becomes))

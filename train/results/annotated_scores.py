@@ -123,6 +123,7 @@ class DetectionScores(AnnotatedScores):
         shown: list[tables.Estimate] = []
         for source, of_group in groups.items():
             for name, metrics in of_group.items():
+                # With a single class, its row would repeat that of all classes.
                 if name != ALL or len(self.labels) > 1:
                     estimates = (metrics.recall, metrics.ap50, metrics.false_per_image)
                     shown += estimates
@@ -188,6 +189,7 @@ def _outputs(
     """Yield photographs with the outputs of a network, and draw some of them into `pictures`."""
     size = height_and_width(network.size)
     shown = {item.name for item in evenly_spaced(photographs, SHOWN)}
+    # Skipped photographs can leave a batch empty.
     for batch in filter(None, fit_batches(photographs, size, how, BATCH, skip_unreadable)):
         images = torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch])).to(device)
         outputs = compute_outputs(network, images, BATCH)
@@ -219,6 +221,7 @@ def evaluate_detector(
     for item, fitted, output in _outputs(network, annotations.photographs, *options):
         sources.append(item.source)
         boxes, own, scores = (output[key].cpu().numpy() for key in ("boxes", "labels", "scores"))
+        # From pixels of the network's image to those of the photograph.
         boxes, scores = fitted.to_photograph(boxes.astype(float)), scores.astype(float)
         found.append(Found(boxes, own, scores))
         names = [annotations.classes[label] for label in item.labels[fitted.is_kept]]
@@ -227,6 +230,7 @@ def evaluate_detector(
         marked.append(Marked(fitted.boxes, true, item.is_crowd[fitted.is_kept]))
         for box, label, score in zip(boxes, own, scores, strict=True):
             left, top, right, bottom = box.round(2).tolist()
+            # COCO's form of a box is left, top, width and height.
             sides = [left, top, round(right - left, 2), round(bottom - top, 2)]
             entry = {"file_name": item.name, "category": network.classes[label], "bbox": sides}
             listed.append(entry | {"score": round(float(score), 4)})
@@ -255,6 +259,7 @@ def _choose_labels(
     annotations: Annotations, classes: Sequence[str], labels: Sequence[str] | None
 ) -> dict[str, int]:
     """Return the index in a network of each scored class of annotations, by its name there."""
+    # None for a class that the network lacks.
     known = {name: class_of_name(name, classes) for name in annotations.classes}
     chosen = [*known] if labels is None else [*labels]
     unmarked = [name for name in chosen if name not in known]
@@ -262,6 +267,7 @@ def _choose_labels(
         names = ", ".join(annotations.classes[:10])
         raise InputError(f"{annotations.file} marks no {unmarked[0]}, but {names}", "label")
     lacking = [name for name in chosen if known[name] is None]
+    # A class that the caller names must be known. Of all classes, unknown ones are left out.
     if len(lacking) == len(chosen) or (labels and lacking):
         raise InputError(
             f"{annotations.file} marks {', '.join(lacking[:10])}, which are no classes of the "
@@ -280,6 +286,7 @@ def _score(
     task: Detection,
 ) -> tuple[DetectionMetrics, dict[str, DetectionMetrics], dict[str, dict[str, DetectionMetrics]]]:
     """Score all classes, each class, and both for the photographs of each source."""
+    # The matches for recall, and those for AP50, whose IoU is always 0.5.
     matches = [detections.match_images(found, marked, iou) for iou in (task.iou, 0.5)]
     groups = {ALL: [*labels.values()], **{name: [label] for name, label in labels.items()}}
 
@@ -292,6 +299,7 @@ def _score(
 
     by_source = {}
     names = sorted({*sources})
+    # The name of a source can be empty: the folder itself.
     for source in names if len(names) > 1 else []:
         by_source[source or "."] = score(np.array([item == source for item in sources]))
     by_label = score(np.ones(len(found), bool))
@@ -310,6 +318,7 @@ def evaluate_segmenter(
     pictures: dict[str, Tensor] = {}
     count = 0
 
+    # Pairs are read one after the other, so that not all masks are in memory.
     def pairs() -> Iterator[tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]]:
         nonlocal count
         options = pictures, how, skip_unreadable, device

@@ -45,6 +45,7 @@ def format_attack(
     """Describe the attack on one mesh in lines of text for the console. The first is a summary."""
     parameters = "+".join(parameter.name for parameter in result.problem.parameters)
     heading = f"{name}: {parameters} against {result.classifier.name}: {_success(result)}"
+    # Steps of the examples that the attack itself changed.
     steps = result.steps[result.success & ~result.success_before].double()
     if len(steps):
         heading += f"; median of {steps.median():.0f} steps"
@@ -62,6 +63,7 @@ def format_attack(
 def _success(result: AttackResult) -> str:
     """Write on how many of the examples classified correctly before an attack it succeeds."""
     clean = result.clean_correct
+    # Only examples that were classified correctly before the attack count.
     rate = _success_rate(result.success[clean])
     if rate.n == 0:
         return f"none of {len(clean)} examples was correct before: there is nothing to count"
@@ -173,6 +175,7 @@ def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], 
 
     figure = Figure(figsize=(5, 3.8), layout="constrained")
     axes = figure.subplots()
+    # The radii of all parameters change in proportion, so the axis shows the first one.
     first, *others = norms
     for method, title in METHODS.items():
         rows = [record for record in records if record["method"] == method]

@@ -197,6 +197,7 @@ def difference(
     """
     after = _jackknives(evaluations, subset, name)
     before = _jackknives(reference, subset, name)
+    # A run whose metric is unknown has no jackknife.
     if len(after) < len(evaluations) or len(before) < len(reference):
         return None
     return Difference(
@@ -226,6 +227,7 @@ def difference_table(methods: Evaluations, *properties: str) -> Table:
     shown: list[Difference | None] = []
     for method, base in choose_pairs(methods):
         evaluations, reference = methods[method], methods[base]
+        # Runs with the same seeds are compared in pairs.
         paired = ", paired" if _seeds(evaluations) == _seeds(reference) else ""
         counts = f"{len(evaluations)} and {len(reference)} seeds{paired}"
         for subset in reference[0].rows(*properties):
@@ -331,6 +333,7 @@ def format_short_comparison(runs: Sequence[RunSummary], by: str = "source") -> s
     """
     methods = store.group_by_method(runs)
     groups = group_by_images(methods)
+    # Titles of the groups begin with the sub-folder of the scored images.
     title = max(
         groups, key=lambda name: (len(groups[name]), name.startswith(PHOTOGRAPHS)), default=""
     )

@@ -62,13 +62,16 @@ def match(found: Found, marked: Marked, iou: float) -> Int[np.ndarray, " N"]:
     with the largest overlap, of those that no other has taken and whose overlap is at least `iou`.
     """
     overlaps = box_overlaps(found.boxes, marked.boxes, marked.is_crowd)
+    # Whether each detection (row) may take each object (column).
     is_free = (overlaps >= iou) & (found.labels[:, None] == marked.labels)
     objects = np.full(len(found.scores), NO_OBJECT)
     for row in np.argsort(-found.scores, kind="stable"):
+        # -1 stands for objects that the detection may not take.
         candidates = np.where(is_free[row] & ~marked.is_crowd, overlaps[row], -1)
         if candidates.max(initial=-1) >= 0:
             objects[row] = candidates.argmax()
             is_free[:, objects[row]] = False
+        # A crowd can have any number of detections, which then count neither as right nor as false.
         elif (is_free[row] & marked.is_crowd).any():
             objects[row] = CROWD
     return objects
@@ -148,10 +151,13 @@ class Matches:
         if not object_count:
             return np.nan
         weights = counts[self.image]
+        # Correct detections among those with at least each score.
         right = np.cumsum(weights * self.is_right)
         # A detection in an image that counts 0 times may come first.
         precision = right / np.maximum(np.cumsum(weights), np.spacing(1))
+        # The precision at a recall is the highest one at this recall or a higher one.
         highest = np.maximum.accumulate(precision[::-1])[::-1]
+        # The first detection that reaches each recall. Without one, the precision is 0.
         places = np.searchsorted(right / object_count, RECALLS, side="left")
         return float(np.append(highest, 0)[places].mean())
 
@@ -170,6 +176,7 @@ def match_images(found: Sequence[Found], marked: Sequence[Marked], iou: float = 
         columns = [truth.labels, np.full(len(truth.labels), image), score_of_object]
         objects.append(np.stack(columns)[:, ~truth.is_crowd])
     joined, of_objects = np.hstack(detections), np.hstack(objects)
+    # In descending order of the scores, as `Matches` says.
     joined = joined[:, np.argsort(-joined[2], kind="stable")]
     return Matches(
         len(found),
@@ -217,6 +224,7 @@ def score(
     joined = matches.of(labels)
     units = np.arange(joined.image_count) if units is None else units
     by_label = [(at_half or matches).of([label]) for label in labels]
+    # Classes without objects have no average precision.
     shown = [item for item in by_label if len(item.object_score)]
 
     def mean_precision(counts: np.ndarray) -> np.ndarray:
@@ -235,6 +243,7 @@ def score(
         groups = _groups(joined)
         recall = estimate(partial(joined.recall, threshold), groups, units, over)
         precision = estimate(mean_precision, groups, units, over)
+    # The estimate of odds is then turned back into a number per image.
     odds = estimate(false_odds, [np.arange(joined.image_count)], units, over)
     value, low, high = (
         None if end is None else end / (1 - end) for end in (odds.value, odds.low, odds.high)
@@ -269,6 +278,7 @@ def estimate(
     """
 
     def of_groups(*counts: np.ndarray) -> np.ndarray:
+        # How often each image counts, shape (k, n). Groups without left-out units count once.
         weights = np.ones((max(map(len, counts)), sum(map(len, groups))))
         for images, of_images in zip(groups, counts, strict=True):
             weights[:, images] = of_images
@@ -298,13 +308,16 @@ def mean_iou(
     for image, mask in images:
         is_scored = mask != UNSCORED
         guess, truth = image[is_scored], mask[is_scored]
+        # Classes of correct pixels, of predicted pixels and of true pixels.
         kinds = truth[guess == truth], guess, truth
         counted.append([np.bincount(values, minlength=class_count) for values in kinds])
+    # Numbers of pixels, each of the shape (images, classes).
     both, guesses, truths = np.array(counted, float).transpose(1, 0, 2)
 
     def by_class(counts: np.ndarray) -> np.ndarray:
         shared = counts @ both
         with np.errstate(invalid="ignore"):
+            # IoU = intersection / (predicted + true - intersection).
             return shared / (counts @ (guesses + truths) - shared)
 
     def mean(counts: np.ndarray) -> np.ndarray:

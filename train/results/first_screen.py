@@ -314,6 +314,7 @@ def _draw_images(before: Predictions, after: Predictions, images: Path) -> list[
     first_of_group: dict[tuple[str, str | None], int] = {}
     for row in ordered:
         photograph = before.photograph[row]
+        # One image of each class and source comes first, so that the images differ.
         first_of_group.setdefault((photograph.label, photograph.source), row)
     chosen = dict.fromkeys([*first_of_group.values(), *ordered])
     drawn = []

@@ -71,6 +71,7 @@ def write_report(
     methods = store.group_by_method(found.runs)
     # Methods and runs that plots and comparisons show.
     shown = {name: runs[:MAX_SEEDS] for name, runs in islice(methods.items(), MAX_METHODS)}
+    # One training run of each method, whose renders are shown. Only such runs have epochs.
     first = {method: runs[0] for method, runs in shown.items() if runs[0].epochs}
     groups = compare.group_by_images(shown)
     screen = _first_screen(groups)
@@ -222,6 +223,7 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
             f"{method[0].upper()}{method[1:]}: accuracy went from {fmean(accuracies):.1%} to "
             f"{mean('test/accuracy'):.1%} on {images}."
         )
+        # Without photographs, nothing shows the price of hardening on real images.
         is_rendered = OmegaConf.select(runs[0].config, "data.name") == "shapes"
         folders = [images_folder(run, name) for run in runs for name in run.photographs]
         if is_rendered and all(folder and (folder / DESCRIPTION).is_file() for folder in folders):
@@ -248,6 +250,7 @@ def _first_screen(groups: Mapping[str, Scored]) -> first_screen.FirstScreen | No
         with suppress(InputError):
             evaluations = compare.read_evaluations(group)
             pairs = compare.choose_pairs(evaluations)
+            # Pairs whose second network is the one that the training began with.
             hardened = [pair for pair in pairs if group[pair[1]][0].run.mode == store.INITIAL]
             if not pairs:
                 continue
@@ -299,6 +302,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         evaluations = compare.read_evaluations(group)
         if evaluations:
             first_evaluation = next(iter(evaluations.values()))[0]
+            # A plot of ROC curves for all images, and one for each positive class.
             for subset in first_evaluation.rows():
                 scores = {
                     method: [pool.scores for item in items if (pool := item.find(subset))]

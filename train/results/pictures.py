@@ -124,6 +124,7 @@ def plot_curves(
     every_line = chain(*lines_of_method.values())
     if all(len({y for _, y in line}) < 2 for line in every_line):
         return None
+    # The last value of each line, whose mean the description states.
     ends = {
         method: [line[-1][1] for line in lines if line] for method, lines in lines_of_method.items()
     }
@@ -267,6 +268,7 @@ def contact_sheet(predictions: Predictions, images: UInt8[np.ndarray, "N 3 H W"]
             tiles = [_tile(rows[row], images[row], color) for row in chosen]
             lines = [tiles[first : first + COLUMNS] for first in range(0, len(tiles), COLUMNS)]
             grids.append(draw_grid(lines, heading=heading))
+    # The upper edge of each grid. `tops.pop()` is the height of the sheet.
     tops = [0, *accumulate(grid.height for grid in grids)]
     sheet = Image.new("RGB", (max(grid.width for grid in grids), tops.pop()), PAPER)
     for grid, top in zip(grids, tops, strict=True):
@@ -288,6 +290,7 @@ def _tile(row: Any, image: UInt8[np.ndarray, "3 H W"], color: str) -> Tile:
     pixels = Image.fromarray(image.transpose(1, 2, 0))
     enlarged = pixels.resize((IMAGE_SIZE, IMAGE_SIZE), Image.Resampling.NEAREST)
     lines = [f"{row.probability:.0%} {row.predicted}"]
+    # A class that the network lacks has the rank infinity, and no probability.
     if row.true_rank != 1:
         label = row.photograph.label
         is_known = np.isfinite(row.true_rank)

@@ -130,6 +130,7 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
     and orange_log_odds. The cell of a value that is unknown is empty.
     """
     by_label = predictions.by_label
+    # All labels have the same photographs and the same predicted classes.
     first = next(iter(by_label.values()))
     photographs = first.photograph
     ranks = first.true_rank.tolist()
@@ -180,6 +181,7 @@ def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
             for row in rows
         ]
 
+        # An empty cell is the value `unknown`. Without one, it raises ValueError.
         def numbers(name: str, unknown: str = "") -> list[float]:
             return [float(row[name] or unknown) for row in rows]
 

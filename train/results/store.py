@@ -386,6 +386,7 @@ def read_attack(folder: Path) -> AttackSummary:
         if len({line["example"] for line in examples}) < len(examples):
             raise ValueError("it has an example twice")
         checks = [dict(line["checks"]) for line in lines if "checks" in line]
+        # Examples that were classified correctly before the attack.
         correct = [line for line in examples if not line["success_before"]]
         return AttackSummary(
             folder=folder,
@@ -460,6 +461,7 @@ def find(folders: Sequence[Path]) -> Findings:
         except (InputError, OSError) as error:
             # OSError is raised if the folder belongs to another user.
             found.unfinished.append(Unfinished(path, f"cannot be read: {error}", 0))
+    # Runs follow in the order of `MODES`. Runs of any other mode come first.
     order = {mode: number for number, mode in enumerate(MODES)}
     found.runs.sort(key=lambda run: order.get(run.mode, -1))
     return found
@@ -482,6 +484,7 @@ def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
             left_out = f"{len(found.unfinished)} unfinished of {folder}"
             console.warning("left out: %s (%s: %s)", left_out, first.folder, first.state)
         for summary in found.runs:
+            # A run that is in several folders counts once.
             runs.setdefault((summary.folder.resolve(), summary.mode), summary)
     return [*runs.values()]
 

@@ -171,7 +171,6 @@ class Trainer:
                 is_stopping = signals.requested()
                 is_last = self.epoch == self.settings.epochs
                 is_due = self.epoch % self.settings.checkpoint_every == 0
-                # After an epoch that was not finished, only a stop needs a checkpoint.
                 if is_stopping or is_last or (is_due and self._epoch_state is None):
                     self._save()
                 if is_stopping:
@@ -294,7 +293,7 @@ class Trainer:
 
     def _save(self) -> None:
         """Write last.pt (the former becomes previous.pt), and best.pt, in the first process."""
-        # A checkpoint with an infinite loss could not be continued.
+        # No checkpoint is written of a run that has diverged.
         if self._epoch_state:
             self._require_finite(float(self._epoch_state.sums[0]), self.epoch + 1)
         with self.phases("input_output"):

@@ -126,7 +126,7 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
         last, class_count = _last_called_layer(network, size)
         named = network.named_parameters()
         weights = [weight for name, weight in named if _module_of(name) == last]
-        # The last layer of a classifier has a row for each class. That of a zero-shot network has none.
+        # The last layer of a classifier has a row for each class, that of a zero-shot network none.
         is_zero_shot = not any(class_count in weight.shape for weight in weights)
         texts = text_vectors(network, class_count)[-1:] if is_zero_shot else []
         # The vectors of the texts become parameters, which can learn.

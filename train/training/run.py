@@ -196,7 +196,6 @@ class Run:
         split = self.data.train.to(trainer.device)  # `_score_initial` may have replaced its labels.
         with keyed(**keys_of("train", self.settings.train)):
             trainer.fit(split, self.held_out, log)
-        # A detector is scored by the photographs alone.
         scores |= self._score() if has_labels else {}
         if log:  # Only the first process has a log.
             scores |= self._score_photographs(trainer.selected, self.folder)
