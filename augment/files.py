@@ -173,6 +173,7 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
         raise name_error(path, f"{reason}, otherwise ask for a state dict, safetensors or ONNX")
     read = {EXPORTED: _read_exported, ONNX: _read_onnx}.get(path.suffix.lower(), _read_torchscript)
     try:
+        # The sizes are those of the four dimensions of images. None stands for any size.
         network, (batch_size, _, height, width) = read(path)
     except InputError:
         raise
@@ -181,26 +182,30 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
         raise name_error(path, f"cannot be read ({single_line(error)}): {advice}") from error
 
     if batch_size is not None:
+        # The file takes batches of one size only. `InBatches` splits other numbers of images.
         network = InBatches(network, batch_size)
     if isinstance(network, nn.Module):
         # Set the mode without a call of `eval`, which networks of torch.export refuse.
         for module in network.modules():
             module.training = False
-    told = (height, width) if height and width else height or width
-    given = facts.size or told, facts.classes, facts.normalization
+    # Images are square if the file fixes one side only. None if it fixes no side.
+    size_in_file = (height, width) if height and width else height or width
+    given = facts.size or size_in_file, facts.classes, facts.normalization
     named: dict[str, Any] = {"name": name, "size_from": YOU if facts.size else FILE}
-    made = classifiers.as_network(network, *given, task=facts.task, says=False, **named)
-    if isinstance(made, Classifier):
-        _require_evaluation_outputs(made, name)
-    return made
+    loaded = classifiers.as_network(network, *given, task=facts.task, says=False, **named)
+    if isinstance(loaded, Classifier):
+        _require_evaluation_outputs(loaded, name)
+    return loaded
 
 
 def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
     """Raise InputError if logits are random or depend on other images (exported training mode)."""
     shape = (3, 3, *height_and_width(classifier.size))
+    # Three images of gray levels in random order, the same in each call.
     levels = torch.linspace(0, 1, math.prod(shape))
     images = levels[torch.randperm(len(levels), generator=torch.Generator().manual_seed(0))]
     images = images.view(shape)
+    # Show the first image beside the second and then beside the third. Its logits must not change.
     with torch.no_grad():
         outputs = [classifier.network(images[[0, other]]) for other in (1, 2)]
     first, second = (plain_outputs(output).float() for output in outputs)
@@ -251,9 +256,11 @@ def _read_exported(path: Path) -> Content:
     for node in program.graph.nodes:
         schema = getattr(node.target, "_schema", None)
         # `train` is an argument of dropout, and `training` one of batch normalization.
+        # Mask of the arguments of an operation that choose between training and evaluation mode.
         modes = [place.name.startswith("train") for place in schema.arguments] if schema else []
         if any(value is True for value in compress(node.args, modes)):
             raise name_error(path, IN_TRAINING_MODE)
+    # The network has one input, the images. Find the node of the graph that stands for it.
     [name] = program.graph_signature.user_inputs
     [node] = [node for node in program.graph.nodes if node.name == name]
     # `node.meta["val"]` is an example of the images. In its shape, the dimensions of fixed size are
@@ -339,15 +346,17 @@ class InBatches(Network):
 def _read_onnx(path: Path) -> Content:
     """Read a file of ONNX, with gradients if onnx2torch is installed and converts it exactly."""
     network, sizes = read_onnx(path)
+    # Dimensions without a size get a default: two images of 224 × 224 pixels.
     shape = [size or default for size, default in zip(sizes, (2, 3, 224, 224), strict=True)]
     images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     try:
         onnx2torch = importlib.import_module("onnx2torch")
         with torch.no_grad():
             converted = onnx2torch.convert(str(path)).eval()
+            # Compare all outputs of the converted network with those of onnxruntime.
             both = (tree_leaves(of(images)) for of in (converted, network))
-            for own, expected in zip(*both, strict=True):
-                torch.testing.assert_close(own, expected, rtol=1e-3, atol=1e-3)
+            for output, expected in zip(*both, strict=True):
+                torch.testing.assert_close(output, expected, rtol=1e-3, atol=1e-3)
     # onnx2torch may be absent. It lacks some operations, and fails in many ways.
     except Exception as error:
         reason = single_line(error)

@@ -409,9 +409,9 @@ def compute_outputs(
     batch_size: int = BATCH,
     device: torch.device | str | None = None,
 ) -> Any:
-    """Compute the outputs (..., *) of a network for many images (..., 3, H, W), without gradients.
+    """Return the outputs (..., *) of a network for many images (..., 3, H, W), without gradients.
 
-    Outputs that are lists, such as detections, become one list.
+    Lists of one output for each image, such as those of a detector, become one list.
 
     The images are in [0, 1] or have 8 bits. They can also come as an iterable of batches
     (N, 3, H, W), which are read one after the other. A network of torch is in eval mode meanwhile.
@@ -420,6 +420,7 @@ def compute_outputs(
     limit = BatchSize(batch_size)
     batches: Iterable[Tensor] = images
     if isinstance(images, Tensor):
+        # All dimensions before (3, H, W) become one dimension of images.
         batches = progress(images.flatten(0, -4).split(batch_size), "predictions")
     outputs: list[Any] = []
     with eval_mode(network):
@@ -427,16 +428,19 @@ def compute_outputs(
             moved = batch if device is None else batch.to(device)
             shown = to_unit(moved) if moved.dtype == torch.uint8 else moved
 
+            # The default value binds the function to the present batch.
             def compute(rows: slice, shown: Tensor = shown) -> Any:
                 result = network(shown[rows])
                 # The network may compute in half precision.
                 return result.to(shown.dtype) if isinstance(result, Tensor) else result
 
-            # No images are a batch, too, which gives outputs their shape.
+            # A batch without images is shown, too, because its outputs tell the shape of a row.
+            # `limit.map` calls `compute` with smaller slices if memory runs out.
             outputs += limit.map(compute, len(shown) or 1)
     if outputs and isinstance(outputs[0], list):
         return [output for batch in outputs for output in batch]
     joined = torch.cat(outputs)
+    # Outputs get the dimensions of the images before (3, H, W) again.
     return joined.unflatten(0, images.shape[:-3]) if isinstance(images, Tensor) else joined
 
 

@@ -269,11 +269,16 @@ def require_transferable(
 def _attack_others(
     found: Successes, result: AttackResult, problem: SceneProblem, values: Values
 ) -> None:
-    """Attack the examples without a success, and add the successes and the values reached."""
+    """Attack the examples without a success, and add the successes and the values reached.
+
+    `found` and `values` are changed in place. The attack starts at `values`.
+    """
+    # The first row of `found` has the successes with sensor noise.
     examples = torch.nonzero(~found[0])[:, 0]
     if len(examples):
         objective = result.objective().select(examples)
         end = minimize(problem, objective, examples=examples, start=values[examples])
+        # The attack with the next scale of the norm-balls starts here.
         values[examples] = end.values
         _add_successes(found, result, problem, end.values, examples, end.images)
 
@@ -314,6 +319,7 @@ def _add_successes(
     objective = result.objective().select(examples)
     objective = objective.moved(problem, values, examples)
     criterion = objective.criterion
+    # Judge the given images, which are cheaper than the final images.
     is_reached = criterion.reached(criterion.predicted(objective.evidence(images)))
     rows = torch.nonzero(is_reached)[:, 0]
     if len(rows):
@@ -368,11 +374,15 @@ def _classify(
     classifier: TaskNetwork,
     change: Callable[[Adversary], Adversary],
 ) -> dict[str, Any]:
-    """Change adversaries, and classify their images by class names, since orders may differ."""
+    """Return how a classifier classifies changed adversaries, as lists for JSON (see `transfer`).
+
+    `adversaries` are the examples before the attack, and then the same examples after it.
+    """
     changed = [change(adversary) for adversary in adversaries]
     classes = result.classifier.classes
     task, count = classifier.task, len(examples)
     labels = [adversary.shown.label for adversary in changed[count:]]
+    # Classes are matched by name, because another classifier may have another order of classes.
     names = [label if isinstance(label, str) else classes[label] for label in labels]
     source = torch.tensor([*map(classifier.label, names)]).long()
     source = source[:, None].expand(-1, result.criterion.view_count)
@@ -385,6 +395,7 @@ def _classify(
         return Truth.join([item.scene(rasterizer).truth(unlabeled) for item in some])
 
     criterion = task.criterion(source, lambda: truth_of(changed[:count]), len(classifier.classes))
+    # `map` moves all tensors of the criterion to the device of the attack.
     criterion = replace(criterion, target=target).map(lambda rows: rows.to(examples.device))
     objective = Objective(classifier, criterion, result.settings, result.seed)
     if len(examples):
@@ -392,9 +403,11 @@ def _classify(
         images_before, images_after = torch.stack(images).to(result.images_in_views).chunk(2)
         evidence_before = objective.evidence(images_before)
         if criterion.needs_truth:
+            # The attack may have moved the objects, so their boxes and masks are computed again.
             objective.criterion = criterion.at(truth_of(changed[count:]))
         evidence, fooled_in_views, without_noise = objective.judge(images_after, examples)
     else:
+        # Without examples, these tensors are empty and have the right number of dimensions.
         evidence_before = evidence = result.evidence_in_views[examples]
         fooled_in_views = result.success_in_views[examples]
         without_noise = result.success_without_noise[examples]

@@ -529,19 +529,25 @@ class LowLight(LightModel):
         """Count electrons, add noise, amplify and round. Gradients pass through the rounding."""
         z = normal_noise(radiance, drawn.seeds)
         middle, slope, curve = self.response(radiance, drawn, strength, white)
+        # middle + z (slope + z curve), limited to the range of the converter.
         signal = torch.addcmul(middle, z, torch.addcmul(slope, z, curve)).clamp(0, self.levels)
         return _rounded(signal) * (white / self.levels)
 
     def response(
         self, radiance: Float[Tensor, "B C H W"], drawn: Drawn, strength: float, white: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return a, b and c, where a + b z + c z² is the signal of the amplifier."""
-        darkness, read, recovered = drawn.numbers
+        """Return a, b and c for each value, where a + b z + c z² is the signal of the amplifier.
+
+        z is a normal number. The mean number of electrons l and σ² = l + r² are those of the class.
+        """
+        darkness, read_noise, recovered = drawn.numbers
+        # The light is 2^-stops of that of the photograph.
         stops = strength * math.log2(1 / self.exposure) * darkness
         mean = radiance.clamp(min=0) * (self.full_well * torch.exp2(-stops) / white)
-        variance = mean + read**2
+        variance = mean + read_noise**2
         # After the gain of the amplifier, a full pixel has the largest number.
         gain = torch.exp2(stops * recovered) * (self.levels / self.full_well)
+        # c = gain · l / (6 σ²). The "−1" of z² − 1 subtracts c from a = gain · l.
         curve = gain / 6 * mean / variance
         return gain * mean - curve, gain * variance.sqrt(), curve
 

@@ -269,11 +269,14 @@ class _Variation:
         """
         scene = self.scene
         example = scene.examples[row]
+        # Scenes with tables have one view.
         item, camera = scene.objects[example.object], example.cameras[0]
+        # The table stands at the lowest vertex, and the wall is behind the object.
         room = Room(rays, item.radius, item.lowest, wall_distance)
+        # Projector and lamps of the scene, which also light the room.
         local = split_light(scene.basis, scene.lights[row].cpu().double()).local_lights
         arriving = irradiance(room, camera, scene.settings, sky.cpu().double(), lamp, local)
-        # A lamp at zero stands for no directional light.
+        # A lamp at zero stands for no directional light. The third axis points to the camera.
         towards = lamp if lamp.any() else torch.from_numpy(camera.axes()[2])
         points = project_along_light(room, item.mesh, camera, scene.settings, towards)
         return example.exposure * arriving, points.float()

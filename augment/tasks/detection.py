@@ -149,29 +149,34 @@ class Detection(Task):
         can raise those of another class. The backbone runs once.
         """
         raw = unwrapped(network)
+        # Module that computes the final boxes. In networks of two stages, it is `roi_heads`.
         owner = getattr(raw, "roi_heads", raw)
         if not _is_of_torchvision(raw) or any(not hasattr(owner, name) for name in CANDIDATES):
             return network(images)
         from torchvision.ops import boxes as box_ops  # torchvision takes half a second.
 
         sort = partial(torch.argsort, descending=True, stable=True)
-        own = owner.postprocess_detections
+        original = owner.postprocess_detections
+        # Candidates of each image, and the (height, width) to which the network resized it.
         candidates: list[Any] = []
 
+        # This replaces `postprocess_detections`. It returns the same boxes, and also calls the
+        # original with other limits and without suppression, to keep the candidates.
         def postprocess(*args: Any) -> Any:
-            final = own(*args)
+            final = original(*args)
             limits = {name: getattr(owner, name) for name in CANDIDATES}
             suppress = box_ops.batched_nms
             try:
                 vars(owner).update(CANDIDATES)
                 # At an IoU of 1, it only sorts, but takes as long as the convolutions.
                 box_ops.batched_nms = lambda _, scores, *others: sort(scores)
-                found = own(*args)
+                found = original(*args)
             finally:
                 vars(owner).update(limits)
                 box_ops.batched_nms = suppress
             if isinstance(found, tuple):  # Heads with regions of interest return three lists.
                 found = [dict(zip(FINAL, item, strict=True)) for item in zip(*found, strict=True)]
+            # The last argument has the sizes of the resized images.
             candidates.extend(zip(found, args[-1], strict=True))
             return final
 
@@ -179,6 +184,7 @@ class Detection(Task):
         try:
             outputs = network(images)
         finally:
+            # The method of the class counts again.
             del owner.postprocess_detections
         for item, (found, (height, width)) in zip(outputs, candidates, strict=True):
             # The network resizes images. The final boxes are in the pixels of the given images.
@@ -200,12 +206,14 @@ class Detection(Task):
         self, outputs: list[Detections], classes: Sequence[str]
     ) -> tuple[Int[Tensor, " E"], DetectionCriterion]:
         """Return the criterion of an attack on each box whose score reaches the threshold."""
+        # The boxes of all images in one list, and the index of the image of each box.
         boxes, scores, labels = (torch.cat([item[key] for item in outputs]) for key in FINAL)
         image = torch.repeat_interleave(torch.tensor([len(item["scores"]) for item in outputs]))
         options: dict[str, Any] = {"task": self, "class_count": len(classes)}
         criterion = DetectionCriterion(labels[:, None], boxes=boxes[:, None], **options)
         is_found = scores >= self.threshold
         image, criterion = image[is_found.cpu()], criterion.select(is_found)
+        # Each example has one view, so its single image can be judged without the axis of views.
         flat = criterion.map(lambda rows: rows[:, 0])
         evidence = flat.evidence([outputs[index] for index in image.tolist()])
         # A box at which another class is surer is mislabeled already.
@@ -260,14 +268,16 @@ class DetectionCriterion(ObjectCriterion):
         views = zip(outputs, self.boxes, self.source.tolist(), strict=True)
         for item, box, source in views:
             scores = item["scores"].detach()
-            row = scores.new_full((self.class_count + 1,), SMALLEST_SCORE)
+            # Largest score of each class near the object, and then the threshold.
+            best_scores = scores.new_full((self.class_count + 1,), SMALLEST_SCORE)
             is_near = _iou(item["boxes"], box) >= self.task.iou
-            row.scatter_reduce_(0, item["labels"][is_near], scores[is_near], "amax")
-            row[-1] = self.task.threshold
+            best_scores.scatter_reduce_(0, item["labels"][is_near], scores[is_near], "amax")
+            best_scores[-1] = self.task.threshold
+            # An object outside of the view counts as found.
             if not box.any():
-                row[source] = 1.0
+                best_scores[source] = 1.0
             # In float64, log-odds differ where scores differ in their last digit.
-            rows.append(log_odds_of(row.double()))
+            rows.append(log_odds_of(best_scores.double()))
         empty = self.boxes.new_zeros(0, self.class_count + 1, dtype=torch.float64)
         return torch.stack(rows) if rows else empty
 
@@ -279,6 +289,7 @@ class DetectionCriterion(ObjectCriterion):
         for item, box, source, target in zip(
             outputs, self.boxes, self.source, targets, strict=True
         ):
+            # Without candidates, the final boxes stand for them.
             boxes = item.get(CANDIDATE_BOXES, item["boxes"])
             scores = item.get(CANDIDATE_SCORES, item["scores"])
             is_near = _iou(boxes, box) >= NEAR * self.task.iou
@@ -291,6 +302,7 @@ class DetectionCriterion(ObjectCriterion):
             # The first row is the smallest score, so that an image without candidates has a cost.
             smallest = scores.new_full((1, self.class_count), SMALLEST_SCORE)
             odds = log_odds_of(torch.cat([smallest, near]))
+            # The smooth maximum log Σ exp gives all boxes near the object a gradient.
             cost = odds[:, source].logsumexp(0)
             if self.task.goal == MISLABEL:
                 has_target = self.target is not None and target != NO_CLASS
@@ -305,9 +317,11 @@ class DetectionCriterion(ObjectCriterion):
             return super().gap(evidence)
         own, limit, others = self.split(evidence)
         best = others.amax(-1)
+        # Without a target, any other class must exceed both the true class and the limit.
         if self.target is None:
             return best - own.maximum(limit)
         target = torch.where(self.target == NO_CLASS, others.argmax(-1), self.target)
+        # The target must exceed all other classes and the limit, which is the last column.
         rest = evidence.scatter(-1, target[..., None], -torch.inf).amax(-1)
         return evidence.gather(-1, target[..., None])[..., 0] - rest
 
@@ -317,6 +331,7 @@ class DetectionCriterion(ObjectCriterion):
             return super().predicted(evidence)
         own, limit, others = self.split(evidence)
         best, index = others.max(-1)
+        # The index C stands for no class.
         nothing = torch.full_like(index, self.class_count)
         is_other = (best > own) & (best >= limit)
         return torch.where(is_other, index, torch.where(own >= limit, self.source, nothing))
@@ -337,6 +352,7 @@ class _Reader:
 
     def __call__(self, outputs: Any, images: Float[Tensor, "N 3 H W"]) -> list[Detections]:
         title, task = self.title, self.task
+        # Whether boxes have not passed non-maximum suppression yet.
         is_raw = task.decode is not None
         if task.decode is not None:
             given, title = outputs, f"decode of {title}"
@@ -365,6 +381,7 @@ class _Reader:
                 tensors = {key: errors.as_tensor(key, item[key]) for key in keys if key in item}
                 found |= self.checked(keys, tensors, images)
         if "labels" not in found:
+            # Scores (n, C) of all classes: each final box gets its best class.
             found[CANDIDATE_BOXES], found[CANDIDATE_SCORES] = found["boxes"], found["scores"]
             found["scores"], found["labels"] = found["scores"].max(1)
         self.require_possible(found, *images.shape[2:])
@@ -386,6 +403,7 @@ class _Reader:
         boxes = found[keys[0]]
         if not boxes.numel():
             boxes = found[keys[0]] = boxes.reshape(0, 4)
+        # A scalar in place of missing scores has the wrong shape, which raises the error below.
         scores = found.setdefault(keys[1], boxes.new_zeros(()))
         labels = found.get(keys[2])
         # Without labels, there is a score for each class.
@@ -420,6 +438,7 @@ class _Reader:
             advice = "give left, top, right, bottom, and not width and height"
             raise InputError(f"{self.title} returned boxes that end before they begin: {advice}")
         is_outside = (left >= width) | (right <= 0) | (top >= height) | (bottom <= 0)
+        # Boxes that all end within the first pixel are probably in units of the image size.
         is_fraction = len(right) > 0 and bool((right <= 1).all() & (bottom <= 1).all())
         if is_outside.any() or (is_fraction and min(height, width) > 1):
             reason = "fractions of the image" if is_fraction else "outside of the image"
@@ -437,6 +456,7 @@ def _iou(boxes: Float[Tensor, "K 4"], box: Float[Tensor, " 4"]) -> Float[Tensor,
 def log_odds_of(scores: Tensor) -> Tensor:
     """Return log(s / (1 − s)) of scores, whose gradient does not vanish at scores of 0 and 1."""
     limited = scores.clamp(SMALLEST_SCORE, 1 - SMALLEST_SCORE)
+    # The sum has the value of the limited scores, but the gradient of the scores.
     return torch.logit(scores + (limited - scores).detach())
 
 
@@ -456,11 +476,13 @@ def _of_transformer(
     """
     given = outputs if isinstance(outputs, Mapping) else vars(outputs)
     logits, fractions = given["logits"], given["pred_boxes"]
+    # Number of classes, maybe with "no object".
     columns = logits.shape[-1]
     if class_count not in (None, columns, columns - 1):
         advice = f"give {columns - 1} names, or {columns} if there is no class for no object"
         raise InputError(f"{title} returned {columns} logits for {class_count} classes: {advice}")
     center, size = fractions[..., :2], fractions[..., 2:]
+    # Width, height, width and height of the images, for left, top, right and bottom.
     scale = fractions.new_tensor([images.shape[3], images.shape[2]] * 2)
     boxes = torch.cat([center - size / 2, center + size / 2], dim=-1) * scale
     if columns != class_count:
@@ -468,6 +490,7 @@ def _of_transformer(
         return [{"boxes": one, "scores": scores} for one, scores in pairs]
     found = []
     for one, scores in zip(boxes, logits.sigmoid(), strict=True):
+        # As many pairs as boxes. The flat index of a pair is box · columns + class.
         best = scores.flatten().topk(len(one))
         row = best.indices.div(columns, rounding_mode="floor")
         chosen = {"boxes": one[row], "labels": best.indices % columns, "scores": best.values}
@@ -491,6 +514,7 @@ def _of_ultralytics(outputs: Tensor) -> list[dict[str, Tensor]]:
             {"boxes": rows[:, :4], "scores": rows[:, 4], "labels": rows[:, 5].detach()}
             for rows in outputs
         ]
+    # The transpose has a row for each box, shape (N, K, 4 + C).
     center, size = outputs.mT[..., :2], outputs.mT[..., 2:4]
     boxes = torch.cat([center - size / 2, center + size / 2], dim=-1)
     pairs = zip(boxes, outputs.mT[..., 4:], strict=True)
@@ -500,6 +524,7 @@ def _of_ultralytics(outputs: Tensor) -> list[dict[str, Tensor]]:
 def stored_names(network: Any) -> list[str]:
     """Return the names of the classes that a network of transformers or Ultralytics stores."""
     raw = unwrapped(network)
+    # Ultralytics has dictionaries from index to name in `names`, transformers in `id2label`.
     names = getattr(raw, "names", None)
     if not isinstance(names, Mapping):
         names = getattr(getattr(raw, "config", None), "id2label", None) or {}
@@ -517,6 +542,8 @@ def _torchvision_count(network: Any) -> int | None:
     raw = unwrapped(network)
     if not _is_of_torchvision(raw):
         return None
+    # Heads of one stage store the number. Heads of two stages have a layer `cls_score` of so many
+    # outputs.
     for module in raw.modules():
         for name in ("num_classes", "num_columns"):
             if isinstance(getattr(module, name, None), int):

@@ -115,6 +115,7 @@ class Segmentation(Task):
         label = outputs.argmax(1)
         area = F.one_hot(label, outputs.shape[1]).float().mean((1, 2))
         area[:, [name.strip("_").lower() == BACKGROUND for name in classes]] = 0
+        # One example for each pair of an image and a class that it shows.
         image, source = (area >= LEAST_AREA).nonzero(as_tuple=True)
         masks = label[image] == source[:, None, None]
         return image.cpu(), SegmentationCriterion(source[:, None], task=self, masks=masks[:, None])
@@ -126,6 +127,7 @@ class Segmentation(Task):
     def draw(self, image: Tensor, output: Tensor, classes: Sequence[str]) -> Tensor:
         """Draw the classes of the pixels as colors, except the first, over the image."""
         label = output.argmax(0)
+        # Channels are cosines of the hue, shifted by 0°, 120° and 240°, and scaled to [0, 1].
         # Hues that follow each other by the golden ratio are far from each other.
         angle = 2 * torch.pi * 0.618 * label
         colors = torch.stack([(angle + shift).cos() for shift in (0.0, 2.1, 4.2)]) / 2 + 0.5
@@ -151,9 +153,12 @@ class SegmentationCriterion(ObjectCriterion):
     def evidence(self, outputs: Float[Tensor, "N C H W"]) -> Float[Tensor, "N K"]:
         """Return the log-odds of the IoU of each class, and of the limit."""
         masks = self.masks.to(outputs.device)
+        # Pixels whose row and column contain pixels of the mask, shape (N, H, W).
         in_box = masks.any(1)[:, None] & masks.any(2)[:, :, None]
+        # Pixels at which each class has the largest logit, shape (N, C, H, W).
         shown = F.one_hot(outputs.detach().argmax(1), outputs.shape[1]).movedim(-1, 1).bool()
         shown = shown & in_box[:, None]
+        # The IoU is the area of the intersection over that of the union.
         common = (shown & masks[:, None]).sum((2, 3)).double()
         ratio = common / (shown | masks[:, None]).sum((2, 3)).clamp(min=1)
         is_outside = ~masks.flatten(1).any(1)
@@ -162,22 +167,24 @@ class SegmentationCriterion(ObjectCriterion):
         return log_odds_of(torch.cat([ratio, limit], dim=1))
 
     def cost(self, outputs: Float[Tensor, "N C H W"]) -> Float[Tensor, " N"]:
-        """Return the mean log-odds of the true class at the pixels of the object."""
+        """Return the mean softplus of the log-odds of the true class over the object's pixels."""
+        # Index of the true class at each pixel, shape (N, 1, H, W).
         source = self.source[:, None, None, None].expand(-1, 1, *outputs.shape[2:])
-        own = outputs.gather(1, source)[:, 0]
-        odds = own - outputs.scatter(1, source, -torch.inf).logsumexp(1)
+        true_logit = outputs.gather(1, source)[:, 0]
+        odds = true_logit - outputs.scatter(1, source, -torch.inf).logsumexp(1)
         masks = self.masks.to(odds)
         # Pixels that are lost already count little, so that the attack goes on to the others.
         return (F.softplus(odds) * masks).sum((1, 2)) / masks.sum((1, 2)).clamp(min=1)
 
 
 def _logits(outputs: Any) -> Any:
-    """Return the logits of pixels, which torchvision names "out".
+    """Return the logits (N, C, H, W) of the pixels, which torchvision names "out".
 
-    Segmenters of transformers with queries, such as Mask2Former, have a mask and the probabilities
-    of the classes for each query. Their sum of both is a score, whose logarithm is returned.
+    Mask2Former and similar networks return a mask and class probabilities for each of Q queries.
+    Their result is log Σ_q P(class of q) · P(pixel in the mask of q).
     """
     if hasattr(outputs, "masks_queries_logits"):
+        # The last class of a query is "no object", which no pixel shows.
         classes = outputs.class_queries_logits.softmax(-1)[..., :-1]
         scores = torch.einsum("nqc,nqhw->nchw", classes, outputs.masks_queries_logits.sigmoid())
         return scores.clamp_min(torch.finfo(scores.dtype).tiny).log()
