@@ -137,6 +137,7 @@ def text_vectors(network: nn.Module, class_count: int) -> list[str]:
 
     A zero-shot network multiplies them by the features of an image.
     """
+    # Plain attributes, buffers and parameters of each module, by their full names.
     return [
         f"{prefix}.{name}".lstrip(".")
         for prefix, module in network.named_modules()
@@ -299,8 +300,11 @@ class Function(nn.Module):
         """Compute the scores (N, C) of images."""
         if self.takes is not None:
             return self._call(images, self.takes)
+        # Kinds of the modules in training mode that the first call runs.
         in_training: list[str] = []
 
+        # A function hides the networks that it calls. A hook that torch calls before each module
+        # finds those in training mode.
         def note(module: nn.Module, _: object) -> None:
             # Transformations of images are modules in training mode, too, but have no weights.
             has_weights = next(module.parameters(recurse=False), None) is not None
@@ -332,6 +336,7 @@ class Function(nn.Module):
                 self.takes = takes
                 return scores
             returned = scores
+        # All calls failed. The error for tensors tells most.
         if len(failures) == 3:
             raise failures[0]
         return returned  # The caller raises an error, because this is not a tensor.
@@ -369,6 +374,7 @@ def are_probabilities(outputs: Float[Tensor, "N C"]) -> bool:
     if outputs.shape[1] < 2 or not outputs.is_floating_point():
         return False
     values = outputs.detach()
+    # C probabilities that are rounded to 0.001 may change their sum by C · 0.001 / 2.
     rounding = max(torch.finfo(values.dtype).eps, ROUNDED * outputs.shape[1] / 2)
     deviation = (values.double().sum(1) - 1).abs().max()
     return bool((values.min() >= 0) & (deviation <= min(rounding, MAX_DEVIATION)))
@@ -509,6 +515,7 @@ def frozen_eval_mode(network: nn.Module) -> Iterator[None]:
     The mode of each module, `requires_grad` of each parameter and the state of
     the global random generators are restored after the block.
     """
+    # Networks may draw random numbers on the GPUs on which they lie.
     gpus = {parameter.device for parameter in network.parameters() if parameter.is_cuda}
     random_state = torch.random.fork_rng(devices=sorted(gpus, key=str))
     with gradient_flags_kept(network), eval_mode(network), random_state:
@@ -574,6 +581,7 @@ def normalization_of(network: Any, limits: tuple[float, float] = (0.0, 1.0)) -> 
             names = name, name.replace("mean", "std")
             mean, std = (_channels(getattr(module, found, None)) for found in names)
             if mean and std:
+                # The network normalizes values in [0, 1]. Convert to the units of the limits.
                 mean = [black + (white - black) * value for value in mean]
                 std = [(white - black) * value for value in std]
                 if np.allclose([*mean, *std], [0, 0, 0, 1, 1, 1], atol=1e-6):

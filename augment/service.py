@@ -177,6 +177,7 @@ class AugmentationService:
         """
         expected = "nb.AugmentationSettings(...) or None"
         require_kind("settings", settings, AugmentationSettings | None, expected)
+        # Given cameras are the views themselves.
         views = 1 if of_scene.get("cameras") else 10
         paper: dict[str, Any] = {"views": views, "samples": 8, "normals": "flat"}
         options = paper | {"backgrounds": [0.0, 0.25, 0.5, 0.75, 1.0]} | of_scene
@@ -189,6 +190,7 @@ class AugmentationService:
         scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **options)
         scene = scene.with_count(count) if count else scene
         task = task or Classification()
+        # Labels of the examples: names of classes or their indices.
         names: Sequence[Any] = scene.labels
         if isinstance(task, Classification):
             for item in scene.objects:
@@ -326,6 +328,7 @@ class AugmentationService:
         and end in another. `number` selections were made before.
         """
         count, image_count = len(self), len(images)
+        # The same number always selects the same images, so that a resumed run repeats them.
         # Imagine all passes one after the other. The first selected image is at this position.
         first = number * count
         passes = range(first // image_count, (first + count - 1) // image_count + 1)
@@ -340,6 +343,7 @@ class AugmentationService:
     def _random(self, model: nn.Module, problem: SceneProblem, number: int) -> _Made:
         """Render all examples with random values of the parameters, such as random lighting."""
         values = self._random_values(problem, number)
+        # This process renders its own rows in their single view, and gets those of the others.
         own = self._own_rows(len(self.labels))
         images = self._gather(problem.images(values, own)[:, 0], own, len(self.labels))
         if self._finds_objects:
@@ -349,7 +353,8 @@ class AugmentationService:
         return _Made(values, images, diagnostics, is_error)
 
     def _truth(self, problem: SceneProblem, values: Float[Tensor, "E D"]) -> Truth:
-        """Find the objects with a class that all images show."""
+        """Return class, box and mask of the objects in all images, with the given attack values."""
+        # Index of the class of each first object, by the label in the scene.
         known = dict(zip(problem.scene.labels, self.labels.tolist(), strict=True))
 
         def index_of(label: str | int) -> int:
@@ -357,10 +362,15 @@ class AugmentationService:
 
         every = problem.all_examples
         truth = problem.scene.truth(index_of, every, problem.conditions(values, every))
+        # All negative labels become −1, which stands for no class.
         return replace(truth, labels=truth.labels.clamp(min=NO_OBJECT))
 
     def _find(self, model: nn.Module, images: Tensor, truth: Truth) -> dict[str, float]:
-        """Measure in how many of up to `CLASSIFIED` images the first object is not found."""
+        """Return the diagnostics "attack_success" and "loss" of a network that finds objects.
+
+        The first is the fraction of up to `CLASSIFIED` images in which the first object is not
+        found.
+        """
         rows = self._shown(truth)
         if not len(rows):
             return {}
@@ -368,11 +378,14 @@ class AugmentationService:
         criterion = self._criterion(truth, rows)
         objective = Objective(model, criterion, self.settings.attack, phases=self.phases)
         with network.frozen_eval_mode(model):
+            # The new axis is that of the single view of each example.
             score, _ = objective.score(images[rows, None], needs_gradient=False)
+        # An attack lowers the cost, and a training loss is its negative.
         return {"attack_success": _mean(score.is_success), "loss": -_mean(score.cost)}
 
     def _shown(self, truth: Truth) -> Int[Tensor, " A"]:
         """Return the examples whose first object is visible and has a class."""
+        # The last two axes of `is_shown` are the views and the objects.
         return torch.nonzero((self.labels >= 0) & truth.is_shown[:, 0, 0]).squeeze(1)
 
     def _criterion(self, truth: Truth, rows: Int[Tensor, " A"]) -> Criterion:
@@ -394,6 +407,8 @@ class AugmentationService:
             batch_size = self.settings.attack.batch_size
             logits = network.compute_outputs(attacked_model, images[rows], batch_size)
         tasks.classification.require_known(labels, logits)
+        # With several positive classes, an image of another class must not be classified as any of
+        # them. Its complementary label stands for the first, and `absent` has the others.
         absent = self.positive_classes[1:]
         is_misclassified = ~tasks.classification.is_correct(logits.argmax(1), labels[rows], absent)
         loss = tasks.classification.label_loss(logits, labels[rows], absent=absent)
@@ -408,6 +423,7 @@ class AugmentationService:
         """
         attack = self.settings.attack
         seed = random_streams.stream_seed(self.seed, number)
+        # Values of all examples. The results of the attack replace those of the attacked ones.
         start = values = self._attack_start(problem, number)
         # Indices of the attacked examples.
         attacked = problem.all_examples
@@ -420,12 +436,14 @@ class AugmentationService:
             criterion = self._criterion(truth, attacked)
         else:
             criterion = self._attack_criterion()
+        # Positions of this process's part among the attacked examples, and their indices.
         own = self._own_rows(len(attacked))
         shard = attacked[own]
         objective = Objective(model, criterion.select(own), attack, seed, self.phases)
         draws = random_streams.generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
         result = minimize(problem, objective, examples=shard, start=start[shard], restarts=restarts)
+        # The attack may have moved the objects. Decide about its images with their new positions.
         objective = objective.moved(problem, result.values, shard)
         with network.frozen_eval_mode(model), self.phases("attack_classifier"):
             is_fooled = objective.fooled_in_views(result.images, result.predicted, shard)
@@ -449,6 +467,7 @@ class AugmentationService:
         if attack.sensor_noise:
             diagnostics["attack_success_without_noise"] = _mean(result.success)
         if self._finds_objects:
+            # Render all examples, since the attack has images of the attacked ones only.
             images = problem.images(values, problem.all_examples)[:, 0]
             return _Made(values, images, diagnostics)
         is_new_success = success & ~result.success_before
@@ -529,6 +548,7 @@ def _describe_scene(scene: Scene) -> list[object]:
         cameras = [_rounded(vars(camera.fixed()).values()) for camera in example.cameras]
         exposure = f"{example.exposure:.3g}"
         examples.append((example.object, example.background, exposure, cameras))
+    # Lights and backgrounds are described by their sums, norms and means, which identify them.
     lights = scene.lights.flatten(1).unique(dim=0).double()
     sizes = [*lights.sum(1).tolist(), *lights.norm(dim=1).tolist()]
     backgrounds = scene.backgrounds.mean((2, 3)).flatten().tolist()

@@ -183,6 +183,7 @@ class Adversary(ShortRepr):
 def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> SceneObject:
     """Copy an object with the shape, colors and gloss of conditions; None changes nothing."""
     mesh, albedo_scale = item.mesh, item.albedo_scale
+    # Arrays of float64. None stays None.
     albedo, hue, vertices = (
         None if values is None else values.detach().cpu().double().numpy()
         for values in (changed.albedo, changed.hue, changed.vertices)
@@ -207,7 +208,9 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     shown, settings, cameras = adversary.shown, adversary.settings, adversary.cameras
     height, width = settings.shape
     export_mesh(shown.mesh, folder / MESH, settings.normals, cameras, shown.own, width / height)
+    # Pairs of a basis and coefficients. The first pair is the environment light.
     (_, light), *local_lights = save_lights(folder, adversary.light, adversary.basis)
+    # A background of one gray value needs no file. Its value is in the description.
     gray = float(adversary.background.flatten()[0])
     is_gray = bool((adversary.background == gray).all())
     if not is_gray:
@@ -235,6 +238,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     }
     atomic_write(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
 
+    # Radiance in each direction. It counts as not negative up to the rounding of an .hdr file.
     radiance = environment.to_map(light, MAP_HEIGHT)
     if radiance.min() >= -RGBE_TOLERANCE * radiance.max():
         for suffix in (".hdr", ".exr"):
@@ -305,9 +309,10 @@ def reload(folder: str | Path) -> Adversary:
 
 
 def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
-    """Read the files of an adversary."""
+    """Return the adversary in a folder, whose JSON file has the given content."""
     settings = ImageSettings(**description["image"])
     cameras: list[Camera] = []
+    # Only pinhole cameras have a roll, and orthographic cameras have no distance.
     for fields in description["cameras"]:
         kind = PerspectiveCamera if "distance" in fields else OrthographicCamera
         cameras.append((PinholeCamera if "roll" in fields else kind)(**fields))
@@ -317,6 +322,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     own_faces = description["own_faces"]
     errors.require_range("own_faces", own_faces, 1, len(mesh.faces))
     label, name = str(description["label"]), str(description["name"])
+    # The faces of the object come first, then those of each other object, and then the table.
     others, start = [], own_faces
     for other, count in description.get("others", []):
         errors.require_range("others", count, 1, len(mesh.faces) - start)

@@ -189,12 +189,14 @@ def _attack(
     evidence_before = objective.evidence(images_before)
     if not force:
         require_clean_correct(scene, evidence_before, criterion, classifier)
+    # The target is set after the check of the unchanged images, since "least_likely" needs them.
     labels = target_labels(target, source, evidence_before, classifier)
     objective.criterion = replace(criterion, target=labels)
     with phases("attack"):
         numbers = range(1, settings.restarts + 1)
         restarts = (problem.sample(generator(seed, number, "restart")) for number in numbers)
         minimum = minimize(problem, objective, restarts=restarts)
+        # Rendered with exact shadows and bounces. Otherwise, they are `minimum.images` themselves.
         images = final_images(problem, minimum.values, problem.all_examples, minimum.images)
 
     # The attack may have moved the objects.
@@ -204,6 +206,7 @@ def _attack(
     # A detector that finds nothing may have constant scores, but a cost with a gradient.
     has_gradient = settings.uses_gradients and not minimum.zero_gradient.all()
     may_be_constant = not has_gradient and torch.equal(evidence, evidence_before)
+    # Scores that are the same for black, white and attacked images count as constant.
     black_and_white = (torch.full_like(images, shade) for shade in (0.0, 1.0))
     if may_be_constant and all(
         torch.equal(objective.evidence(shown), evidence) for shown in black_and_white
@@ -266,6 +269,7 @@ def target_labels(
         return None
     classifier.task.require_target(target)
     if isinstance(target, str) and target == LEAST_LIKELY:
+        # The last axis of the evidence has the classes.
         return evidence.argmin(2)
     view_count = evidence.shape[1]
     names: list[Any] = [target] * view_count
@@ -317,6 +321,7 @@ def _candidates(settings: Settings, cameras: int, draws: Generator) -> Iterator[
     """Yield settings with other cameras, each also on light gray if the only background is gray."""
     has_one_gray = len(settings.backgrounds) == 1 and not isinstance(settings.backgrounds[0], str)
     for index in range(cameras):
+        # The first candidate has the given camera.
         candidate = settings
         if index > 0:
             becomes_perspective = settings.fov is None and index % 2 == 1

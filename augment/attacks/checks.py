@@ -229,6 +229,7 @@ def transfer(
     images = result.images_in_views
     given = attacked.size, attacked.classes, normalization, value_range, images.device
     examples = torch.nonzero(result.clean_correct & result.success)[:, 0]
+    # `classify` takes a classifier, and a function that changes an adversary before it is rendered.
     classify = partial(_classify, result, examples, _adversaries(result, examples))
     rows = []
     for index, network in enumerate(networks):
@@ -278,7 +279,7 @@ def _attack_others(
     if len(examples):
         objective = result.objective().select(examples)
         end = minimize(problem, objective, examples=examples, start=values[examples])
-        # The attack with the next scale of the norm-balls starts here.
+        # In `success_by_radius`, the attack in the next larger norm-ball starts here.
         values[examples] = end.values
         _add_successes(found, result, problem, end.values, examples, end.images)
 

@@ -138,6 +138,7 @@ def _write_example(
     write_image(path.with_suffix(".png"), figure(result, example))
     adversary = Adversary.of(scene, example, after, *images)
     light_numbers = write_adversary(adversary, path)
+    # The files of an adversary have the light after the attack. Add that before it.
     light_before, basis_before = result.light(problem.start, example)
     exposed = light_before.cpu() * scene.examples[example].exposure
     save_lights(path, exposed, basis_before, "_before")
@@ -165,6 +166,7 @@ def _numbers_of_version(result: AttackResult, images: Images) -> list[dict[str, 
     """Return successes, predictions and differences of another version for each example."""
     judged = result.objective().judge(images, result.problem.all_examples)
     evidence, fooled_in_views, without_noise = judged
+    # Examples that reach the criterion before the attack are no successes.
     is_counted = ~result.success_before
     differences = (images - result.images_in_views).abs().flatten(1)
     return [
@@ -221,6 +223,7 @@ def figure(result: AttackResult, example: int) -> Image.Image:
     columns = {
         "initial": tiles_of(drawn[0], captions_before, SIDE),
         "adversarial": tiles_of(drawn[1], captions_after, SIDE),
+        # A difference of 0 becomes the gray value 1/2.
         "difference": tiles_of((1 + scale * differences) / 2, captions, SIDE),
     }
     light_before, basis_before = result.light(result.problem.start, example)
@@ -231,6 +234,7 @@ def figure(result: AttackResult, example: int) -> Image.Image:
         columns["initial light"] = tiles_of(balls)
         balls = [light_sphere(light_after, SIDE, camera, basis_after) for camera in cameras]
         columns["adversarial light"] = tiles_of(balls)
+    # `draw_grid` takes rows of tiles, one for each view, and the titles of the columns.
     return draw_grid(list(zip(*columns.values(), strict=True)), list(columns))
 
 
@@ -246,7 +250,7 @@ def _captions(result: AttackResult, evidence: Tensor, example: int) -> list[tupl
     captions = []
     columns = (found["predicted"], found["confidence"], source.tolist(), of_label.tolist())
     for name, confidence, label, label_confidence in zip(*columns, strict=True):
-        # A dictionary has each class once.
+        # A dictionary has each class once, so a correct prediction takes one line.
         shown = {name: confidence, result.classifier.classes[label]: label_confidence}
         captions.append(tuple(f"{value:.1%} {text}" for text, value in shown.items()))
     return captions

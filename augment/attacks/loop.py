@@ -79,10 +79,12 @@ class Minimum(Rows, ShortRepr):
     def at_start(cls, evaluation: Evaluation) -> Minimum:
         """Return the result before the evaluated initial values are recorded: no success."""
         score = evaluation.score
+        # One integer zero for each example.
         zeros = torch.zeros_like(score.predicted[:, 0])
         is_zero = torch.zeros_like(score.is_success)
         if evaluation.gradient is not None:
             is_zero = evaluation.gradient.abs().amax(1) == 0
+        # The cost is infinite, so that the first candidate of each example is recorded.
         nothing = {"success": zeros.bool(), "cost": torch.full_like(score.cost, torch.inf)}
         minimum = cls(
             **evaluation.found | nothing,
@@ -145,6 +147,7 @@ def minimize(
     search = kind(problem, objective.settings, objective.seed)
     minima = []
     for rows in groups:
+        # Further initial values of the group, which are read only while examples fail.
         starts = (restart[rows] for restart in restarts)
         part = objective.select(rows)
         minima.append(_minimize_group(search, part, examples[rows], start[rows], starts))
@@ -165,6 +168,7 @@ def _minimize_group(
     settings = objective.settings
     result = minimize_from(start, optimizer, objective, examples)
     limit = settings.query_limit_of_start
+    # Stop if the queries of a start do not even pay for one candidate.
     if limit is not None and limit < objective.passes_per_candidate:
         return result
     # Result of the latest start alone, and the rows of its examples in the whole result.
@@ -207,12 +211,15 @@ def minimize_from(
     the examples that are not finished, whatever they cost. Their images and costs are older then.
     """
     settings = objective.settings
+    # Rows of the examples that are not finished.
     active = torch.arange(len(start), device=start.device)
     optimizer.begin(examples, start)
     with frozen_eval_mode(objective.model):
         evaluation_count = settings.step_limit + scores_last
         for step in progress(range(evaluation_count), "attack, until all succeed"):
+            # Step 0 evaluates the initial values.
             candidates = optimizer.ask(active) if step else start[:, None]
+            # The last evaluation needs no gradient, because no step follows.
             needs_gradient = optimizer.uses_gradients and step < settings.step_limit
             part = objective.select(active)
             shown = candidates, examples[active], needs_gradient
@@ -232,6 +239,7 @@ def minimize_from(
             result.queries[active] += passes + noisy_count
             result.backward_passes[active] += passes * needs_gradient
             active = active[~is_finished]
+            # Drop the examples that cannot pay for another step.
             if settings.query_limit_of_start is not None:
                 needed = optimizer.candidate_count * objective.passes_per_candidate
                 affordable = settings.query_limit_of_start - needed
@@ -264,6 +272,7 @@ def evaluate(
             rendered = problem.render(part, examples[rows[group]])
         images.append(rendered.detach())
         chosen = objective.select(rows[group])
+        # The values may move the objects, and with them the truth that the criterion needs.
         chosen = chosen.moved(problem, part.detach(), examples[rows[group]])
         score, image_gradient = chosen.score(images[-1], needs_gradient)
         scores.append(score)

@@ -70,6 +70,7 @@ class Score(Rows):
 
     def of_examples(self, view_count: int) -> Score:
         """Combine the scores of single images. The views of an example follow each other."""
+        # Each tensor gets the shape (E, V).
         cost, gap, predicted, is_success, is_extreme = (
             tensor.unflatten(0, (-1, view_count)) for tensor in vars(self).values()
         )
@@ -131,6 +132,7 @@ class Objective:
 
         Return also the gradients of the costs with respect to the images, if they are needed.
         """
+        # One list of the views of all examples. The criterion gets one row for each image, too.
         all_images = images.flatten(0, 1)
         criterion = self.criterion.map(of_single_images)
         gradients = torch.empty_like(all_images) if needs_gradient else None
@@ -149,6 +151,8 @@ class Objective:
         """Score single images, and write the gradients of their costs if a tensor is given."""
         batch = batch.detach().requires_grad_(gradients is not None)
         outputs = self._outputs(batch)
+        # Costs and gaps are those of the mean over random transformations, if there are any.
+        # The success is that of the image as it is.
         expected = outputs
         if self.settings.eot.draws:
             averaged = (batch, outputs, self.settings.eot, self._transformations)
@@ -188,6 +192,7 @@ class Objective:
             noisy_count[checked] = NOISE_DRAWS * self.criterion.view_count
             with self.phases("attack_classifier"):
                 is_robust = self.select(checked).is_robust(images[checked], examples[checked])
+            # The examples that were tested with noise get the result of this test.
             is_finished = is_finished.index_copy(0, checked, is_robust)
         return is_finished, noisy_count
 
@@ -225,7 +230,7 @@ class Objective:
             return criterion.select(rows).evidence(self._outputs(all_images[rows]))
 
         with eval_mode(self.model):
-            # No images are a batch, too, which gives evidence its shape.
+            # Without images, an empty batch is shown, because its evidence tells the number K.
             batches = [*self._batch_size.map(compute, len(all_images) or 1)]
         return torch.cat(batches).unflatten(0, images.shape[:2])
 
@@ -272,6 +277,7 @@ def _image_gradient(cost: Tensor, outputs: Any, batch: SingleImages) -> Tensor:
     if not cost.requires_grad:
         # A detector that finds nothing returns nothing that depends on the image.
         return torch.zeros_like(batch)
+    # Detections are lists of several tensors.
     if not isinstance(outputs, Tensor):
         (gradient,) = torch.autograd.grad(cost.sum(), batch)
         return gradient

@@ -187,6 +187,7 @@ class NormBalls:
         random directions, as far from the start as the values of an attack.
         """
         if self.settings.radius is None and reached is not None:
+            # Each example gets a random direction, at the distance that its attack has reached.
             direction = torch.randn(reached.shape, generator=draws).to(reached)
             if self.used_mask is not None:
                 direction = direction * self.used_mask
@@ -404,6 +405,7 @@ class CMAES(Optimizer):
             # Distance of each value from the norm-ball in units of `scale`, shape (P, D).
             relative_offsets = torch.where(scale > 0, offsets / scale, 0.0).double()
             costs = evaluation.costs[index].double()
+            # Points that left the norm-ball are penalized, in units of the spread of the costs.
             lower, upper = costs.quantile(costs.new_tensor([0.25, 0.75]))
             penalties = (upper - lower) * relative_offsets.square().mean(1)
             self._strategies[row].tell(list(self._drawn[row]), (costs + penalties).tolist())
@@ -419,6 +421,7 @@ class CMAES(Optimizer):
         draws = np.random.default_rng(seed)
         value_count = self.values.shape[1]
         options = {
+            # Print nothing, and adapt the variances alone if there are many values.
             "verbose": -9,
             "popsize": self.candidate_count,
             "CMA_diagonal": value_count > MAX_FULL_COVARIANCE,

@@ -141,6 +141,7 @@ class _Variation:
             gloss = settings.gloss
             ranges = torch.tensor([gloss.roughness, gloss.specular_factor], dtype=torch.float64)
             fractions = torch.rand(count, 2, generator=self.draws, dtype=torch.float64)
+            # Roughness and specular factor of each object, uniform between both ends of a range.
             values = torch.lerp(ranges[:, 0], ranges[:, 1], fractions).tolist()
             objects = [
                 with_own_mesh(item, Gloss(rough, specular_factor=strength).on(item.own_mesh))
@@ -201,6 +202,7 @@ class _Variation:
         if not settings.directional_fraction:
             return environment, torch.zeros(count, 3, dtype=torch.float64)
         low, high = settings.fill_light
+        # Factor by which the environment of an example with a directional light is dimmed.
         fill = low + (high - low) * torch.rand(count, 1, 1, generator=self.draws)
         is_chosen = torch.rand(count, 1, 1, generator=self.draws) < settings.directional_fraction
         turns = zip(scene.cameras, self._draw_pairs(MAX_LIGHT_ANGLE), strict=True)
@@ -223,6 +225,7 @@ class _Variation:
         albedo = albedo[[example.background for example in scene.examples]]
         if self.settings.background_saturation:
             fractions = torch.rand(len(scene), 2, generator=self.draws)
+            # Hue in [0, 1], and saturation up to that of the settings.
             saturations = fractions * torch.tensor([1, self.settings.background_saturation])
             albedo = albedo * patterns.random_colors(saturations).to(albedo)
         return albedo
@@ -241,6 +244,7 @@ class _Variation:
         scene = self.scene
         # If backgrounds are not lit, an irradiance of 1 leaves the albedo as it is.
         is_lit = self.settings.lit_background
+        # A background is lit as a surface that faces the camera. Tables and walls follow below.
         linear = albedo * (_facing_irradiance(scene) if is_lit else albedo.new_ones(3, 1, 1))
         pattern_points = None
         if self.settings.tables:
@@ -321,6 +325,7 @@ def _move(
     gets the field of view, at the distance from which it sees the same width at the origin, unless
     this is 0. Above a table, a camera below the horizon is mirrored, and its elevation is limited.
     """
+    # A camera that sees half the width shows the object at twice the size.
     width = camera.width / scale
     right = camera.right + shift[0] * width
     up = camera.up + shift[1] * width
@@ -331,6 +336,7 @@ def _move(
         moved = replace(moved, polar=90 - min(max(elevation, MIN_ELEVATION), MAX_ELEVATION))
     if fov:
         distance = width / 2 / math.tan(math.radians(fov) / 2)
+        # An orthographic camera becomes a perspective camera with the same fields.
         if isinstance(moved, PerspectiveCamera):
             return replace(moved, distance=distance)
         fields_of_camera = {item.name: getattr(moved, item.name) for item in fields(Camera)}
@@ -346,6 +352,7 @@ def _with_directional(environment: Float[Tensor, "E K 3"], directions: Tensor) -
     is_directional = directions.any(1)
     if not is_directional.any():
         return environment
+    # Coefficients of a white directional light of each example, shape (E, K, 3).
     added = directional(directions, torch.ones(3), degree_of(environment[0]))
     mask = is_directional[:, None, None].to(environment.device)
     return torch.where(mask, added.to(environment) + environment, environment)
@@ -359,6 +366,7 @@ def _facing_irradiance(scene: Scene) -> Float[Tensor, "E 3 1 1"]:
     normals = _towards_cameras([cameras[0] for cameras in scene.cameras])
     exposures = torch.tensor([example.exposure for example in scene.examples])[:, None]
     harmonics = harmonics_of(scene.basis)
+    # Only the harmonics with the indices `nonzero` contribute irradiance.
     coefficients = scene.lights.cpu().double()[:, harmonics.nonzero]
     facing = torch.einsum("ek,ekc->ec", harmonics.irradiance(normals), coefficients) * exposures
     return facing.to(scene.backgrounds)[:, :, None, None]
@@ -401,6 +409,7 @@ def draw_camera_effects(
     deviations = (settings.blur * torch.rand(count, generator=draws)).to(device)
     noise_deviations = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
     noises = (noise_deviations * torch.randn(count, 3, *image.shape, generator=draws)).to(device)
+    # Factor of each channel and pixel, by pattern and white balance.
     gains = (pattern_gains * 2**stops).to(device)
 
     def apply_effects(

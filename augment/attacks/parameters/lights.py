@@ -195,6 +195,7 @@ class Skylight(Parameter):
     ) -> Float[Tensor, "A 3"]:
         """Find the nearest values for which the sky model is defined."""
         # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
+        # The order of the values is zenith angle, azimuth, turbidity.
         lowest_zenith, highest_zenith = ZENITH
         lowest_turbidity, highest_turbidity = TURBIDITY
         low = values.new_tensor(

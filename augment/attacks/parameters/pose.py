@@ -65,6 +65,7 @@ class Pose(Parameter):
         self._movable_objects = _movable_objects(scene)
         self._unit = _pose_units(settings).to(scene.lights)
         self._limit = self._largest_values(scene, settings)
+        # A value with the unit 0 has no effect.
         used_mask = (self._unit > 0).expand(len(scene.object_of), -1)
         start = self._unit.new_zeros(used_mask.shape)
         super().__init__(settings, start=start, used_mask=used_mask)
@@ -177,6 +178,7 @@ class _MovableObject:
         # Append 0 for the shift along z.
         shift = F.pad(change[SHIFT], (0, 1))
         moved = rotated + shift
+        # Lift the object until its lowest vertex is on the ground.
         if self.ground_height is not None:
             lift = self.ground_height - moved[self.object_mask, 2].amin()
             moved = moved + lift * moved.new_tensor([0, 0, 1])
