@@ -241,6 +241,7 @@ class TaskNetwork(CheckedNetwork):
         if next(self.parameters(), None) is not None:
             return True
         images = render()[:MAX_PROBED]
+        # Any image tells whether logits have gradients, but boxes exist only where objects are.
         if isinstance(self.task, Classification):
             shown = images.new_full((1, 3, *height_and_width(self.size)), GRAY)
         else:
@@ -358,6 +359,7 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
     names.
     """
     errors.require_kind("label", name, str | Integral, "the name of a class, or its index")
+    # Unicode can write an accent in two ways. `composed` makes them equal.
     text = errors.composed(str(name))
     names = [*map(errors.composed, classes)]
     if isinstance(name, str) and text in names:
@@ -452,8 +454,9 @@ def as_network(
     device = wrappers.device_of(network) if device is None else errors.as_device(device)
     function = _preprocessed(network, normalization, value_range).to(device)
     name = name or type(network).__name__
-    own = wrappers.NETWORK if wrappers.normalization_of(network) else None
-    normalizer = own if normalization is None else wrappers.YOU
+    # Who states the normalization and the size, for the line that is logged. None: assumed.
+    stated_by_network = wrappers.NETWORK if wrappers.normalization_of(network) else None
+    normalizer = stated_by_network if normalization is None else wrappers.YOU
     # A mean is in the units of the value range. The default range is an object of its own.
     is_stated = normalization is not None or value_range is not UNIT_RANGE
     limits = (0.0, 1.0) if normalization == IMAGENET else (value_range[0], value_range[1])
@@ -467,6 +470,7 @@ def as_network(
     inputs = wrappers.Inputs(sizer, normalizer, wrappers.YOU if is_stated else None, limits)
     if says:
         wrappers.say_inputs(name, function, size, inputs)
+    # Gray images of different shades, to find errors before an attack begins.
     shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device, dtype=dtype)
     images = shades.view(-1, 1, 1, 1).expand(-1, 3, *height_and_width(size)).contiguous()
     with torch.no_grad():

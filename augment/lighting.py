@@ -139,11 +139,13 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         Returns:
             Lights, which `apply` takes.
         """
+        # A sample may have single images beside a batch.
         count = max([math.prod(_batch_shape(image)) for image in flat_inputs], default=1)
         models, weights = [*self.lights], [*self.lights.values()]
         lights: list[Light | None] = []
         seeds = torch.randint(2**62, (count,)).tolist()
         for seed, (chance, choice) in zip(seeds, torch.rand(count, 2).tolist(), strict=True):
+            # Draw a model with a probability in proportion to its weight.
             model = models[bisect(list(accumulate(weights)), choice * sum(weights))]
             values = torch.rand(model.dimensions + model.constants)
             is_changed = chance < self.p and self.strength > 0
@@ -205,6 +207,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         paths, spec = tree_flatten_with_path(sample)
         leaves = [leaf for _, leaf in paths]
         keys = [getattr(path[-1], "key", None) if path else None for path, _ in paths]
+        # Keys of leaves that are no images: all but `IMAGES`, if the sample has one of those.
         hidden = {"depth"} if {*IMAGES}.isdisjoint(keys) else {*keys} - {*IMAGES}
         # Torchvision tells which of the others are images: the first of plain tensors.
         others = [
@@ -281,6 +284,7 @@ def relight_photographs(
     if slides is not None:
         require_photographs("slides", slides)
     count, _, *shape = photographs.shape
+    # Photographs stand for the albedo, and the light of the projector multiplies it.
     light = draw_projected_light(count, shape, generator(seed, "relight"), slides)
     return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
 
@@ -309,6 +313,7 @@ def _apply_to_pil(image: Image.Image, lights: Sequence[Light | None], depth: Any
         return image
     if image.mode in MODES or image.mode == "I":
         array = np.array(image)
+        # Mode "I" has integers of 32 bits. Those that fit 16 bits are relit as integers of 16 bits.
         is_wide = image.mode == "I" and not 0 <= array.min() <= array.max() < 2**16
         if array.dtype.byteorder == ">" or (image.mode == "I" and not is_wide):
             array = array.astype(np.uint16)
@@ -356,6 +361,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         raise InputError(f"the image has values that are NaN or beyond ±{limit}: replace them")
     depths = None if depth is None else _as_depth(depth, frames, count)
     is_mixed = torch.is_autocast_enabled(plain.device.type)
+    # Rows of the frames that have the same model and the same strength. Unchanged frames have None.
     groups: dict[Any, list[int]] = {}
     for row, light in enumerate(lights):
         groups.setdefault((id(light and light.model), light and light.strength), []).append(row)
@@ -368,6 +374,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
             parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
     relit = parts[0]
     if len(parts) > 1:
+        # Sort the frames back to their original order.
         order = torch.tensor([row for rows in groups.values() for row in rows]).argsort()
         relit = torch.cat(parts)[order.to(plain.device)]
     if frames.is_contiguous(memory_format=torch.channels_last):
@@ -395,6 +402,7 @@ def _relight(
 ) -> Tensor:
     """Relight images (N, C, H, W) in lights of one model and one strength."""
     model, strength = lights[0].model, lights[0].strength
+    # Number of color channels: 1 of 1 or 2 channels, and 3 of 3 or 4. The rest is alpha.
     colored = images.shape[1] // 3 * 2 + 1
     colors = images[:, :colored]
     # Integers of more than 24 bits do not fit 32-bit numbers.
@@ -452,6 +460,7 @@ class Tables(NamedTuple):
 def _tables(device: torch.device) -> Tables:
     """Compute the tables in double precision. A value that is half way is rounded up."""
     decoded = decode(torch.arange(256, dtype=torch.float64) / 255, "srgb")
+    # Linear values at which the nearest byte changes.
     halves = decode((torch.arange(255, dtype=torch.float64) + 0.5) / 255, "srgb").float()
     starts = torch.arange(BINS + 1) / BINS
     lowest = torch.searchsorted(halves, starts, right=True)
@@ -463,16 +472,19 @@ def _noisy_bytes(
     colors: UInt8[Tensor, "N C H W"], model: LowLight, drawn: Drawn, strength: float
 ) -> UInt8[Tensor, "N C H W"]:
     """Return the nearest bytes of what a camera measures, from a table of its response to each."""
+    # Response a + b z + c z² of each image to each of the 256 bytes, shape (N, 1, 1, 256).
     tables = _tables(colors.device)
     decoded = tables.decoded.expand(len(colors), 1, 1, -1)
     response = model.response(decoded, drawn, strength, decoded.new_ones(()))
     z = normal_noise(tables.decoded.new_empty(colors.shape), drawn.seeds)
+    # Byte of each level of the camera's converter.
     levels = torch.arange(model.levels + 1, device=colors.device).view(1, 1, 1, -1) / model.levels
     encoded = relit_bytes(torch.full_like(levels, 255, dtype=torch.uint8), Illumination(levels))
     if loop := loops.noisy_bytes(z):
         parts = [part.flatten(1) for part in (colors, z, *response)]
         loop(*parts, encoded.flatten(), (noisy := torch.empty_like(parts[0])))
         return noisy.view(colors.shape)
+    # Without a compiled loop: look up the coefficients at 256 · image + byte.
     first = 256 * torch.arange(len(colors), device=colors.device, dtype=torch.int32)
     index = (colors.int() + first[:, None, None, None]).flatten()
     middle, slope, curve = (
@@ -486,6 +498,7 @@ def relit_bytes(colors: UInt8[Tensor, "N C H W"], light: Illumination) -> UInt8[
     """Multiply the linear colors of bytes by light, and return the nearest bytes."""
     tables = _tables(colors.device)
     loop = loops.relit_bytes(colors, light.field)
+    # The light is gain · field + offset. The loop takes these parts instead of their sum.
     if loop is None:
         decoded = tables.decoded.index_select(0, colors.flatten().int()).view(colors.shape)
         linear = (decoded * light.total()).clamp_(max=1)

@@ -289,10 +289,12 @@ def _attack(
     """Attack all photographs with all slides, one batch after the other."""
     device = wrappers.device_of(classifier)
     probed = to_unit(photographs[:MAX_PROBED]).to(device)
+    # A network without gradients has no adversarial light, which is the last one.
     lights = LIGHTS if classifier.is_differentiable(lambda: probed) else LIGHTS[:-1]
     with wrappers.frozen_eval_mode(classifier):
         quantizing = preprocessed_model(success, classifier)
         outputs = wrappers.compute_outputs(quantizing, photographs, success.batch_size, device)
+    # Index of the photograph of each attacked finding, and what the network finds there.
     index, criterion = classifier.task.as_found(outputs, classifier.classes)
     if len(photographs) and not len(index):
         found, count = classifier.task.finds[0], len(photographs)
@@ -358,18 +360,19 @@ def _attack_slide(
         )
         objective = Objective(result.classifier, criterion, search)
         optimizer: type[Optimizer] = UniformDraws if light == RANDOM else Gradient
-        found = minimize(problem, objective, examples=examples, optimizer=optimizer)
+        minimum = minimize(problem, objective, examples=examples, optimizer=optimizer)
         # The sensor noise differs for each pair of a photograph and a slide.
         noise_indices = rows * settings.slides + slide
         noisy = Objective(result.classifier, criterion, success, result.seed)
-        is_changed = noisy.fooled_in_views(found.images, found.predicted, noise_indices)[:, 0]
+        is_changed = noisy.fooled_in_views(minimum.images, minimum.predicted, noise_indices)[:, 0]
         # If factors are searched, the records of the other lights are replaced later.
         for name in result.changed if light == SLIDE else [light]:
-            result.predicted[name][rows, slide] = found.predicted[:, 0].cpu()
+            result.predicted[name][rows, slide] = minimum.predicted[:, 0].cpu()
             result.changed[name][rows, slide] = is_changed.cpu()
-            log_gain = found.values.cpu().view_as(result.log_gain[name][rows, slide])
+            log_gain = minimum.values.cpu().view_as(result.log_gain[name][rows, slide])
             result.log_gain[name][rows, slide] = log_gain
         if light == SLIDE:
+            # Only photographs that keep their class in the light of the slide are attacked.
             criterion = criterion.select(~is_changed)
             examples = examples[~is_changed]
             rows = rows[~is_changed.cpu()]

@@ -98,6 +98,7 @@ def _torchvision(
     sets = get_model_weights(model)
     # A set without names of classes has no last layer.
     named = [entry for entry in sets if entry.meta["categories"]]
+    # The set whose file the user gives. An empty list stands for a file of unknown origin.
     of_file = [entry for entry in named if weights and Path(entry.url).name == weights.name]
     published = (of_file or [sets.DEFAULT])[0]
     transforms = published.transforms()
@@ -147,7 +148,8 @@ def _with_weights(
     if hasattr(network, "pretrained_cfg"):  # timm tells which layer is the last one.
         head = network.pretrained_cfg["classifier"]
         last_weight = f"{head if isinstance(head, str) else head[0]}.weight"
-    told = facts
+    # The user's facts, and those that the weights tell.
+    all_facts = facts
     # Otherwise, the weights belong to another network, and `fill` refuses them.
     if last_weight in state:
         # The last layer has one row of weights for each class.
@@ -158,13 +160,13 @@ def _with_weights(
             raise InputError(f"{reason} classes: {advice}", "classes")
         if facts.size is None:
             own_height, _ = height_and_width(classifier.size)
-            told = replace(told, size=_size_for_positions(own_height, own_state, state))
+            all_facts = replace(all_facts, size=_size_for_positions(own_height, own_state, state))
         if count != len(classifier.classes):
-            told = replace(told, classes=tuple(map(str, range(count))))
-    if told != facts:
-        classifier = build(told)
+            all_facts = replace(all_facts, classes=tuple(map(str, range(count))))
+    if all_facts != facts:
+        classifier = build(all_facts)
     if not is_published:
-        classifier.inputs = _inputs_of(facts, FILE if told.size else None, None)
+        classifier.inputs = _inputs_of(facts, FILE if all_facts.size else None, None)
     return files.fill(classifier, state, source)
 
 
@@ -177,6 +179,7 @@ def _size_for_positions(own_size: int, own_state: State, state: State) -> int | 
         # These are the ends of names in the transformers of torchvision and timm.
         is_position = name.endswith(("pos_embedding", "pos_embed")) and own.ndim == 3
         if is_position and name in state and state[name].ndim == 3:
+            # The side of an image is proportional to the root of the number of patches.
             return own_size * math.isqrt(state[name].shape[1]) // math.isqrt(own.shape[1])
     return None
 
@@ -248,6 +251,7 @@ def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
             network = timm.create_model(model, **options)
             published = network.pretrained_cfg
             size = facts.size or published["input_size"][-1]
+            # A transformer of a fixed size is built again for the size that the user gives.
             if wrappers.own_size(network) not in (None, size):
                 network = timm.create_model(model, img_size=size, **options)
         except Exception as error:  # The connection, the disk or timm's hub may fail.
@@ -291,6 +295,7 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     logits. The name is "package.module:function".
     """
     full_name = f"{PYTHON}{name}"
+    # Part of the name before the function. A missing module of this name gets its own advice.
     module_name = name.rpartition(":" if ":" in name else ".")[0]
     try:
         network, size, classes = import_function(name)()

@@ -201,11 +201,13 @@ def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
     objects = []
     for index, member in enumerate(progress(members, "reading meshes")):
         name = f"meshes[{index}]"
+        # A pair of a mesh and a label is a list, too, but has no settings or pairs inside.
         is_list = isinstance(member, list | tuple) and any(
             isinstance(part, ObjectSettings | tuple | list | Mapping) for part in member
         )
         given = enumerate(member) if is_list else ()
         parts = [_as_object(f"{name}[{part}]", item) for part, item in given]
+        # All further objects of an entry stand beside its first one.
         first, *others = parts or [_as_object(name, member)]
         together = replace(first, others=[*first.others, *others])
         item = placed.load_object(together, settings.vertices)
@@ -473,7 +475,9 @@ def expose(scene: Scene) -> Scene:
     factors = []
     for index, item in enumerate(scene.objects):
         rows = [row for row, example in enumerate(scene.examples) if example.object == index]
+        # At most `PROBED` examples at equal distances. -(-a // b) divides and rounds up.
         values = _linear_values(scene, rows[:: -(-len(rows) // PROBED)]) if rows else torch.empty(0)
+        # Fraction of the values that are not 0, which alone can grow with the exposure.
         lit = float((values > 0).float().mean()) if rows else 0.0
         aim = min(MEAN, LIT_MEAN * lit)
         low, high = -float(STOPS), float(STOPS)
@@ -504,6 +508,7 @@ def _linear_values(scene: Scene, rows: list[int]) -> Float[Tensor, "N 3"]:
         one_light=True,
     )
     every = torch.arange(len(rows))
+    # Images that have the values of the object at its pixels, and 0 elsewhere.
     canvas = torch.zeros(len(rows) * scene.views, 3, scene.settings.pixel_count)
     for layer in probe.layers(probe.conditions(every), every.to(scene.lights.device)):
         shown = layer.composite.detach().float().cpu()
@@ -515,6 +520,7 @@ def _linear_values(scene: Scene, rows: list[int]) -> Float[Tensor, "N 3"]:
 @torch.no_grad()
 def warn_of_exposure(scene: Scene) -> None:
     """Warn of objects that are almost black or white in their first example."""
+    # First example of each object.
     seen: dict[int, int] = {}
     for row, example in enumerate(scene.examples):
         seen.setdefault(example.object, row)

@@ -167,6 +167,7 @@ class LightModel:
     ) -> Drawn:
         """Map the numbers of the lights of images to their ranges."""
         low, span, is_geometric = _ranges(self.ranges, values.device, values.dtype)
+        # Ends of geometric ranges are logarithms.
         numbers = torch.addcmul(low, span, values[:, : self.dimensions])
         numbers = torch.where(is_geometric, numbers.exp(), numbers)
         return Drawn(
@@ -176,12 +177,14 @@ class LightModel:
     def illumination(self, drawn: Drawn, strength: float = 1.0) -> Illumination:
         """Mix the light with the unchanged light, and expose it."""
         light = self.light(drawn)
+        # The unchanged light is 1 at each pixel.
         if strength < 1:
             light = light.scaled(strength, 1 - strength)
         if not self.has_meter:
             return light
         mean = light._replace(field=light.field.mean((2, 3), keepdim=True)).total()
         gray = luminance(mean) if mean.shape[1] == 3 else mean
+        # The last number is the exposure in stops. After it, the mean luminance is 2^stops.
         return light.scaled(torch.exp2(strength * drawn.numbers[-1]) / gray.clamp(min=DARKEST))
 
     def camera(
@@ -212,10 +215,13 @@ class ProjectedSlide(LightModel):
 
     def light(self, drawn: Drawn) -> Illumination:
         """Project a picture of its own on each image."""
+        # Each picture is drawn with the seed of its image.
         draws = [torch.Generator().manual_seed(seed) for seed in drawn.seeds]
         pictures = torch.cat([draw_slides(1, drawn.size, draw, self.slides) for draw in draws])
+        # Logarithms of the gains of the channels in a grid of cells, shape (B, 3, cells, cells).
         log_gain = drawn.numbers[4:-1, :, 0, 0, 0].T.reshape(-1, 3, self.cells, self.cells)
         light = smooth(log_gain, drawn.size, mode="bilinear").exp_()
+        # Autograd needs the factors, so they are multiplied in place only without gradients.
         for factor in (pictures.to(light), shading(drawn)):
             light = light * factor if light.requires_grad else light.mul_(factor)
         return Illumination(light, offset=drawn.numbers[3])
@@ -226,6 +232,7 @@ def shading(drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
     steepness, azimuth, polar, *_ = drawn.numbers
     surface = drawn.surface(steepness)
     slopes, towards = (surface.slope_down, surface.slope_right), direction(azimuth, polar)
+    # The compiled loop is faster. It does not exist without numba, on a GPU or with gradients.
     if loop := loops.cosines(drawn.numbers, *slopes):
         cosine = drawn.numbers.new_empty(slopes[0].shape)
         flat = (slope.flatten(1) for slope in slopes)
@@ -261,6 +268,7 @@ def lamp_light(
         light = height.new_empty(len(places), colors.shape[2], *height.shape[2:])
         loop(*slopes, height[:, 0], x.flatten(), y.flatten(), places, colors, light)
         return light
+    # Position of each lamp, shape (B, L, 1, 1) each, so that fields have the shape (B, L, H, W).
     right, down, above = places[..., None, None].unbind(2)
     # No surface is nearer to the lamp than a tenth of its distance.
     offsets = right - x, down - y, torch.maximum(above - height, 0.1 * above)
@@ -284,6 +292,7 @@ class PointLight(LightModel):
 
     def light(self, drawn: Drawn) -> Illumination:
         """Add weak ambient light to the light of the lamp."""
+        # Position of the one lamp of each image, shape (B, 1, 3).
         place = drawn.numbers[1:4, :, :, 0, 0].permute(1, 2, 0)
         light = lamp_light(drawn.surface(drawn.numbers[0]), place, torch.ones_like(place[..., :1]))
         return Illumination(light, offset=drawn.numbers[4])
@@ -331,6 +340,7 @@ class LinearLight(LightModel):
         height, width = height_and_width(drawn.size)
         x, y = axes(drawn.size, turn)
         right, down = turn.cos(), turn.sin()
+        # The largest value of right · x + down · y is in a corner. There, the ramp is 1 ± contrast.
         gain = contrast / (right.abs() + height / width * down.abs())
         return Illumination(right * x + down * y, gain, 1.0)
 
@@ -350,6 +360,7 @@ class FractalLight(LightModel):
     def light(self, drawn: Drawn) -> Illumination:
         """Blend two random fields of the same variance, and take the exponential."""
         contrast, angle, _ = drawn.numbers
+        # Normal numbers at the nodes of all octaves, shape (B, all nodes).
         blended = blend(drawn.constants, angle)[..., 0, 0]
         nodes = blended @ _sum_of_octaves(self.octaves, angle.device, angle.dtype)
         nodes = contrast * nodes.view(-1, 1, self.octaves[-1], self.octaves[-1])
@@ -362,6 +373,7 @@ def _sum_of_octaves(
     octaves: Sequence[int], device: torch.device, dtype: torch.dtype
 ) -> Float[Tensor, "E nodes"]:
     """Return the matrix that adds the nodes of all octaves at the nodes of the last one."""
+    # Each octave is interpolated at the nodes of the last one, along rows and along columns.
     parts = [spline(count, octaves[-1], 0.0, "bicubic", device, dtype) for count in octaves]
     return torch.cat([0.5**i * torch.kron(part, part).T for i, part in enumerate(parts)])
 
@@ -416,6 +428,7 @@ class CastShadow(LightModel):
         last = len(self.kinds) - 1
         kinds = [min(int(each * (last + 1)), last) for each in drawn.constants[:, 0].tolist()]
 
+        # Segments of the images with one kind of shadow.
         def segment(kind: int, rows: list[int] | slice) -> Tensor:
             numbers, constants = drawn.numbers[:, rows], drawn.constants[rows, 1:]
             part = drawn._replace(numbers=numbers, constants=constants)
@@ -424,6 +437,7 @@ class CastShadow(LightModel):
         *_, ambient, blue = drawn.numbers
         # Light of the sky in the shadow, relative to that of sun and sky.
         sky = ambient - ambient * blue * blue.new_tensor([0.5, 0.2, 0.0])[:, None, None]
+        # sky + (1 − sky) · v, where v = 1/2 + segment / π is the visible fraction of the sun.
         return Illumination(by_kind(kinds, segment), (1 - sky) / math.pi, (1 + sky) / 2)
 
     def _segment(self, kind: str, drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
@@ -443,9 +457,12 @@ class CastShadow(LightModel):
         x, y = axes(drawn.size, right)
         x, y, scale = (x - right) / softness, (y - down) / softness, scale / softness
         constants = drawn.constants[..., None, None]
+        # `back` is the distance of the edges of a polygon from its center. `limits` are the half
+        # widths of gaps, panes and bars, and the period of blinds.
         period, back, limits = 1.0, 0.0, [scale] * 3
         index = torch.arange(self.corners, device=scale.device)[:, None, None]
         if kind == "polygon":
+            # Each edge has a random direction near that of a regular polygon, and a distance.
             turns, far = constants[:, : 2 * self.corners].chunk(2, 1)
             normal = angle + 2 * math.pi / self.corners * (index + 0.8 * turns)
             back = scale * between(far, 0.4, 1.0)
@@ -492,6 +509,7 @@ class ColorTemperature(LightModel):
     def light(self, drawn: Drawn) -> Illumination:
         """Compute one color for all pixels. Temperatures are uniform in reciprocal units."""
         lamp, balance, tint = drawn.numbers
+        # The camera assumes a color between that of D65 (6504 K) and that of the lamp.
         assumed = 1 / 6504 + balance * (lamp - 1 / 6504)
         color = planckian_rgb(1 / lamp, tint) / planckian_rgb(1 / assumed)
         return Illumination(torch.ones_like(lamp), color / luminance(color))
@@ -541,7 +559,7 @@ class LowLight(LightModel):
         z is a normal number. The mean number of electrons l and σ² = l + r² are those of the class.
         """
         darkness, read_noise, recovered = drawn.numbers
-        # The light is 2^-stops of that of the photograph.
+        # The light is 2^-stops of that of the photograph, between `exposure` and 1.
         stops = strength * math.log2(1 / self.exposure) * darkness
         mean = radiance.clamp(min=0) * (self.full_well * torch.exp2(-stops) / white)
         variance = mean + read_noise**2

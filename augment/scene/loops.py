@@ -28,6 +28,7 @@ def _loop(
     """
 
     def delayed(function: Callable[..., None]) -> Callable[..., Callable[..., None] | None]:
+        # The loop, compiled in the first call. None without numba.
         @cache
         def compiled() -> Callable[..., None] | None:
             try:
@@ -54,6 +55,7 @@ def _loop(
                 settings.LOOP_VECTORIZE = vectorize
             return lambda *values: loop(*map(_as_array, values))
 
+        # The loop if it takes such tensors, or None.
         def fitting(*tensors: Tensor) -> Callable[..., None] | None:
             for values in tensors:
                 is_other = values.requires_grad or values.dtype == torch.float64
@@ -110,6 +112,7 @@ def noisy_bytes(
     for image in range(len(colors)):
         for pixel in range(colors.shape[1]):
             byte, noise = colors[image, pixel], z[image, pixel]
+            # middle + slope · noise + curve · noise², rounded to a level of the converter.
             signal = (curve[image, byte] * noise + slope[image, byte]) * noise
             signal = min(max(signal + middle[image, byte], zero), most)
             out[image, pixel] = encoded[np.uint32(np.int32(np.rint(signal)))]
@@ -118,6 +121,7 @@ def noisy_bytes(
 @_loop("int64, float32[:,:,::1], float32[:,:,::1], float32[:,::1], float32[:,:,::1]")
 def edges(kind: int, columns: Any, rows: Any, limits: Any, out: Any) -> None:
     """Compute the distance of each pixel to the nearest edge of a shadow."""
+    # Kind 0 is a polygon, 1 are blinds, and 2 is a window (see `CastShadow`).
     half = np.float32(0.5)
     for image, row in np.ndindex(out.shape[:2]):
         across, down, distance = columns[image, 0], rows[image, 0, row], out[image, row]
@@ -182,6 +186,7 @@ def lamps(
                 dx, dz = right - x[column], max(above - height[column], np.float32(0.1) * above)
                 across, along = slopes[0][column], slopes[1][column]
                 squares = dx * dx + dy * dy + dz * dz
+                # Vector to the lamp times the normal (−across, −along, 1), before normalization.
                 dot = max(dz - dx * across - dy * along, zero) * (above * above)
                 length = one + across * across + along * along
                 field[column] = dot / (squares * np.sqrt(squares * length))

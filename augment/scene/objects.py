@@ -167,6 +167,7 @@ def name_mesh(mesh: Mesh) -> str:
 
     `load_object` finds the mesh by this name as long as the caller keeps the mesh.
     """
+    # Hash the names, types, shapes and values of all arrays of the mesh.
     digest = hashlib.sha256()
     for field in fields(mesh):
         value = getattr(mesh, field.name)
@@ -194,6 +195,7 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
     spans = [_span_of_y(mesh) for mesh, given in zip(others, item.others, strict=True) if given.at]
     ends = np.array([-loaded.radius, loaded.radius, *(end for span in spans for end in span)])
     left, right = ends.min(), ends.max()
+    # Put the others without a position at the ends of the row, with a gap.
     for index, given in enumerate(item.others):
         if given.at is None:
             low, high = _span_of_y(others[index])
@@ -229,6 +231,7 @@ def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
         return item
     # Horizontal coordinates x and y of the vertices that a face uses.
     horizontal = item.mesh.vertices[np.unique(item.mesh.faces), :2]
+    # Smallest and largest x and y of the table, with a margin around the objects.
     left, near = np.minimum(horizontal.min(0) - TABLE_MARGIN, -MIN_TABLE_REACH)
     right, far = np.maximum(horizontal.max(0) + TABLE_MARGIN, MIN_TABLE_REACH)
     square = ((left, near), (right, near), (right, far), (left, far))
@@ -242,6 +245,7 @@ def resample_instance(item: SceneObject, seed: int) -> SceneObject:
 
     A solid that is named with a seed, such as "solid:orange:3", and other meshes stay as they are.
     """
+    # The name of a solid is "solid:NAME" or "solid:NAME:SEED".
     kind, *name_and_seed = item.name.split(":")
     if kind != "solid" or len(name_and_seed) != 1:
         return item
@@ -277,6 +281,7 @@ def _turn(azimuth: float) -> Float[np.ndarray, "3 3"]:
 def _load_other(item: ObjectSettings) -> Mesh:
     """Load the mesh of an object beside another one, and put it on the plane z = 0."""
     mesh = normalize(_load(item))
+    # Rows are points, so the rotation matrix is transposed.
     turned = item.scale * mesh.vertices @ _turn(item.azimuth).T
     lowest = turned[mesh.faces, 2].min()
     return replace(mesh, vertices=turned + np.array([*(item.at or (0.0, 0.0)), -lowest]))
@@ -303,6 +308,7 @@ def _load(item: MeshSettings) -> Mesh:
             raise InputError(f"{item.mesh}: {error}") from error
     else:
         mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
+    # Meshes without colors of their own are white.
     has_colors = bool(mesh.textures) or bool((mesh.corner_colors != 1).any())
     if item.color is not None:
         if has_colors:
@@ -369,6 +375,7 @@ def initial_materials(item: SceneObject) -> FaceMaterials:
     face_gloss = torch.tensor([MATTE]).expand(len(object_mask), 3)
     if item.mesh.gloss is not None:
         face_gloss = torch.from_numpy(item.mesh.gloss)
+    # A matte object has no metallic and no specular factor, which are the last two columns.
     if not face_gloss[object_mask, METALLIC:].any():
         specular_layer = face_gloss.new_tensor(SPECULAR_LAYER)
         face_gloss = torch.where(object_mask[:, None], specular_layer, face_gloss)
@@ -442,6 +449,7 @@ class Conditions(ShortRepr):
                 its vertices and faces.
         """
         rows = {name: field[index] for name, field in vars(self).items() if field is not None}
+        # Only these fields are padded to the size of the largest mesh.
         counts = {"vertices": len(mesh.vertices)} | dict.fromkeys(OF_FACES, len(mesh.faces))
         for name in rows.keys() & counts:
             rows[name] = rows[name][: counts[name]]

@@ -123,6 +123,7 @@ def random_colors(draws: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3 1 1"]:
 
     The columns of `draws` are hue and saturation in [0, 1]. Colors are linear RGB.
     """
+    # Shape (N, 1) each.
     hue, saturation = draws.split(1, dim=1)
     # The sRGB channels of a pure hue are piecewise linear in the hue (HSV, Smith 1978).
     ramps = (6 * hue + hue.new_tensor([0.0, 4.0, 2.0])) % 6
@@ -141,6 +142,7 @@ def draw_patterns(
     """
     # Without points, the coordinates of columns and rows are enough.
     x, y = _centers(*height_and_width(size)) if points is None else points
+    # Draw all numbers of one pattern before those of the next.
     drawn = [
         (
             torch.rand(4, generator=draws),
@@ -177,6 +179,7 @@ def by_kind(
     kinds = sorted(set(kind_of_row))
     if len(kinds) == 1:
         return compute(kinds[0], slice(None))
+    # The rows of each kind, in the order of `kinds`. Parts are then sorted back by row.
     rows = [[row for row, of_row in enumerate(kind_of_row) if of_row == kind] for kind in kinds]
     parts = [compute(kind, of_kind) for kind, of_kind in zip(kinds, rows, strict=True)]
     order = torch.tensor([*chain(*rows)]).argsort().to(parts[0].device)
@@ -194,6 +197,7 @@ def draw_photograph_patterns(
     # Three numbers in [0, 1] of each photograph, shape (N, 1, 1) each.
     turn, zoom, relative_saturation = torch.rand(3, len(photographs), 1, 1, generator=draws)
     angle = 2 * math.pi * turn
+    # Factor from 1 / MAX_ZOOM to MAX_ZOOM, whose logarithm is uniform.
     scale = MAX_ZOOM ** (2 * zoom - 1)
     rotated = turned(points * scale, angle.cos(), angle.sin())
     # `grid_sample` needs the coordinates on the last axis, shape (N, size, size, 2).
@@ -266,6 +270,8 @@ def draw_cells(count: int, size: Size, draws: Generator) -> Pictures:
     unit = 4 * (1 + (height / width) ** 2) / 2**25
     pictures = []
     for used, places, palette in zip(cell_counts.tolist(), centers, colors, strict=True):
+        # Squared distances along x and along y from each cell, as multiples of `CELL_CODE`. Their
+        # sum is the squared distance, and its lowest bits are the index of the cell.
         columns, rows = (
             ((axis - place) ** 2 / unit).round().int() * CELL_CODE
             for axis, place in zip((x, y), places[:used].T[..., None, None], strict=True)

@@ -345,14 +345,17 @@ class DirectRenderer:
         item = self.objects[object_index]
         mesh, seen = self._seen(object_index, camera, vertices)
         pixel_count = self.settings.pixel_count
+        # `item.ends` has the index after the last face of each object.
         # Index of the object that each sample shows. The table comes after the objects.
         owner_of_face = np.searchsorted(item.ends, seen.faces.numpy(), side="right")
         owner = torch.from_numpy(owner_of_face)[seen.sample_to_seen_face]
+        # Count the samples of each pair of an object and a pixel, shape (O, height, width).
         keys = owner * pixel_count + seen.pixels[seen.sample_to_pixel]
         owner_count = len(item.ends)
         counts = torch.bincount(keys, minlength=(owner_count + 1) * pixel_count)
         counts = counts.view(-1, *self.settings.shape)[:owner_count]
-        own_counts = counts.sum((1, 2))
+        visible_counts = counts.sum((1, 2))
+        # Rasterize each object by itself, to count its samples if nothing hides it.
         ends = zip([0, *item.ends[:-1]], item.ends, strict=True)
         parts = [mesh.faces[start:end] for start, end in ends]
         shown = [camera], self.settings, self.rasterizer
@@ -360,7 +363,7 @@ class DirectRenderer:
         if item.own is not None:
             alone = [build_fragments(mesh.vertices, faces, *shown)[0] for faces in parts]
         counts_alone = torch.tensor([len(each.sample_numbers) for each in alone])
-        visible = own_counts / counts_alone.clamp(min=1)
+        visible = visible_counts / counts_alone.clamp(min=1)
         return counts >= COVERED * self.settings.samples**2, visible
 
     def surface_maps(
@@ -372,6 +375,7 @@ class DirectRenderer:
         normals are along the axes right, up and back of the camera. Both are 0 in other pixels.
         """
         mesh, fragments = self._seen(object_index, camera, vertices)
+        # Columns of the pose are the axes right, up and back of the camera, and its position.
         pose = torch.from_numpy(camera.pose())
         from_camera = pose[:3, 3] - torch.from_numpy(mesh.vertices)[fragments.corners]
         depths = fragments.interpolate((from_camera @ pose[:3, 2])[:, :, None])[:, 0]
@@ -386,7 +390,9 @@ class DirectRenderer:
         faces = fragments.faces[seen_face]
         corner_normals = torch.from_numpy(in_world)[faces] @ pose[:3, :3]
         normals = (fragments.barycentric[nearest][:, :, None] * corner_normals).sum(1)
+        # `facing` turns the normals of faces that are seen from behind.
         normals = normalize(normals, dim=1) * fragments.facing[seen_face]
+        # Depth and the three components of the normal, shape (4, P).
         at_pixels = torch.cat([depth[None], normals.T])
         maps = torch.zeros(4, math.prod(fragments.shape))
         is_covered = fragments.coverage >= COVERED

@@ -224,8 +224,9 @@ class Scene:
         Args:
             arguments: Arguments of `Scene` that differ in the copy, by name.
         """
-        own = {name: getattr(self, name) for name in signature(Scene).parameters}
-        return Scene(**own | arguments)
+        # Each argument is also an attribute of this name.
+        present = {name: getattr(self, name) for name in signature(Scene).parameters}
+        return Scene(**present | arguments)
 
     def with_count(self, count: int) -> Scene:
         """Return a copy with `count` examples, as many of each object as possible.
@@ -233,13 +234,14 @@ class Scene:
         The first objects get one more if the number does not divide. The examples of an object
         are repeated if there are too few.
         """
+        # Indices of the examples of each object.
         of_object: list[list[int]] = [[] for _ in self.objects]
         for row, example in enumerate(self.examples):
             of_object[example.object].append(row)
         rows: list[int] = []
-        for index, own in enumerate(of_object):
+        for index, rows_of_object in enumerate(of_object):
             share = count // len(of_object) + (index < count % len(of_object))
-            rows += islice(cycle(own), share)
+            rows += islice(cycle(rows_of_object), share)
         if rows == [*range(len(self))]:
             return self
         return self.changed(examples=[self.examples[row] for row in rows], lights=self.lights[rows])
@@ -378,6 +380,7 @@ class Scene:
         items = [self.objects[self.examples[example].object] for example in rows.tolist()]
         # Indices among the objects of each example of those in the truth.
         kept = [[0, *(i for i, of in enumerate(item.labels) if i and of != "")] for item in items]
+        # Largest number of objects in an example. Examples with fewer are padded with NO_OBJECT.
         most = max(map(len, kept))
         labels = torch.full((len(rows), self.views, most), NO_OBJECT)
         masks = torch.zeros((*labels.shape, *self.settings.shape), dtype=torch.bool)
@@ -388,8 +391,9 @@ class Scene:
             count = len(kept[row])
             labels[row, :, :count] = torch.tensor([index_of(item.labels[i]) for i in kept[row]])
             for view, camera in enumerate(self.cameras_under(conditions, row, example)):
-                found = self._direct_renderer.masks(index, camera.fixed(), vertices)
-                mask, fraction = (part[kept[row]] for part in found)
+                # Masks and visible fractions of all objects of the example, of which some are kept.
+                all_objects = self._direct_renderer.masks(index, camera.fixed(), vertices)
+                mask, fraction = (part[kept[row]] for part in all_objects)
                 masks[row, view, :count], visible[row, view, :count] = mask, fraction
         is_hidden = (labels != NO_OBJECT) & (visible < LEAST_VISIBLE)
         if is_hidden.any():
@@ -480,12 +484,14 @@ class Scene:
         assert self.basis.movable_light is not None
         # Rows of the lamps in the K coefficients, and the basis of the lamps.
         lamp_rows, lamps = self.basis.movable_light
+        # Operators are built for the lamps at their old places, so they render without the lamps.
         other_light = light.clone()
         other_light[:, lamp_rows] = 0
         batch_images = torch.arange(len(light) * self.views, device=light.device)
         for rows, pixels, composite in self._render_with_operators(other_light, examples):
             lamp_radiances = []
             for image in batch_images[rows].tolist():
+                # Image a · V + v is view v of row a.
                 row, view = divmod(image, self.views)
                 example = self.examples[int(examples[row])]
                 shown = (example.object, example.cameras[view])
@@ -519,5 +525,6 @@ class Scene:
             shown = example_index, example.object, camera, light[row], changed, background
             pixels, coverage, radiance = self._direct_renderer.radiance(*shown)
             background_pixels = background.index_select(1, pixels)
+            # Pixels at the border of the object show a part of the background.
             term = background_term(coverage[None], background_pixels, self.settings.encoding)
             yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])

@@ -54,6 +54,7 @@ def spline(
     identity = torch.eye(nodes).view(1, nodes, nodes, 1)
     # A spline has its outer nodes at the border, and linear interpolation at centers of cells.
     corners = True if mode == "bicubic" else None
+    # Column i of the matrix is the interpolation of nodes that are 1 at node i and 0 elsewhere.
     values = F.interpolate(identity, (pixels, 1), mode=mode, align_corners=corners)
     matrix = values[0, :, :, 0].T
     if spacing and pixels == 1:
@@ -74,6 +75,8 @@ def smooth(
     height, width = height_and_width(size)
     count = nodes.shape[-1]
     kind = mode, nodes.device, nodes.dtype
+    # Matrices from nodes to rows and to columns. Half the width has the length 1, so a pixel is
+    # 2 / width.
     to_rows = spline(count, height, 2 / width if slope == "y" else 0.0, *kind)
     to_columns = spline(count, width, 2 / width if slope == "x" else 0.0, *kind)
     return to_rows @ nodes @ to_columns.T
@@ -96,6 +99,7 @@ def surface_of_depth(depth: Float[Tensor, "B 1 H W"]) -> Surface:
     is_known = depth.isfinite() & (depth > 0)
     known = torch.where(is_known, depth, 0)
     mean = known.mean((2, 3), keepdim=True) / is_known.float().mean((2, 3), keepdim=True)
+    # An image without any depth has the mean 0 / 0.
     mean = mean.nan_to_num(1.0)
     relative = torch.where(is_known, known / mean, 1)
     tangent = math.tan(math.radians(FIELD_OF_VIEW / 2))

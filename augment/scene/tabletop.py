@@ -150,6 +150,7 @@ def irradiance(
     from_table_sky, from_wall_sky = from_whole_sky.clamp(min=0)
     # The following values are averages over the samples of each of the P pixels.
     fraction_on_wall = fine_points.is_on_wall.double().mean(0)[:, None]
+    # Irradiance if nothing blocked the sky, shape (P, 3).
     open_sky = from_table_sky + fraction_on_wall * (from_wall_sky - from_table_sky)
     from_lamp = _from_lamp(room, fine_points, lamp).mean(0)[:, None]
     from_lights = _from_local_lights(room, fine_points, lights).mean(0)
@@ -183,6 +184,7 @@ def _from_lamp(room: Room, seen: _SeenPoints, lamp: Float[Tensor, " 3"]) -> Floa
     The result is 0 in the shadow of the object.
     """
     lit = (seen.normals @ lamp).clamp(min=0)
+    # Rays are traced only from points that the object can shade, since tracing takes most time.
     # Indices of the samples, and of the pixels, of the points that may be shaded.
     may_be_shaded = (lit > 0) & _passes_near_origin(seen.points, lamp, room.radius)
     candidates = torch.nonzero(may_be_shaded, as_tuple=True)
@@ -267,6 +269,7 @@ def project_along_light(
     height = ((first - starts[mesh_pixels]) * face_normals).sum(1)
     length = height / (forward[mesh_pixels] * face_normals).sum(1)
     points[mesh_pixels] = starts[mesh_pixels] + length[:, None] * forward[mesh_pixels]
+    # Axes of the pattern, both perpendicular to the rays of the projector.
     # Horizontal direction perpendicular to the rays of the projector. If these are vertical, the
     # small number keeps the vector from being zero.
     right = torch.stack([-towards[1], towards[0] + 1e-9, towards.new_zeros(())])
@@ -328,9 +331,11 @@ def _find_seen_points(
     # Table and wall are the planes normal · p = level.
     normals = _normals(camera)
     levels = torch.tensor([room.height, -room.wall], dtype=torch.float64)
+    # Component of each ray along both normals, which is negative if the ray meets the plane.
     falling = (forward @ normals.T).clamp(max=FALLING)
     # Length at which a ray p = starts + length · forward meets each plane, shape (S, P, 2).
     lengths = (levels - starts @ normals.T) / falling
+    # The nearer of both surfaces hides the other.
     points = starts + lengths.amin(2, keepdim=True) * forward
     is_on_wall = lengths[..., WALL] < lengths[..., TABLE]
     return _SeenPoints(points, normals[is_on_wall.long()], is_on_wall)
