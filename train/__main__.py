@@ -63,6 +63,7 @@ def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str 
     pairs = [(key, value) for key, value in pairs if key not in CIRCUMSTANCES]
     digest = hashlib.sha256(repr(pairs).encode(errors="surrogatepass")).hexdigest()
     ending = f"@{digest[:8]}"
+    # The folder of an earlier run with these settings, from which training can continue.
     if parent:
         for known in Path(parent).glob(f"*{ending}"):
             return known.name

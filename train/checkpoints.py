@@ -262,12 +262,14 @@ def load_run(
         built = build_network(classes, size, trust_code=trust_code, **shape)
         network = with_normalized_light(built, light)
         network.load_state_dict(state["model"])
+        # Arguments of `Classifier` and `TaskNetwork`: network, size, classes and name.
         facts = network, size, classes, f"{RUN}{run}"
         loaded: Any
         if name == DETECTOR:
             loaded = TaskNetwork(*facts, task=Detection())
         else:
             loaded = Classifier(*facts)
+            # Earlier versions stored a single operating point instead of a list.
             stored = state.get("operating_point", [])
             points = stored if isinstance(stored, list) else [stored]
             loaded.operating_points = [OperatingPoint(**values) for values in points]

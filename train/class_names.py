@@ -72,6 +72,7 @@ def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) ->
         values = item if isinstance(item, dict) else {"mesh": item}
         mesh, label = str(values.get("mesh")), values.get("label")
         if label in (None, ""):
+            # None if no class has this name.
             name = class_of_name(name_of_mesh(mesh), classes)
         else:
             name = class_name(classes, label, f"{key}[{index}].label")
@@ -142,6 +143,7 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
         meshes = [with_class_name(item, classes, "meshes") for item in settings.meshes]
     key = "hard_negatives"
     negatives = [with_class_name(item, classes, key) for item in settings.hard_negatives]
+    # A single positive class is given by its name, several are given as a list.
     label = names[0] if len(names) == 1 else names
     return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
 

@@ -196,6 +196,7 @@ def build_network(
     # Architectures raise errors of many types if images are too small for them.
     try:
         if not is_own:
+            # Networks of torchvision take normalized images, so a layer before them normalizes.
             built = _build_architecture(architecture, len(classes), size)
             network = Network(built, [ChannelNormalization(mean, std)])
         with eval_mode(network), torch.no_grad():

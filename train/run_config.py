@@ -80,6 +80,7 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
     A fact that contains "${" is left out, because `read_config` refuses it.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    # Relative paths in the command are relative to this folder.
     if "command" in facts:
         facts["working_folder"] = os.getcwd()
     # This import is here because results of runs are read without torch.
@@ -191,6 +192,7 @@ def require_same(
         if old != new and not is_permitted(key, old, new):
             advice = f"set it so, or another {elsewhere}"
             raise InputError(f"{folder} was made with {key}={old}, not {new}: {advice}")
+    # Fingerprints of the input files at that time, by path.
     hashes = config.get("inputs") or {}
     for path, fingerprint in fingerprints(settings).items():
         if hashes.get(path, fingerprint) != fingerprint:

@@ -116,6 +116,7 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
             yield
         finally:
             for folder in folders:
+                # Only the file of the lock is there.
                 if [path.name for path in folder.iterdir()] == [LOCK]:
                     (folder / LOCK).unlink()
                     folder.rmdir()
@@ -128,6 +129,7 @@ def state(folder: Path) -> str:
     """
     if not folder.exists():
         return "not begun"
+    # The process that trains the run holds its lock.
     with locked(folder) as is_ours:
         if not is_ours:
             return "in training"
@@ -172,6 +174,7 @@ def writable_folder(folder: str | Path, key: str) -> Path:
     try:
         existing = next(one for one in (path, *path.absolute().parents) if one.exists())
         with tempfile.TemporaryFile(dir=existing) as file:
+            # An empty file could be created on a full disk.
             file.write(bytes(TEST_SIZE))
     except OSError as error:
         fault = f"{key}={path} cannot be written to ({error.strerror})"

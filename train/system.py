@@ -162,6 +162,7 @@ def program(name: str, as_called: bool = False) -> list[str]:
     if process_count == 1:
         return words if is_installed else [python, *words]
     torchrun = [python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
+    # torchrun would otherwise start the installed command as a Python file.
     no_python = ["--no-python"] if is_installed else []
     return [*torchrun, f"--nproc_per_node={process_count}", *no_python, *words]
 

@@ -171,6 +171,7 @@ def _caveats(
     for network in networks.values():
         if plan is None and not isinstance(network, Classifier):
             continue
+        # `render` makes images by which the network is tried. A classifier needs none.
         render: Callable[[], Tensor] = partial(torch.empty, 0, device=device_of(network))
         if plan is not None:
             # Only an image with an object tells whether a detector has gradients.
@@ -201,6 +202,7 @@ class _Plan:
         meshes = [*read_objects(settings.meshes, self.label, "meshes").values()]
         hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
         for item in hard_negatives:
+            # Such a label is of no class of the network, and names a folder of test images.
             if item.label == "":
                 item.label = OTHER_PREFIX + class_names.name_of_mesh(item.mesh)
         for item in meshes:
@@ -284,6 +286,7 @@ class _Plan:
                 negatives = replace(views, objects=self.negatives)
                 lit = (network, views, attacked_views, negatives, *environments[1:], results)
                 _write_json(results / found.DETECTED, found.find_in_lights, *lit)
+        # Test images are also scored with the remedy "normalized light".
         for key, network in {**networks, **normalizing(networks)}.items():
             for name, images in self.image_folders.items():
                 predictor = Predictor(network, network.classes, network.size, self.views.device)

@@ -164,6 +164,7 @@ def sections(networks: Mapping[str, Path], label: str) -> list[dict[str, Any]]:
             continue
         content = read_json(folder / DETECTED)
         tables = [_table(content["metrics"], f"renders; 95% intervals over {VIEWS}", "light")]
+        # The same network with the remedy "normalized light", which may have scores, too.
         normalized = folder.with_name(f"{folder.name}{NORMALIZED}")
         for path, title in ((folder, ""), (normalized, ", with normalized light")):
             if (path / BOXED / SUMMARY).exists():

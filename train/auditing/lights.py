@@ -165,6 +165,7 @@ class Views:
 
     def scene(self, size: Size, kind: str = "lighting") -> Scene:
         """Build a scene with one example for each view."""
+        # The views show the objects in turn.
         objects = [self.objects[index % len(self.objects)] for index in range(self.count)]
         local_lights = [build_local_light(light) for light in KINDS[kind].local]
         natural_light = load_light(self.light) * self.exposure
@@ -172,6 +173,7 @@ class Views:
         scene = Scene.grid(
             objects,
             CAMERA,
+            # A gray background, shape (1, 1, H, W).
             torch.full((1, 1, *height_and_width(size)), BACKGROUND),
             lights.to(self.device),
             ImageSettings(size, samples=2, encoding="srgb", normals="smooth"),
@@ -179,6 +181,7 @@ class Views:
             shared=False,
             basis=basis,
         )
+        # Azimuth of the camera, rotation and size of the object are random in each view.
         variation = replace(VARIATION, scale=[self.size * scale for scale in VARIATION.scale])
         return vary(scene, variation, generator(self.seed, "views"))
 

@@ -342,6 +342,7 @@ class AuditedNetwork:
             )
             for kind, counts in self.counts.items()
         }
+        # `views` says for each view whether it is recognized, so the mean is a fraction.
         recognized = {light: sum(views) / len(views) for light, views in self.recognized.items()}
         results = (recognized, attacks, scores, self.transfers)
         return NetworkReport(self.name, self.answer, *results)

@@ -180,6 +180,7 @@ def _first_screen(
     if len(networks) > 1:
         folder = folders[images]
         names = (f"before: {networks[0].name}", f"after: {networks[1].name}")
+        # Each side of the comparison is a list of evaluations, one for each seed.
         before, after = ([evaluation] for evaluation in evaluations)
         screen = first_screen.compare_networks(before, after, names, folder, folder.name)
         if screen is not None:
@@ -299,6 +300,7 @@ def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:
         }
         if lines:
             unit = f"radius ({light.unit})"
+            # Radius 0 is before the attack.
             pictures.append(plot_by_radius(lines, (0, *light.radii), light.title, unit))
     return pictures
 

@@ -296,6 +296,7 @@ def _drawn(result: PhotographAttackResult, image: UInt8[Tensor, "3 H W"]) -> Flo
 def screen_of_photographs(results: Mapping[str, Path]) -> FirstScreen:
     """Make the top of the report of an audit without meshes."""
     scores = [read_relit(path / RELIT_FOLDER) for path in results.values()]
+    # With a hardened network, the first scores are before hardening, and the last ones after it.
     first, last = scores[0], scores[-1]
     numbers = []
     for light in first.lights:
@@ -326,6 +327,7 @@ def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
             "network. A change counts only if it remains in three draws of the noise of a sensor.",
         ]
         unreadable_count = len(scores.unreadable)
+        # Only a part of the photographs is attacked.
         if scores.shown + unreadable_count < scores.found:
             sentences.append(
                 f"The folder holds {scores.found} photographs, of which these are some."

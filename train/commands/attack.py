@@ -185,6 +185,7 @@ def attacks(
 
     def start(scene: Scene, force: bool) -> AttackResult:
         with keyed("attack", **keys_of("attack", settings.attack)):
+            # The target class and the settings of the attack.
             given = settings.target, settings.attack
             return attack(classifier, scene, *given, seed=settings.seed, force=force)
 
@@ -257,6 +258,7 @@ def load_targets(
         classifiers.append(other.to(device))
     objects = []
     for mesh in read_objects(chosen.meshes, label, "transfer.meshes").values():
+        # A mesh with a class that the attacked network lacks raises InputError.
         attacked.label(mesh.label)
         objects.append(add_table(load_object(mesh, settings.scene.vertices), settings.scene.ground))
     return {"classifiers": classifiers, "azimuths": chosen.azimuths, "objects": objects}

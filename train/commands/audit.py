@@ -117,10 +117,12 @@ def audit(
         networks: dict[str, Any] = {CLASSIFIER: as_network(network, *options, **named)}
         if hardened is not None:
             if isinstance(hardened, TaskNetwork):
+                # A `TaskNetwork` knows itself whether it normalizes light.
                 named["normalize_light"] = None
             networks[HARDENED] = as_network(hardened, *options, argument="hardened", **named)
         classifier = networks[CLASSIFIER]
         with folder_or_temporary(out) as folder:
+            # `run_audit` takes settings, as the command does, so the arguments become settings.
             items = as_mappings("meshes", meshes, classifier)
             negatives = as_mappings("hard_negatives", hard_negatives, classifier)
             folders = {"photos": photos, "laboratory": laboratory, "out": folder}

@@ -176,6 +176,7 @@ def evaluate(
             annotations = read_annotations(folder)
         elif isinstance(made, Classifier):
             labels = choose_labels(as_folder("photos", folder), made.classes, label)
+        # The folder of the results. It is checked before the long computation.
         target = None
         if out is not None:
             target = writable_folder(str(out), "out")
@@ -185,6 +186,7 @@ def evaluate(
         with sole_writer("out", target) if target else nullcontext():
             if not isinstance(made, Classifier):
                 found: AnnotatedScores
+                # Arguments that the functions for detectors and segmenters share.
                 how = fit, skip_unreadable, device
                 if isinstance(made.task, Detection):
                     chosen = None if label is None else label_names(label)
@@ -196,6 +198,7 @@ def evaluate(
                 return found
             model = MixedPrecision(made, choose_precision(precision, device))
             predictor = Predictor(model, made.classes, made.size, device)
+            # Thresholds that are stored with the network, used if every label has one.
             stored = {point.label: point for point in made.operating_points}
             points = [stored[name] for name in labels] if stored.keys() >= set(labels) else []
             if calibrate is not None and false_positive_rate is not None:

@@ -156,8 +156,10 @@ def harden(
             raise InputError(f"network is for {classifier.task.name}: give another")
         if next(classifier.parameters(), None) is None:
             raise InputError("network has no parameters: give a network that can be trained")
+        # Text vectors of a zero-shot network become buffers, so that they are copied and saved.
         keep_text_vectors(classifier.network, len(classifier.classes))
         items = class_names.as_mappings("meshes", meshes, classifier)
+        # Settings by which this call differs from the experiment.
         changes: dict[str, Any] = {"seed": seed, "overwrite": overwrite, "meshes": items}
         changes |= {"network": classifier.name, "unlabeled": str(as_path("unlabeled", unlabeled))}
         changes |= {"data": {"name": "unlabeled"}, "train": {"device": str(device)}}
@@ -172,6 +174,7 @@ def harden(
             negatives = class_names.as_mappings("hard_negatives", hard_negatives, classifier)
             changes["hard_negatives"] = negatives
         if out is None:
+            # Nothing is written outside of the temporary folder.
             changes["train"]["cache"] = None
         experiment = "detector" if is_detector else "classifier"
         sections: dict[str, Any] = {"train": train, "augment": augment, "scene": scene}
@@ -186,6 +189,7 @@ def harden(
             run.train(logger)
             if out is not None:
                 console.info("%s", report_of([folder], folder))
+    # The network of the caller stays as it is, so a new copy gets the trained weights.
     copy = _trainable_copy(network)
     keep_text_vectors(copy, len(classifier.classes))
     target = copy
@@ -220,6 +224,7 @@ def _read_settings(
     `sections`, which the caller gave, win over `changes`, and these win over the experiment.
     """
     config = main.compose([f"experiment={experiment}"])
+    # The configuration without keys that belong to the command alone.
     settings = OmegaConf.masked_copy(config, [item.name for item in fields(ExperimentSettings)])
     # `harden` returns only the network, so scores on test renders are not needed.
     settings.evaluate.laboratory_setups = 0

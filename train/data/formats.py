@@ -80,10 +80,12 @@ class DataSet:
         """Return the content of the files of a render by their paths. The last one is its JSON."""
         part = self.split(render.index)
         number = f"{render.index:06d}"
+        # The path of the image, by the template of the format.
         image = self.image.format(part=part, number=number, label=first_label(render))
         facts = render.boxes.tolist(), render.visible.tolist(), render.masks.numpy()
         objects = []
         for label, box, visible, mask in zip(render.labels, *facts, strict=True):
+            # The mask is stored as run lengths, as in COCO.
             item = {"class": str(label), "box": box, "visible": visible}
             objects.append(item | {"area": int(mask.sum()), "counts": run_lengths(mask)})
         details = {
@@ -139,6 +141,7 @@ class Coco(DataSet):
         for part in self.splits:
             images, annotations = [], []
             for render in (one for one in renders if one["split"] == part):
+                # Ids of COCO count from 1.
                 image_id, name = render["index"] + 1, Path(render["image"]).name
                 height, width = render["size"]
                 images.append({"id": image_id, "file_name": name, "height": height, "width": width})
@@ -253,6 +256,7 @@ def _map(render: LabeledRender, name: str) -> np.ndarray:
     if name == "mask":
         numbers = np.arange(1, len(render.masks) + 1, dtype=np.uint8)[:, None, None]
         shape = render.image.shape[1:]
+        # Masks of visible parts do not overlap, so the maximum is the number of the object, or 0.
         return (render.masks.numpy() * numbers).max(0, initial=0).reshape(shape).astype(np.uint8)
     assert render.depth is not None and render.normals is not None
     if name == "depth":

@@ -92,6 +92,7 @@ class ImageFiles:
         loader: DataLoader = DataLoader(_Reader(self), batch_sampler=list(batches), **options)
         for images, errors_in_batch in loader:
             errors |= errors_in_batch
+            # Unless errors are skipped, the first one stops the run.
             for path, error in () if self.skip else errors.items():
                 advice = "replace the file, or set skip_unreadable=True"
                 raise InputError(f"{self.folder / path} cannot be read ({error}): {advice}")
@@ -127,6 +128,7 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
         index, seed = key
         paths, size = self._files.paths, self._files.size
         errors: ReadErrors = {}
+        # The files after this one, and then those before it. Only those in its subfolder are tried.
         for path in (*paths[index:], *paths[:index]):
             if path.parent != paths[index].parent:
                 continue

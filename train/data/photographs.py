@@ -74,6 +74,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     if len(labels) > 1 and not has_class_folders:
         raise InputError(f"{folder} has several labels, but no folders of classes: make some")
     table = folder / TABLE
+    # Source, hard negatives and mesh of each path in photos.csv.
     rows = _read_table(table)
     missing = sorted(rows.keys() - set(map(_composed_path, files)))
     if missing:
@@ -84,6 +85,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
         _warn_once(fault)
     photographs = []
     for path in paths:
+        # The class is the first folder in the path.
         name = composed(path.parts[0]) if has_class_folders else labels[0]
         row = rows.get(_composed_path(path), (None, (), None))
         photographs.append(Photograph(path, name, *row))
@@ -214,6 +216,7 @@ def _has_class_folders(
     known = [name for name in names if name in classes or name.startswith(OTHER_PREFIX)]
     no_classes = [name for name in names if name not in known]
     for name in no_classes:
+        # A name that resembles a positive class must not count as a negative by mistake.
         is_misspelled = any(label in name.lower() for label in labels)
         if not known or is_misspelled or get_close_matches(name.lower(), labels):
             fault = f"{folder / name} is not a class, such as {nearest(name, classes)}"

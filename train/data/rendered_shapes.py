@@ -79,12 +79,14 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: Path | None 
     settings = replace(SETTINGS, size=size)
     splits = []
     for split_name, images_per_class in (("train", train), ("test", test)):
+        # All that determines the images, so that other settings use another file of the cache.
         key = content_hash([CODE, CLASSES, images_per_class, seed, split_name, settings])
         images = read_cached(cache, key) if cache else None
         if images is None:
             images = _render(split_name, images_per_class, seed, settings)
             if cache:
                 write_cached(cache, key, images)
+        # The images are in the order of their classes.
         labels = torch.arange(len(CLASSES)).repeat_interleave(images_per_class)
         splits.append(Split(images, labels))
     return DataSet(CLASSES, splits[0], splits[1], rendered=True)
@@ -140,6 +142,7 @@ def _render(
 def _render_solid(name: str, settings: ImageSettings, draws: Generator) -> UInt8[Tensor, "_ 3 S S"]:
     """Render a random solid in another light for each pair of random camera and background."""
     mesh = solid(name, int(torch.randint(2**31, (1,), generator=draws)))
+    # Three random numbers in [0, 1] for each camera.
     numbers = torch.rand(3, CAMERAS, generator=draws, dtype=torch.float64).T.tolist()
     cameras = [
         OrthographicCamera(40 + 45 * polar, 360 * azimuth, 2 + width)
@@ -149,6 +152,7 @@ def _render_solid(name: str, settings: ImageSettings, draws: Generator) -> UInt8
     lights = []
     for camera in cameras:
         to_camera = torch.tensor(camera.axes()[2], dtype=torch.float32)
+        # Each pair of camera and background has a light of its own, from the side of the camera.
         lights += [soft_front_light(to_camera, draws) for _ in grays]
     shown = ([SceneObject("", normalize(mesh))], cameras, load_backgrounds(grays, settings.size))
     scene = Scene.grid(*shown, torch.stack(lights), settings, choose("numpy"))

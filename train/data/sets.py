@@ -282,6 +282,7 @@ def load_folder(
         console.warning("%d files are no images: %s", len(other_files), root / other_files[0])
     options = (classes, size, skip_unreadable, workers)
     train = _read(train_root, *options)
+    # A class without an image could not be learned.
     for label in sorted(set(range(len(classes))).difference(train.labels.tolist())):
         raise InputError(f"{train_root / classes[label]} holds no image: add some, or remove it")
     if split_names:
@@ -308,6 +309,7 @@ def _read(root: Path, classes: Sequence[str], size: int, skip: bool, workers: in
     label is 0.
     """
     if classes:
+        # The positive class does not matter here, so the first class stands for it.
         found = photographs.find_photographs(root, classes, classes[0])
     else:
         found = photographs.find_unlabeled(root)

@@ -100,6 +100,7 @@ def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
         return np.clip(albedo_scale * albedo, 0, 1).astype(np.float32)
 
     parts = []
+    # A part has one texture, or colors at its vertices.
     for part in split_parts(mesh, mesh.written_normals("smooth"), "srgb"):
         texture = part.texture
         if texture is not None:
@@ -154,6 +155,7 @@ def _light_sources(shot: Shot) -> list[dict[str, Any]]:
         power = shot.brightness * distance**2
         pose = look_at(position, shot.center)
         lights.append(projector(pose, fov, {"bitmap": pattern}, power / len(shot.patterns)))
+    # Light from all directions, as from the walls of a room.
     lights.append({"type": "constant", "radiance": _rgb(shot.ambient)})
     return lights
 
@@ -287,6 +289,7 @@ def _read_environment(path: Path) -> Float[np.ndarray, "H W 3"]:
     It is linear radiance, whose upper half is above the horizon. Negative radiance of a built-in
     light is removed.
     """
+    # Built-in lights are spherical harmonics, whose radiance can be negative in some directions.
     if str(path) in PROBES:
         light = HARMONICS.project_nonnegative(load_light(str(path)))
         return to_map(light, BUILT_IN_MAP_HEIGHT).clamp(min=0).numpy()

@@ -188,6 +188,7 @@ def _outputs(
 ) -> Iterator[tuple[Annotated, Fitted, Any]]:
     """Yield photographs with the outputs of a network, and draw some of them into `pictures`."""
     size = height_and_width(network.size)
+    # Names of SHOWN photographs, whose pictures are drawn.
     shown = {item.name for item in evenly_spaced(photographs, SHOWN)}
     # Skipped photographs can leave a batch empty.
     for batch in filter(None, fit_batches(photographs, size, how, BATCH, skip_unreadable)):
@@ -212,6 +213,7 @@ def evaluate_detector(
     label_of_class = _choose_labels(annotations, network.classes, labels)
     task = network.task
     assert isinstance(task, Detection)
+    # Detections, true boxes and folder of each photograph. `listed` has all detections.
     found: list[Found] = []
     marked: list[Marked] = []
     sources: list[str] = []
@@ -329,6 +331,7 @@ def evaluate_segmenter(
 
     miou, by_class = mean_iou(pairs(), len(network.classes))
     named = zip(network.classes, by_class, strict=True)
+    # The IoU of a class that no pixel has is NaN.
     known = {name: iou for name, iou in named if np.isfinite(iou)}
     return SegmentationScores(
         file=folder,

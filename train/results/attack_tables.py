@@ -55,6 +55,7 @@ def format_attack(
     text = [f"{heading}; {queries} ({result.seconds['attack']:.1f} s)"]
     if checks is not None:
         text += _check_lines(checks, result.settings.uses_gradients)
+    # Versions are other ways to make the images, such as another renderer.
     adversaries = [line for line in lines if line["success"] and line["clean_correct"]]
     versions = adversaries[0]["versions"] if adversaries else ()
     return text + [_version_line(version, adversaries) for version in versions]
@@ -84,6 +85,7 @@ def _success(result: AttackResult) -> str:
 def _check_lines(checks: Mapping[str, Any], uses_gradients: bool) -> list[str]:
     """Describe the results of the checks of an attack in lines of text."""
     unit, units = ("step", "steps") if uses_gradients else ("query", "queries")
+    # Success rates of attacks with several numbers of steps.
     attacks = [f"{rate:.0%} in {count}" for count, rate in checks["success_by_steps"].items()]
     zero_gradient = ""
     if uses_gradients:
@@ -122,6 +124,7 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
     lines = []
     rows = []
     for result in transfers:
+        # Such as "classifier" and "resnet50".
         kind, name = next(iter(result.items()))
         is_correct = torch.tensor(result["clean_correct"])
         rate = _success_rate(torch.tensor(result["success"])[is_correct])
@@ -162,8 +165,10 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
         for method in methods
         for row in sweep
     ]
+    # The header, and a row for each record.
     cells = [[*records[0]], *([*record.values()] for record in records)]
     write_csv(out / SWEEP_TABLE, cells, line_end="\r\n")
+    # The last mesh is "all" if there are several.
     last_mesh = records[-1]["mesh"]
     shown = [record for record in records if record["mesh"] == last_mesh and record["n"]]
     _draw_sweep(shown, norms, out / SWEEP_FIGURE)

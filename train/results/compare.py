@@ -77,6 +77,7 @@ def group_by_images(methods: Methods) -> dict[str, Scored]:
     for method, runs in methods.items():
         for run in runs:
             for name, scores in run.photographs.items():
+                # `scores.images` is the hash of the images, which is the same wherever they lie.
                 group = groups.setdefault(scores.images, {})
                 group.setdefault(method, []).append(ScoredRun(run, name))
     titled: dict[str, Scored] = {}
@@ -93,6 +94,7 @@ def group_by_images(methods: Methods) -> dict[str, Scored]:
             title += f"{auc.negatives:,} images of other objects"
             title += COUNTED_EACH if len(labels) > 1 else ""
             title += f"; {describe_intervals([auc])}" if auc.low is not None else ""
+        # Two groups can have the same folder name and the same numbers.
         if title in titled:
             title = f"{title} ({len(titled) + 1})"
         titled[title] = group
@@ -253,6 +255,7 @@ def run_tables(methods: Methods) -> list[Table]:
     tables = [_run_table(title, [_accuracy_title(every_run)], lines)]
     # The first run of each method. Networks without a run have no settings of a training.
     heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
+    # Titles of the settings in which the runs differ, by their keys.
     varied = store.varied_settings([*heads.values()])
     rows = [
         [method, *(str(head.settings.get(key)) for key in varied)]
@@ -277,6 +280,7 @@ def score_table(title: str, group: Scored) -> Table:
     lines: dict[str, list[Line]] = {}
     points = set()
     for method, scored_runs in group.items():
+        # How the threshold was chosen, in words. Empty without a threshold.
         points |= {scored.scores.operating_point for scored in scored_runs}
         lines[method] = [
             (scored.run.seed, [*map(scored.scores.overall.find, METRICS)]) for scored in scored_runs
@@ -350,6 +354,7 @@ def format_short_comparison(runs: Sequence[RunSummary], by: str = "source") -> s
         gain = None
         if first is not None and method in evaluations and method != first:
             gain = difference(evaluations[method], evaluations[first], ALL, "auc")
+        # The short table has no intervals, except for the gain.
         values = [format_interval(item and Estimate(item.value)) for item in shown]
         rows.append([method, len(runs_of_method), *values, format_interval(gain, sign="+")])
     header = ["network", "runs", _accuracy_title(runs), *map(metric_title, SHORT_METRICS)]

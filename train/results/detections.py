@@ -171,6 +171,7 @@ def match_images(found: Sequence[Found], marked: Sequence[Marked], iou: float = 
         is_counted, is_right = index != CROWD, index >= 0
         columns = [item.labels, np.full(len(index), image), item.scores, is_right]
         detections.append(np.stack(columns)[:, is_counted])
+        # Objects without a detection have the score -inf.
         score_of_object = np.full(len(truth.labels), -np.inf)
         score_of_object[index[is_right]] = item.scores[is_right]
         columns = [truth.labels, np.full(len(truth.labels), image), score_of_object]

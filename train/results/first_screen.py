@@ -152,6 +152,7 @@ def compare_networks(
     if not is_hardening:
         subjects = f"the network “{names[0]}”", f"the network “{names[1]}”"
         change = f"“{names[1]}”"
+    # All seeds have the same images, so the first one gives their numbers and labels.
     pool = after[0].pooled.all
     labels = pool.predictions.labels
     label = join_words([in_words(item) for item in labels], "or")
@@ -166,6 +167,7 @@ def compare_networks(
         each = ", mean over these classes"
         metrics["class_top1"] = ("Top-1 among all classes, mean over classes", "higher is better")
         reasons["class_top1"] = "Among all classes of the network, top-1 (the mean over classes)"
+    # Difference after minus before of each metric. None if it is unknown.
     gains = {
         metric: compare.difference(after, before, compare.ALL, metric)
         for metric in (*metrics, EQUAL_RATE)
@@ -193,6 +195,7 @@ def compare_networks(
     sentences += [gain_sentence(text, gain) for text, gain in known.items() if gain is not None]
 
     shown = pool.negatives.photograph
+    # Object of each image without a positive class. A photograph has one prediction for each label.
     others = {item.path: item.mesh or item.path for item in shown if item.label not in labels}
     scored = pool.metrics.auc
     images = (
@@ -212,6 +215,7 @@ def compare_networks(
     )
     rows = {}
     if folder is not None:
+        # The pictures are from the first seed.
         one, other = (item[0].pooled.predictions for item in (before, after))
         rows = choose_disagreements(one, other, folder, labels, subjects)
     answer = _answer(change, recall, mistaken, auc)
@@ -244,6 +248,7 @@ def _answer(
     subject = change[0].upper() + change[1:]
     ends = f"{_rounded(auc.low, 2)}, {_rounded(auc.high, 2)}"
     gain = f"AUC {_rounded(auc.value, 2, '+')} [{ends}] over {auc.over}"
+    # A direction is the sign of a difference that is proven, and otherwise 0.
     if auc.direction > 0:
         price = ", at a price" if false_positives.direction > 0 else ""
         return f"{subject} improved the ranking ({gain}){price}."

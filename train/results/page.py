@@ -119,6 +119,7 @@ def _title(found: store.Findings, methods: Methods) -> str:
     stored = [scores for runs in methods.values() for scores in runs[0].photographs.values()]
     labels = {label for scores in stored for label in scores.labels}
     trained = [method for method, runs in methods.items() if runs[0].mode != store.INITIAL]
+    # A run that began with a network hardened it.
     if labels and len(trained) < len(methods):
         return f"Hardened against unusual lighting: {', '.join(map(in_words, sorted(labels)))}"
     subject = " and ".join(sorted(labels)) or "Networks"
@@ -146,6 +147,7 @@ def write_page(out: Path, script: str = "", **content: Any) -> Path:
     environment.filters.update(command=_shell_command, yaml=OmegaConf.to_yaml)
     # The base64 SHA-256 with which the content security policy allows the script.
     allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    # Blocks without content are empty.
     content = {name: {} for name in BLOCKS} | content | {"script": script, "allowed": allowed}
     out.mkdir(parents=True, exist_ok=True)
     path = out / PAGE
@@ -212,6 +214,7 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
 
     sentences = []
     accuracies = [run.before.accuracy or 0.0 for run in runs if run.before]
+    # If the agreement with the original network was measured, it is told instead of the accuracy.
     if (agreement := mean("test/agreement")) is not None:
         sentences.append(
             f"{method}: on photographs that training did not use, the network predicts the "
@@ -277,6 +280,7 @@ def images_folder(run: RunSummary, name: str) -> Path | None:
         # The run may have rendered the images itself.
         rendered = run.folder / KEPT_ASIDE
         return rendered if name == LABORATORY and rendered.is_dir() else None
+    # A relative path is relative to the folder in which the run was started.
     working_folder = Path(run.config.get("working_folder") or "")
     for candidate in (published_folder(Path(folder)), working_folder / folder):
         if candidate.is_dir():

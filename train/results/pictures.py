@@ -117,6 +117,7 @@ def plot_curves(
 
     None if the metric is constant in each line.
     """
+    # Epochs in which the metric is unknown are left out.
     lines_of_method = {
         method: [[(x, y) for x, y in points if y is not None] for points in seeds]
         for method, seeds in methods.items()
@@ -253,6 +254,7 @@ def contact_sheet(predictions: Predictions, images: UInt8[np.ndarray, "N 3 H W"]
     """
     grids = [draw_grid([], heading=LEGEND)]
     for label, rows in predictions.by_label.items():
+        # Photographs by the probability of their predicted class, the highest first.
         order = np.argsort(-rows.probability, kind="stable")
         is_positive = rows.positive[order]
         is_found = rows.predicted[order] == label

@@ -124,6 +124,7 @@ class Predictor:
             images=images,
             labels=labels,
             unreadable=unreadable,
+            # Files that are no images.
             left_out=[str(path) for path in unsupported_files(folder)],
             images_hash=_hash(folder, photographs, labels),
         )
@@ -287,6 +288,7 @@ class Scores(ShortRepr):
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""
         predicted = self.predicted
+        # `by_label` is empty if there is a single label. The file then has no lists for it.
         has_labels = bool(self.by_label)
         groups = {"by_label": self.by_label, "by_source": self.by_source}
         groups[SUMMARY_KEYS[self.by]] = self.groups
@@ -357,6 +359,7 @@ def write(scores: Scores, out: Path) -> None:
     write_image(out / CONTACT_SHEET, contact_sheet(predicted.predictions, predicted.images.numpy()))
     pooled = scores.pooled
     groups = pooled.by_label if len(predicted.labels) > 1 else pooled.by_source
+    # The log-odds of positives and negatives of each group.
     curves = {name: pool.scores for name, pool in groups.items()}
     write_roc(out, pooled.all.scores, curves, scores.label)
     write_summary(out, scores.to_summary())

@@ -341,6 +341,7 @@ class ExampleRow(NamedTuple):
         views = []
         for end in ("_before", ""):
             pairs = zip(line[f"predicted{end}"], line[f"confidence{end}"], strict=True)
+            # The predicted class of each view.
             views.append(", ".join(f"{probability:.1%} {name}" for name, probability in pairs))
         outcome = "success only without noise" if line["success_without_noise"] else "no success"
         outcome = f"{'success' if line['success'] else outcome} in {int(line['steps'])} steps"

@@ -43,6 +43,7 @@ class MovingAverage(AveragedModel):
         The method of the base class copies a counter to the GPU in each step,
         which the GPU waits for. This method keeps the counter on the CPU.
         """
+        # The first call copies the weights, as the base class does.
         if self.n_averaged == 0:
             return super().update_parameters(model)
         averages = [*self.module.parameters(), *self.module.buffers()]

@@ -174,6 +174,7 @@ def scale_learning_rate(settings: TrainSettings, network: nn.Module, images: Ten
     if wanted is None or settings.freeze != ALL_BUT_LAST:
         return settings.learning_rate
     norm = feature_norm(network, images)
+    # rate · norm = learning_rate · feature_norm, which is the same for all networks.
     rate = settings.learning_rate * wanted / norm if norm else math.inf
     if not 0 < rate <= MAX_SCALE:
         fault = f"feature_norm={wanted:g}, but the features of the last layer have norm {norm:g}"
@@ -192,6 +193,7 @@ def feature_norm(network: nn.Module, images: Float[Tensor, "N 3 H W"]) -> float:
     """
     name = last_layer(network)
     layer = network.get_submodule(name)
+    # The matrix of the layer, without its bias.
     weights = [one for one in layer.parameters() if one.ndim > 1 and one.requires_grad]
     squares = []
     with eval_mode(network):

@@ -112,6 +112,7 @@ class Run:
         recipe = settings.train
         shape = _network_shape(settings, initial)
         images = data.train.images
+        # Images on disk: some of them tell mean and standard deviation.
         if not isinstance(images, Tensor):
             images = data.train.sample(SAMPLED)
         mean, std = channel_statistics(images)
@@ -133,6 +134,7 @@ class Run:
             initial.copy_to(network, facts)
             if initial.network is None:
                 wrappers.say_inputs(str(settings.network), network, data.size, initial.inputs)
+            # Facts about the images that nobody states, such as a usual normalization.
             assumed = [name for name, source in vars(initial.inputs).items() if source is None]
             facts |= {checkpoints.ASSUMED: assumed} if assumed else {}
             light = light or initial.architecture.get(checkpoints.NORMALIZE_LIGHT)
@@ -281,6 +283,7 @@ class Run:
             self._interpolate()
         best = trainer.best
         epoch = best["epoch"]
+        # The selected network differs from the last one.
         if epoch != trainer.epoch or INTERPOLATION in best:
             trainer.selected.network.load_state_dict(best["model"])
             selected = evaluate(trainer.selected, test)["accuracy"]
@@ -337,6 +340,7 @@ class Run:
         predictor = Predictor(model, self.data.classes, self.data.size, self.trainer.device)
         values = {}
         for name, folder in self.scored_folders.items():
+            # Without a label, all classes that have a sub-folder are positive.
             label = photographs.choose_labels(folder, self.data.classes, self.settings.label)
             skip = self.settings.evaluate.skip_unreadable
             scores = evaluate_photographs(predictor, folder, label, out / name, skip)

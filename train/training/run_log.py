@@ -60,6 +60,7 @@ class RunLog:
             # This import takes half a second. Programs that only read metrics do not need it.
             from torch.utils.tensorboard import SummaryWriter
 
+            # Events after the checkpoint are removed, since the resumed run writes them again.
             self._board = SummaryWriter(str(folder), purge_step=self._epoch_count + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
