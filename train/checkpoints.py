@@ -158,6 +158,7 @@ def load_network(
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     path = Path(name)
+    # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path
     if (folder / BEST).is_file():
         raise InputError(f"name={name} is a training run: give name={RUN}{folder} instead", "name")

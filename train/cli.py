@@ -344,6 +344,7 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     if not key.lstrip("+").startswith("hydra"):
         key = key.lstrip("+")
     kind = without_none(keys.get(key))
+    # A key such as attack@augment.attack chooses a file of the folder conf/attack.
     choices = key.partition("@")[0]
     if (CONF / choices).is_dir() and re.fullmatch(r"null|true|false|[-+.\d]+", value):
         # Hydra raises an error of the program for a choice that is no text.
@@ -387,7 +388,7 @@ def _as_text(value: str) -> str:
 
 
 def _as_list(value: str, is_text: bool) -> str:
-    """Write a value of a list setting as a list with this member, except null and sweeps."""
+    """Write the only value of a list setting as a list with this member, except null and sweeps."""
     try:
         parsed = _parsed(value)
     except HydraException:  # Hydra refuses some paths.

@@ -170,8 +170,8 @@ def build_network(
 
     The name is "wideresnet", "torchvision:NAME", "python:MODULE:FUNCTION" or, with `classifier`, a
     pretrained network of `augment.build_classifier`. "small_detector" finds boxes, see
-    `train.detectors`. The mean of the data is 0.5 and the std 0.25
-    if they are None; a network of Python normalizes images itself. `shape` is for "wideresnet".
+    `train.detectors`. If mean and std are None, they are 0.5 and 0.25. A network of Python
+    normalizes images itself. `shape` is for "wideresnet".
     """
     if classifier:
         normalization = None if mean is None or std is None else (mean, std)

@@ -169,6 +169,7 @@ def require_same_run(folder: Path, settings: ExperimentSettings, done: bool = Fa
 
     def is_permitted(key: str, old: Any, new: Any) -> bool:
         is_longer = key == "train.epochs" and isinstance(old, int) and new > old
+        # A finished run may not differ at all.
         return not done and (is_longer or key.startswith(("evaluate.", "photos")))
 
     return require_same(folder, settings, "out= (sweep=)", is_permitted)
@@ -219,6 +220,7 @@ def fingerprints(settings: Any) -> dict[str, str]:
     The fingerprint of a training run covers its selected network, that of a mesh its materials and
     textures, and that of a network python:MODULE:FUNCTION the file of the module.
     """
+    # Values of the settings by their dotted keys. Those of INPUTS may name files.
     values = dict(dotted(asdict(settings)))
     texts = _collect_texts([values.get(key) for key in INPUTS]) - {""}
     paths = {text.removeprefix("run:"): _path_of(text) for text in sorted(texts)}
@@ -277,6 +279,7 @@ def _companions(mesh: Path) -> set[Path]:
         words = unquote((line or uri).decode(errors="replace")).replace("\\", "/").split(" ")
         # A line may have options before the path.
         for name in (" ".join(words[start:]).strip('"') for start in range(len(words))):
+            # The path is relative to the mesh, or its last part is a file beside the mesh.
             for file in (mesh.parent / name, mesh.parent / Path(name).name):
                 with suppress(OSError, ValueError):  # The name is too long or has a NUL.
                     if file.is_file() and file != mesh:

@@ -57,7 +57,7 @@ ABOUT_PIXELS = "Mean of the IoU of the pixels of {} and of that of all other pix
 def _find(
     network: TaskNetwork, label: int, images: Float[Tensor, "E 1 3 H W"], truth: Truth | None
 ) -> list[tuple[Any, Any]]:
-    """Pair what is found in renders with the truth. Without one, nothing is of the class."""
+    """Return a pair for each render: what is found, and the truth. None stands for no object."""
     pairs: list[tuple[Any, Any]] = []
     for row, output in enumerate(compute_outputs(network, images[:, 0], BATCH)):
         # The mask of the class in a segmentation, and the true mask: 1 on the object, otherwise 0.
@@ -132,7 +132,7 @@ def find_in_lights(
 
 
 def _match(pairs: Sequence[tuple[Found, Marked]], iou: float) -> Matches:
-    """Match the detections in all views."""
+    """Return the matches of detections and true boxes in all views."""
     found, marked = zip(*pairs, strict=True)
     return detections.match_images(found, marked, iou)
 
@@ -140,9 +140,11 @@ def _match(pairs: Sequence[tuple[Found, Marked]], iou: float) -> Matches:
 def _curve(matches: Matches) -> list[tuple[float, ...]]:
     """Return false detections per image and recall at descending thresholds."""
     every = np.ones((1, matches.image_count))
+    # Objects that are never detected have the score -inf, which is no threshold.
     finite = matches.object_score[np.isfinite(matches.object_score)]
     thresholds = np.unique([*finite, *matches.score])[::-1]
     measures = (matches.false_per_image, matches.recall)
+    # CURVE_POINTS thresholds are enough for the plot.
     return [
         tuple(float(measure(threshold, every)[0]) for measure in measures)
         for threshold in evenly_spaced(thresholds.tolist(), CURVE_POINTS)

@@ -284,6 +284,7 @@ def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path
     result = adversaries(classifier, views, kind)
     radii = KINDS[kind].radii
     clean = result.clean_correct
+    # Success of the attack and of random draws at each radius, for views that were correct before.
     by_radius = success_by_radius(result, [radius / radii[-1] for radius in radii])
     counts: dict[str, Any] = {"n": views.count, "correct": int(clean.sum())}
     for suffix, success in (("", result.success), ("_without_noise", result.success_without_noise)):
@@ -299,9 +300,11 @@ def success_by_light(classifier: TaskNetwork, views: Views, kind: str, out: Path
     np.save(content, to_bytes(result.images_in_views.cpu()))
     atomic_write(out / f"{kind}.npy", content.getbuffer())
     if is_wrong.any():
+        # The first view that is lost is shown before and after the attack.
         example = int(is_wrong.nonzero()[0])
         evidence = (result.evidence_in_views_before, result.evidence_in_views)
         both_evidence = torch.cat([part[example] for part in evidence])
+        # The same example stands for both rows of the evidence.
         criterion = result.criterion.map(lambda rows: rows[[example, example], 0])
         predicted = criterion.predicted(both_evidence)
         counts |= classifier.task.found(both_evidence, predicted, classifier.classes)

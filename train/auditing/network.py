@@ -284,6 +284,7 @@ class AuditedNetwork:
             error = scores.overall.false_positive_rate
             if error.value is not None and error.high is not None:
                 text = f"it takes {error.value:.0%} of other objects for {place}"
+                # What counts is the fraction that is not taken for the class, and its lower limit.
                 findings.append(_Finding(text, 1 - error.value, 1 - error.high))
         return findings
 

@@ -214,6 +214,7 @@ def plain_sentence(network: AuditedNetwork) -> str:
             "does."
         )
     sentence = f"In plain light, {name} recognizes {plain.recognized} of {plain.n} views of {label}"
+    # The search changed nothing, or found nothing better.
     if plain.recognized == plain.recognized_as_given:
         return f"{sentence}."
     return (

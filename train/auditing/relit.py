@@ -287,7 +287,7 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
 
 @torch.no_grad()
 def _drawn(result: PhotographAttackResult, image: UInt8[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """Draw what the attacked network finds in an image on it."""
+    """Return an image with a drawing of what the attacked network finds in it."""
     network = result.classifier
     shown = to_unit(image).to(device_of(network))
     return network.task.draw(shown, network(shown[None])[0], network.classes).cpu()

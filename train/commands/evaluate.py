@@ -46,6 +46,7 @@ def run(settings: EvaluateSettings) -> None:
         # The returned copy normalizes the light of each image, unless the setting is None.
         network = loaded.normalizing_light(settings.normalize_light)
         photos = published_folder(Path(settings.photos))
+        # The run is scored on the positive classes of its training, if the folder has classes.
         if label is None and class_folders(photos, network.classes):
             label = trained_labels(Path(settings.run)) or None
     with keyed("label"):
@@ -161,6 +162,7 @@ def evaluate(
         >>> scores.overall.recall.n
         280
     """
+    # `calibrate` and `false_positive_rate` belong together.
     require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
     require_choice("fit", fit, FITS)
     folder = published_folder(as_path("photos", photos))

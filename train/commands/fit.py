@@ -165,7 +165,7 @@ def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height w
 
 
 def _levels(path: str) -> np.ndarray:
-    """Read the coverage of each pixel by the object, uint8. Raises ValueError if it is unknown."""
+    """Read the coverage of pixels by the object, 0 to 255, or raise ValueError if it is unclear."""
     pixels = _pixels(path)
     # Opacity and gray images have one channel. Equal channels are a gray image, too.
     is_colored = pixels.ndim == 3 and np.ptp(pixels, axis=-1).max() > TINT
@@ -198,7 +198,7 @@ def _levels(path: str) -> np.ndarray:
 
 
 def _pixels(path: str) -> np.ndarray:
-    """Read what may tell the object: opacity, one channel (H, W) or colors (H, W, 3)."""
+    """Read the opacity or the only channel of an image, (H, W), or else its colors, (H, W, 3)."""
     with open_image(path) as image:
         ImageOps.exif_transpose(image, in_place=True)
         if image.has_transparency_data:

@@ -186,7 +186,7 @@ def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, 
 def read_annotations(photos: Path) -> Annotations:
     """Read the annotations of a COCO file, or of a folder that has one or is in the form of YOLO.
 
-    A photograph without a label file has no objects. Missing photographs are said.
+    A photograph without a label file has no objects. Missing photographs are listed in the result.
     """
     if photos.is_file():
         is_list_of_images = photos.suffix.lower() in (".yaml", ".yml")
@@ -300,7 +300,7 @@ def _read_yolo(folder: Path) -> Annotations:
 
 
 def _label_files(path: Path) -> list[Path]:
-    """Return where the label file of an image may be."""
+    """Return the paths at which the label file of an image may be."""
     parts = [*path.absolute().parts]
     beside = path.with_suffix(".txt")
     files = [beside, path.parent / "labels" / beside.name]
@@ -420,7 +420,7 @@ def fit_batches(
     batch_size: int,
     skip_unreadable: bool = False,
 ) -> Iterator[list[tuple[Annotated, Fitted]]]:
-    """Read photographs in batches, by several threads. Unreadable ones are skipped, or an error."""
+    """Yield photographs in batches. Unreadable ones are skipped, or raise InputError."""
 
     def read(photograph: Annotated) -> Fitted | Exception:
         try:

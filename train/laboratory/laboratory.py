@@ -229,6 +229,7 @@ def write_laboratory(settings: LabSettings) -> int:
                 subject = group[number % len(group)]
                 path = _write_render(out, settings, subject, shot, number)
                 brightness = f"{shot.brightness:.4f}"
+                # A row of photos.csv. Images of one shot have its number.
                 rows.append((path, shot.lighting, number, subject.mesh, brightness))
         write_csv(out / TABLE, [COLUMNS, *sorted(rows)], line_end="\r\n")
         versions = {"python": platform.python_version()}
@@ -258,6 +259,7 @@ def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[
     groups = [[subject for subject in subjects if subject.label == label] for label in labels]
     negatives = [subject for subject in subjects if subject.label not in labels]
     for label, group in zip(labels, groups, strict=True):
+        # A metric of a single class needs negatives.
         if not group or (len(labels) == 1 and not negatives):
             raise InputError(
                 f"meshes has {len(group)} meshes of the class label={label} and "
@@ -345,6 +347,7 @@ def kept_aside_settings(
         if can_be_generated(label):
             meshes += _generated(_solid_name(label), label, POSITIVE_COUNT)
         else:
+            # Meshes of the user are the objects of the training, in other lighting.
             trained = settings.objects.values()
             meshes += [asdict(item) for item in trained if item.label == label]
     # Names are compared in lower case and with spaces instead of "_" and "-", as `simplified`

@@ -132,8 +132,10 @@ def _scale_environment(
     `brightness` is the radiance of a white diffuse surface that faces up.
     """
     directions, solid_angles = equirectangular(*radiance.shape[:2])
+    # Light from a direction counts by its cosine to the vertical. Light from below does not count.
     weights = directions[..., 2].clamp(min=0) * solid_angles
     irradiance = (weights[..., None] * torch.from_numpy(radiance)).sum((0, 1))
+    # A white diffuse surface has the radiance irradiance / π.
     white_radiance = float(irradiance.mean()) / math.pi
     # A map whose columns are shifted is rotated about the vertical axis.
     rotated = np.roll(radiance, rng.integers(radiance.shape[1]), axis=1)
@@ -153,6 +155,8 @@ def _draw_shot(
     `brightness` is the radiance of a white surface that faces all projectors.
     """
     first_pattern, *other_patterns = pattern_names.split("+")
+    # The first pattern and its generator, and further projectors with another generator, so that
+    # they do not change the other draws of the shot.
     sources = [(first_pattern, rng), *((name, extra_rng) for name in other_patterns)]
     azimuth = rng.uniform(0, 360)
     half_width = rng.uniform(*HALF_WIDTHS)
@@ -169,6 +173,7 @@ def _draw_shot(
         elevation = _between(settings.elevation, draws)
         distance = draws.uniform(*PROJECTOR_DISTANCES)
         projectors.append(center + _from_angles(projector_azimuth, elevation, distance))
+    # At this distance, the image shows `half_width` to each side of its center.
     camera_distance = half_width / math.tan(math.radians(FOV / 2))
     camera = aim + _from_angles(azimuth, rng.uniform(*CAMERA_ELEVATIONS), camera_distance)
     angles = rng.uniform(0, MAX_EULER_ANGLES)

@@ -260,7 +260,7 @@ def evaluate_detector(
 def _choose_labels(
     annotations: Annotations, classes: Sequence[str], labels: Sequence[str] | None
 ) -> dict[str, int]:
-    """Return the index in a network of each scored class of annotations, by its name there."""
+    """Return the index in the network of each scored class, by its name in the annotations."""
     # None for a class that the network lacks.
     known = {name: class_of_name(name, classes) for name in annotations.classes}
     chosen = [*known] if labels is None else [*labels]
@@ -287,7 +287,7 @@ def _score(
     sources: Sequence[str],
     task: Detection,
 ) -> tuple[DetectionMetrics, dict[str, DetectionMetrics], dict[str, dict[str, DetectionMetrics]]]:
-    """Score all classes, each class, and both for the photographs of each source."""
+    """Return the metrics of all classes, of each class, and of both in each source."""
     # The matches for recall, and those for AP50, whose IoU is always 0.5.
     matches = [detections.match_images(found, marked, iou) for iou in (task.iou, 0.5)]
     groups = {ALL: [*labels.values()], **{name: [label] for name, label in labels.items()}}

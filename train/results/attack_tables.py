@@ -62,7 +62,7 @@ def format_attack(
 
 
 def _success(result: AttackResult) -> str:
-    """Write on how many of the examples classified correctly before an attack it succeeds."""
+    """Write on how many examples an attack succeeds, of those classified correctly before."""
     clean = result.clean_correct
     # Only examples that were classified correctly before the attack count.
     rate = _success_rate(result.success[clean])
@@ -90,6 +90,7 @@ def _check_lines(checks: Mapping[str, Any], uses_gradients: bool) -> list[str]:
     zero_gradient = ""
     if uses_gradients:
         zero_gradient = f", without a gradient at the start in {checks['zero_gradient']:.0%}"
+    # A cost is lower after the attack if the network is less sure of the right class.
     return [
         "log-probability of the right class over all views (less a target's): "
         f"{checks['cost_before']:.2f} before, {checks['cost']:.2f} after; "

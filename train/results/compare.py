@@ -125,7 +125,7 @@ def mean_metric(evaluations: Sequence[Evaluation], subset: Subset, name: str) ->
 
 
 def _mean(estimates: Iterable[Estimate | None]) -> Estimate | None:
-    """Average the known values, with the lowest and the highest of several as their interval."""
+    """Return the mean of the known values, with the lowest and highest of several as interval."""
     known = [item for item in estimates if item is not None and item.value is not None]
     if len(known) < 2:
         return known[0] if known else None

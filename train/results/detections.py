@@ -119,7 +119,7 @@ class Matches:
     def _choose(
         self, is_detection: Bool[np.ndarray, " N"], is_object: Bool[np.ndarray, " M"]
     ) -> "Matches":
-        """Choose detections and objects."""
+        """Return the matches of the chosen detections and objects."""
         detections = self.label, self.image, self.score, self.is_right
         objects = self.object_label, self.object_image, self.object_score
         columns = [column[is_detection] for column in detections]
@@ -146,7 +146,7 @@ class Matches:
         return np.array([self._average_precision(row) for row in counts])
 
     def _average_precision(self, counts: Float[np.ndarray, " n"]) -> float:
-        """Compute the average precision if each image counts so often."""
+        """Compute the average precision of one class if image i counts `counts[i]` times."""
         object_count = counts[self.object_image].sum()
         if not object_count:
             return np.nan
@@ -254,9 +254,10 @@ def score(
 
 
 def _groups(matches: Matches) -> list[np.ndarray]:
-    """Divide images into those with and without objects, of which each is left out by itself.
+    """Return the indices of the images with objects, and those of the images without.
 
-    A rare class then has an interval over the few images that show it.
+    Images of each group are left out by themselves. A rare class then has an interval over the few
+    images that show it. With fewer than two images without objects, all images are one group.
     """
     has_object = np.zeros(matches.image_count, bool)
     has_object[matches.object_image] = True

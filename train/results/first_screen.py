@@ -273,7 +273,7 @@ def _rounded(value: float, decimals: int, sign: str = "") -> str:
     """Write a number with a fixed number of decimals.
 
     A number that would be rounded to 0 keeps one significant digit, so that its sign is visible.
-    "+" as `sign` writes positive numbers with a plus sign.
+    With "+" as `sign`, positive numbers have a plus sign.
     """
     text = f"{value:{sign}.{decimals}f}"
     if float(text) == 0:

@@ -283,7 +283,7 @@ def _keep_errors(values: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 
 def _logit(values: np.ndarray) -> np.ndarray:
-    """Log-odds of values in (0, 1)."""
+    """Compute the log-odds of values in (0, 1)."""
     return np.log(values) - np.log1p(np.negative(values))
 
 
@@ -297,10 +297,9 @@ def class_means(
 ) -> Float[np.ndarray, "... k"]:
     """Compute the fraction of hits in each class, and average it over the classes.
 
-    This is the mean over all images if an image of a class with n images has
-    the weight 1 / n. `functools.partial(class_means, hits, names)` is a
-    statistic for `leave_out`. `hits` has a row for each definition of a hit, such as top-1, and
-    `counts` says how often each image counts.
+    An image of a class with n images has the weight 1 / n. `functools.partial(class_means, hits,
+    names)` is a statistic for `leave_out`. `hits` has a row for each definition of a hit, such as
+    top-1, and `counts` says how often each image counts.
     """
     _, class_of_image, class_sizes = np.unique(names, return_inverse=True, return_counts=True)
     weights = 1 / class_sizes[class_of_image]

@@ -153,7 +153,7 @@ class Metrics:
 
 
 def _read_estimate(entry: Mapping[str, Any], kind: type[Estimate]) -> Estimate:
-    """Read an estimate of a kind. Its value is needed; what an earlier version lacks is unknown."""
+    """Read an estimate of the class `kind`. Counts that an earlier version lacks are unknown."""
     numbers = {item.name: entry[item.name] for item in fields(kind) if item.name in entry}
     if entry["value"] is not None:
         numbers |= {name: float(entry[name]) for name in ("value", "low", "high")}
@@ -283,7 +283,7 @@ class Pool(ShortRepr):
 
     @cached_property
     def _rankings(self) -> dict[str, Jackknife]:
-        """Values without each unit of the known metrics that depend on a ranking."""
+        """Jackknives of AUC, recalls and top ranks by name, without metrics that are unknown."""
         jackknives: dict[str, Jackknife] = {}
         # A ROC curve needs positives and negatives.
         if all(map(len, self.ranked)):

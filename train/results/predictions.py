@@ -81,6 +81,7 @@ class Predictions(ShortRepr):
         """
         photograph, *others = (np.tile(as_column(column), len(by_label)) for column in columns)
         label = as_column([*by_label]).repeat(len(columns[0]))
+        # Rows of the first class come first, and then those of the next classes.
         last = [np.concatenate(parts) for parts in zip(*by_label.values(), strict=True)]
         return cls(photograph, label, *others, *last)
 

@@ -211,6 +211,7 @@ def _read(folder: Path) -> RunSummary:
         from train.checkpoints import load_selected
 
         stored = load_selected(folder)[1].get("scores", {})
+        # None for a network that was not scored on test images.
         accuracy = stored.get("test/accuracy")
         # Scores on photographs are mappings. Others are numbers.
         found = {key: value for key, value in stored.items() if isinstance(value, dict)}

@@ -73,6 +73,7 @@ class Augmentation:
             seed = stream_seed(self.seed, step, "low light", distributed.rank())
             dark = relight_photographs(images, seed, lights=["low_light"])
             if name == RELIGHT_AND_LOW_LIGHT:
+                # Half of the images are relit, and the others stay dark.
                 dark[::2] = self._relight(images, step)[::2]
             return dark
         # A transform of torchvision draws the same random numbers for all images of a batch, from
@@ -116,6 +117,7 @@ class Augmentation:
         # The linear colors of an image stand for the albedo of what it shows.
         albedo = decode(unit, "srgb")
         steps = self.settings.relight_steps
+        # A pass for the start, and two for each step: forward and backward.
         relighting = RelightingSettings(self.settings.relight_gain, passes=2 * steps + 1)
         problem = RelitPhotographs(albedo, light, relighting)
         values = problem.sample(draws)
@@ -141,7 +143,7 @@ class Augmentation:
     def _descend(
         self, problem: Any, start: Float[Tensor, "B D"], criterion: ClassCriterion, steps: int
     ) -> Float[Tensor, "B D"]:
-        """Attack the images of a batch along the gradient. With this margin, none ends early."""
+        """Return the values that gradient descent finds. With this margin, no attack ends early."""
         count = len(start)
         options: dict[str, Any] = {"margin": MAX_SCALE, "quantized": False, "sensor_noise": 0.0}
         settings = AttackSettings(max_steps=steps, batch_size=count, **options)
