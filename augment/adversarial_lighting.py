@@ -114,13 +114,14 @@ class AdversarialLighting:
                 # Autograd cannot save a tensor that inference mode made.
                 images, targets = tree_map_only(Tensor, Tensor.clone, (images, targets))
             params = self.lighting.make_params([images])
-            found = self._search(images, targets, params["lights"])
-            return self.lighting.apply(images, {"lights": found})
+            worst = self._search(images, targets, params["lights"])
+            return self.lighting.apply(images, {"lights": worst})
 
     def _search(
         self, images: Tensor, targets: Any, lights: list[Light | None]
     ) -> list[Light | None]:
         """Return the light of each image in which the cost of the task is lowest."""
+        # None stands for unchanged light, which `RandomLighting` can draw.
         if not any(lights):
             return lights
         is_float = images.is_floating_point()
@@ -131,8 +132,10 @@ class AdversarialLighting:
             image_of_row, criterion = self._criterion(network, unit, targets)
             if not len(image_of_row):
                 return lights
+            # The last light needs no gradient, because no step follows.
             for step in range(self.steps + 1):
                 with torch.set_grad_enabled(step < self.steps):
+                    # The numbers of these lights are leaves of the graph, which get gradients.
                     leaves = [light and _leaf(light) for light in lights]
                     cost = self._cost(network, unit, leaves, image_of_row, criterion)
                     if step < self.steps:
@@ -163,6 +166,7 @@ class AdversarialLighting:
             outputs, classes = self._as_outputs(targets, unit)
         if len(outputs) != len(unit):
             raise InputError(f"{len(outputs)} targets are given for {len(unit)} images: give each")
+        # Each row is one object in one image. `map` drops the axis of its single view.
         image_of_row, criterion = self.task.as_found(outputs, classes)
         return image_of_row.to(unit.device), criterion.map(lambda rows: rows[:, 0].to(unit.device))
 
@@ -180,6 +184,7 @@ class AdversarialLighting:
         count = len(self.classes) or max(targets.flatten().tolist(), default=0) + 1
         has_class = (targets >= 0) & (targets < count)
         is_wrong = ~has_class
+        # Pixels of a map may have no class.
         if is_map:
             is_wrong &= (targets >= 0) & (targets != IGNORED)
         if is_wrong.any():
@@ -187,6 +192,7 @@ class AdversarialLighting:
             raise InputError(f"targets has the label {label}: give those of {count} classes")
         if not is_map:
             return F.one_hot(targets, count).float(), self.classes
+        # The class is the last axis of `one_hot`, but the first axis of the outputs of an image.
         outputs = F.one_hot(targets.where(has_class, count), count + 1).movedim(-1, 1)
         return outputs.float(), [*self.classes, BACKGROUND]
 
@@ -202,6 +208,7 @@ class AdversarialLighting:
         outputs = network(self.lighting.apply(unit, {"lights": lights}))
         rows = image_of_row.tolist()
         chosen = [outputs[row] for row in rows] if isinstance(outputs, list) else outputs[rows]
+        # Costs of objects, of which the sum over each image is returned.
         costs = criterion.cost(chosen)
         return costs.new_zeros(len(unit)).index_add(0, image_of_row, costs)
 
@@ -210,6 +217,7 @@ class AdversarialLighting:
         values = light.values.detach().clone()
         gradient = light.values.grad
         if gradient is not None:
+            # The light is differentiable in its first numbers only. The others stay.
             smooth = slice(light.model.dimensions)
             moved = values[smooth] - STEP / self.steps * gradient[smooth].sign()
             values[smooth] = moved.clamp(0, 1)

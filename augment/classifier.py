@@ -107,6 +107,7 @@ class CheckedNetwork(wrappers.Network):
             given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
             kind = f"{type(error).__name__}: {errors.single_line(error)}"
             remedy = "give the size of its images, or use a network that takes such images"
+            # Images of another precision than the weights are the most frequent cause.
             dtypes = {weight.dtype for weight in self.parameters() if weight.is_floating_point()}
             if dtypes and images.dtype not in dtypes:
                 names = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))

@@ -169,6 +169,8 @@ def _render_blocks(
     shape = (len(scene.objects), -1, len(scene.backgrounds))
     in_turn = torch.arange(len(scene)).view(shape).permute(1, 2, 0).flatten().tolist()
     for block, members in groupby(indices, lambda index: index // BLOCK):
+        # The whole block is prepared even if few of its renders are needed, so that the random
+        # numbers of a render do not depend on the others.
         every = range(block * BLOCK, (block + 1) * BLOCK)
         chosen = [in_turn[index % len(scene)] for index in every]
         examples = [scene.examples[example] for example in chosen]
@@ -187,6 +189,7 @@ def _render_blocks(
         values = service.values(network, problem, block)
         if block == indices[0] // BLOCK:
             warn_of_exposure(problem.scene)
+        # Positions of the needed renders in the block.
         rows = torch.tensor([index - every.start for index in members], device=values.device)
         yield from _renders(problem, values, rows, every.start, maps)
 
@@ -195,6 +198,7 @@ def _show_all(camera: Camera, item: SceneObject, size: Size) -> Camera:
     """Widen a camera such that the shorter side of images shows all objects of an entry."""
     height, width = height_and_width(size)
     aspect = max(1.0, width / height)
+    # Vertices of all objects, without the table, and half of their largest extent.
     points = item.mesh.vertices[np.unique(item.mesh.faces[: item.ends[-1]])]
     span = float(np.ptp(points, axis=0).max()) / 2 if item.others else 1.0
     scaled = {"width": camera.width * aspect * span}
@@ -203,6 +207,7 @@ def _show_all(camera: Camera, item: SceneObject, size: Size) -> Camera:
     camera = replace(camera, **scaled)
     if not item.others:
         return camera
+    # Positions in the image in units of half its width. Shift the camera to their center.
     seen = camera.project(points)[:, :2]
     right, up = ((seen.min(0) + seen.max(0)) / 2 * camera.width / 2).tolist()
     # Near objects are larger in perspective.
@@ -227,6 +232,7 @@ def _renders(
         row = torch.tensor([example], device=values.device)
         conditions = problem.conditions(values[row], row)
         image = to_bytes(problem.images(values, row)[0, 0]).cpu()
+        # Labels, boxes, masks and visible fractions in the one view of the one example.
         truth = [part[0, 0].cpu() for part in vars(scene.truth(index_of, row, conditions)).values()]
         classes, boxes, masks, visible = (part[truth[0] != NO_OBJECT] for part in truth)
         [camera] = scene.cameras_under(conditions, 0, example)

@@ -73,6 +73,7 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
     except Exception as error:  # The folder, its files or the connection may have any fault.
         advice = "give a folder that save_pretrained wrote, or a repository of the Hugging Face Hub"
         raise name_error(name, f"cannot be read ({single_line(error)}): {advice}") from error
+    # Name of the class of the network, by which its task is known.
     architecture = (config.architectures or [""])[0]
     auto = library.models.auto.modeling_auto
     zero_shot = auto.MODEL_FOR_ZERO_SHOT_IMAGE_CLASSIFICATION_MAPPING_NAMES.values()
@@ -89,6 +90,7 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
         raise InputError(f"prompt={facts.prompt} {reason}: {advice}", "prompt")
 
     network = _model(getattr(library, architecture), model, config, name, is_random)
+    # What the user gives replaces what the files state.
     size, mean, std, is_bgr, inputs = _read_preprocessor(library, model, config, name)
     if facts.normalization is not None:
         mean, std = mean_and_std(facts.normalization)
@@ -150,6 +152,7 @@ def _read_preprocessor(
         processor: Any = library.AutoImageProcessor.from_pretrained(model)
         source: str | None = PREPROCESSOR
     except (OSError, ValueError):
+        # Without a file, the default processor of the kind of the model counts, if there is one.
         mapping = library.models.auto.image_processing_auto.IMAGE_PROCESSOR_MAPPING
         kinds = mapping.get(type(config), {})
         kind = next(iter(kinds.values()), None) if isinstance(kinds, dict) else None
@@ -159,16 +162,19 @@ def _read_preprocessor(
         image = Image.fromarray(np.full((side, side, 3), color, np.uint8))
         return processor(images=image, return_tensors="pt")["pixel_values"][0]
 
+    # Networks of images and texts have a configuration of their vision part.
     vision = getattr(config, "vision_config", config)
     of_config = getattr(vision, "image_size", None)
     size: Size = of_config if isinstance(of_config, int) else USUAL_SIZE
     sizer = FILE if isinstance(of_config, int) else None
     if processor is None:
         return size, *mean_and_std(IMAGENET), False, Inputs(sizer, None, None)
+    # Images of two sizes become images of one size if the processor resizes to a fixed size.
     shapes = {tuple(prepare((0, 0, 0), side).shape) for side in PROBED}
     if source and len(shapes) == 1:
         _, height, width = shapes.pop()
         size, sizer = height if height == width else (height, width), source
+    # The values of black, and of pure red, green and blue, tell the linear map of each channel.
     colors = [prepare(color, PROBED[1]) for color in ((0, 0, 0), *np.eye(3, dtype=int) * 255)]
     black, *gains = (
         image[:, image.shape[1] // 2, image.shape[2] // 2].double() for image in colors
@@ -176,8 +182,9 @@ def _read_preprocessor(
     # Rows are channels of the network, and columns are red, green and blue.
     gain = torch.stack(gains, 1) - black[:, None]
     is_bgr = bool(gain[0, 2].abs() > gain[0, 0].abs())
-    own = (gain.flip(1) if is_bgr else gain).diagonal()
-    mean, std = (-black / own).tolist(), (1 / own).tolist()
+    # The value x of a channel becomes gain · x + black, which is (x − mean) / std.
+    own_gain = (gain.flip(1) if is_bgr else gain).diagonal()
+    mean, std = (-black / own_gain).tolist(), (1 / own_gain).tolist()
     return size, mean, std, is_bgr, Inputs(sizer, source, source)
 
 
@@ -188,6 +195,7 @@ def _zero_shot(
     """Make a classifier of a model with an image and a text encoder, and check it on an image."""
     classes = facts.classes or ()
     if is_random:
+        # The features of an image tell the number of inputs of the last layer.
         features = model.eval().get_image_features(pixel_values=gray)
         return ZeroShot(model, len(classes), getattr(features, "pooler_output", features).shape[-1])
     prompts = [(facts.prompt or PROMPT).replace("{}", label) for label in classes]
@@ -199,6 +207,7 @@ def _zero_shot(
         tokenizer = library.AutoTokenizer.from_pretrained(name)
         tokens = tokenizer(prompts, return_tensors="pt", **options)
         output = model.eval()(pixel_values=gray, **tokens)
+        # Unit vectors of the prompts, times the scale of the model, shape (C, D).
         vectors = F.normalize(output.text_embeds, dim=-1) * model.logit_scale.exp()
         network = ZeroShot(model, *vectors.shape)
     except Exception as error:  # Files of the tokenizer, or a model of another kind.

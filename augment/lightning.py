@@ -58,6 +58,7 @@ def lightning_callback(service: AugmentationService, network: nn.Module | None =
     expected = "nb.AugmentationService.from_meshes(...)"
     require_kind("service", service, AugmentationService, expected)
     require_kind("network", network, nn.Module | None, "a torch.nn.Module or None")
+    # Lightning has two packages, of which a user has one.
     for name in ("lightning.pytorch", "pytorch_lightning"):
         with suppress(ImportError):
             base: Any = import_module(name).Callback

@@ -68,6 +68,7 @@ class RelitPhotographs(NormBalls):
         settings: RelightingSettings,
         generators: Sequence[Generator] = (),
     ):
+        # All steps together can cross the norm-ball. `StepSettings` refuses a step of 0.
         step_size = TRAVELED_RADII * settings.radius / max(settings.steps, 1)
         step_size = max(step_size, 1 / errors.MAX_MAGNITUDE)
         ball = StepSettings("linf", settings.radius, "sign", step_size)

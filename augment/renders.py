@@ -96,6 +96,7 @@ def select_examples_to_log(
     before = problem.conditions(problem.start[rows], rows)
     after = problem.conditions(values[rows], rows)
     with frozen_eval_mode(model), torch.no_grad():
+        # Each example has one view.
         images = [problem.scene.render(one, rows)[:, 0] for one in (before, after)]
         logits = [model(one).float() if len(rows) else one.new_zeros(0, 0) for one in images]
     predictions = torch.stack(logits).softmax(2)

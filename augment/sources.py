@@ -424,6 +424,7 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
 
     `path` is a file of weights. None stands for the weights of the source.
     """
+    # A name is "source:model", or the name of a source or a file without a colon.
     source, colon, model = name.partition(":")
     known = SOURCES.get(source + colon)
     if known is None:

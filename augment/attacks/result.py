@@ -239,6 +239,7 @@ class AttackResult(ShortRepr):
 
         example, view = self._shown_view(example, view)
         classes = self.classifier.classes
+        # Evidence of the view before and after the attack, shape (2, K).
         parts = (self.evidence_in_views_before, self.evidence_in_views)
         evidence = torch.stack([part[example, view] for part in parts])
         before_title, after_title = self._titles(evidence, example, view)
@@ -289,6 +290,7 @@ class AttackResult(ShortRepr):
         if view is not None:
             require_whole("view", view, 0, view_count - 1)
             scores[:, view] += 3
+        # The index of the first highest score in the flat list is example · V + view.
         return divmod(int(scores.argmax()), view_count)
 
     def save_animation(
@@ -338,6 +340,7 @@ class AttackResult(ShortRepr):
         for index in range(frame_count):
             values = start + index / (frame_count - 1) * change
             rendered = self.problem.images(values, examples)
+            # The first and the last frame are the images of the result itself.
             if index == 0:
                 rendered = self.images_in_views_before[examples]
             elif index == frame_count - 1:

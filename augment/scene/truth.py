@@ -89,7 +89,9 @@ def boxes_of(masks: Bool[Tensor, "... H W"]) -> Float[Tensor, "... 4"]:
     The box of an empty mask is 0.
     """
     sides = []
+    # Columns and then rows that contain a pixel of the mask.
     for is_used in (masks.any(-2), masks.any(-1)):
+        # `argmax` of a mask is the index of its first true entry.
         count = is_used.shape[-1]
         first = is_used.int().argmax(-1)
         end = count - is_used.flip(-1).int().argmax(-1)

@@ -89,6 +89,7 @@ class Segmentation(Task):
     ) -> Float[Tensor, "N C H W"]:
         logits = _logits(outputs)
         is_tensor = isinstance(logits, Tensor) and logits.ndim == 4
+        # Whether the network returns logits of the size of the images, as torchvision does.
         is_full = logits is outputs or (isinstance(outputs, Mapping) and "out" in outputs)
         if is_tensor and not is_full:
             # Segmenters of transformers return smaller logits, which its own reader enlarges.
@@ -101,9 +102,10 @@ class Segmentation(Task):
 
     def criterion(self, source: Tensor, truth: GetTruth, class_count: int) -> SegmentationCriterion:
         """Return the criterion of an untargeted attack on the first object of each example."""
-        found = truth()
-        visible_boxes(found)
-        return SegmentationCriterion(source, task=self, masks=found.masks[..., 0, :, :])
+        positions = truth()
+        # This raises InputError if a view does not show its object.
+        visible_boxes(positions)
+        return SegmentationCriterion(source, task=self, masks=positions.masks[..., 0, :, :])
 
     def as_found(
         self, outputs: Float[Tensor, "N C H W"], classes: Sequence[str]

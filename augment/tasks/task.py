@@ -122,6 +122,7 @@ class ObjectCriterion(Criterion):
     def predicted(self, evidence: Float[Tensor, "... K"]) -> Int[Tensor, " ..."]:
         """Return the source class if it is found, or else the best other class or C."""
         own, limit, others = self.split(evidence)
+        # The limit takes the index C. It is largest if no other class is found.
         best = torch.cat([others, limit[..., None]], dim=-1).argmax(-1)
         return torch.where(own >= limit, self.source, best)
 
@@ -223,6 +224,7 @@ class Task(ABC):
         as "_before", ends the two keys.
         """
         confidences = self.confidences(evidence)
+        # The index C, one beyond the classes, stands for nothing, so append a column and a name.
         largest = confidences.amax(-1, keepdim=True)
         values = torch.cat([confidences, largest], dim=-1).gather(-1, predicted[..., None])
         names = np.asarray([*classes, NOTHING])[predicted.cpu().numpy()]

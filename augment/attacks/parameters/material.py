@@ -109,6 +109,7 @@ class Material(Parameter):
             values = torch.where(self.used_mask[examples], values, self.start[examples])
         material = values * self._unit
         objects = self._object_of[examples]
+        # Columns `GLOSS` are the three factors, and column `HUE` is the rotation.
         if self._changes_gloss:
             conditions = self._with_gloss(conditions, material[:, GLOSS], objects)
         if self._changes_hue:
