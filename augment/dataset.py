@@ -139,6 +139,7 @@ def render_dataset(
         missing = "gets none" if network is None else "gets one"
         raise InputError(f"mode={settings.mode} does not fit a data set that {missing}: set {mode}")
     scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **of_scene)
+    # Cameras that the user gives stay as they are.
     if "cameras" not in of_scene:
         examples = []
         for example in scene.examples:
@@ -252,6 +253,7 @@ def describe_camera(camera: Camera, shape: tuple[int, int]) -> dict[str, Any]:
     if not camera.has_perspective:
         return facts | {"width": camera.width}
     height, width = shape
+    # Focal length in pixels: at `distance`, the camera sees `camera.width` across.
     focal = width * camera.distance / camera.width
     facts |= {"fx": focal, "fy": focal * camera.pixel_aspect}
     facts["cx"] = width / 2 * (1 + camera.principal_right)

@@ -315,6 +315,7 @@ def _apply_to_pil(image: Image.Image, lights: Sequence[Light | None], depth: Any
         array = np.array(image)
         # Mode "I" has integers of 32 bits. Those that fit 16 bits are relit as integers of 16 bits.
         is_wide = image.mode == "I" and not 0 <= array.min() <= array.max() < 2**16
+        # torch has no numbers with the highest byte first.
         if array.dtype.byteorder == ">" or (image.mode == "I" and not is_wide):
             array = array.astype(np.uint16)
         tensor = torch.from_numpy(array)
@@ -391,6 +392,7 @@ def _as_depth(depth: Any, frames: Tensor, count: int) -> Float[Tensor, "N 1 H W"
         raise InputError(
             f"depth has shape {tuple(values.shape)}, but the image is {tuple(size)}: resize it"
         )
+    # A sample has one depth map, one for each image or video, or one for each frame.
     values = values.reshape(-1, 1, *size)
     if len(values) not in (1, count, len(frames)):
         raise InputError(f"depth has {len(values)} maps for {count} images: give one for each")

@@ -240,6 +240,7 @@ class AugmentationService:
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
         problem = self.problem(number)
+        # Both functions return the attack values, the images and numbers about them.
         make = self._random if self.settings.mode == "random" else self._adversarial
         made = make(model, problem, number)
         if number == 0:
@@ -248,6 +249,7 @@ class AugmentationService:
         if made.is_wrong is None:
             truth = made.truth or self._truth(problem, made.values)
             return Renders(made.images, self.labels, diagnostics, targets=truth.targets())
+        # Classification has no boxes, but a few examples for figures.
         chosen = (made.values, made.is_wrong, self.labels)
         examples = select_examples_to_log(model, problem, *chosen)
         return Renders(made.images, self.labels, diagnostics, examples)
@@ -566,6 +568,7 @@ def _changes(problem: SceneProblem, values: Float[Tensor, "E D"]) -> dict[str, f
     before = problem.conditions(problem.start, problem.all_examples)
     after = problem.conditions(values, problem.all_examples)
     changes = {}
+    # Fields that are None are not attacked.
     for condition in fields(Conditions):
         new_values = getattr(after, condition.name)
         if new_values is not None:

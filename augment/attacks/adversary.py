@@ -121,6 +121,7 @@ class Adversary(ShortRepr):
         row = example if row is None else row
         before_attack = scene.examples[example]
         item = scene.objects[before_attack.object]
+        # Cameras that an attack on the pose has moved, with numbers in place of tensors below.
         cameras = scene.cameras_under(after, row, example)
         return Adversary(
             shown=_attacked_object(item, after.row(row, item.mesh), scene.settings.encoding),

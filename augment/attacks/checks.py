@@ -291,6 +291,7 @@ def _add_draws(found: Successes, result: AttackResult, draw: Callable[[], Tensor
     show as many images to the classifier.
     """
     settings = result.settings
+    # Number of draws of each example.
     count = settings.max_steps
     if not settings.uses_gradients:
         count = max(1, settings.step_limit // result.objective().passes_per_candidate)
@@ -298,6 +299,7 @@ def _add_draws(found: Successes, result: AttackResult, draw: Callable[[], Tensor
         examples = torch.nonzero(~found[0])[:, 0]
         if not len(examples):
             break
+        # Draw values of all examples, so that those of one do not depend on earlier successes.
         values = draw()[examples]
         with torch.no_grad():
             images = result.problem.render(values, examples)

@@ -96,6 +96,7 @@ def save(
     after = result.conditions
     shown_paths = enumerate(progress(paths, "saving"))
     lines = [_write_example(result, after, example, path) for example, path in shown_paths]
+    # Versions of the attacked images, which are judged like the images themselves.
     versions = {
         "float": images,
         "8 bits": to_unit(to_bytes(images)),
@@ -103,6 +104,7 @@ def save(
     }
     if verify:
         rasterizer = result.problem.scene.rasterizer
+        # Images of all examples by the name of the renderer, shape (E, V, 3, height, width) each.
         folders = progress(paths, "rendering the saved files")
         rendered = [render_again(path, verify, rasterizer) for path in folders]
         versions |= {name: torch.stack([views[name] for views in rendered]) for name in verify}

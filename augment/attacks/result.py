@@ -353,6 +353,7 @@ class AttackResult(ShortRepr):
             balls.append(light_sphere(light, SIDE, basis=basis))
         titles = self._titles(torch.stack(evidence), example, view)
         shown = torch.stack(images).float()
+        # Shrink large images, so that the file stays small.
         scale = MAX_SIDE / max(shown.shape[-2:])
         if scale < 1:
             size = [max(1, round(scale * side)) for side in shown.shape[-2:]]

@@ -177,6 +177,7 @@ def lamps(
     zero, one = np.float32(0), np.float32(1)
     field = np.empty(len(x), np.float32)
     for image, row in np.ndindex(len(out), len(y)):
+        # The slope to the right comes first, as x does.
         slopes, height = (slope_right[image, row], slope_down[image, row]), heights[image, row]
         out[image, :, row] = zero
         for lamp in range(places.shape[1]):

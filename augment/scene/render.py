@@ -501,6 +501,7 @@ class DirectRenderer:
         def trace(mesh: Mesh) -> FrozenTransport:
             return FrozenTransport(mesh, self.settings, item.albedo_scale, self.basis)
 
+        # The light paths of the unmoved mesh are traced once.
         frozen = self._transport_of_object.get(object_index) or trace(item.mesh)
         self._transport_of_object[object_index] = frozen
         if not frozen.is_near(positions):

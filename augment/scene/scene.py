@@ -150,6 +150,7 @@ class Scene:
         height, width = settings.shape
         count = f"{len(self) * self.views} renders of {height} × {width} pixels"
         errors.require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
+        # Images are numbered by example and then by view: e · V + v.
         built_with: dict[str, Any] = {"rasterizer": rasterizer, "basis": basis}
         self._operator_renderer = OperatorRenderer(
             self.objects,

@@ -53,6 +53,7 @@ def vary(scene: Scene, settings: VariationSettings, draws: Generator, once: bool
     All views of one example change in the same way. With `once`, the examples are rendered in one
     lighting only, and directly, without matrices from light to image.
     """
+    # Mask of the examples whose background becomes a table and a wall.
     is_on_table = torch.zeros(len(scene), dtype=torch.bool)
     if settings.tables:
         if scene.views > 1 or any(item.ground is not None for item in scene.objects):
@@ -112,6 +113,7 @@ class _Variation:
         shifts = self._draw_pairs(settings.shift)
         scales = self._draw_log_uniform(settings.scale)
         angles = self._draw_pairs(settings.azimuth)
+        # A field of view of 0 leaves the kind and the distance of a camera as they are.
         fovs = [0.0] * len(shifts)
         if any(settings.fov):
             fovs = self._draw_uniform(*settings.fov).tolist()
