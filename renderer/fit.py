@@ -393,7 +393,7 @@ class _Target(NamedTuple):
         lowest = [MIN_POLE_ANGLE, -np.inf, 0.5, -1.0, -1.0]
         highest = [math.pi - MIN_POLE_ANGLE, np.inf, 2.0, 1.0, 1.0]
         start = [math.radians(first.polar), math.radians(first.azimuth), 1.0, *shift]
-        found = least_squares(
+        solution = least_squares(
             residuals,
             np.clip(start, lowest, highest),
             jacobian,
@@ -403,7 +403,7 @@ class _Target(NamedTuple):
             xtol=MIN_GAIN,
             max_nfev=MAX_STEPS,
         )
-        return camera_of(found.x)
+        return camera_of(solution.x)
 
     def fit_final_light(self, camera: Camera) -> FittedScene:
         """Fit the light to fully covered pixels, and compute how well the render fits."""
@@ -506,7 +506,7 @@ def _radiance_rows(grid: int) -> NDArray[Any]:
 
 
 def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Camera:
-    """Give the mesh's bounding box in the image the center and the area of that of the mask."""
+    """Return a camera whose image of the mesh has the box center and the box area of the mask."""
     # Bounding boxes in image coordinates from -1 to 1, with x to the right and y up.
     points = camera.project(mesh.vertices[np.unique(mesh.faces)])[:, :2]
     mesh_low = points.min(0)
@@ -519,6 +519,7 @@ def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Cam
     factor = math.sqrt(np.prod(mesh_high - mesh_low) / np.prod(mask_high - mask_low))
     width = camera.width * factor
     mask_center = (mask_low + mask_high) / 2
+    # Offset of the center of the box from its place in the image of the wider camera.
     shift = mask_center - (mesh_low + mesh_high) / 2 / factor
     framed = replace(camera, width=width, right=shift[0] * width / 2, up=shift[1] * width / 2)
     if isinstance(framed, PerspectiveCamera):

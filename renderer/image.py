@@ -195,17 +195,17 @@ def to_rec709(chromaticities: Sequence[float], adapt: bool) -> Float[np.ndarray,
     as for photographs (Bradford). Otherwise each light keeps its chromaticity, as for radiance.
     None stands for Rec. 709.
     """
-    given = np.asarray(chromaticities, dtype=np.float64)
+    xy = np.asarray(chromaticities, dtype=np.float64)
     # Files round chromaticities, so small differences from Rec. 709 do not count.
-    if given.shape == (8,) and np.abs(given - REC_709).max() <= ROUNDING:
+    if xy.shape == (8,) and np.abs(xy - REC_709).max() <= ROUNDING:
         return None
-    error = ValueError(f"the primaries {given.tolist()} span no colors")
-    if np.abs(given).max(initial=0) > LARGEST:
+    error = ValueError(f"the primaries {xy.tolist()} span no colors")
+    if np.abs(xy).max(initial=0) > LARGEST:
         raise error
     try:
         # Matrices from linear RGB to the responses of the cones of the eye, for both kinds of
         # primaries.
-        theirs = BRADFORD @ _to_xyz(given)
+        theirs = BRADFORD @ _to_xyz(xy)
     except (ValueError, np.linalg.LinAlgError):
         raise error from None
     ours = BRADFORD @ _to_xyz(np.array(REC_709))

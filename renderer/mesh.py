@@ -301,6 +301,7 @@ def _closed_parts(face_bytes: bytes) -> Int[np.ndarray, " F"] | None:
     if (np.bincount(edges) != 2).any() or directions.any():
         return None
     # Side s of face f has the number 3 f + s.
+    # Sorted by edge, the two sides of each edge follow each other.
     neighboring_faces = np.argsort(edges, kind="stable").reshape(-1, 2) // 3
     return connected_component_labels(neighboring_faces, node_count=len(faces))
 

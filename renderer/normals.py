@@ -157,7 +157,7 @@ class _AreaVectors(torch.autograd.Function):
 
 
 def _length(vectors: Vectors) -> Float[Tensor, " N"]:
-    """Compute lengths; torch.norm would be fifty times slower along an axis of length three."""
+    """Compute the lengths of N vectors; torch.norm would be fifty times slower along short axes."""
     return vectors.square().sum(0).sqrt()
 
 

@@ -143,6 +143,8 @@ class Window:
         # maps lines to lines, so the outermost points of the window are its corners.
         half = self.side / 2
         corners = self.pixels(*np.meshgrid([-half, half], [-half, half]))
+        # First and last column and row of the rectangle. `pixels` repeats the border of the
+        # photograph beyond it.
         low = np.floor(corners.min(axis=(0, 1))).astype(int) - BORDER
         high = np.ceil(corners.max(axis=(0, 1))).astype(int) + BORDER
         columns = np.arange(low[0], high[0])

@@ -421,7 +421,7 @@ def _recolored(mesh: Mesh, albedo: Float[Tensor, " ..."], encoding: str) -> Mesh
 def _sample_albedo(
     mesh: Mesh, view: Fragments, albedo: Float[Tensor, " ..."] | None, encoding: str
 ) -> Float[Tensor, "S 3"]:
-    """Compute linear albedo from linear rows per face, the only texture, or (None) the mesh."""
+    """Compute linear albedo at samples from one color per face, a texture, or None (the mesh's)."""
     if albedo is not None and albedo.shape == mesh.faces.shape:
         return face_albedo(albedo, view)
     return surface_albedo(mesh, view, encoding, None if albedo is None else [albedo])

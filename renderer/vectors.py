@@ -185,6 +185,7 @@ def _nearest_in_box_and_sphere(values: Rows, low: Any, high: Any, ball: Ball) ->
     squared_distance = offset.new_zeros(())
     slope = _squared_norm(offset)
     for _ in range(_MAX_STEPS):
+        # Newton step for squared distance = squared radius.
         missing = squared_radius - squared_distance
         step = missing / slope.clamp(min=torch.finfo(values.dtype).tiny)
         squared_factor = (squared_factor + step.clamp(min=0)).clamp(max=1)

@@ -75,8 +75,9 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     nodes = [node for node in file.scene_nodes() if "mesh" in file.tree["nodes"][node]]
     # Nodes may share a mesh, and meshes a material. Each is read once and cached.
     material = cache(lambda index: read_material(file, index, gloss))
-    part = cache(lambda *key: _read_part(file, material, *key))
+    read_part = cache(lambda *key: _read_part(file, material, *key))
     placed_parts = []
+    # Bytes of memory for all parts.
     needed = 0
     for index in nodes:
         node = file.tree["nodes"][index]
@@ -92,12 +93,12 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
             if mode < TRIANGLES:
                 mesh_file.ignore("points and lines")
             else:
-                read = part(node["mesh"], number, weights)
+                primitive_part = read_part(node["mesh"], number, weights)
                 # A small file can show one mesh very often.
-                needed += FACE_BYTES * len(read.surface.faces)
-                needed += VERTEX_BYTES * len(read.surface.values)
+                needed += FACE_BYTES * len(primitive_part.surface.faces)
+                needed += VERTEX_BYTES * len(primitive_part.surface.values)
                 require_memory("its faces", needed, CPU)
-                placed_parts += _place(read, file.poses[index])
+                placed_parts += _place(primitive_part, file.poses[index])
     modes = {material.get("alphaMode") for material in file.tree.get("materials", ())}
     if not placed_parts and "MASK" in modes:
         raise ValueError("its alpha cuts out all faces (alphaMode MASK): use OPAQUE")
@@ -120,8 +121,8 @@ def _read_part(
     colors = np.ones((len(positions), 4))
     if "COLOR_0" in attributes:
         # The file may leave out alpha, the fourth column.
-        given = attributes["COLOR_0"]
-        colors[:, : given.shape[1]] = np.clip(given, 0, 1)
+        file_colors = attributes["COLOR_0"]
+        colors[:, : file_colors.shape[1]] = np.clip(file_colors, 0, 1)
     colors *= material.color
     uvs = np.zeros((len(positions), 2))
     if material.placement is not None:
@@ -188,7 +189,7 @@ def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.n
 
 
 def _place(part: _Primitive, pose: Float[np.ndarray, "4 4"]) -> list[Part]:
-    """Cut holes out of a part, and place it in the scene by a matrix: none if no face is left."""
+    """Return a part without its holes, with its matrix in the scene, or none if no face is left."""
     values, faces = _visible(part.material, part.surface)
     if not len(faces):
         return []
@@ -369,6 +370,6 @@ def _cut(values: np.ndarray, faces: np.ndarray, excess: Float[np.ndarray, " V"])
     points = values[low] + share[:, None] * (values[high] - values[low])
     ids = np.column_stack([turned, len(values) + point_of_side.reshape(-1, 2)])
     # One kept corner leaves a triangle. Two leave a quadrilateral, that is, two triangles.
-    one = count[is_cut] == 1
-    pieces = [ids[one][:, [0, 3, 4]], ids[~one][:, [3, 1, 2]], ids[~one][:, [3, 2, 4]]]
+    single = count[is_cut] == 1
+    pieces = [ids[single][:, [0, 3, 4]], ids[~single][:, [3, 1, 2]], ids[~single][:, [3, 2, 4]]]
     return _Surface(np.concatenate([values, points]), np.concatenate([faces[is_whole], *pieces]))

@@ -430,7 +430,10 @@ def _specular_factor(extensions: dict[str, Any]) -> float:
 def _specular_glossiness(
     material: Material, file: GltfFile, model: dict[str, Any], gloss: bool
 ) -> Material:
-    """Read KHR_materials_pbrSpecularGlossiness: its albedo is diffuse · (1 - max(specular))."""
+    """Return a material with the color and the gloss of KHR_materials_pbrSpecularGlossiness.
+
+    The albedo of this extension is diffuse · (1 - max(specular)).
+    """
     material = _with_color(material, file, model, "diffuse")
     # Specular color and glossiness become arrays (H, W, 3) and (H, W) if there is a texture.
     specular = _factor(model, "specularFactor", 3)
@@ -448,10 +451,10 @@ def _specular_glossiness(
     else:
         material = material.with_placement(placement, reflectance.shape)
         assert material.texture is not None
-        kept = _resized((1 - reflectance).astype(np.float32), material.texture)
+        diffuse_fraction = _resized((1 - reflectance).astype(np.float32), material.texture)
         # Colors are multiplied as linear light and encoded again.
         linear = decode(torch.from_numpy(material.texture).float() / 255, "srgb")
-        dimmed = to_bytes(encode(linear * torch.from_numpy(kept)[..., None], "srgb"))
+        dimmed = to_bytes(encode(linear * torch.from_numpy(diffuse_fraction)[..., None], "srgb"))
         material = replace(material, texture=dimmed.numpy())
     if not gloss:
         return material
@@ -477,7 +480,7 @@ def _factor(model: dict[str, Any], name: str, count: int) -> np.ndarray:
 
 
 def _with_color(material: Material, file: GltfFile, model: dict[str, Any], name: str) -> Material:
-    """Add the factor and the texture of color and alpha, whose names begin with `name`."""
+    """Return a material with the factor and the texture whose names begin with `name`."""
     material = replace(material, color=_factor(model, f"{name}Factor", 4))
     if f"{name}Texture" not in model:
         return material

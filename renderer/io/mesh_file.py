@@ -362,8 +362,8 @@ def _clip_ears(points: Num[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], 
         triangles = triangles[:, ::-1]
     # The ears leave out some corners on straight edges. Each triangle
     # at such an edge is divided, so that it has these corners, too.
-    kept = np.unique(triangles)
-    for start, end in pairwise([*kept, kept[0] + count]):
+    used_corners = np.unique(triangles)
+    for start, end in pairwise([*used_corners, used_corners[0] + count]):
         if end == start + 1:
             continue
         # Corners that were left out, with the corners before and behind them.

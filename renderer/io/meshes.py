@@ -281,7 +281,7 @@ def _glb(
 
 
 def _add_material(tree: _Tree, mesh: Mesh, texture_id: int, gloss: list[float]) -> int:
-    """Add the material of one texture, or -1, and gloss, which is empty if matte."""
+    """Add a material with a texture (-1: none) and gloss (empty: matte), and return its index."""
     roughness, metallic, *specular_factors = gloss or (1.0, 0.0)
     model: dict[str, Any] = {"roughnessFactor": roughness, "metallicFactor": metallic}
     if texture_id >= 0:

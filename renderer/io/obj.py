@@ -186,7 +186,7 @@ def _corners(words: list[bytes]) -> np.ndarray:
 
 
 def _materials(lines: dict[str, _Lines], file: MeshFile) -> tuple[list[_Material], np.ndarray]:
-    """Read the materials in use, the first for faces without one, and the index of each face's."""
+    """Read the used materials, a white one first, and find the index of the one of each face."""
     library = _library(lines["mtllib"].names(), file)
     # Name of the material of each line "usemtl", after None for faces before these lines.
     names = [None, *lines["usemtl"].names()]
@@ -206,24 +206,24 @@ def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
         for path in re.findall(r"\S.*?\.mtl(?!\S)", name, re.IGNORECASE) or [name]:
             folder = "".join(path.replace("\\", "/").rpartition("/")[:2])
             # Materials of this .mtl file by name.
-            own: dict[str, _Definition] = {}
+            materials_of_file: dict[str, _Definition] = {}
             properties: list[tuple[str, str]] = []
             for word, rest in _LINE.findall(_cleaned(file.read(path))):
                 keyword, text = word.decode(), rest.decode().strip()
                 if keyword.lower() != "newmtl":
                     properties.append((keyword, text))
                     continue
-                if text in own:
+                if text in materials_of_file:
                     raise ValueError(f"an .mtl file defines the material {text} twice")
                 properties = []
-                own[text] = (folder, properties)
+                materials_of_file[text] = (folder, properties)
             # The first file that defines a material counts.
-            library = own | library
+            library = materials_of_file | library
     return library if names else None
 
 
 def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile) -> _Material:
-    """Interpret the properties of a material."""
+    """Find the color and the texture of a material among its properties in the library."""
     if library is None:
         file.assume("materials are white, because the file names no material library")
         return _Material()

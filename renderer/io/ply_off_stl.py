@@ -98,17 +98,17 @@ def _columns(values: _Values, names: tuple[str, ...]) -> np.ndarray | None:
 
 def _rgb(values: _Values, file: MeshFile) -> np.ndarray | None:
     """Remove the colors from an element, and return them as sRGB-encoded values in [0, 1]."""
-    found = [c for names in _COLORS if (c := _columns(values, names)) is not None]
-    if not found:
+    colors = [c for names in _COLORS if (c := _columns(values, names)) is not None]
+    if not colors:
         return None
-    if len(found) > 1:
+    if len(colors) > 1:
         raise ValueError("an element has two kinds of colors, such as red and diffuse_red")
     # Opacity must be 1, because the renderer has no transparency.
     for name in ("alpha", "a"):
         alpha = _columns(values, (name,))
         if alpha is not None and (mesh_file.unit_colors(alpha, file) < mesh_file.OPAQUE).any():
             raise ValueError("the file has transparent colors, which are not supported")
-    return mesh_file.unit_colors(found[0], file)
+    return mesh_file.unit_colors(colors[0], file)
 
 
 def _corner_uvs(vertex: _Values, face: _Values, faces: _Lists) -> np.ndarray:

@@ -284,7 +284,7 @@ def _to_rgbe_precision(radiance: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3
 
 
 def _color_channels(names: Sequence[str]) -> list[int]:
-    """Find red, green and blue by names such as "R" or "LAYER.R"; gray repeats its index."""
+    """Find the indices of red, green and blue by names such as "LAYER.R". Gray is used for all."""
     # Pairs (layer, color) in lower case, such as ("layer", "r"). The layer is "" without a dot.
     keys = [name.casefold().rpartition(".")[::2] for name in names]
     # OpenImageIO lists the layer without a name first. The loop therefore prefers it.

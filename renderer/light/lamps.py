@@ -384,6 +384,7 @@ class Lamps(LocalBasis):
     ) -> Float[Tensor, " ..."]:
         """Compute irradiance for a coefficient of 1, at most 0 behind the surface or a disc."""
         squared_distance = to_lamp.square().sum(-1)
+        # Cosine to the normal, divided by the squared distance.
         irradiance = (to_lamp * normals).sum(-1) / squared_distance**1.5
         if not self.radius:
             return irradiance

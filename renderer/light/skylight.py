@@ -158,12 +158,12 @@ def _as_parameters(
     The dtype and the device are those of the first floating-point tensor among turbidity, zenith
     and azimuth, or else float64.
     """
-    given = {"turbidity": turbidity, "zenith": zenith, "azimuth": azimuth}
-    floating = [v for v in given.values() if isinstance(v, Tensor) and v.is_floating_point()]
+    parameters = {"turbidity": turbidity, "zenith": zenith, "azimuth": azimuth}
+    floating = [v for v in parameters.values() if isinstance(v, Tensor) and v.is_floating_point()]
     # Tensor that gives the dtype and the device of the results.
     like = floating[0] if floating else torch.zeros((), dtype=torch.float64)
     tensors = {}
-    for name, value in given.items():
+    for name, value in parameters.items():
         # `as_tensor` raises InputError if the value is no tensor, but rounds Python numbers.
         as_tensor(name, value)
         is_floating = any(value is tensor for tensor in floating)

@@ -422,10 +422,12 @@ class _Charts:
         number_in_chart = np.arange(len(chart)) - (counts.cumsum() - counts).repeat(counts)
         row, column = np.divmod(number_in_chart, self._size[chart, 0])
         place = np.stack([column, row], axis=1)
+        # Center of each texel, relative to the corner of the old texture, in texels of the new one.
         center = self._first_texel[chart] + place + 0.5
         from_first_corner = center - self._positions[chart, 0]
-        last = np.einsum("ni,nij->nj", from_first_corner, self._inverse_edges[chart])
-        weights = np.column_stack([1 - last.sum(axis=1), last]).clip(min=0)
+        # Weights of the second and the third corner. The first has the rest to 1.
+        last_weights = np.einsum("ni,nij->nj", from_first_corner, self._inverse_edges[chart])
+        weights = np.column_stack([1 - last_weights.sum(axis=1), last_weights]).clip(min=0)
         weights /= weights.sum(axis=1, keepdims=True)
         sheet_place = (self._corner[chart] + place).T
         return chart, sheet_place, center / self._new_size, torch.from_numpy(weights).float()
@@ -440,10 +442,12 @@ def _pack(sizes: Int[np.ndarray, "N 2"]) -> tuple[np.ndarray, tuple[int, int]]:
     widths, heights = sizes[order].T
     row_width = max(int(np.sqrt(sizes.prod(axis=1).sum())), 1)
     # A rectangle belongs to the row in which it begins, and may end beyond `row_width`.
+    # All rectangles in one long line, which is broken after each `row_width` texels.
     row, column = np.divmod(widths.cumsum() - widths, row_width)
     row_heights = np.zeros(row.max(initial=0) + 1, dtype=np.int64)
     np.maximum.at(row_heights, row, heights)
     tops = row_heights.cumsum() - row_heights
+    # Undo the sorting.
     corners = np.empty_like(sizes)
     corners[order] = np.stack([column, tops[row]], axis=1)
     sheet_width = int((column + widths).max(initial=1))

@@ -129,6 +129,7 @@ def _draw(
     subsamples = 1 << bits
     for index in range(len(faces)):
         i, j, k = faces[index]
+        # Skip faces without an area and, of a closed mesh, faces that are seen from behind.
         area = _doubled_area(x, y, i, j, k)
         if area == 0 or (closed and area > 0):
             continue

@@ -142,6 +142,7 @@ def _draw(
     rows, columns = shape
     size = (columns, rows)
     program = context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
+    # Buffer for x, y and z of the three corners of all faces of one view.
     corners = context.buffer(reserve=faces.size * 3 * FLOAT_BYTES, dynamic=True)
     triangles = context.vertex_array(program, [(corners, "3f", "position")])
     texture = context.texture(size, 1, dtype="i4")

@@ -41,7 +41,10 @@ def _draw(
     faces: Int[Tensor, "F 3"],
     closed: bool,
 ) -> None:
-    """Lower the key of each sample to that of the nearest face."""
+    """Lower the key of each sample to that of the nearest face.
+
+    A key has the depth in its high bits and the index of the face in its low FACE_BITS bits.
+    """
     rows, columns = keys.shape[1:]
     # As on GPUs, positions in samples are computed with one multiplication and one addition, and
     # rounded to float32. x points to the right and y down.
