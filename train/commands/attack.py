@@ -206,8 +206,8 @@ def attacks(
         # `search` is the number of cameras that the search for a recognized view tries.
         if chosen.search and not settings.attack.force:
             draws = generator(settings.seed, mesh.mesh, "search")
-            found = classifier, chosen, settings.attack, build, chosen.search, draws
-            chosen, scene = find_scene(*found)
+            arguments = classifier, chosen, settings.attack, build, chosen.search, draws
+            chosen, scene = find_scene(*arguments)
         else:
             scene = build(chosen)
         yield mesh.mesh, chosen, start(scene, settings.attack.force)

@@ -60,17 +60,17 @@ def run(settings: FitSettings) -> None:
     mesh = load_object(mesh_settings).mesh
     names = ("fov", "albedo_scale", "encoding", "bounces")
     options = {name: getattr(settings, name) for name in names}
-    found = fit_photograph(image, mask, mesh, settings.size, **options)
+    fitted = fit_photograph(image, mask, mesh, settings.size, **options)
     out.mkdir(parents=True, exist_ok=True)
     # The window is the square of the photograph that the found camera shows.
-    background = found.window.cut(image, BACKGROUND_SIZE, settings.encoding)
+    background = fitted.window.cut(image, BACKGROUND_SIZE, settings.encoding)
     write_image(out / "background.png", encode(background, settings.encoding))
     # Outside of the photograph, there is no object.
-    coverage = found.window.cut(mask[..., None], BACKGROUND_SIZE, beyond=0)
+    coverage = fitted.window.cut(mask[..., None], BACKGROUND_SIZE, beyond=0)
     write_image(out / "mask.png", coverage.expand(3, -1, -1))
-    save_light(out / "light.json", found.scene.light)
+    save_light(out / "light.json", fitted.scene.light)
     # The result is checked in the picture that pnb-attack will render from the written files.
-    scene, renderer = attacked_scene(settings, found.scene.camera, out)
+    scene, renderer = attacked_scene(settings, fitted.scene.camera, out)
     photograph, rendered = render_attacked(settings, scene, renderer)
     write_image(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
     # The three channels of the mask are equal, so the first one is enough.
@@ -80,7 +80,7 @@ def run(settings: FitSettings) -> None:
     linear = decode(photograph[:, is_object].double(), settings.encoding)
     difference = decode(rendered[:, is_object].double(), settings.encoding) - linear
     error = float(difference.norm() / linear.norm())
-    overlap = found.scene.overlap
+    overlap = fitted.scene.overlap
     print(f"outlines overlap by {overlap:.1%}; the object's pixels differ by {error:.1%}")
     if overlap < MIN_OVERLAP or error > MAX_ERROR:
         print("warning: the mesh hardly fits; see comparison.png, and check mask, mesh and fov")

@@ -143,13 +143,13 @@ class Metrics:
         nested = entries.get("recall_at") or {}
         rates = {rate: entries.get(f"recall_at/{rate}") or nested.get(rate) for rate in RATES}
         # Entries are missing for metrics that were not computed.
-        found: dict[str, Any] = {
+        estimates: dict[str, Any] = {
             name: _read_estimate(entries[name], kinds.get(name, Estimate))
             for name in (*kinds, *TOP_RANKS)
             if entries.get(name)
         }
         recalls = {rate: _read_estimate(item, Estimate) for rate, item in rates.items() if item}
-        return cls(**found, recall_at=recalls)
+        return cls(**estimates, recall_at=recalls)
 
 
 def _read_estimate(entry: Mapping[str, Any], kind: type[Estimate]) -> Estimate:
