@@ -583,7 +583,7 @@ def score_rows(method: Method, images: str, scores: Scores) -> Iterator[list[str
     for part in scores.evaluations[0].rows("source", "mesh"):
         estimates = [mean_metric(scores.evaluations, part, metric) for metric in METRICS]
         cells = [format_interval(estimate) for estimate in estimates]
-        yield [method.name, images, Path(part.title()).stem, *cells]
+        yield [method.name, images, Path(part.title).stem, *cells]
 
 
 def accuracy_row(method: Method, path: Path, split: str) -> list[str]:

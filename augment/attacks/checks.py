@@ -8,13 +8,13 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from augment.attack_settings import StepSettings
 from augment.attacks.adversary import Adversary, final_images
 from augment.attacks.loop import minimize
-from augment.attacks.objective import Examples, Images, Objective, Values
+from augment.attacks.objective import Examples, Objective, Values
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import SceneProblem, build_problem
 from augment.attacks.result import AttackResult, require_result
@@ -310,9 +310,9 @@ def _add_successes(
     found: Successes,
     result: AttackResult,
     problem: SceneProblem,
-    values: Values,
-    examples: Examples,
-    images: Images,
+    values: Float[Tensor, "R D"],
+    examples: Int[Tensor, " R"],
+    images: Float[Tensor, "R V _ H W"],
 ) -> None:
     """Add the examples that meet the criterion with some attack values.
 
