@@ -584,7 +584,6 @@ def normalization_of(network: Any, limits: tuple[float, float] = (0.0, 1.0)) -> 
                 # The network normalizes values in [0, 1]. Convert to the units of the limits.
                 mean = [black + (white - black) * value for value in mean]
                 std = [(white - black) * value for value in std]
-                # Mean 0 and standard deviation 1 change nothing.
                 if np.allclose([*mean, *std], [0, 0, 0, 1, 1, 1], atol=1e-6):
                     return ""
                 means, stds = (", ".join(f"{value:.3g}" for value in row) for row in (mean, std))

@@ -43,6 +43,7 @@ from augment.scene.surfaces import (
     SURFACE_NODES,
     Surface,
     axes,
+    circle_segment,
     direction,
     lambert,
     smooth,
@@ -167,7 +168,6 @@ class LightModel:
     ) -> Drawn:
         """Map the numbers of the lights of images to their ranges."""
         low, span, is_geometric = _ranges(self.ranges, values.device, values.dtype)
-        # Ends of geometric ranges are logarithms.
         numbers = torch.addcmul(low, span, values[:, : self.dimensions])
         numbers = torch.where(is_geometric, numbers.exp(), numbers)
         return Drawn(
@@ -177,7 +177,6 @@ class LightModel:
     def illumination(self, drawn: Drawn, strength: float = 1.0) -> Illumination:
         """Mix the light with the unchanged light, and expose it."""
         light = self.light(drawn)
-        # The unchanged light is 1 at each pixel.
         if strength < 1:
             light = light.scaled(strength, 1 - strength)
         if not self.has_meter:
@@ -215,7 +214,6 @@ class ProjectedSlide(LightModel):
 
     def light(self, drawn: Drawn) -> Illumination:
         """Project a picture of its own on each image."""
-        # Each picture is drawn with the seed of its image.
         draws = [torch.Generator().manual_seed(seed) for seed in drawn.seeds]
         pictures = torch.cat([draw_slides(1, drawn.size, draw, self.slides) for draw in draws])
         # Logarithms of the gains of the channels in a grid of cells, shape (B, 3, cells, cells).
@@ -378,20 +376,6 @@ def _sum_of_octaves(
     return torch.cat([0.5**i * torch.kron(part, part).T for i, part in enumerate(parts)])
 
 
-def circle_segment(distance: Tensor) -> Tensor:
-    """Return t √(1 − t²) + asin t, where t is the distance of an edge from the center of a disc.
-
-    A straight edge at a distance, in units of the radius, leaves the fraction 1/2 + segment / π of
-    a uniform disc visible. The distance is positive if the center is visible.
-    """
-    if loop := loops.segment(distance):
-        segment = distance.new_empty(distance.shape)
-        loop(distance.flatten(), segment.flatten())
-        return segment
-    t = distance.clamp(-1 + 1e-6, 1 - 1e-6)
-    return torch.addcmul(torch.asin(t), t, torch.addcmul(t.new_ones(()), t, t, value=-1).sqrt())
-
-
 @dataclass(frozen=True)
 class CastShadow(LightModel):
     """An object between the sun and the scene casts a shadow, whose penumbra has a uniform width.
@@ -428,7 +412,6 @@ class CastShadow(LightModel):
         last = len(self.kinds) - 1
         kinds = [min(int(each * (last + 1)), last) for each in drawn.constants[:, 0].tolist()]
 
-        # Segments of the images with one kind of shadow.
         def segment(kind: int, rows: list[int] | slice) -> Tensor:
             numbers, constants = drawn.numbers[:, rows], drawn.constants[rows, 1:]
             part = drawn._replace(numbers=numbers, constants=constants)

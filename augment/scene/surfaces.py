@@ -146,3 +146,17 @@ def lambert(down: Tensor, right: Tensor, to_right: Tensor, to_bottom: Tensor, up
     # Product of the light's vector with the normal (-right, -down, 1) / length.
     dot = torch.addcmul(torch.addcmul(up, to_right, right, value=-1), to_bottom, down, value=-1)
     return (dot * squares.rsqrt()).clamp(min=0)
+
+
+def circle_segment(distance: Tensor) -> Tensor:
+    """Return t √(1 − t²) + asin t, where t is the distance of an edge from the center of a disc.
+
+    A straight edge at a distance, in units of the radius, leaves the fraction 1/2 + segment / π of
+    a uniform disc visible. The distance is positive if the center is visible.
+    """
+    if loop := loops.segment(distance):
+        segment = distance.new_empty(distance.shape)
+        loop(distance.flatten(), segment.flatten())
+        return segment
+    t = distance.clamp(-1 + 1e-6, 1 - 1e-6)
+    return torch.addcmul(torch.asin(t), t, torch.addcmul(t.new_ones(()), t, t, value=-1).sqrt())
