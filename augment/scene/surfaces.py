@@ -1,4 +1,4 @@
-"""Surfaces: smooth random heights or depths, and their shading.
+"""Surfaces: smooth random heights or depths, their shading, and the disc of the sun at an edge.
 
 The image is 2 units wide: x points to the right, y down, and heights towards the camera.
 """
@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from augment.scene import loops
 from renderer.settings import Size, height_and_width
 
 # A random smooth surface interpolates random heights at a grid of this number of points per side.

@@ -16,7 +16,8 @@ from torchvision import tv_tensors
 import norm_balls as nb
 from augment import lighting
 from augment.scene import lights, loops, patterns, surfaces
-from augment.scene.lights import MODELS, Illumination, circle_segment
+from augment.scene.lights import MODELS, Illumination
+from augment.scene.surfaces import circle_segment
 from renderer.errors import InputError
 from renderer.image import decode, encode
 
