@@ -24,6 +24,7 @@ y down.
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -92,12 +93,12 @@ def _draw(
     # if the edge is horizontal, to the triangle below it. A triangle therefore covers only samples
     # whose x and y are at least its smallest x and y, and less than its largest x and y.
     triangles = positions.take(block, axis=1)
-    areas = _doubled_areas(triangles)
+    areas = doubled_areas(triangles)
     # First column and first row of samples in the bounding box of each triangle, as the
     # two rows of this array.
-    first = _next_sample(triangles.min(axis=1)).clip(0, None)
+    first = next_sample(triangles.min(axis=1)).clip(0, None)
     limits = np.array([[column_count], [row_count]])
-    counts = _next_sample(triangles.max(axis=1)).clip(None, limits) - first
+    counts = next_sample(triangles.max(axis=1)).clip(None, limits) - first
     # y points down, so triangles that are counter-clockwise in the image have negative
     # areas.
     is_facing = areas < 0 if closed else areas != 0
@@ -108,7 +109,8 @@ def _draw(
     corners = _sort(block.take(drawn, axis=1))
     triangles = positions.take(corners, axis=1)
     edges, middle_row = _edges(triangles)
-    planes = _planes(triangles, depths.take(corners))
+    areas = doubled_areas(triangles)
+    planes = np.stack(depth_planes(triangles, depths.take(corners), areas))
     # One entry for each pair of a triangle and a row of samples that it may cover.
     for triangle, row in _expand(counts[1].take(drawn)):
         row += first_row.take(triangle)
@@ -169,13 +171,17 @@ def to_fixed_point(
     return positions, depths
 
 
-def _doubled_areas(triangles: Int[np.ndarray, "2 3 F"]) -> Int[np.ndarray, " F"]:
-    """Compute twice the signed areas of F triangles, negative if counter-clockwise in the image."""
+def doubled_areas(triangles: Any) -> Any:
+    """Compute twice the signed areas of triangles, negative if counter-clockwise in the image.
+
+    The axes of `triangles` are coordinate, corner and triangle. Like `next_sample` and
+    `depth_planes`, this function takes arrays and tensors.
+    """
     (ax, bx, cx), (ay, by, cy) = triangles
     return (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
 
 
-def _next_sample(positions: np.ndarray) -> np.ndarray:
+def next_sample(positions: Any) -> Any:
     """Round positions in subsamples up to whole samples."""
     return (positions + (SUBSAMPLES - 1)) >> SUBSAMPLE_BITS
 
@@ -213,16 +219,14 @@ def _edges(
     slope = -SUBSAMPLES * dx
     constant = y[start] * dx - x[start] * dy
     height = SUBSAMPLES * dy
-    return np.stack([slope, constant, height]).reshape(3, -1), _next_sample(y[1])
+    return np.stack([slope, constant, height]).reshape(3, -1), next_sample(y[1])
 
 
-def _planes(
-    triangles: Int[np.ndarray, "2 3 T"], depths: Float[np.ndarray, "3 T"]
-) -> Float[np.ndarray, "5 T"]:
-    """Compute the depth of T triangles as a linear function of column and row.
+def depth_planes(triangles: Any, depths: Any, areas: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """Compute the depth of triangles as a linear function of column and row.
 
-    The rows are the column, the row and the depth of the first corner, and the slopes of the depth
-    per column and per row.
+    `areas` are those of `doubled_areas`. The results are the column, the row and the depth of the
+    first corner, and the slopes of the depth per column and per row.
     """
     (ax, bx, cx), (ay, by, cy) = triangles
     depth_a, depth_b, depth_c = depths
@@ -230,10 +234,10 @@ def _planes(
     # (Cramer's rule).
     to_b = depth_b - depth_a
     to_c = depth_c - depth_a
-    scale = SUBSAMPLES / _doubled_areas(triangles)
+    scale = SUBSAMPLES / areas
     slope_x = (to_b * (cy - ay) - to_c * (by - ay)) * scale
     slope_y = (to_c * (bx - ax) - to_b * (cx - ax)) * scale
-    return np.stack([ax / SUBSAMPLES, ay / SUBSAMPLES, depth_a, slope_x, slope_y])
+    return ax / SUBSAMPLES, ay / SUBSAMPLES, depth_a, slope_x, slope_y
 
 
 def _expand(counts: Int[np.ndarray, " N"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -6,11 +6,21 @@ less 1 for an edge that leaves its samples to the other face (the top-left rule)
 therefore faces are those of `renderer.visibility.numpy`.
 """
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from renderer.visibility.numpy import EMPTY_KEY, FACE_BITS, FAR, SUBSAMPLE_BITS, SUBSAMPLES
+from renderer.visibility.numpy import (
+    EMPTY_KEY,
+    FACE_BITS,
+    FAR,
+    SUBSAMPLES,
+    depth_planes,
+    doubled_areas,
+    next_sample,
+)
 
 # Faces of all views that are prepared at once, and pairs of a face and a sample that are tested at
 # once. A face takes about 300 bytes, and a pair 200.
@@ -35,6 +45,64 @@ def rasterize(
     return keys.int()
 
 
+class _Triangles(NamedTuple):
+    """The M = N · F triangles of N views, and their pairs with samples of their bounding boxes.
+
+    Pairs are numbered triangle by triangle, and row by row in a bounding box.
+
+    Attributes:
+        edges: Integers by which column and row of a sample are multiplied, and a constant, for
+            each of the three edge functions, shape (3, 3, M).
+        planes: Results of `depth_planes`, shape (5, M).
+        boxes: First column and first row of the bounding box, its width, and the number of the
+            first pair, shape (4, M).
+        ends: First number behind the pairs of each triangle, shape (M,).
+    """
+
+    edges: Int[Tensor, "3 3 M"]
+    planes: Float[Tensor, "5 M"]
+    boxes: Int[Tensor, "4 M"]
+    ends: Int[Tensor, " M"]
+
+
+def _triangles(
+    points: Float[Tensor, "N V 3"], faces: Int[Tensor, "F 3"], shape: tuple[int, int], closed: bool
+) -> _Triangles:
+    """Prepare the triangles of all views. Those that are not drawn have no pairs."""
+    rows, columns = shape
+    # As on GPUs, positions in samples are computed with one multiplication and one addition, and
+    # rounded to float32. x points to the right and y down.
+    halves = points.new_tensor([columns / 2, rows / 2])
+    window = points[..., :2].float() * points.new_tensor([columns / 2, -columns / 2]) + halves
+    positions = (window.float() * SUBSAMPLES).round().long() - SUBSAMPLES // 2
+    depths = (points[..., 2] + 1) / 2 * FAR
+    # A closed mesh shows only faces that are counter-clockwise in the image.
+    areas = doubled_areas(_by_corner(positions, faces))
+    is_drawn = areas < 0 if closed else areas != 0
+    # Corners are sorted, so that two faces with the same corners get exactly the same depth.
+    corners = faces.sort(dim=1).values
+    triangles = _by_corner(positions, corners)
+    areas = doubled_areas(triangles)
+    planes = depth_planes(triangles.double(), depths[:, corners].flatten(0, 1).T, areas.double())
+    x, y = triangles
+    first_column, widths = _covered_range(x, columns)
+    first_row, heights = _covered_range(y, rows)
+    counts = widths * heights * is_drawn
+    ends = counts.cumsum(0)
+    # The sign of the area makes the edge functions positive inside, whatever the orientation.
+    sign = areas.sign()
+    to_x, to_y = x.roll(-1, 0) - x, y.roll(-1, 0) - y
+    by_column, by_row = -SUBSAMPLES * to_y * sign, SUBSAMPLES * to_x * sign
+    is_owner = (by_column > 0) | ((by_column == 0) & (by_row > 0))
+    constant = (x * to_y - y * to_x) * sign - (~is_owner).long()
+    return _Triangles(
+        torch.stack([by_column, by_row, constant]),
+        torch.stack(planes),
+        torch.stack([first_column, first_row, widths, ends - counts]),
+        ends,
+    )
+
+
 def _draw(
     keys: Int[Tensor, "N R C"],
     points: Float[Tensor, "N V 3"],
@@ -43,79 +111,36 @@ def _draw(
 ) -> None:
     """Lower the key of each sample to that of the nearest face.
 
-    A key has the depth in its high bits and the index of the face in its low FACE_BITS bits.
+    A key has the depth in its high bits and the index of the face in its low FACE_BITS bits. The
+    smallest key of a sample is therefore the nearest face, or the first of equally near faces.
     """
     rows, columns = keys.shape[1:]
-    # As on GPUs, positions in samples are computed with one multiplication and one addition, and
-    # rounded to float32. x points to the right and y down.
-    halves = points.new_tensor([columns / 2, rows / 2])
-    window = points[..., :2].float() * points.new_tensor([columns / 2, -columns / 2]) + halves
-    positions = (window.float() * SUBSAMPLES).round().long() - SUBSAMPLES // 2
-    depths = (points[..., 2] + 1) / 2 * FAR
-    # Counter-clockwise triangles have negative areas, since y points down.
-    # A mesh that is not closed is drawn from both sides, except for faces without an area.
-    areas = _doubled_areas(positions[:, faces])
-    is_drawn = (areas < 0 if closed else areas != 0).flatten()
-    # Corners are sorted, so that two faces with the same corners get exactly the same depth. Axes
-    # of the tensors below: corner, or edge to the next corner; M = N · F triangles.
-    corners = faces.sort(dim=1).values
-    triangles = positions[:, corners].flatten(0, 1)
-    x, y = triangles.permute(2, 1, 0)
-    depth = depths[:, corners].flatten(0, 1).T
-    # Bounding box of each triangle, in samples.
-    first_column, widths = _covered_range(x, columns)
-    first_row, heights = _covered_range(y, rows)
-    counts = widths * heights * is_drawn
-    # Pairs of a triangle and a sample are numbered triangle by triangle. `ends` has the first
-    # number behind the pairs of each triangle.
-    ends = counts.cumsum(0)
-    # The edge function is by_column · column + by_row · row + constant.
-    areas = _doubled_areas(triangles)
-    # The sign of the area makes functions positive inside, whatever the orientation.
-    to_x, to_y = x.roll(-1, 0) - x, y.roll(-1, 0) - y
-    by_column, by_row = -SUBSAMPLES * to_y * areas.sign(), SUBSAMPLES * to_x * areas.sign()
-    # A sample exactly on a common edge belongs to one face only (the top-left rule).
-    is_owner = (by_column > 0) | ((by_column == 0) & (by_row > 0))
-    constant = (x * to_y - y * to_x) * areas.sign() - (~is_owner).long()
-    edges = torch.stack([by_column, by_row, constant])
-    boxes = torch.stack([first_column, first_row, widths, ends - counts])
-    # The depth is a plane through the first corner.
-    depth_b, depth_c = depth[1:] - depth[0]
-    scale = SUBSAMPLES / areas.double()
-    slope_x = (depth_b * (y[2] - y[0]) - depth_c * (y[1] - y[0])) * scale
-    slope_y = (depth_c * (x[1] - x[0]) - depth_b * (x[2] - x[0])) * scale
-    origins = triangles[:, 0].T.double() / SUBSAMPLES
-    planes = torch.stack([*origins, depth[0], slope_x, slope_y])
-    pair_count = int(ends[-1:].sum())  # The only wait for a GPU.
+    triangles = _triangles(points, faces, (rows, columns), closed)
+    pair_count = int(triangles.ends[-1:].sum())  # The only wait for a GPU.
     for begin in range(0, pair_count, PAIRS_PER_TILE):
         pair = torch.arange(begin, min(begin + PAIRS_PER_TILE, pair_count), device=points.device)
         # Triangle of each pair, and the sample from the place of the pair in the bounding box.
-        triangle = torch.searchsorted(ends, pair, right=True)
-        column, row, width, first_pair = boxes[:, triangle]
+        triangle = torch.searchsorted(triangles.ends, pair, right=True)
+        column, row, width, first_pair = triangles.boxes[:, triangle]
         step = pair - first_pair
         column, row = column + step % width, row + step // width
-        by_column, by_row, constant = edges[..., triangle]
+        by_column, by_row, constant = triangles.edges[..., triangle]
         is_inside = (by_column * column + by_row * row + constant >= 0).all(0)
-        x_a, y_a, depth_a, slope_x, slope_y = planes[:, triangle]
-        # Depths are rounded to integers, as in the other rasterizers.
-        rounded = (depth_a + (row - y_a) * slope_y + slope_x * (column - x_a)).round()
+        x, y, depth, slope_x, slope_y = triangles.planes[:, triangle]
+        rounded = (depth + (row - y) * slope_y + slope_x * (column - x)).round()
         is_seen = is_inside & (rounded >= 0) & (rounded < FAR)
-        # A key has the depth in its high bits and the face in its low bits. The smallest key of a
-        # sample is therefore the nearest face, or the first of equally near faces.
         view, face = triangle // len(faces), triangle % len(faces)
         key = torch.where(is_seen, (rounded.long() << FACE_BITS) | face, EMPTY_KEY)
         keys.view(-1).scatter_reduce_(0, (view * rows + row) * columns + column, key, "amin")
 
 
-def _doubled_areas(triangles: Int[Tensor, "... 3 2"]) -> Int[Tensor, "..."]:
-    """Compute twice the signed areas of triangles, negative if counter-clockwise in the image."""
-    to_b, to_c = (triangles[..., 1:, :] - triangles[..., :1, :]).unbind(-2)
-    return to_b[..., 0] * to_c[..., 1] - to_c[..., 0] * to_b[..., 1]
+def _by_corner(positions: Int[Tensor, "N V 2"], faces: Int[Tensor, "F 3"]) -> Int[Tensor, "2 3 M"]:
+    """Return the corners of the faces in all views, with the axes coordinate, corner, triangle."""
+    return positions[:, faces].flatten(0, 1).permute(2, 1, 0)
 
 
 def _covered_range(positions: Int[Tensor, "3 M"], count: int) -> tuple[Tensor, Tensor]:
     """Find the first row, or column, that each triangle can cover, and the number of them."""
-    # Dividing by `SUBSAMPLES` and rounding up gives the first sample at or behind a position.
-    low, high = (-(-ends >> SUBSAMPLE_BITS) for ends in positions.aminmax(dim=0))
+    low, high = (next_sample(limits) for limits in positions.aminmax(dim=0))
     first = low.clamp(min=0)
     return first, (high.clamp(max=count) - first).clamp(min=0)
