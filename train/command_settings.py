@@ -51,16 +51,24 @@ LAB_MESHES = [
 class AttackCommandSettings(AttackSettings):
     """Settings of an attack that only the command pnb-attack has."""
 
-    relighting: RelightingSettings | None = setting(None, "Projector light on `unlabeled` instead.")
-    shared: bool = setting(False, "One lighting, shape or color for all views.")
+    relighting: RelightingSettings | None = setting(
+        None, "Attack on the light of a projector on the photographs in `unlabeled`."
+    )
+    shared: bool = setting(False, "The views share one lighting, shape or color.")
     force: bool = setting(False, "Also attack images that are misclassified before the attack.")
     checks: bool | None = setting(
-        None, "Compare with random draws, and 3 and 10 times the steps. null: true with gradients."
+        None,
+        "Compare with random draws, and with 3 and 10 times as many steps. null: true if the "
+        "network has gradients.",
     )
     radius_scales: list[float] = setting(
-        [], "Factors of each radius, such as [0.5, 1, 2], to measure success.", within=SCALES
+        [],
+        "Factors of each radius, such as [0.5, 1, 2], for which success is measured.",
+        within=SCALES,
     )
-    verify: str | None = setting("reload", "Render files again: reload, mitsuba, reload+mitsuba.")
+    verify: str | None = setting(
+        "reload", "Render the written files again: reload (here), mitsuba, reload+mitsuba or null."
+    )
 
     def __post_init__(self) -> None:
         """Check all values, and that the renderers in `verify` exist."""
@@ -98,7 +106,9 @@ class TransferSettings(Settings):
     """
 
     networks: list[Any] = setting([], "Other networks: as `network`, or {network, weights}.")
-    azimuths: list[float] = setting([], "Rotations of the camera.", "degrees", within=(-360, 360))
+    azimuths: list[float] = setting(
+        [], "Rotations of the camera about the vertical.", "degrees", within=(-360, 360)
+    )
     meshes: list[Any] = setting([], "Other meshes, as `meshes`, in the same lighting.")
 
 
@@ -113,9 +123,11 @@ class AttackExperimentSettings(TaskSettings):
 
     network: str = setting("efficientnet_lite0", f"The attacked network: {NETWORKS}.")
     label: Any = text(LABEL)
-    target: Any = text("Class to reach: least_likely, a class, or one per view. null: any.")
+    target: Any = text(
+        "Class to reach: a class, least_likely, or one per view. null: any other class."
+    )
     goal: str | None = setting(
-        None, "hide or mislabel a detection. null: hide.", choices=("hide", "mislabel")
+        None, "Goal of an attack on a detector. null: hide.", choices=("hide", "mislabel")
     )
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
@@ -124,10 +136,16 @@ class AttackExperimentSettings(TaskSettings):
     reload: str | None = setting(None, "Folder of an adversary to classify, or to attack further.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
-    attack: AttackCommandSettings = setting(AttackCommandSettings, "The attack: attack=NAME+NAME.")
-    transfer: TransferSettings = setting(TransferSettings, "Where else adversaries are shown.")
+    attack: AttackCommandSettings = setting(
+        AttackCommandSettings, "What is attacked, and how. attack=NAME+NAME names it."
+    )
+    transfer: TransferSettings = setting(
+        TransferSettings, "Where else successful adversaries are tried."
+    )
     scene: AttackSceneSettings = setting(AttackSceneSettings, "The scene.")
-    renderer: RendererSettings = setting(lambda: RendererSettings(shadows=True), "The renderer.")
+    renderer: RendererSettings = setting(
+        lambda: RendererSettings(shadows=True), "How images are rendered."
+    )
 
     def __post_init__(self) -> None:
         """Check all values, and add to the scene the lights that are attacked."""
@@ -167,22 +185,34 @@ class LabSettings(Settings):
     """
 
     out: str = setting(REQUIRED, "A new folder, for photos= of pnb-evaluate.")
-    label: Any = text("Positive class, or several, one in each render. null: orange.")
+    label: Any = text("Positive class, or several, of which a render shows one. null: orange.")
     meshes: list[Any] = setting(LAB_MESHES, "The objects: by default, 6 oranges and 10 others.")
     setups: int = setting(180, "Draws of lighting, camera and pose.", within=(1, common.MAX_IMAGES))
     patterns: list[str] = setting(
         list(TRAINED_PATTERNS), f"Projected patterns: {', '.join(PATTERNS)}. a+b: two projectors."
     )
     slides: list[str] = setting([], "Image files that the pattern `slides` projects.")
-    environments: list[str] = setting([], "Maps (.npy, .hdr, .exr) of environments, not patterns.")
-    brightness: list[float] = pair([0.2, 2.5], "radiance of white surfaces in the light.", SCALES)
-    azimuth: list[float] = pair([-70, 70], "azimuth of a projector.", (-180, 180), "degrees")
-    elevation: list[float] = pair([25, 70], "elevation of a projector.", (1, 89), "degrees")
+    environments: list[str] = setting(
+        [], "Environment maps (.npy, .hdr, .exr) that light setups of their own."
+    )
+    brightness: list[float] = pair(
+        [0.2, 2.5], "radiance of white surfaces that face the light.", SCALES
+    )
+    azimuth: list[float] = pair(
+        [-70, 70], "azimuth of a projector from the camera.", (-180, 180), "degrees"
+    )
+    elevation: list[float] = pair(
+        [25, 70], "elevation of a projector above the table.", (1, 89), "degrees"
+    )
     ambient: list[float] = pair([0.01, 0.06], "radiance of the uniform environment.", (0, 1))
     albedo: list[float] = pair([0.04, 0.16], "albedo of table and wall.", (0, 1))
-    walls: float = setting(0.0, "Fraction of the setups with a wall.", within=(0, 1))
-    roughness: list[float] = pair([0.5, 0.5], "roughness of the object. 1 is matte.", (0.05, 1))
-    exposure: float = setting(1.0, "Factor of the radiance. 1 is white.", within=SCALES)
+    walls: float = setting(
+        0.0, "Fraction of the setups with a wall behind the object.", within=(0, 1)
+    )
+    roughness: list[float] = pair(
+        [0.5, 0.5], "roughness of the object. 0.1 is glossy, 1 is matte.", (0.05, 1)
+    )
+    exposure: float = setting(1.0, "Factor of the radiance, of which 1 is white.", within=SCALES)
     size: Any = setting(64, "Pixels per side, or [height, width].", within=(1, base.MAX_SIZE))
     spp: int = setting(32, "Paths per pixel and light.", within=(1, 10**5))
     bounces: int = setting(4, "Largest number of bounces of light.", within=(1, 1000))
@@ -205,7 +235,9 @@ class LabSettings(Settings):
         # Each pattern and each environment lights the same number of setups, and names files.
         sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
         if not sources or self.setups % len(sources):
-            raise self.wrong("setups", f"is no multiple of the {len(sources)} lights")
+            raise self.wrong(
+                "setups", f"must be a multiple of the {len(sources)} patterns and environments"
+            )
         if len(set(sources)) < len(sources):
             raise InputError(f"patterns and environments {sources} must have different names")
 
@@ -219,19 +251,31 @@ class AuditSettings(TaskSettings):
     """
 
     network: str = setting(REQUIRED, f"The audited network: {NETWORKS}.")
-    hardened: str | None = setting(None, "Another network beside it, such as run:runs/harden.")
+    hardened: str | None = setting(
+        None, "Another network to compare with, such as run:runs/harden."
+    )
     label: Any = text(LABEL)
     meshes: list[Any] = setting([], "Meshes of the class. []: only `unlabeled` is audited.")
-    unlabeled: str | None = setting(None, "Photographs to relight, at most 100 × `budget`.")
-    hard_negatives: list[Any] = setting([], "Meshes of other classes. []: generated fruit, balls.")
+    unlabeled: str | None = setting(
+        None, "Folder of photographs, of which 100 × `budget` are relit by a projector."
+    )
+    hard_negatives: list[Any] = setting(
+        [], "Meshes of other classes. []: generated fruit and balls."
+    )
     photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")
-    laboratory: str | None = setting(None, "Folder of renders. null: made of meshes by Mitsuba.")
+    laboratory: str | None = setting(
+        None, "Folder of renders of pnb-lab. null: Mitsuba renders the meshes."
+    )
     environments: list[str] = setting([*ENVIRONMENTS], "Environment lightings, or maps (.hdr ...).")
-    budget: float = setting(1.0, "Factor of views, lightings and renders.", within=(0.01, 100))
+    budget: float = setting(
+        1.0, "Factor of the numbers of views, lightings and renders.", within=(0.01, 100)
+    )
     overwrite: bool = setting(False, "Start anew in a folder that holds an audit or other results.")
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
-    out: str = setting(f"runs/audits/{TIME_FOLDER}", "Folder. A stopped audit continues in it.")
+    out: str = setting(
+        f"runs/audits/{TIME_FOLDER}", "Folder of the audit. A stopped audit continues in it."
+    )
 
     def __post_init__(self) -> None:
         """Check all values, and that there is something to audit: meshes or photographs."""
@@ -259,16 +303,28 @@ class EvaluateSettings(TaskSettings):
         "COCO, or a folder of images with labels of YOLO. Of a segmenter: images/ and masks/.",
     )
     fit: str = setting(
-        "letterbox", "How photographs get the network's size.", choices=("letterbox", "stretch")
+        "letterbox",
+        "How photographs get the size of a detector or segmenter.",
+        choices=("letterbox", "stretch"),
     )
     run: str | None = setting(
-        None, "A run, instead of `network`, which can only be the python: function that built it."
+        None,
+        "Folder of a run, instead of `network`. Both may be set if a python: function built the "
+        "network of the run.",
     )
-    label: Any = text("Positive class, or several. null: the run's, or all with a folder.")
+    label: Any = text(
+        "Positive class, or several. null: that of the run, or each class with a folder."
+    )
     out: str = setting(f"runs/photographs/{TIME_FOLDER}", "Folder of the scores.")
-    false_positive_rate: float | None = setting(None, "Rate on `calibrate`.", within=PROBABILITY)
-    calibrate: str | None = setting(None, "Folder like photos. null: the stored threshold, if any.")
-    by: str = setting("source", "Groups of the tables.", choices=common.GROUPS)
+    false_positive_rate: float | None = setting(
+        None, "False-positive rate on `calibrate` that sets the threshold.", within=PROBABILITY
+    )
+    calibrate: str | None = setting(
+        None, "A folder like photos. null: the threshold of the network, if it has one."
+    )
+    by: str = setting(
+        "source", "Groups of the tables: a column of photos.csv, or class.", choices=common.GROUPS
+    )
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
     precision: str = setting("auto", "auto (bfloat16 where it is fast), bfloat16 or float32.")
@@ -307,14 +363,27 @@ class FitSettings(Settings):
     photograph: str = setting(REQUIRED, "An image file.")
     mesh: str = setting(REQUIRED, "A mesh file or solid:NAME:SEED, upright as in the photograph.")
     mask: str | None = setting(None, "Image of the photograph's size, white where the object is.")
-    box: list[int] = setting([], "Or [left, top, right, bottom] in pixels, for GrabCut.")
-    fov: float | None = setting(
-        None, "Angle across 1.6 object widths. null: orthographic.", "degrees", within=(0.1, 120)
+    box: list[int] = setting(
+        [], "Box of the object instead of a mask, [left, top, right, bottom] in pixels."
     )
-    albedo_scale: float = setting(1.0, "Factor of the albedo.", within=(1e-3, 1e3))
-    encoding: str = setting("srgb", "Encoding of photograph and mesh.", choices=base.ENCODINGS)
-    bounces: int = setting(3, "Bounces of light. 0: also no shadows.", within=(0, base.MAX_BOUNCES))
-    label: str | None = setting(None, "Class of the printed attack. null: what the mesh is named.")
+    fov: float | None = setting(
+        None,
+        "Angle across a square 1.6 times as wide as the object. null: orthographic.",
+        "degrees",
+        within=(0.1, 120),
+    )
+    albedo_scale: float = setting(
+        1.0, "Factor of the albedo. Twice as much halves the light.", within=(1e-3, 1e3)
+    )
+    encoding: str = setting(
+        "srgb", "Encoding of the photograph and of the colors of the mesh.", choices=base.ENCODINGS
+    )
+    bounces: int = setting(
+        3, "Bounces of light between surfaces. 0: no shadows, either.", within=(0, base.MAX_BOUNCES)
+    )
+    label: str | None = setting(
+        None, "Class in the command that is printed. null: that of the name of the mesh."
+    )
     size: int = setting(64, "Pixels per side that are compared.", within=(16, 512))
     out: str = setting("runs/fit", "Folder of the background, the mask, the light and a picture.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
@@ -333,18 +402,26 @@ class RenderSettings(TaskSettings):
     The renders show the meshes in turn, then the next background, then the next view.
     """
 
-    network: str | None = setting(None, f"Network that each render is to fool: {NETWORKS}.")
+    network: str | None = setting(
+        None, f"Network that each render is attacked to fool: {NETWORKS}."
+    )
     size: Any = setting(
-        None, "Pixels, or [height, width]. null: the network's, or 224.", within=(1, base.MAX_SIZE)
+        None,
+        "Pixels per side, or [height, width]. null: those of the network, or 224.",
+        within=(1, base.MAX_SIZE),
     )
     meshes: list[Any] = setting(
         ["solid:orange", "solid:apple", "solid:cup"], MESHES, is_filled=True
     )
-    label: Any = text("Class of the meshes. null: the names of the files.")
+    label: Any = text("Class of the meshes. null: what the name of each file tells.")
     format: str = setting("imagefolder", "Layout of the data set.", choices=DATA_SET_FORMATS)
     count: int = setting(100, "Number of renders.", within=(1, MAX_SEED))
-    splits: Any = setting({"train": 0.8, "val": 0.1, "test": 0.1}, "Fractions of the parts.")
-    maps: list[str] = setting(list(DATA_SET_MAPS), "Further images.", choices=DATA_SET_MAPS)
+    splits: Any = setting(
+        {"train": 0.8, "val": 0.1, "test": 0.1}, "Parts of the data set, and their fractions."
+    )
+    maps: list[str] = setting(
+        list(DATA_SET_MAPS), "Further images of each render.", choices=DATA_SET_MAPS
+    )
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
     shards: int = setting(1, "Parts of the work that --multirun shard=0,1,... shares.")
     shard: int = setting(0, "Index of the part that this process renders.", within=(0, None))
@@ -372,7 +449,9 @@ class RenderSettings(TaskSettings):
         ),
         "The scene. light=NAME is short for scene.light=NAME.",
     )
-    renderer: RendererSettings = setting(lambda: RendererSettings(encoding="srgb"), "The renderer.")
+    renderer: RendererSettings = setting(
+        lambda: RendererSettings(encoding="srgb"), "How images are rendered."
+    )
 
     def __post_init__(self) -> None:
         """Check all values, and compute the number of renders in each part."""
@@ -398,8 +477,12 @@ class RenderSettings(TaskSettings):
 class CompareSettings(Settings):
     """Settings of the command pnb-compare, which prints tables of the metrics of training runs."""
 
-    runs: list[str] = setting(REQUIRED, "Runs and sweeps, or folders above them.", is_filled=True)
-    by: str = setting("source", "Groups of the tables.", choices=common.GROUPS)
+    runs: list[str] = setting(
+        REQUIRED, "Folders of runs and sweeps, or folders above them.", is_filled=True
+    )
+    by: str = setting(
+        "source", "Groups of the tables: a column of photos.csv, or class.", choices=common.GROUPS
+    )
 
 
 @dataclass

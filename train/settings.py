@@ -112,7 +112,9 @@ class TrainingSceneSettings(SceneSettings):
     """Settings of the scene of training renders. The defaults are those of the paper."""
 
     backgrounds: list[Any] = setting_like(SceneSettings, "backgrounds", [0.0, 0.25, 0.5, 0.75, 1.0])
-    views: int | None = setting(None, "Cameras per mesh. null: as needed.", within=(1, MAX_VIEWS))
+    views: int | None = setting(
+        None, "Cameras per mesh. null: as many as augment.examples needs.", within=(1, MAX_VIEWS)
+    )
 
 
 @dataclass
@@ -131,7 +133,7 @@ class EvaluationSettings(Settings):
         """Check all values."""
         super().__post_init__()
         if self.laboratory_setups % KEPT_ASIDE_PATTERNS:
-            raise self.wrong("laboratory_setups", f"is no multiple of {KEPT_ASIDE_PATTERNS}")
+            raise self.wrong("laboratory_setups", f"must be a multiple of {KEPT_ASIDE_PATTERNS}")
 
 
 @dataclass(kw_only=True)
@@ -140,7 +142,9 @@ class NetworkSettings(Settings):
 
     network: str | None = setting(None, f"The network: {NETWORKS}.")
     size: Any = setting(
-        None, "Pixels, or [height, width]. null: the network's, or 224.", within=(1, MAX_SIZE)
+        None,
+        "Pixels per side, or [height, width]. null: those of the network, or 224.",
+        within=(1, MAX_SIZE),
     )
     weights: str | None = setting(None, "File of the network's weights. null: its own.")
     classes: Any = text(
@@ -182,7 +186,9 @@ class NetworkSettings(Settings):
 class TaskSettings(NetworkSettings):
     """Settings that choose a network, and say what its outputs mean."""
 
-    task: str | None = setting(None, "What outputs mean. null: their type tells.", choices=TASKS)
+    task: str | None = setting(
+        None, "What the outputs of the network are. null: their type tells.", choices=TASKS
+    )
     threshold: float | None = setting(None, "Threshold of scores. null: 0.4.", within=PROBABILITY)
     iou: float | None = setting(None, "Least intersection over union. null: 0.5.", within=(0.01, 1))
     decode: str | None = setting(
@@ -198,7 +204,7 @@ class ExperimentSettings(NetworkSettings):
 
     network: str | None = setting(None, f"Initial network: {NETWORKS}. null: random weights.")
     size: int | None = setting(
-        None, "Pixels per side. null: the network's, or 32.", within=(MIN_SIZE, MAX_SIZE)
+        None, "Pixels per side. null: those of the network, or 32.", within=(MIN_SIZE, MAX_SIZE)
     )
     meshes: list[Any] = setting(["solid:orange:0", "solid:orange:1"], MESHES)
     hard_negatives: list[Any] = setting(
@@ -224,7 +230,9 @@ class ExperimentSettings(NetworkSettings):
     renderer: RendererSettings = setting(
         lambda: RendererSettings(samples=8, normals="flat"), "The renderer, by default the paper's."
     )
-    model: ModelSettings = setting(ModelSettings, "The architecture. model=NAME: model.name=NAME.")
+    model: ModelSettings = setting(
+        ModelSettings, "The architecture. model=NAME is short for model.name=NAME."
+    )
     train: TrainSettings = setting(TrainSettings, "How the network is trained.")
     evaluate: EvaluationSettings = setting(EvaluationSettings, "What the network is scored on.")
 

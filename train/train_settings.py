@@ -57,7 +57,7 @@ class TrainSettings(Settings):
         None, "Number of training images, drawn anew for each epoch. null: all.", within=(1, 10**9)
     )
     batch_size: int = setting(128, "Images per training step.", within=(1, 10**6))
-    optimizer: str = setting("sgd", "adamw decays no biases and norms.", choices=OPTIMIZERS)
+    optimizer: str = setting("sgd", "adamw decays neither biases nor norms.", choices=OPTIMIZERS)
     learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
     feature_norm: float | None = setting(
         None,
@@ -87,7 +87,9 @@ class TrainSettings(Settings):
     relight_gain: float = setting(
         3.0, "Largest factor of a channel for relight, and 1 / the smallest.", within=(1, 100)
     )
-    relight_steps: int = setting(0, "Gradient steps for the factors. 0: random.", within=(0, 1000))
+    relight_steps: int = setting(
+        0, "Gradient steps that find the factors. 0: random factors.", within=(0, 1000)
+    )
     label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
     ranking_weight: float = setting(
         0.0, "Weight of the loss that ranks `label` above other classes.", within=(0, MAX_SCALE)
@@ -103,7 +105,7 @@ class TrainSettings(Settings):
     soup: bool = setting(False, "Keep the mean of all epochs, which all start with `network`.")
     eval_mode: bool | None = setting(
         None,
-        "Train with the statistics of `network`, without dropout. null: classifiers of others.",
+        "Train with the statistics of `network`, without dropout. null: true for other libraries.",
     )
     precision: str = setting("auto", "bfloat16, float16, float32, or auto: by the hardware.")
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
