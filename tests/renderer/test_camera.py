@@ -4,9 +4,7 @@ Comparisons with Mitsuba are in test_mitsuba.py.
 """
 
 import math
-from ctypes.util import find_library
 from dataclasses import replace
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -20,11 +18,9 @@ from renderer.operators.rays import Surface
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.visibility import choose
-from renderer.visibility.fragments import Fragments, build_fragments
+from renderer.visibility.fragments import build_fragments
 
 EPS = np.finfo(np.float64).eps
-# Corners of the cube [-1, 1]³.
-CUBE_CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
 ORTHOGRAPHIC = [
     *orbit_cameras(7, 2.0),
     OrthographicCamera(0, 0, 2.0),
@@ -40,29 +36,12 @@ SHIFTED_PINHOLE = PinholeCamera(
 )
 CAMERA = PerspectiveCamera(51.6, 22.9, 2.4, right=0.2, up=-0.1, distance=1.9)
 POSITION = CAMERA.pose()[:3, 3]
-NO_NUMBA = find_spec("numba") is None
-NO_EGL = find_library("EGL") is None
-RASTERIZERS = [
-    "numpy",
-    pytest.param("numba", marks=pytest.mark.skipif(NO_NUMBA, reason="numba is not installed")),
-    pytest.param("opengl", marks=pytest.mark.skipif(NO_EGL, reason="no EGL on this machine")),
-]
-
-
-@pytest.mark.parametrize("camera", ORTHOGRAPHIC)
-def test_orthographic_depth_grows_with_distance_and_positions_do_not_depend_on_it(camera):
-    back = camera.axes()[2]
-    near, far = camera.project(np.stack([back, -back]))
-    assert near[2] < 0 < far[2]
-    np.testing.assert_allclose(near[:2], far[:2], atol=4 * EPS)
-    assert np.abs(camera.project(CUBE_CORNERS)[:, 2]).max() <= math.sqrt(3) / 2 + EPS
 
 
 @pytest.mark.parametrize(
     ("camera", "points", "expected"),
     [
-        # The camera is on the +x side at the polar angle 60°. Right is +y, and
-        # up is (-1/2, 0, √3/2).
+        # Right is +y, and up is (-1/2, 0, √3/2).
         (
             OrthographicCamera(60.0, 0, width=4.0),
             [[1.0, 1.0, 1.0], [0.5, -0.25, 0.0], [0.0, 0.0, 0.0]],
@@ -78,8 +57,7 @@ def test_orthographic_depth_grows_with_distance_and_positions_do_not_depend_on_i
             [[0, 0, 0], [9, 0.5, 1]],
             [[0.5, -0.25], [1, 0.75]],
         ),
-        # The camera lies on +x at distance 2, and the image is 4 wide. What is
-        # 1 in front of the origin is twice as large, and 2 behind half as large.
+        # What is 1 in front of the origin is twice as large, and 2 behind half as large.
         (
             PerspectiveCamera(90.0, 0, 4.0, right=0.5, distance=2.0),
             [[0.0, 1.0, 1.0], [1.0, 1.0, 1.0], [-2.0, 1.0, -1.0], [0.0, -0.5, 0.0]],
@@ -106,17 +84,6 @@ def test_nearness_falls_with_the_distance_and_is_linear_in_the_image_of_a_plane(
     weights = np.append(image[3], 1.0) @ np.linalg.inv(corners_of_image)
     nearness = camera.homogeneous(torch.from_numpy(points))[1].numpy()
     np.testing.assert_allclose(weights @ nearness[:3], nearness[3], rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("camera", PERSPECTIVE)
-def test_perspective_depth_grows_from_the_near_plane_to_the_far_plane(camera):
-    distances = np.linspace(camera.near, camera.far, 9)
-    back = camera.axes()[2]
-    points = (camera.distance - distances)[:, None] * back
-    depths = camera.project(points)[:, 2]
-    np.testing.assert_allclose(depths[[0, -1]], [-1, 1], atol=64 * EPS)
-    assert (np.diff(depths) > 0).all()
-    assert np.abs(camera.project(CUBE_CORNERS)[:, 2]).max() < 1
 
 
 @pytest.mark.parametrize("distance", [0.5, 1.731])
@@ -168,17 +135,11 @@ def first_hits(mesh: Mesh, directions: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return faces, points
 
 
-def view_of_torus(mesh: Mesh, rasterizer: str) -> Fragments:
-    settings = ImageSettings(64, 1)
-    [view] = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose(rasterizer))
-    return view
-
-
-@pytest.mark.parametrize("name", RASTERIZERS)
-def test_a_sample_shows_the_face_that_its_ray_meets_first_and_the_point_there(name):
+def test_a_sample_shows_the_face_that_its_ray_meets_first_its_side_and_the_point_there():
     """A few samples near edges differ, because corners are rounded by up to 1/512 of a sample."""
     mesh = open_torus()
-    view = view_of_torus(mesh, name)
+    settings = ImageSettings(64, 1)
+    [view] = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"))
     ids = np.full(64 * 64, -1)
     ids[view.sample_numbers] = view.faces[view.sample_to_seen_face]
     expected, hits = first_hits(mesh, rays(64))
@@ -186,30 +147,21 @@ def test_a_sample_shows_the_face_that_its_ray_meets_first_and_the_point_there(na
     assert (ids != expected).sum() <= 4
 
     is_same = torch.from_numpy(ids == expected)[view.sample_numbers]
-    points = Surface(mesh, view, ImageSettings(64, 1)).points
+    points = Surface(mesh, view, settings).points
     np.testing.assert_allclose(
         points[is_same], hits[view.sample_numbers[is_same]], rtol=0, atol=1e-12
     )
 
-
-@pytest.mark.parametrize("name", RASTERIZERS)
-def test_the_visible_side_of_a_face_depends_on_its_position(name):
-    mesh = open_torus()
-    view = view_of_torus(mesh, name)
     a, b, c = mesh.vertices[view.corners].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     sides = np.sign(((POSITION - a) * normals).sum(axis=1))
     np.testing.assert_array_equal(view.facing[:, 0], sides)
     # A camera without perspective would see other sides.
-    orthographic_sides = np.sign(normals @ CAMERA.axes()[2])
-    assert (sides != orthographic_sides).sum() > 5
+    assert (sides != np.sign(normals @ CAMERA.axes()[2])).sum() > 5
 
 
 def homography_of(positions: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """Find the matrix (3, 3) that maps four positions to texture coordinates.
-
-    It solves the eight equations of Hartley and Zisserman 2004, section 4.1.
-    """
+    """Solve the eight equations of Hartley and Zisserman 2004, section 4.1."""
     equations = []
     for (x, y), (u, v) in zip(positions, uvs, strict=True):
         equations.append([x, y, 1, 0, 0, 0, -u * x, -u * y])
@@ -220,7 +172,6 @@ def homography_of(positions: np.ndarray, uvs: np.ndarray) -> np.ndarray:
 
 def test_a_texture_on_a_tilted_plane_follows_the_homography_of_its_corners():
     corners = np.array([[-0.9, -0.8, -0.7], [0.9, -0.6, 0.1], [0.8, 0.9, 0.9], [0, 0, 0]])
-    # The fourth corner lies in the plane of the others.
     corners[3] = corners[0] + corners[2] - corners[1]
     uvs = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])

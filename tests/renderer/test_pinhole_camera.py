@@ -14,7 +14,7 @@ from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
-from tests.renderer.test_camera import RASTERIZERS, open_torus
+from tests.renderer.test_camera import open_torus
 
 SIZE = 64
 INTRINSICS = np.array([[70.0, 0.0, 27.0], [0.0, 76.0, 39.0], [0.0, 0.0, 1.0]])
@@ -45,12 +45,11 @@ def as_pixels(image_positions: np.ndarray) -> np.ndarray:
 
 
 def points_around(place: np.ndarray) -> np.ndarray:
-    """Draw points in a cube with sides of 2."""
     return place + np.random.default_rng(0).uniform(-1, 1, (30, 3))
 
 
 @pytest.mark.parametrize("convention", ["opencv", "opengl"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_points_are_projected_by_the_matrices(seed, convention):
     view = view_matrix(seed)
     points = points_around(PLACE)
@@ -106,15 +105,14 @@ def test_a_normalized_camera_sees_the_moved_mesh_in_the_same_place():
         np.testing.assert_allclose(found, given.project(points)[:, :2], rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("name", RASTERIZERS)
-def test_a_sample_shows_the_point_of_its_own_pixel(name):
+def test_a_sample_shows_the_point_of_its_own_pixel():
     """The samples of the mesh are projected by the matrices to the centers of their pixels."""
     view = view_matrix(3)
     camera = PinholeCamera.from_matrix(view, INTRINSICS, SIZE)
     torus = open_torus()
     mesh = replace(torus, vertices=torus.vertices + PLACE)
     settings = ImageSettings(SIZE, 1)
-    [seen] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose(name))
+    [seen] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("numpy"))
     assert len(seen.sample_numbers) > 300
     points = Surface(mesh, seen, settings).points.numpy()
     row, column = np.divmod(seen.sample_numbers.numpy(), SIZE)

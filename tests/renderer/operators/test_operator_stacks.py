@@ -1,13 +1,11 @@
 """Many views in one call, compared with the single views."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache, partial
 
 import pytest
 import torch
 from oracles import draw
-from torch import Tensor
 
 import renderer
 from renderer.camera import orbit_cameras
@@ -69,51 +67,31 @@ def scene_operators(scene: str) -> TransferOperators:
     return SCENES[scene]()
 
 
-@dataclass(frozen=True)
-class Call:
-    """Arguments of `TransferOperators.image`, of which `batch` precedes the coefficients.
-
-    The background is "gray", "image", "image of view" or "all images".
-    """
-
-    batch: tuple[int, ...]
-    per_view: bool
-    background: str
-
-    def lights(self, count: int) -> Tensor:
-        return 0.3 * draw(*self.batch, count, 3)
-
-    def backgrounds(self) -> tuple[float | Tensor, list[float | Tensor]]:
-        """Return the background of the call, and that of each view."""
-        images = draw(VIEW_COUNT, 2, 3, SIZE, SIZE, seed=3).abs().clamp(max=1)
-        if self.background == "gray":
-            return 0.2, [0.2] * VIEW_COUNT
-        if self.background == "image":
-            return images[0, 0], [images[0, 0]] * VIEW_COUNT
-        given = images[:, :1] if self.background == "image of view" else images
-        return given, list(given)
+BEHIND = draw(VIEW_COUNT, 2, 3, SIZE, SIZE, seed=3).abs().clamp(max=1)
 
 
-CALLS = [
-    Call((), False, "gray"),
-    Call((2,), False, "image of view"),
-    Call((VIEW_COUNT,), True, "image"),
-    Call((VIEW_COUNT, 2), True, "all images"),
-]
-
-
-@pytest.mark.parametrize("call", CALLS, ids=str)
+@pytest.mark.parametrize(
+    ("batch", "per_view", "background", "background_of_view"),
+    [
+        ((), False, 0.2, [0.2] * VIEW_COUNT),
+        ((2,), False, BEHIND[:, :1], BEHIND[:, :1]),
+        ((VIEW_COUNT,), True, BEHIND[0, 0], [BEHIND[0, 0]] * VIEW_COUNT),
+        ((VIEW_COUNT, 2), True, BEHIND, BEHIND),
+    ],
+    ids=["gray", "image of view", "image", "all images"],
+)
 @pytest.mark.parametrize("scene", SCENES)
-def test_all_views_in_one_call_are_the_single_views(scene, call):
+def test_all_views_in_one_call_are_the_single_views(
+    scene, batch, per_view, background, background_of_view
+):
     operators = scene_operators(scene)
     tolerance = 1e-5 if scene == "float32" else 1e-12
-    lights = call.lights(operators[0].basis.size)
-    background, background_of_view = call.backgrounds()
+    lights = 0.3 * draw(*batch, operators[0].basis.size, 3)
 
     variable = lights.clone().requires_grad_()
-    found = operators.image(variable, background, light_per_view=call.per_view)
+    found = operators.image(variable, background, light_per_view=per_view)
     single = lights.clone().requires_grad_()
-    light_of_view = single if call.per_view else single.expand(VIEW_COUNT, *single.shape)
+    light_of_view = single if per_view else single.expand(VIEW_COUNT, *single.shape)
     images = []
     for operator, light, behind in zip(operators, light_of_view, background_of_view, strict=True):
         images.append(operator.image(light, behind))
@@ -125,7 +103,7 @@ def test_all_views_in_one_call_are_the_single_views(scene, call):
     [expected_gradient] = torch.autograd.grad(expected, single, upstream)
     torch.testing.assert_close(gradient, expected_gradient, rtol=tolerance, atol=100 * tolerance)
     without_autograd = operators.image_and_gradient(
-        lights, lambda _: upstream, background=background, light_per_view=call.per_view
+        lights, lambda _: upstream, background=background, light_per_view=per_view
     )
     assert torch.equal(without_autograd[0], found)
     assert torch.equal(without_autograd[1], gradient)
