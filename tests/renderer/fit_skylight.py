@@ -1,13 +1,8 @@
 """Fit polynomials to the coefficients of the sky.
 
-The script writes the fit that `renderer.light.skylight` reads, and prints its
-largest error:
+The script writes the fit that `renderer.light.skylight` reads, and prints its largest error:
 
     python tests/renderer/fit_skylight.py [FILE]
-
-The model of the sky is the one of Preetham et al. that
-`renderer.light.skylight` describes. Its coefficients are integrals over the
-hemisphere, by Gauss-Legendre quadrature.
 """
 
 import math
@@ -40,9 +35,8 @@ PEREZ = np.array(
         ],
     ]
 )
-# Chromaticities x and y overhead. There is a row for each of T², T and 1 of the
-# turbidity T, and a column for each of θ³, θ², θ and 1 of the sun's zenith
-# angle θ.
+# Chromaticities x and y overhead: rows T², T and 1 of the turbidity, and columns θ³, θ², θ and 1 of
+# the sun's zenith angle.
 ZENITH_X = [
     [0.00166, -0.00375, 0.00209, 0],
     [-0.02903, 0.06377, -0.03202, 0.00394],
@@ -55,13 +49,11 @@ ZENITH_Y = [
 ]
 # Matrix of IEC 61966-2-1.
 RGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-# Degree in the zenith angle, which is the paper's, and in the inverse of
-# turbidity. With the paper's degree of 7, the error is 25 times larger.
+# Degrees in the zenith angle, which is the paper's, and in the inverse of turbidity.
 DEGREES = (13, 11)
 # Indices of the 28 fitted coefficients, which are those with m >= 0.
 UPRIGHT = [l * l + l + m for l in range(7) for m in range(l + 1)]
-# The exponential exp(b / cosine) is below 1e-57 at a cosine of the zenith angle
-# of 1e-3. The limit keeps 1 / cosine finite at the horizon.
+# The limit keeps 1 / cosine finite at the horizon, where the exponential vanishes.
 MIN_COSINE = 1e-3
 
 
@@ -76,13 +68,8 @@ def main(out: str = "renderer/light/skylight_fit.safetensors") -> None:
 def fit_polynomials(zenith_degree: int, turbidity_degree: int, nodes: int = 32) -> torch.Tensor:
     """Fit Chebyshev coefficients (zeniths, turbidities, 28, 3) of skies with the sun at azimuth 0.
 
-    The fit is a least-squares fit to quadratures at Chebyshev points, with
-    twice as many points as polynomials in each variable. Coefficients with
-    m < 0 vanish by symmetry.
-
-    The model has a pole at a turbidity of 1.65. Polynomials of the paper's
-    degrees 13 and 7 in turbidity are therefore off by up to 4%, and polynomials
-    in its inverse by 0.15%. Monomials would lose digits of float32.
+    Coefficients with m < 0 vanish by symmetry. The model has a pole at a turbidity of 1.65, so that
+    polynomials in the turbidity are off by up to 4%, and polynomials in its inverse by 0.15%.
     """
     zenith_points = chebpts1(2 * (zenith_degree + 1))
     turbidity_points = chebpts1(2 * (turbidity_degree + 1))
@@ -100,11 +87,7 @@ def fit_polynomials(zenith_degree: int, turbidity_degree: int, nodes: int = 32) 
 
 
 def fit_error(fit: torch.Tensor, skies: int, rng: np.random.Generator) -> float:
-    """Return the largest error of a fit on random skies.
-
-    The error is relative to the L2 norm of the sky's coefficients by
-    quadrature.
-    """
+    """Return the largest error of a fit on random skies, relative to the sky's L2 norm."""
     lowest = [0, 0, TURBIDITY[0]]
     highest = [math.pi / 2, 2 * math.pi, TURBIDITY[1]]
     suns = rng.uniform(lowest, highest, (skies, 3))
@@ -120,15 +103,9 @@ def coefficients_by_quadrature(
 ) -> np.ndarray:
     """Integrate the sky's radiance times harmonics over the upper hemisphere, shape (49, 3).
 
-    The quadrature has 4 · nodes² directions in polar coordinates around the
-    sun, so that the cusp there is an end of the integration. Circles around the
-    sun are whole until they touch the horizon. From there on only the arcs above
-    the horizon count, at angles of π/2 - zenith · cos t. Their length is smooth
-    in t.
-
-    With 48 nodes the error is mostly 1e-9 of the norm of the coefficients, and
-    up to 2e-8 in the clearest air with the sun overhead. With 24 nodes it is up
-    to 1e-5.
+    The quadrature has 4 · nodes² directions in polar coordinates around the sun, whose cusp is an
+    end of the integration. Circles around the sun are whole until they touch the horizon. From
+    there on only arcs count, at angles of π/2 - zenith · cos t. Their length is smooth in t.
     """
     # A sun overhead has no arcs, and the ratio of the tangents would be 0/0.
     tilt = max(zenith, 1e-8)
@@ -164,8 +141,7 @@ def _unit_interval_quadrature(nodes: int) -> tuple[np.ndarray, np.ndarray]:
 def radiance(cosine: np.ndarray, angle: np.ndarray, zenith: float, turbidity: float) -> np.ndarray:
     """Evaluate the sky's radiance (N, 3) in kcd/m² by cosines to the zenith, and angles to the sun.
 
-    Saturated skies leave the gamut and are not clamped. Around a clear sunset,
-    blue falls to -2.6% of the largest value.
+    Saturated skies leave the gamut and are not clamped.
     """
     chi = (4 / 9 - turbidity / 120) * (math.pi - 2 * zenith)
     luminance_overhead = (4.0453 * turbidity - 4.9710) * math.tan(chi) - 0.2155 * turbidity + 2.4192

@@ -16,6 +16,7 @@ from scipy.special import sph_harm_y_all
 from renderer.io.meshes import load_mesh
 from renderer.light.harmonics import lambertian_factors
 from renderer.mesh import Mesh, normalize
+from renderer.operators.apply import TransferOperator
 from renderer.solids import SOLIDS, solid
 
 SCANS = Path(__file__).parents[3] / "shared" / "data" / "meshes"
@@ -39,10 +40,7 @@ def random_directions(count: int, seed: int = 0) -> torch.Tensor:
 
 
 def real_harmonics(complex_values: np.ndarray) -> np.ndarray:
-    """Combine SciPy's complex harmonics (L, M, ...) into real ones (L², ...), index l² + l + m.
-
-    They have no Condon-Shortley sign.
-    """
+    """Combine complex harmonics (L, M, ...) into real ones (L², ...) without the sign."""
     rows = []
     for l in range(len(complex_values)):
         for m in range(-l, l + 1):
@@ -63,11 +61,7 @@ def scipy_basis(directions: np.ndarray | torch.Tensor, degree: int) -> np.ndarra
 def scipy_irradiance(
     normals: np.ndarray | torch.Tensor, light: np.ndarray | torch.Tensor
 ) -> np.ndarray:
-    """Compute the irradiance Σ A_l U_lm Y_lm(n), shape (N, 3).
-
-    test_harmonics.py checks the factors A_l that this function takes from the
-    renderer.
-    """
+    """Compute the irradiance Σ A_l U_lm Y_lm(n), (N, 3). test_harmonics.py checks the factors."""
     degree = math.isqrt(len(light)) - 1
     factors = lambertian_factors(degree).numpy()
     reflected = factors[:, None] * np.asarray(light, dtype=np.float64)
@@ -75,11 +69,7 @@ def scipy_irradiance(
 
 
 def patchwork(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> Mesh:
-    """Dent a mesh, and give its faces one of two textures or none.
-
-    All corners have their own colors and texture coordinates. The coordinates
-    lie outside of [0, 1], too.
-    """
+    """Dent a mesh, and give its faces one of two textures or none, with coordinates of any size."""
     rng = np.random.default_rng(seed)
     face_count = len(faces)
     dents = rng.uniform(0.7, 1, (len(vertices), 1))
@@ -112,6 +102,15 @@ def named_mesh(name: str) -> Mesh:
 def corners_of(mesh: Mesh) -> np.ndarray:
     """Return the positions of the corners of all faces, shape (F, 3 corners, 3)."""
     return mesh.vertices[mesh.faces]
+
+
+def image_of(operator: TransferOperator, light: torch.Tensor) -> torch.Tensor:
+    """Return the radiance and the coverage of an operator's view, float64, (4, size, size)."""
+    size = operator.settings.size
+    image = torch.zeros(4, size**2, dtype=torch.float64)
+    image[:3, operator.pixels] = operator.radiance(light).double()
+    image[3, operator.pixels] = operator.coverage.double()
+    return image.unflatten(1, (size, size))
 
 
 def srgb_of(linear: ArrayLike) -> np.ndarray:

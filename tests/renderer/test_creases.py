@@ -51,17 +51,13 @@ def test_a_can_has_flat_lids_and_a_round_side():
 
 
 @pytest.mark.parametrize(("angle", "is_sharp"), [(0, 0), (39.9, 0), (40, 0), (40.1, 1), (170, 1)])
-def test_an_edge_is_sharp_beyond_40_degrees(angle, is_sharp):
+def test_an_edge_is_sharp_beyond_40_degrees_or_the_chosen_angle(angle, is_sharp):
     for sign, mirrored in itertools.product((1, -1), (False, True)):
         mesh = folded_strip(sign * angle, mirrored)
         assert mesh.normal_ids.max() + 1 == 6 + 2 * is_sharp
-
-
-def test_the_angle_of_a_crease_can_be_chosen():
-    mesh = folded_strip(60)
-    for crease, count in [(0, 8), (59, 8), (61, 6), (180, 6)]:
-        found = nb.Mesh.plain(mesh.vertices, mesh.faces, crease=crease)
-        assert found.normal_ids.max() + 1 == count
+        for crease, count in ((max(angle - 1, 0), 8 if angle else 6), (angle + 1, 6)):
+            found = nb.Mesh.plain(mesh.vertices, mesh.faces, crease=crease)
+            assert found.normal_ids.max() + 1 == count
 
 
 def test_a_crease_that_ends_at_a_vertex_divides_only_its_other_end():
@@ -141,19 +137,16 @@ def test_faces_that_only_touch_at_a_vertex_share_its_normal_in_a_file():
     assert ids[0, 0] == ids[1, 0]
 
 
-def test_a_subdivided_mesh_has_the_same_sharp_edges():
+def test_subdivided_and_refined_meshes_have_the_same_sharp_edges():
     finer = subdivide(CAN, 1000)
     assert is_same_partition(finer.normal_ids, normal_groups(finer.vertices, finer.faces))
-    assert_array_equal(finer.corner_normals[lids(finer)][..., :2], 0)
-
-
-def test_a_refined_mesh_has_the_normals_of_its_faces():
-    finer = refine(CAN, 0.005)
-    assert len(np.unique(finer.face_areas().round(9))) > 1
-    is_lid = lids(finer)
-    assert 0 < is_lid.sum() < len(is_lid)
-    assert_array_equal(finer.corner_normals[is_lid][..., :2], 0)
-    assert_allclose(finer.corner_normals[~is_lid][..., 2], 0, atol=1e-15)
+    refined = refine(CAN, 0.005)
+    assert len(np.unique(refined.face_areas().round(9))) > 1
+    for mesh in (finer, refined):
+        is_lid = lids(mesh)
+        assert 0 < is_lid.sum() < len(is_lid)
+        assert_array_equal(mesh.corner_normals[is_lid][..., :2], 0)
+        assert_allclose(mesh.corner_normals[~is_lid][..., 2], 0, atol=1e-15)
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -18,25 +18,18 @@ def pixel(*rgb: float) -> Tensor:
     return torch.tensor(rgb, dtype=torch.float64)[:, None]
 
 
-def one(value: float) -> Tensor:
-    return pixel(value)
-
-
 def test_the_surface_covers_the_background_in_linear_light():
-    image = tonemap(pixel(0.1, 0.2, 0.3), one(0.25), one(0.4))
+    image = tonemap(pixel(0.1, 0.2, 0.3), pixel(0.25), pixel(0.4))
     torch.testing.assert_close(image, pixel(0.4, 0.5, 0.6), rtol=4 * EPS, atol=0)
 
-    image = tonemap(pixel(0.1, 0.2, 0.3), one(0.25), one(0.5), "srgb")
+    image = tonemap(pixel(0.1, 0.2, 0.3), pixel(0.25), pixel(0.5), "srgb")
     linear = np.array([0.1, 0.2, 0.3]) + 0.75 * linear_of(0.5)
     torch.testing.assert_close(image, pixel(*srgb_of(linear)), rtol=8 * EPS, atol=0)
 
 
 def test_the_clamp_comes_after_the_sum_with_the_background():
-    """The surface covers half of the pixel, with the radiance 1.5, -0.4 and 2.5.
-
-    If it were clamped before the sum, the first two channels would be 0.5.
-    """
-    image = tonemap(pixel(0.75, -0.2, 1.25), one(0.5), pixel(0, 1, 1), "srgb")
+    """If the radiance were clamped before the sum, the first two channels would be 0.5."""
+    image = tonemap(pixel(0.75, -0.2, 1.25), pixel(0.5), pixel(0, 1, 1), "srgb")
     expected = pixel(*srgb_of([0.75, 0.3, 1.0]))
     torch.testing.assert_close(image, expected, rtol=8 * EPS, atol=0)
 
@@ -45,8 +38,7 @@ def test_the_clamp_comes_after_the_sum_with_the_background():
 def test_the_background_is_unchanged_if_nothing_covers_it(encoding):
     grays = torch.linspace(0, 1, 256).view(256, 1, 1)
     images = tonemap(torch.zeros(1, 3, 1), torch.zeros(1, 1, 1), grays, encoding)
-    # Decoding and encoding in float32 are powers with errors of about 4 eps,
-    # which the curve multiplies by up to 2.4.
+    # Powers have errors of about 4 eps, which the curve multiplies by up to 2.4.
     tolerance = 0 if encoding == "linear" else 16 * torch.finfo(torch.float32).eps
     torch.testing.assert_close(images, grays.expand(-1, 3, 1), rtol=0, atol=tolerance)
 
@@ -98,9 +90,9 @@ def test_gradients_by_radiance_coverage_and_background_are_central_differences(e
 def test_only_values_outside_the_range_have_no_gradient(encoding, coverage, background):
     """Black and white themselves have a gradient, so that a light of zero can grow."""
     radiance = torch.tensor([[-0.3, 0, 0.2, 1, 1.4]], dtype=torch.float64, requires_grad=True)
-    linear = radiance + background_term(one(coverage), one(background), encoding)
+    linear = radiance + background_term(pixel(coverage), pixel(background), encoding)
     is_outside = (linear < 0) | (linear > 1)
-    image = tonemap(radiance, one(coverage), one(background), encoding)
+    image = tonemap(radiance, pixel(coverage), pixel(background), encoding)
     (gradient,) = torch.autograd.grad(image.sum(), radiance)
     assert gradient.isfinite().all()
     assert torch.equal(is_outside, gradient == 0)

@@ -37,7 +37,6 @@ INSIDE_OUT = Mesh.plain(BOX.vertices, BOX.faces[:, ::-1])
 
 
 def moved_box(offset: float, scale: float = 1.0, faces: np.ndarray = BOX.faces) -> Mesh:
-    """Return the box, scaled about its center and moved along the diagonal."""
     return Mesh.plain(scale * BOX.vertices + offset, faces)
 
 
@@ -79,10 +78,7 @@ def test_a_mesh_is_closed_if_none_of_its_faces_may_be_visible_from_behind(name):
 
 
 def test_a_normalized_mesh_is_centered_at_its_centroid_and_fits_the_unit_cube():
-    """The tolerance is half of float32's spacing below 1.
-
-    The centroid of trimesh is also the mean of the faces, weighted by area.
-    """
+    """The tolerance is half of float32's spacing below 1."""
     cone = trimesh.creation.cone(radius=0.3, height=2)
     cone.apply_translation([7, -3, 11])
     mesh = normalize(mesh_of(cone))

@@ -1,10 +1,4 @@
-"""Images compared with Mitsuba 3, which traces rays from the surface into a map of the same light.
-
-A diffuse face reflects albedo / π of its irradiance. This renderer leaves out
-the factor 1 / π, and the scene files for Mitsuba make up for it. Mitsuba draws
-directions by the cosine, so that its noise only comes from the variation of the
-light.
-"""
+"""Images compared with Mitsuba 3, which traces rays from the surface into a map of the light."""
 
 import math
 from dataclasses import replace
@@ -16,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import mesh_of
+from oracles import image_of, mesh_of
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.light.environment import write_map
@@ -69,10 +63,7 @@ def colored_cube() -> Mesh:
 
 
 def textured_hull() -> Mesh:
-    """Create the hull of twelve points on an ellipsoid.
-
-    The texture repeats, and each face has another part of it.
-    """
+    """Create the hull of twelve points on an ellipsoid, whose texture repeats."""
     rng = np.random.default_rng(2)
     points = rng.normal(size=(12, 3))
     on_sphere = points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -89,27 +80,21 @@ def textured_hull() -> Mesh:
 
 
 def bowl(subdivisions: int = 3) -> Mesh:
-    """Create the lower half of a ball, which is seen from within."""
     ball = trimesh.creation.icosphere(subdivisions, radius=0.9)
     heights = ball.vertices[ball.faces].mean(axis=1)[:, 2]
     return Mesh.plain(ball.vertices, ball.faces[heights < 0], (0.8, 0.8, 0.3))
 
 
 def coarse_bowl() -> Mesh:
-    """Create a bowl of few faces, off which light bounces fast."""
     return bowl(subdivisions=1)
 
 
 def cup() -> Mesh:
-    """Create a cup, whose inner wall is in the shadow of the rim."""
     return normalize(solid("cup"))
 
 
 def vessel() -> Mesh:
-    """Make a closed bowl with a thick wall and a round rim.
-
-    It is so fine that its faces are close to its smooth normals.
-    """
+    """Make a closed bowl, so fine that its faces are close to its smooth normals."""
     around = np.linspace(0, np.pi / 2, 13)
     over = np.linspace(0, np.pi, 9)[1:-1]
     quarter = np.stack([np.sin(around), -np.cos(around)], axis=1)
@@ -122,10 +107,7 @@ def vessel() -> Mesh:
 def our_image(mesh: Mesh, camera: Camera, settings: ImageSettings) -> np.ndarray:
     """Render radiance and coverage with an operator, shape (size, size, 4)."""
     [operator] = build_operators(mesh, [camera], settings, choose("numpy"))
-    image = np.zeros((settings.size**2, 4))
-    image[operator.pixels, :3] = operator.radiance(LIGHT).T
-    image[operator.pixels, 3] = operator.coverage
-    return image.reshape(settings.size, settings.size, 4)
+    return image_of(operator, LIGHT).permute(1, 2, 0).numpy()
 
 
 class NoisyImage(NamedTuple):
@@ -168,16 +150,10 @@ def mean_square(values: np.ndarray) -> float:
 def test_a_convex_mesh_is_rendered_as_by_mitsuba_within_its_noise(
     tmp_path, make_mesh, view, size, samples, ray_count
 ):
-    """Errors in units of Mitsuba's standard errors have a mean of 0 and a mean square of about 1.
+    """Errors in units of the standard errors of n images follow Student's t distribution.
 
-    A standard error from n images makes an error follow Student's t distribution
-    with n - 1 degrees of freedom. This gives the mean and the variance of the
-    squared error. The three channels share their rays, so a pixel counts once.
-
-    With s rows of samples, the coverage of a pixel at the outline is wrong by
-    1 / √(12 s³), because each row is rounded to its samples. That is 0.2 % of a
-    pixel, and 0.06 % in the slow runs. Mitsuba's noise there is up to 0.8 % and
-    0.4 %.
+    The three channels share their rays, so a pixel counts once. At the outline, s rows of samples
+    leave an error of the coverage of 1 / √(12 s³), a quarter of Mitsuba's noise or less.
     """
     settings = ImageSettings(size, samples)
     ours = our_image(make_mesh(), VIEWS[view], settings)
@@ -200,7 +176,6 @@ def test_a_convex_mesh_is_rendered_as_by_mitsuba_within_its_noise(
 
 
 def lumpy_sphere() -> Mesh:
-    """Create a closed sphere whose dents shade each other."""
     return hard.sphere(2, lowest=0.5)
 
 
@@ -228,21 +203,17 @@ def test_shadows_and_bounces_are_those_of_mitsuba_within_its_noise(
 ):
     """The rays are enough for errors of 0.5 % of the brightest value, and 0.1 % on average.
 
-    If a smooth normal turns away from the camera, Mitsuba takes its other side.
-    The meshes with smooth normals show no such normal. Light bounces off flat
-    faces here, and off smooth normals in Mitsuba. Smooth normals and faces
-    therefore have to be close where light bounces. At the creases of a cup they
-    are not, and the mean differs by 0.4 %.
+    Light bounces off flat faces here, and off smooth normals in Mitsuba, so that both have to be
+    close where light bounces. If a normal turns away from the camera, Mitsuba takes its other side.
     """
     monkeypatch.setattr(rays, "DIRECTIONS", 2**12)
-    # The default test of bounces has fewer pixels, which take less time.
-    size = 20 if make_mesh is coarse_bowl else 32
+    size = 20 if make_mesh is coarse_bowl else 32  # Fewer pixels take less time.
     plain = ImageSettings(size, 8, normals=normals)
     theirs_settings = replace(plain, bounces=bounces)
     with_shadows = replace(plain, shadows=True)
-    settings, settings_of_less = with_shadows, plain
-    if bounces:
-        settings, settings_of_less = theirs_settings, with_shadows
+    settings, settings_of_less = (
+        (theirs_settings, with_shadows) if bounces else (with_shadows, plain)
+    )
     mesh = make_mesh()
     theirs = mitsuba_image(tmp_path, mesh, VIEWS[view], theirs_settings, ray_count=128)
     ours = our_image(mesh, VIEWS[view], settings)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import mesh_of
+from oracles import image_of, mesh_of
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera
@@ -23,7 +23,6 @@ from renderer.mitsuba_scene import (
     render_mitsuba_scene,
     write_mitsuba_scene,
 )
-from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
@@ -71,14 +70,6 @@ def can() -> Mesh:
     return mesh_of(trimesh.creation.cylinder(0.8, 1.2), (0.5, 0.4, 0.3))
 
 
-def render_operator(operator: TransferOperator, light: Tensor, size: int) -> Tensor:
-    """Return our radiance and coverage, shape (4, size, size)."""
-    image = torch.zeros(4, size * size, dtype=torch.float64)
-    image[:3, operator.pixels] = operator.radiance(light).double()
-    image[3, operator.pixels] = operator.coverage.double()
-    return image.view(4, size, size)
-
-
 def test_a_mitsuba_map_equals_the_light_in_every_direction(tmp_path):
     """The tolerance is the error of interpolation between texels."""
     light = load_light("grace").double()
@@ -103,11 +94,7 @@ def test_a_mitsuba_map_equals_the_light_in_every_direction(tmp_path):
     ("make_mesh", "encoding", "normals"), [(ball, "srgb", "flat"), (can, "linear", "smooth")]
 )
 def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, encoding, normals):
-    """Inside the silhouette, the mean error is below half of 1/255, and the root mean square
-    error below 1/200. It is the noise of Mitsuba at the edges of texels.
-
-    The lighting has no negative radiance.
-    """
+    """The errors are the noise of Mitsuba at the edges of texels."""
     mesh = normalize(make_mesh())
     light = load_light("st_peters")
     settings = ImageSettings(24, 8, encoding, normals)
@@ -118,7 +105,7 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, enc
     ).double()
     operators = build_operators(mesh, CAMERAS, settings, choose("numpy"), 2.0)
     for operator, expected in zip(operators, expected_views, strict=True):
-        found = render_operator(operator, light, size=24)
+        found = image_of(operator, light)
         error = found - expected
         is_inside = (found[3] == 1) & (expected[3] == 1)
         assert is_inside.sum() > 100
@@ -129,11 +116,7 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, enc
 
 
 def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
-    """Metals agree within 5%, and dielectrics within 10%, because `principled` has another
-    diffuse part.
-
-    The error is also clearly smaller than that of the mesh without gloss.
-    """
+    """Dielectrics agree within 10%, because `principled` has another diffuse part."""
     textured = normalize(ball())
     light = load_light("st_peters")
     settings = ImageSettings(24, 8)
@@ -144,7 +127,7 @@ def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
 
     def render(mesh: Mesh) -> Tensor:
         [operator] = build_operators(mesh, CAMERAS[:1], settings, choose("numpy"))
-        return render_operator(operator, light, size=24)[:3]
+        return image_of(operator, light)[:3]
 
     matte_image = render(textured)
     for name, mesh, largest_error in (("metal", metal, 0.05), ("varnish", varnished, 0.1)):

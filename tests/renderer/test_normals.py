@@ -48,10 +48,8 @@ def exact_cross_product(u: list[Fraction], v: list[Fraction]) -> list[Fraction]:
 def exact_normal(corners: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Compute the normal of a triangle and its derivative (3, 3 corners, 3) in exact arithmetic.
 
-    If a corner moves by dv, the cross product of the edges moves by e × dv, with
-    the opposite edge e. The normal moves by the part of it that is tangential,
-    divided by the length of the cross product. Both are rounded to float64 at the end. Without an
-    area, both are zero.
+    If a corner moves by dv, the cross product of the edges moves by e × dv, with the opposite edge
+    e. The normal moves by the tangential part of it, divided by the length of the cross product.
     """
     a, b, c = ([Fraction(value) for value in corner] for corner in corners.double().tolist())
     opposite_edges = [
@@ -75,10 +73,7 @@ def exact_normal(corners: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sliver(height: float, edge: float, seed: int) -> torch.Tensor:
-    """Return a rotated triangle with coordinates of order 1, so that differences are rounded.
-
-    Its height is relative to its longest edge, whose length is `edge` up to a factor of 1.3.
-    """
+    """Return a rotated triangle, of a height relative to its longest edge, of order 1."""
     corners = edge * np.array([[-0.6, 0, 0], [0.7, 0, 0], [0.1, height, 0]])
     rng = np.random.default_rng(seed)
     rotated = Rotation.random(rng=rng).apply(corners)
@@ -101,9 +96,7 @@ def require_exact(corners: torch.Tensor, tolerance: float) -> None:
 def test_slivers_have_exact_normals_and_derivatives_up_to_rounding(log_height, log_edge, seed):
     """Plain float64 would be off by 1e-4 at a relative height of 1e-12.
 
-    The last steps of each component have two or three roundings. Faces that are
-    less than about thirty times as wide as high lose a few times that. The
-    corners of the given example lie on a line in float32.
+    The corners of the given example lie on a line in float32.
     """
     height = 10**log_height
     corners = sliver(height, 10**log_edge, seed)

@@ -12,6 +12,7 @@ from renderer.image import to_bytes
 from renderer.photograph import Photograph
 
 SIZE = 384  # pixels per side of the photographs
+GRACE = renderer.load_light("grace").double()
 
 
 def error(actual: torch.Tensor, expected: torch.Tensor) -> float:
@@ -19,7 +20,7 @@ def error(actual: torch.Tensor, expected: torch.Tensor) -> float:
 
 
 def photographed(mesh: renderer.Mesh, camera: renderer.camera.Camera) -> np.ndarray:
-    image = renderer.render(mesh, camera, renderer.load_light("grace").double(), SIZE, 0.0)
+    image = renderer.render(mesh, camera, GRACE, SIZE, 0.0)
     return to_bytes(image.permute(1, 2, 0)).numpy()
 
 
@@ -42,9 +43,7 @@ def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, s
         width=side * distance / focal_length,
         distance=distance,
     )
-    expected = renderer.render(
-        mesh, turned, renderer.load_light("grace").double(), size, 0.0, samples=8
-    )
+    expected = renderer.render(mesh, turned, GRACE, size, 0.0, samples=8)
     straight = Photograph(pixels, None).window(origin, side, above).cut(pixels, size)
     assert error(window.cut(pixels, size), expected) < 0.04
     assert error(straight, expected) > 0.1
@@ -71,14 +70,8 @@ def test_a_window_without_perspective_is_what_the_moved_camera_renders():
     # The center of the window is at a corner of pixels.
     origin = np.array([1.25, 0.9375]) / 6 * SIZE + SIZE / 2
     window = Photograph(pixels, None).window(origin, SIZE / 2, np.array([0.0, 1.0, 0.0]))
-    expected = renderer.render(
-        mesh,
-        OrthographicCamera(57.3, 40.1, 3.0),
-        renderer.load_light("grace").double(),
-        48,
-        0.0,
-        samples=8,
-    )
+    nearer = OrthographicCamera(57.3, 40.1, 3.0)
+    expected = renderer.render(mesh, nearer, GRACE, 48, 0.0, samples=8)
     assert error(window.cut(pixels, 48), expected) < 0.02
 
 

@@ -89,8 +89,7 @@ def test_vertices_replace_those_of_the_mesh(stone, light, change):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("gloss", [None, renderer.Gloss(0.5)])
-@pytest.mark.parametrize("shadows", [False, True])
+@pytest.mark.parametrize(("shadows", "gloss"), [(True, None), (False, renderer.Gloss(0.5))])
 def test_a_leaf_with_two_sides_has_the_image_of_a_leaf_with_one(light, shadows, gloss):
     """The sides do not share normals, which would cancel. A single side is shaded on both sides."""
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0.5], [-1, 1, 0]])
@@ -105,9 +104,9 @@ def test_a_leaf_with_two_sides_has_the_image_of_a_leaf_with_one(light, shadows, 
     torch.testing.assert_close(operators.image(light.float()), found.float(), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["a color per face", "a texture"])
 @pytest.mark.parametrize(
-    ("name", "bounces", "encoding"), [("plate", 0, "linear"), ("cup", 2, "srgb")]
+    ("kind", "name", "bounces", "encoding"),
+    [("a color per face", "plate", 0, "linear"), ("a texture", "cup", 2, "srgb")],
 )
 def test_a_given_albedo_replaces_that_of_the_mesh_and_light_bounces_off_it(
     light, kind, name, bounces, encoding
@@ -177,8 +176,7 @@ def test_an_image_of_few_pixels_is_the_mean_of_those_of_a_finer_one(stone, light
     torch.testing.assert_close(coarse, expected, rtol=0, atol=64 * EPS)
 
 
-@pytest.mark.parametrize("sky", [None, load_light("grace")], ids=["alone", "with a sky"])
-@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize(("sky", "samples"), [(None, 1), (load_light("grace"), 2)])
 def test_lamps_and_projectors_are_rendered_as_by_operators(sky, samples):
     """Lamps without coefficients have their full power. The cup casts shadows."""
     cup = renderer.solid("cup")
@@ -217,12 +215,7 @@ def ball_from_above(size: int) -> tuple[Tensor, Tensor]:
 
 
 def test_a_light_sphere_shows_a_lamp_by_the_inverse_square_law():
-    """A lamp of power P at distance d adds the irradiance P cos θ / d².
-
-    The edges of the ball's faces have a length of 0.036, so its faces lie up
-    to 0.036² / 8 inside of it. The slope of the sRGB curve is 1.7 at 0.1. The
-    light of the lamp has a kink where the surface turns away from it.
-    """
+    """A lamp of power P at distance d adds the irradiance P cos θ / d². The ball has faces."""
     position = torch.tensor([0.3, -0.4, 2.5], dtype=torch.float64)
     power = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
     soft_front_light = ambient(torch.full((3,), 0.1))

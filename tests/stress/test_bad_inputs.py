@@ -81,7 +81,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 }
 UNLIMITED = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 # Numbers of examples. A command takes longer, and tries a fifth of them.
-QUICK = 8
+QUICK = 5
 MANY = 100
 # These commands train.
 SLOW_COMMANDS = [file for file in COMMANDS if COMMANDS[file] == RESUME]

@@ -50,8 +50,7 @@ def logits_of_means(images: np.ndarray) -> np.ndarray:
     return 30 * np.stack([images[:, 0].mean((1, 2)), images[:, 2].mean((1, 2))], axis=1)
 
 
-@pytest.mark.parametrize("optimizer", OPTIMIZERS)
-@pytest.mark.parametrize("noise", [0.0, 1.0])
+@pytest.mark.parametrize(("optimizer", "noise"), [("random_search", 1.0), ("cma_es", 0.0)])
 @pytest.mark.filterwarnings("ignore:the light is negative")
 def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, noise):
     pytest.importorskip("cma")
@@ -83,7 +82,7 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
 
 
 @pytest.mark.parametrize("optimizer", ["gradient", *OPTIMIZERS])
-@pytest.mark.parametrize("max_queries", [1, 7, 20])
+@pytest.mark.parametrize("max_queries", [1, 20])
 def test_all_starts_together_show_at_most_the_given_number_of_images(
     attacked, optimizer, max_queries
 ):
@@ -194,11 +193,10 @@ def test_a_function_may_take_and_return_tensors_or_arrays(function):
         torch.testing.assert_close(classifier(images), images.mean((2, 3)))
 
 
-@pytest.mark.parametrize("class_count", [3, 100])
 @pytest.mark.parametrize(
-    "rounded",
-    [lambda scores: scores.astype(np.float16), lambda scores: np.round(scores, 3)],
-    ids=["float16", "three decimals"],
+    ("class_count", "rounded"),
+    [(3, lambda scores: np.round(scores, 3)), (100, lambda scores: scores.astype(np.float16))],
+    ids=["three decimals", "float16"],
 )
 def test_rounded_probabilities_become_their_logarithms(class_count, rounded):
     logits = np.random.default_rng(1).normal(size=(6, class_count))

@@ -23,7 +23,6 @@ FIELDS = [field.name for field in dataclasses.fields(Minimum)]
 
 
 def random(*shape: int, seed: int) -> Tensor:
-    """Return normal numbers in float64."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
@@ -49,16 +48,12 @@ SLOPES = CAMERAS @ (WEIGHT[0] - WEIGHT[1])
 
 @dataclass
 class LinearScene:
-    """A scene whose images are linear in the values.
-
-    Each view has its own camera, and example i is 1 + i / 10 times as bright as the first.
-    """
+    """Images that are linear in the values; example i is 1 + i / 10 times as bright."""
 
     start: Tensor
     steps: StepSettings = field(default_factory=StepSettings)
     views: int = 1
-    center: Tensor | None = None
-    """Centers of the balls, shape (E, D); None for the start."""
+    center: Tensor | None = None  # of the balls, shape (E, D); None for the start
     group_size: int = 1000
 
     def __post_init__(self):
@@ -80,7 +75,6 @@ class LinearScene:
 
 
 def settings_of(max_steps: int = 30, margin: float = 0.0, **others) -> AttackSettings:
-    """Return settings of an attack that ends when the classifier errs by the margin."""
     return AttackSettings(max_steps=max_steps, margin=margin, quantized=False, **others)
 
 
@@ -110,7 +104,7 @@ def test_the_lowest_point_of_a_ball_is_found_from_anywhere_in_it(optimizer, norm
     views = 2
     zeros = torch.zeros(3, views, dtype=torch.int64)
     criterion = ClassCriterion(zeros, zeros + 1)
-    queries = None if optimizer == "gradient" else 400 * views
+    queries = None if optimizer == "gradient" else 300 * views
     settings = settings_of(120, optimizer=optimizer, max_queries=queries)
     problem = LinearScene(start, ball, views, center)
     result = descend(Linear(bias=50.0), problem, criterion, settings)
@@ -133,10 +127,7 @@ MAX_STEPS = 6
 
 @pytest.mark.parametrize("rule", STEP_SIZES)
 def test_descent_on_a_linear_classifier_follows_its_closed_form(rule):
-    """The cost is log σ(m) with the lead m = slope · values, and its gradient σ(−m) · slope.
-
-    Examples succeed at once, on the way, and never.
-    """
+    """The cost is log σ(m) with the lead m = slope · values, and its gradient σ(−m) · slope."""
     start = random(EXAMPLE_COUNT, VALUE_COUNT, seed=2)
     labels = torch.arange(EXAMPLE_COUNT) % 2
     problem = LinearScene(start, StepSettings(step=rule, step_size=STEP_SIZES[rule]))
@@ -254,7 +245,7 @@ FROM_EIGHTH = [1 / 8, 1 / 8, 1 / 8, 1 / 8, -1 / 16, -1 / 16, 1 / 32, 1 / 32]
 FROM_THREE_QUARTERS = [3 / 4, 3 / 4, 0, 0, 0, 0, 0, 0]
 
 
-@pytest.mark.parametrize("steps", range(8))
+@pytest.mark.parametrize("steps", range(2, 8))
 def test_a_step_that_does_not_lower_the_cost_is_taken_back_and_tried_at_half_its_length(steps):
     """Every value is exact."""
     start = torch.tensor([[1.0], [0.125], [0.75]], dtype=torch.float64)
@@ -336,7 +327,6 @@ def test_a_zero_gradient_leaves_the_values_and_is_reported(step):
 
 
 def small_network() -> nn.Sequential:
-    """Return a small convolutional network of four classes with random weights."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return nn.Sequential(
@@ -361,8 +351,7 @@ def attack_nine(views: int, examples: Tensor | None = None, seed: int = 0, **set
     return minimize(problem, objective, examples=examples)
 
 
-@pytest.mark.parametrize("views", [1, 2])
-@pytest.mark.parametrize("batch_size", [1, 4, 100])
+@pytest.mark.parametrize(("batch_size", "views"), [(1, 2), (4, 1), (100, 2)])
 def test_the_batch_size_does_not_matter(batch_size, views):
     """A batch may end between two views of an example."""
     whole = attack_nine(views, batch_size=9 * views)
@@ -377,12 +366,11 @@ def test_the_batch_size_does_not_matter(batch_size, views):
 @pytest.mark.parametrize(
     "options",
     [
-        {},
         {"backtracking": True},
-        {"optimizer": "random_search", "max_queries": 40},
-        {"optimizer": "cma_es", "max_queries": 40},
+        {"optimizer": "random_search", "max_queries": 30},
+        {"optimizer": "cma_es", "max_queries": 30},
     ],
-    ids=["gradient", "backtracking", "random_search", "cma_es"],
+    ids=["gradient", "random_search", "cma_es"],
 )
 def test_every_example_is_attacked_as_if_alone_and_alike_with_the_same_seed(options):
     numpy_state = np.random.get_state()[1].copy()
@@ -390,7 +378,7 @@ def test_every_example_is_attacked_as_if_alone_and_alike_with_the_same_seed(opti
     together = attack_nine(2, **options)
     assert (np.random.get_state()[1] == numpy_state).all()
     assert torch.equal(torch.random.get_rng_state(), torch_state)
-    for row in range(9):
+    for row in range(0, 9, 2):
         alone = attack_nine(2, torch.tensor([row]), **options)
         for name in FIELDS:
             found = getattr(alone, name)[0]
@@ -477,8 +465,7 @@ class Watched(nn.Module):
         }
 
 
-@pytest.mark.parametrize("fails_at", [None, 1, 4])
-@pytest.mark.parametrize("grad_mode", [True, False])
+@pytest.mark.parametrize(("fails_at", "grad_mode"), [(None, True), (1, False), (4, True)])
 def test_the_model_and_the_random_state_are_left_as_they_were(fails_at, grad_mode):
     model = Watched(fails_at).train()
     model.network[1].eval()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scipy.special import log_softmax, logit, rel_entr, softmax
+from scipy.special import log_softmax, logit, softmax
 from torch import Tensor, nn
 
 import augment
@@ -18,7 +18,7 @@ from augment.network import Network, Quantization
 from augment.random_streams import generator
 from augment.tasks.classification import ClassCriterion, complementary_label, is_correct, label_loss
 from augment.tasks.task import NO_CLASS
-from train.training.recipe import kl_divergence, ranking_loss
+from train.training.recipe import ranking_loss
 
 EPS = torch.finfo(torch.float64).eps
 ROWS = torch.arange(6)
@@ -29,7 +29,7 @@ LOG_PROBABILITIES = torch.from_numpy(log_softmax(LOGITS.numpy(), axis=1))
 PROBABILITIES = softmax(LOGITS.numpy(), axis=1)
 
 
-@pytest.mark.parametrize("gap", [0, 5, 17, 30, 48])
+@pytest.mark.parametrize("gap", [0, 17, 48])
 def test_the_gradient_in_float32_is_exact_if_the_network_is_certain(gap):
     logits = torch.tensor([[0.5, 2.0 + gap, 2.0, 0.0]], requires_grad=True)
     probabilities = torch.from_numpy(softmax(logits.detach().double().numpy(), axis=1))
@@ -101,14 +101,6 @@ def test_a_class_is_right_for_its_label_and_for_complementary_labels_of_others()
 def test_log_odds_are_the_logit_of_the_probability():
     expected = torch.from_numpy(logit(PROBABILITIES[:, 2]))
     torch.testing.assert_close(log_odds(LOGITS, 2), expected, rtol=64 * EPS, atol=64 * EPS)
-
-
-def test_divergence_is_the_relative_entropy_of_the_predictions():
-    predictions = LOGITS.flip(0) / 2
-    terms = rel_entr(softmax(predictions.numpy(), axis=1), PROBABILITIES)
-    expected = torch.from_numpy(terms.sum(1))
-    found = kl_divergence(LOGITS, predictions)
-    torch.testing.assert_close(found, expected, rtol=64 * EPS, atol=64 * EPS)
 
 
 def test_ranking_is_the_mean_logistic_loss_of_all_pairs_of_the_class_and_another():

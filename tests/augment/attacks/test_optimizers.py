@@ -16,7 +16,7 @@ from augment.attacks.optimizers import NormBalls, sample
 from renderer.vectors import Ball, nearest_in_box
 
 EPS = torch.finfo(torch.float32).eps
-DTYPES = [torch.float32, torch.float64]
+DTYPES = st.sampled_from([torch.float32, torch.float64])
 # Squares of smaller coordinates vanish in float32.
 COORDINATES = st.floats(-100, 100).map(lambda value: round(value, 6))
 RADII = st.one_of(st.just(0.0), st.floats(1e-3, 100))
@@ -39,9 +39,8 @@ def project(name: str, radius: float | None, values: Tensor, center: Tensor) -> 
 PAIRS = arrays(np.float64, (2, 4, 6), elements=COORDINATES)  # values and centers
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", NORMS)
-@given(pair=PAIRS, radius=RADII)
+@given(pair=PAIRS, radius=RADII, dtype=DTYPES)
 def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radius):
     """The nearest point p to v is in the ball and has (v - p)·(q - p) ≤ 0 for all its points q.
 
@@ -89,9 +88,8 @@ SMALL_PAIRS = arrays(np.float64, (2, 3), elements=st.floats(-3, 3))
 REACHES = arrays(np.float64, (2, 3), elements=st.one_of(st.floats(0, 2), st.just(np.inf)))
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", NORMS)
-@given(pair=SMALL_PAIRS, reaches=REACHES, radius=st.floats(0.01, 4))
+@given(pair=SMALL_PAIRS, reaches=REACHES, radius=st.floats(0.01, 4), dtype=DTYPES)
 def test_within_a_box_no_descent_by_scipy_gets_nearer_than_the_projection(
     name, dtype, pair, reaches, radius
 ):
@@ -112,7 +110,7 @@ def test_within_a_box_no_descent_by_scipy_gets_nearer_than_the_projection(
     assert distance <= nearest_distance(name, radius, *arrays_of) + 1e-5
 
 
-@pytest.mark.parametrize("dimensions", [1, 3, 12])
+@pytest.mark.parametrize("dimensions", [1, 12])
 @pytest.mark.parametrize("name", NORMS)
 def test_draws_are_uniform_in_the_ball(name, dimensions):
     """In D dimensions (norm / radius)^D is uniform in [0, 1], and no direction is preferred.
@@ -149,7 +147,7 @@ def test_draws_along_some_axes_are_uniform_in_the_ball_of_these_axes(name):
 @pytest.mark.parametrize(
     ("scale", "tolerance"),
     # 1e-40 is subnormal in float32, with five digits left.
-    [(1.0, EPS), (1e30, EPS), (1e-30, EPS), (1e-40, 1e-4)],
+    [(1e30, EPS), (1e-30, EPS), (1e-40, 1e-4)],
 )
 def test_a_unit_step_has_unit_length_whatever_the_gradients_size(scale, tolerance):
     gradient = torch.randn(20, 50, generator=torch.Generator().manual_seed(0))

@@ -5,7 +5,7 @@ import torch
 
 import norm_balls as nb
 
-VIEWS = 5
+VIEWS = 3
 # Radius at which attacks with each optimizer succeed in some views and fail in others.
 RADIUS = 0.08
 

@@ -86,8 +86,9 @@ def test_each_light_changes_alone_with_the_gradient_of_finite_differences(parame
     assert changed_count == (0 if parameter == "positions" else values.shape[1] // 3)
 
 
-@pytest.mark.parametrize("norm", ["linf", "l2"])
-@pytest.mark.parametrize(("parameter", "power"), [("projector", 2.0), ("lamps", 10.0)])
+@pytest.mark.parametrize(
+    ("parameter", "power", "norm"), [("projector", 2.0, "linf"), ("lamps", 10.0, "l2")]
+)
 def test_patterns_and_powers_stay_in_range_and_in_their_norm_ball(norm, parameter, power):
     changed = make_parameter(parameter, scene(), StepSettings(norm, 0.4))
     draws = torch.Generator().manual_seed(1)
@@ -133,12 +134,17 @@ def test_a_joint_attack_lowers_the_cost_and_is_read_back_to_its_image(joint_atta
     torch.testing.assert_close(image, done.images[0], rtol=0, atol=1e-6)
 
 
-def test_an_attacked_pattern_is_written_as_an_image(joint_attack):
-    _, written, folder = joint_attack
+def test_an_attacked_pattern_is_written_as_an_image_and_moved_lamps_where_they_ended(joint_attack):
+    done, written, folder = joint_attack
     image = str(folder / "projector.png")
     projector, pattern = build_local_light(ProjectorSettings(6, power=2.0, pattern=image))
     expected = written.light[49 : 49 + 6**2]
     torch.testing.assert_close(pattern, expected, rtol=0, atol=projector.power / 255)
+    lamps, powers = build_local_light(LampsSettings(start=str(folder / "lamps.json")))
+    assert torch.equal(torch.tensor(lamps.positions), done.conditions.positions[0])
+    assert torch.equal(powers, written.light[-len(powers) :])
+    with pytest.raises(InputError, match=r"projector\.json"):
+        build_local_light(LampsSettings(start=str(folder / "projector.json")))
 
 
 def test_mitsuba_renders_a_joint_attack_alike(joint_attack):
@@ -149,22 +155,6 @@ def test_mitsuba_renders_a_joint_attack_alike(joint_attack):
     done, _, folder = joint_attack
     image = render_again(folder, ["mitsuba"], choose("numpy"))["mitsuba"]
     assert (image - done.images[0]).abs().median() < 2 / 255
-
-
-def test_moved_lamps_are_read_back_where_they_ended(tmp_path):
-    positions = StepSettings("l2", 0.6, "unit", 0.5)
-    settings = augment.AttackSettings(positions=positions, max_steps=3)
-    done = augment.attack(by_mean_color(), scene(exposure=0.3), settings=settings, force=True)
-    before = done.images_in_views_before[1]
-    written = Adversary.of(done.problem.scene, 1, done.conditions, before, done.images_in_views[1])
-    write_adversary(written, tmp_path)
-    image = reload(tmp_path).render(choose("numpy"))
-    torch.testing.assert_close(image, done.images[1], rtol=0, atol=1e-6)
-    lamps, powers = build_local_light(LampsSettings(start=str(tmp_path / "lamps.json")))
-    assert torch.equal(torch.tensor(lamps.positions), done.conditions.positions[1])
-    assert torch.equal(powers, written.light[-len(powers) :])
-    with pytest.raises(InputError, match=r"projector\.json"):
-        build_local_light(LampsSettings(start=str(tmp_path / "projector.json")))
 
 
 def test_a_table_receives_the_projection_and_the_shadow():
@@ -190,11 +180,10 @@ def test_a_table_receives_the_projection_and_the_shadow():
 
 
 @pytest.mark.parametrize(
-    ("shadows", "distance", "tolerance"),
-    [(False, 0.1, 2e-6), (True, 1e-3, 2e-3)],
+    ("shadows", "distance", "tolerance", "normals"),
+    [(False, 0.1, 2e-6, "smooth"), (True, 1e-3, 2e-3, "flat")],
     ids=["no shadows", "shadows"],
 )
-@pytest.mark.parametrize("normals", ["flat", "smooth"])
 def test_a_moved_mesh_under_moved_lamps_looks_like_a_mesh_built_there(
     normals, shadows, distance, tolerance
 ):

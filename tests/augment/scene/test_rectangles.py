@@ -36,7 +36,9 @@ CAMERAS = {
 }
 SHAPES = [(12, 20), (20, 12)]
 each_shape = pytest.mark.parametrize("shape", SHAPES, ids=["wide", "tall"])
-each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+each_view = pytest.mark.parametrize(
+    ("camera", "shape"), [*zip(CAMERAS.values(), [*SHAPES, SHAPES[0]], strict=True)], ids=CAMERAS
+)
 CUP = nb.solid("cup")
 LIGHT = nb.load_light("grace")
 
@@ -60,8 +62,7 @@ def center(image, shape):
 
 
 @pytest.mark.parametrize("rasterizer", ["numpy", "numba", "opengl"])
-@each_camera
-@each_shape
+@each_view
 def test_a_rectangle_is_the_center_of_a_square(shape, camera, rasterizer):
     try:
         choose(rasterizer)
@@ -76,8 +77,7 @@ def test_a_rectangle_is_the_center_of_a_square(shape, camera, rasterizer):
     torch.testing.assert_close(cut, center(whole, shape), atol=1e-5, rtol=0)
 
 
-@each_camera
-@each_shape
+@each_view
 def test_gradients_at_silhouettes_are_those_of_the_square(shape, camera):
     wider, side = around(camera, shape)
     # Silhouettes at the border of the rectangle move into pixels outside of it.
@@ -85,56 +85,48 @@ def test_gradients_at_silhouettes_are_those_of_the_square(shape, camera):
     weights = torch.rand(inner, generator=torch.Generator().manual_seed(1)).double()
     weights = torch.nn.functional.pad(weights, (1, 1, 1, 1))
     gradients = []
+    options = {"silhouettes": True, "samples": 3, "rasterizer": "numpy"}
     for seen, size in ((camera, shape), (wider, side)):
         vertices = torch.from_numpy(CUP.vertices).requires_grad_()
-        image = nb.render(
-            CUP,
-            seen,
-            LIGHT.double(),
-            size,
-            vertices=vertices,
-            silhouettes=True,
-            samples=3,
-            rasterizer="numpy",
-        )
+        image = nb.render(CUP, seen, LIGHT.double(), size, vertices=vertices, **options)
         (center(image, shape) * weights).sum().backward()
         gradients.append(vertices.grad)
     assert gradients[0].abs().max() > 0.01
     torch.testing.assert_close(*gradients, atol=1e-4, rtol=1e-4)
 
 
+VIEW = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
+
+
+def ball_seen_at(camera, shape, radius, place):
+    """Return the column and the row at which the image shows a ball."""
+    ball = nb.solid("ball")
+    small = replace(ball, vertices=radius * ball.vertices + place)
+    image = 1 - nb.render(small, camera, 0 * LIGHT, shape, 1.0, samples=8)[0]
+    rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
+    weights = image.numpy() / image.sum().item()
+    return (weights * columns).sum(), (weights * rows).sum()
+
+
 def test_a_point_is_seen_where_its_intrinsics_say():
     """A small ball at (x, y, z) is seen at (fx x / z + cx, fy y / z + cy)."""
-    view = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
-    camera = nb.PinholeCamera.from_matrix(view, [[60, 0, 16], [0, 66, 16], [0, 0, 1]], size=32)
-    ball = nb.solid("ball")
-    small = replace(ball, vertices=0.1 * ball.vertices + [0.8, 0.4, 0.0])
-    image = 1 - nb.render(small, camera, 0 * LIGHT, (24, 32), 1.0, samples=8)[0]
-    rows, columns = np.mgrid[:24, :32] + 0.5
-    weights = image.numpy() / image.sum().item()
+    camera = nb.PinholeCamera.from_matrix(VIEW, [[60, 0, 16], [0, 66, 16], [0, 0, 1]], size=32)
     # The square of 32 rows begins 4 rows above this image.
-    assert (weights * columns).sum() == pytest.approx(60 * 0.8 / 5 + 16, abs=0.05)
-    assert (weights * rows).sum() == pytest.approx(66 * 0.4 / 5 + 16 - 4, abs=0.05)
+    expected = (60 * 0.8 / 5 + 16, 66 * 0.4 / 5 + 16 - 4)
+    found = ball_seen_at(camera, (24, 32), 0.1, [0.8, 0.4, 0.0])
+    assert found == pytest.approx(expected, abs=0.05)
 
 
 @each_shape
 def test_the_camera_of_a_whole_photograph_shows_all_of_it(shape):
-    """The center of a ball is seen at the pixel that the intrinsics say."""
     height, width = shape
-    view = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
     intrinsics = [[20, 0, width - 5], [0, 22, height - 5], [0, 0, 1]]
-    camera = nb.PinholeCamera.from_matrix(view, intrinsics, (width, height), whole=True)
-    ball = nb.solid("ball")
-    ball = replace(ball, vertices=0.3 * ball.vertices)
-    image = 1 - nb.render(ball, camera, 0 * LIGHT, shape, 1.0, samples=8)[0]
-    rows, columns = np.mgrid[:height, :width] + 0.5
-    weights = image.numpy() / image.sum().item()
-    assert (weights * columns).sum() == pytest.approx(width - 5, abs=0.05)
-    assert (weights * rows).sum() == pytest.approx(height - 5, abs=0.05)
+    camera = nb.PinholeCamera.from_matrix(VIEW, intrinsics, (width, height), whole=True)
+    found = ball_seen_at(camera, shape, 0.3, [0, 0, 0])
+    assert found == pytest.approx((width - 5, height - 5), abs=0.05)
 
 
-@each_camera
-@each_shape
+@each_view
 def test_mitsuba_agrees(tmp_path, shape, camera):
     pytest.importorskip("mitsuba")
     settings = ImageSettings(shape, 8)
@@ -227,7 +219,7 @@ def test_a_classifier_of_rectangles_refuses_other_images():
         classifier(torch.zeros(2, 3, 12, 8))
 
 
-@pytest.mark.parametrize("size", [0, 2.5, (8,), (8, 8, 8), (8, 0), "8", (8, True), None])
+@pytest.mark.parametrize("size", [0, 2.5, (8,), (8, True), None])
 def test_another_size_is_refused_in_one_sentence(size):
     with pytest.raises(nb.InputError, match=r"^size is .*: give a whole number from 1 to"):
         nb.build_scene([("solid:cup", "0")], size)

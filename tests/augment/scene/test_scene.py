@@ -55,13 +55,10 @@ def built(*names: str, views: int = 2, **options) -> Scene:
 
 
 def first_image(scene: Scene) -> torch.Tensor:
-    """Render the first view (3, H, W) of the first example."""
     return scene.render(scene.conditions(FIRST), FIRST)[0, 0]
 
 
-@pytest.mark.parametrize(
-    ("examples", "meshes", "backgrounds"), [(100, 2, 5), (100, 3, 5), (7, 3, 2), (2, 3, 1)]
-)
+@pytest.mark.parametrize(("examples", "meshes", "backgrounds"), [(100, 3, 5), (7, 3, 2), (2, 3, 1)])
 def test_renders_are_shared_as_equally_as_possible(examples, meshes, backgrounds):
     entries = [("solid:orange", str(index)) for index in range(meshes)]
     views = views_of(examples, meshes, backgrounds)

@@ -18,7 +18,7 @@ from renderer.operators.rays import Rays
 from renderer.settings import ImageSettings
 from renderer.solids import sphere
 
-SIZE = 32
+SIZE = 24
 FAR = 1000.0
 BALL = normalize(renderer.solid("ball"))
 CAMERAS = {
@@ -43,10 +43,8 @@ def square(middle: list[float], first: list[float], second: list[float]) -> Mesh
 class Place:
     """A table or a wall, as a room has it and as a mesh."""
 
-    height: float
-    """Of the table; -50 is out of sight."""
-    wall: float
-    """Distance of the wall behind the object; 50 is out of sight."""
+    height: float  # of the table; -50 is out of sight
+    wall: float  # distance of the wall behind the object; 50 is out of sight
     mesh: Mesh
 
 
@@ -60,14 +58,8 @@ def place(surface: str, camera: PerspectiveCamera | OrthographicCamera) -> Place
     return Place(-50.0, 1.5, square(list(-1.5 * towards), aside, [0, 0, 1]))
 
 
-RENDERED = {
-    "size": SIZE,
-    "samples": 3,
-    "normals": "flat",
-    "shadows": True,
-    "background": 0.0,
-    "rasterizer": "numpy",
-}
+RENDERED = {"size": SIZE, "samples": 3, "normals": "flat", "shadows": True, "background": 0.0}
+RENDERED["rasterizer"] = "numpy"
 
 
 @dataclass

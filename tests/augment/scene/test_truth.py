@@ -98,24 +98,6 @@ def test_objects_without_a_position_do_not_touch_and_stand_on_one_ground():
     assert all(after[0] - before[1] > 0.1 for before, after in itertools.pairwise(spans))
 
 
-def test_an_attack_on_shape_moves_the_first_object_only():
-    scene = nb.build_scene(
-        [[("solid:pear", "pear"), ("solid:cup", "cup")]], 32, width=6.0, rasterizer="numpy"
-    )
-    settings = nb.AttackSettings(geometry=nb.StepSettings(step_size=0.05), max_steps=1)
-    result = nb.attack(
-        lambda images: torch.stack([images.mean((1, 2, 3)), 0.9 + images[:, 0, 0, 0]], 1),
-        scene,
-        settings=settings,
-        classes=["pear", "cup"],
-        force=True,
-    )
-    moved = (result.conditions.vertices[0] - scene.vertices[0]).abs().amax(1) > 0
-    is_first = torch.from_numpy(scene.objects[0].own_vertices)
-    assert moved[is_first].any()
-    assert not moved[~is_first].any()
-
-
 def test_a_list_of_objects_in_settings_and_arguments_is_one_entry():
     classifier = nb.Classifier(lambda x: x.mean((2, 3)), 8, ["pear", "cup", "lemon"])
     cup = nb.ObjectSettings("solid:cup", "cup", at=[1.0, 2.0])

@@ -56,7 +56,6 @@ def images_of(scene: Scene) -> Tensor:
 
 
 def cameras_of(scene: Scene) -> list:
-    """Return the only camera of each example."""
     return [camera for (camera,) in scene.cameras]
 
 
@@ -305,8 +304,7 @@ LOCAL_LIGHTS = {
 }
 
 
-@pytest.mark.parametrize("name", LOCAL_LIGHTS)
-def test_local_lights_light_a_drawn_table_as_they_do_a_ground_of_triangles(name):
+def test_local_lights_light_a_drawn_table_as_they_do_a_ground_of_triangles():
     """The object and its prop throw their shadows on both."""
     prop = ObjectSettings(mesh="solid:ball", at=[0.7, -0.4], scale=0.3)
     meshes = [ObjectSettings("solid:pear:1", "pear", others=[prop])]
@@ -315,7 +313,7 @@ def test_local_lights_light_a_drawn_table_as_they_do_a_ground_of_triangles(name)
         "light": torch.zeros(49, 3),
         "polar": 30.0,
         "width": 2.4,
-        name: LOCAL_LIGHTS[name],
+        **LOCAL_LIGHTS,
     }
     white = [1.0, 1.0, 1.0]
     with_ground = augment.build_scene(meshes, SIZE, ground=white, backgrounds=[0.0], **options)
@@ -325,7 +323,8 @@ def test_local_lights_light_a_drawn_table_as_they_do_a_ground_of_triangles(name)
 
     everywhere_lit = with_ground.changed(lights=torch.ones_like(with_ground.lights))
     is_covered = images_of(everywhere_lit).amin((0, 1)) > 0
-    is_dark = expected.sum(0)[is_covered] < 0.02
+    total = expected.sum(0)[is_covered]
+    is_dark = total < 0.3 * total.median()
     assert is_covered.float().mean() > 0.7
     assert 0.01 < is_dark.float().mean() < 0.5
     assert expected.max() > 0.3
@@ -337,8 +336,7 @@ def test_local_lights_light_a_drawn_table_as_they_do_a_ground_of_triangles(name)
 # --------------------------------------------------------------- light and exposure
 
 
-@pytest.mark.parametrize("name", LOCAL_LIGHTS)
-def test_light_is_drawn_as_without_local_lights_and_these_stay(name):
+def test_light_is_drawn_as_without_local_lights_and_these_stay():
     settings = {
         "environments": ["grace", "eucalyptus"],
         "directional_fraction": 0.5,
@@ -346,7 +344,7 @@ def test_light_is_drawn_as_without_local_lights_and_these_stay(name):
         "lit_background": True,
     }
     without = built("solid:plate", views=6)
-    beside = built("solid:plate", views=6, **{name: LOCAL_LIGHTS[name]})
+    beside = built("solid:plate", views=6, **LOCAL_LIGHTS)
     lights = drawn(beside, **settings).lights
     assert torch.equal(lights[:, :49], drawn(without, **settings).lights)
     assert torch.equal(lights[:, 49:], beside.lights[:, 49:])
@@ -471,7 +469,6 @@ def photographed(images: Tensor = IMAGES, examples: Tensor = EVERY, **settings) 
 
 
 def linear_light(images: Tensor) -> Tensor:
-    """Decode sRGB images."""
     return decode(images, "srgb")
 
 

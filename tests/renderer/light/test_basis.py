@@ -23,14 +23,6 @@ ORDERS = [([SKY, LAMPS, PROJECTOR], [0, 9, 11]), ([LAMPS, SKY, PROJECTOR], [0, 2
 
 
 @pytest.mark.parametrize(("parts", "first_rows"), ORDERS)
-def test_the_parts_of_a_sum_have_their_coefficients_in_the_order_of_the_parts(parts, first_rows):
-    found = SumBasis(tuple(parts)).lights
-    assert [basis for _, basis in found] == parts
-    assert [rows.start for rows, _ in found] == first_rows
-    assert [rows.stop for rows, _ in found] == [*first_rows[1:], 20]
-
-
-@pytest.mark.parametrize(("parts", "first_rows"), ORDERS)
 def test_a_light_is_split_into_environment_light_and_local_lights(parts, first_rows):
     coefficients = torch.arange(20.0)[:, None].expand(-1, 3)
     split = split_light(SumBasis(tuple(parts)), coefficients)

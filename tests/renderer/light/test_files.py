@@ -40,11 +40,7 @@ def irradiance(light: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("name", PROBES)
 def test_probes_are_as_published_after_a_rotation_back_to_y_up(name):
-    """The probe's radiance at (x, -z, y) is the published polynomial at (x, y, z).
-
-    The tolerance is half a unit of the second digit, which is the last one of
-    the publication, and the rounding to float32.
-    """
+    """The probe's radiance at (x, -z, y) is the published polynomial at (x, y, z)."""
     y_up = random_directions(100)
     x, y, z = y_up.T
     z_up = torch.stack([x, -z, y], dim=1)
@@ -58,10 +54,7 @@ def test_probes_are_as_published_after_a_rotation_back_to_y_up(name):
 
 
 def smooth_map(height: int = 128, width: int = 256) -> np.ndarray:
-    """Return a map of the radiance 1 + 0.5 z + 0.3 y with a tint.
-
-    The azimuth is π at the left edge and falls to the right.
-    """
+    """Return a map of the radiance 1 + 0.5 z + 0.3 y with a tint; the azimuth falls from π."""
     polar = np.pi * (np.arange(height) + 0.5)[:, None] / height
     azimuth = np.pi - 2 * np.pi * (np.arange(width) + 0.5) / width
     z = np.cos(polar)
@@ -70,11 +63,7 @@ def smooth_map(height: int = 128, width: int = 256) -> np.ndarray:
 
 
 def test_the_coefficients_of_a_map_are_those_of_its_formula_up_to_a_factor(tmp_path):
-    """A row misses (π/128)²/24 of the curvature of radiance times harmonics.
-
-    The curvature is at most 6 · 7 at degree 6. The tolerance is three times
-    this error.
-    """
+    """A row misses (π/128)²/24 of the curvature, which is at most 6 · 7 at degree 6."""
     np.save(tmp_path / "map.npy", smooth_map())
     light = load_light(str(tmp_path / "map.npy"))
     assert light.shape == (49, 3)

@@ -43,18 +43,6 @@ def test_the_basis_is_scipys_without_the_condon_shortley_sign(degree):
     np.testing.assert_allclose(basis(directions, degree), expected, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("degree", [1, 6, MAX_DEGREE])
-def test_gradients_are_finite_differences_at_and_near_the_poles_and_off_the_sphere(degree):
-    """Derivatives in polar angles would not be finite at the poles."""
-    near_the_pole = [1e-4, 0, 1]
-    short = [3e-2, -5e-2, 4e-2]
-    special = torch.tensor([*POLES, near_the_pole, *EQUATOR[:2], short], dtype=torch.float64)
-    directions = torch.cat([special, 7 * random_directions(2)]).requires_grad_(True)
-    assert torch.autograd.gradcheck(
-        lambda values: basis(values, degree), directions, fast_mode=degree > 1
-    )
-
-
 def clamped_cosine_factor(l: int) -> float:
     """Integrate the Legendre polynomial of band l times the clamped cosine over the sphere."""
     integral, _ = quad(lambda cosine: cosine * eval_legendre(l, cosine), 0, 1, epsabs=1e-13)

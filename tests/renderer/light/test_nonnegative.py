@@ -37,17 +37,11 @@ def random_lights(count: int, amplitude: float) -> Tensor:
 
 
 def test_degree_1_is_projected_into_a_second_order_cone():
-    """The light a + b·ω is nowhere negative if |b| ≤ a.
-
-    The projection to this cone has a closed form (Boyd and Vandenberghe, section
-    8.1.1). The harmonics of band 1 are √3 times as steep as the one of band 0 is
-    high.
-    """
+    """The light a + b·ω is nowhere negative if |b| ≤ a (Boyd and Vandenberghe, section 8.1.1)."""
     lights = draw(10, 4, 3)
     height = lights[:, 0]
     tilt = lights[:, 1:].norm(dim=1)
-    # The cone has the axis (1, 0) and the side (1, 1/√3) in the plane of height
-    # and tilt.
+    # The cone has the side (1, 1/√3) in the plane of height and tilt.
     height_on_side = (height + tilt / math.sqrt(3)).clamp(min=0) * 3 / 4
     tilt_on_side = height_on_side / math.sqrt(3)
     is_inside = math.sqrt(3) * tilt <= height
@@ -62,8 +56,7 @@ def best_on_grid(
 ) -> float:
     """Return the weighted distance of SciPy's nearest light that is nowhere negative on a grid.
 
-    The grid lacks the directions between its nodes. Its light is therefore
-    slightly nearer than the light that is nowhere negative.
+    Its light is slightly nearer than the one that is nowhere negative between the nodes, too.
     """
     [constraint] = options.pop("constraints", [None])
     radiance = {"type": "ineq", "fun": lambda values: grid @ values, "jac": lambda values: grid}
@@ -101,29 +94,6 @@ def test_scipy_finds_no_nearer_light_also_in_a_ball(norm):
     expected = best_on_grid(target.numpy(), np.ones(49), nearest.numpy(), grid, **options)
     distance = float((nearest - target).norm())
     assert expected - 1e-5 <= distance <= 1.03 * expected
-
-
-@pytest.mark.parametrize("radius", [0.3, 3.0])
-def test_the_result_in_a_sphere_satisfies_the_conditions_of_optimality(radius):
-    """With a multiplier λ, the result x is nearest to c + (v - c) / (1 + λ) without the sphere.
-
-    Here v is the target and c the center. What this projection adds is
-    orthogonal to x, so that x·(v - x) = λ x·(x - c). Dips within the tolerance
-    are left, so the comparison allows 1%.
-    """
-    target = random_lights(2, 0.1)
-    center = nearest_nonnegative(GRACE).expand_as(target)
-    nearest = nearest_nonnegative(target, Ball(center, radius, "l2"))
-    distance = (nearest - center).flatten(1).norm(dim=1)
-    assert (distance <= radius * (1 + 1e-12)).all()
-    is_sphere_active = radius < 1
-    if is_sphere_active:
-        assert (distance >= radius * (1 - 1e-6)).all()
-    to_target = (nearest * (target - nearest)).sum((1, 2), keepdim=True)
-    from_center = (nearest * (nearest - center)).sum((1, 2), keepdim=True)
-    multiplier = (to_target / from_center).clamp(min=0)
-    expected = nearest_nonnegative(center + (target - center) / (1 + multiplier))
-    assert ((nearest - expected).flatten(1).norm(dim=1) <= 0.01 * distance).all()
 
 
 def assert_nowhere_negative(lights: Tensor) -> None:
@@ -177,15 +147,13 @@ def test_light_that_is_zero_along_circles_stays(projection):
 
 
 @both_projections
-@pytest.mark.parametrize("scale", [1e-30, 1e5])
-def test_the_projection_scales_with_the_light(scale, projection):
+def test_the_projection_scales_with_the_light(projection):
     light = random_lights(1, 0.1)[0, :, :1]
-    expected = scale * projection(light)
-    torch.testing.assert_close(projection(scale * light), expected, rtol=1e-4, atol=1e-5 * scale)
+    expected = 1e-30 * projection(light)
+    torch.testing.assert_close(projection(1e-30 * light), expected, rtol=1e-4, atol=1e-35)
 
 
-# Powers of three point sources in concentrated lights. One sun is the hardest
-# case. Of the lamps, no channel but the first one contains all.
+# Powers of three point sources in concentrated lights.
 POWERS = {
     "sun": [[1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
     "two suns": [[1.0, 0.8, 0.6], [0.2, 0.3, 0.5], [0.0, 0.0, 0.0]],
@@ -204,7 +172,7 @@ def concentrated_light(name: str, degree: int) -> Tensor:
 
 @cache
 def irradiance_at_normals(degree: int) -> Tensor:
-    """Integrate each harmonic times the clamped cosine at the nodes of `quadrature(20)`: (N, K)."""
+    """Integrate each harmonic times the clamped cosine at the nodes of `quadrature(20)`, (N, K)."""
     normals, _ = quadrature(20)
     directions, weights = quadrature(160)
     cosine = (normals @ directions.T).clamp(min=0)
@@ -218,11 +186,7 @@ def rms_irradiance_error(found: Tensor, given: Tensor, degree: int) -> Tensor:
 
 
 def require_physical(given: Tensor, degree: int) -> None:
-    """Check the three documented properties of `project_nonnegative` by quadrature.
-
-    The projection keeps the mean, is nowhere negative, and has no larger
-    irradiance error than the best window.
-    """
+    """Check the three documented properties of `project_nonnegative` by quadrature."""
     physical = project_nonnegative(given)
     torch.testing.assert_close(physical[0], given[0].clamp(min=0), rtol=1e-6, atol=0)
     directions, _ = quadrature(4 * degree + 7)
@@ -258,7 +222,6 @@ def test_light_of_degree_2_is_closer_to_a_physical_one_with_more_degrees():
 
 @pytest.mark.parametrize("degree", [2, *slow(6)])
 def test_scipy_finds_no_light_of_the_same_mean_with_a_closer_irradiance(degree):
-    """The grid of the search lacks the directions between its nodes."""
     given = random_lights(1, 0.1)[0, : (degree + 1) ** 2, 0]
     physical = project_nonnegative(given[:, None])[:, 0]
     factors = lambertian_factors(degree).numpy()

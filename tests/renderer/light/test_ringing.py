@@ -16,9 +16,8 @@ from renderer.light.ringing import (
     window_without_ringing,
 )
 
-# Error of the irradiance of a point source, relative to its root mean square,
-# by degree. It follows from the closed form of the clamped cosine.
-ERRORS = {1: 0.59, 2: 0.412, 4: 0.249, 6: 0.168, 8: 0.1214, 12: 0.0733, 19: 0.0394, 20: 0.0366}
+# Error of the irradiance of a point source by degree, from the closed form of the clamped cosine.
+ERRORS = {1: 0.59, 2: 0.412, 6: 0.168, 12: 0.0733, 19: 0.0394, 20: 0.0366}
 
 
 def test_light_whose_narrower_highlights_do_not_ring_keeps_its_coefficients():
@@ -45,12 +44,7 @@ def kernel(factors: np.ndarray, cosines: np.ndarray) -> np.ndarray:
 
 
 def irradiance_error(factors: np.ndarray) -> float:
-    """Measure the rms error of the irradiance of a windowed point source at the pole.
-
-    The error is relative to the rms irradiance of the source, which is 1 / √6
-    because its irradiance is cos θ. The irradiance is a quadrature of the
-    radiance over directions, and its error a quadrature over normals.
-    """
+    """Measure the rms error of the irradiance of a windowed point source, relative to 1 / √6."""
     directions, weights = quadrature(400)
     radiance = torch.from_numpy(kernel(factors, directions[:, 2].numpy())) / (4 * math.pi)
     # The clamped cosine has a kink at 0, so each half has its own nodes.
@@ -64,7 +58,7 @@ def irradiance_error(factors: np.ndarray) -> float:
     return float((6 * mean_square).sqrt())
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 5, 6, 12, 19, 20])
+@pytest.mark.parametrize("degree", [0, 1, 2, 5, 20])
 def test_the_kernel_is_nowhere_negative_and_keeps_the_mean(degree):
     factors = band_factors(degree)
     values = kernel(factors, np.cos(np.linspace(0, math.pi, 20_001)))
@@ -80,11 +74,10 @@ def test_the_irradiance_of_a_point_source_has_the_documented_error(degree):
 
 
 def searched_factors(degree: int) -> np.ndarray:
-    """Search for the best window by SciPy, without the window's own quadratic program.
+    """Search for the best window by SciPy, four times.
 
-    A kernel that is nowhere negative is the square of a polynomial, times
-    1 + z if the degree is odd. The search is over the Legendre coefficients of
-    this polynomial. The result is the best of four searches from random polynomials.
+    A kernel that is nowhere negative is the square of a polynomial, times 1 + z if the degree is
+    odd. The search is over the Legendre coefficients of this polynomial.
     """
     node, node_weight = legendre.leggauss(64)
     cosine, weight = legendre.leggauss(400)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw, draw_uniform, mesh_of
+from oracles import draw, draw_uniform, image_of, mesh_of
 from torch import Tensor
 
 from renderer import mitsuba_scene
@@ -33,7 +33,7 @@ DISCS = replace(LAMPS, radius=0.3)
 TWO_DISCS = replace(DISCS, positions=LAMPS.positions[:2])
 ORANGE = (0.9, 0.5, 0.2)
 BLUE = (0.3, 0.6, 0.9)
-SIZE = 24
+SIZE = 16
 SAMPLES = 16
 lamps_and_discs = pytest.mark.parametrize("basis", [LAMPS, DISCS], ids=["lamps", "discs"])
 
@@ -44,7 +44,6 @@ def ball(subdivisions: int = 2) -> Mesh:
 
 
 def ball_on_a_table() -> Mesh:
-    """Return a mesh that casts a shadow on itself."""
     shape = trimesh.creation.icosphere(subdivisions=2, radius=0.45)
     shape.apply_translation([0, 0, 0.45])
     table = Mesh.plain(
@@ -56,30 +55,18 @@ def ball_on_a_table() -> Mesh:
 def operator_of(
     mesh: Mesh, basis: Basis, size: int = SIZE, samples: int = SAMPLES
 ) -> TransferOperator:
-    [operator] = build_operators(
-        mesh,
-        [CAMERA],
-        ImageSettings(size, samples),
-        choose("numpy"),
-        basis=basis,
-        dtype=torch.float64,
-    )
+    settings = ImageSettings(size, samples)
+    options = {"basis": basis, "dtype": torch.float64}
+    [operator] = build_operators(mesh, [CAMERA], settings, choose("numpy"), **options)
     return operator
 
 
 def canvas(operator: TransferOperator, light: Tensor) -> np.ndarray:
-    size = operator.settings.size
-    image = torch.zeros(3, size**2, dtype=torch.float64)
-    image[:, operator.pixels] = operator.radiance(light)
-    return image.view(3, size, size).permute(1, 2, 0).numpy()
+    return image_of(operator, light)[:3].permute(1, 2, 0).numpy()
 
 
 def mitsuba_image(folder: Path, mesh: Mesh, basis: LocalBasis, light: Tensor) -> np.ndarray:
-    """Render a mesh in local light by Mitsuba, shape (SIZE, SIZE, 3).
-
-    Each lamp is rendered alone, because Mitsuba would choose one of several
-    lamps at random.
-    """
+    """Render each local light alone, since Mitsuba would choose one of several at random."""
     pytest.importorskip("mitsuba")
     write_map(folder / "light.exr", torch.zeros(8, 16, 3))
     lights = [(basis, light)]
@@ -102,11 +89,7 @@ def mitsuba_image(folder: Path, mesh: Mesh, basis: LocalBasis, light: Tensor) ->
     ids=["projector", "lamps", "discs"],
 )
 def test_images_are_mitsubas(make_mesh, basis, sample_count, tmp_path, monkeypatch):
-    """The direct light of a point has noise only at edges of patterns, shadows and silhouettes.
-
-    Most pixels are therefore equal up to the float32 rays, and all pixels are
-    equal on average. Discs have little noise with 1,024 rays.
-    """
+    """The direct light of a point has noise only at edges of patterns, shadows and silhouettes."""
     monkeypatch.setattr(mitsuba_scene, "SAMPLES", sample_count)
     light = 2 * draw_uniform(basis.size, 3, seed=1)
     found = canvas(operator_of(make_mesh(), basis), light)
@@ -246,8 +229,7 @@ def test_a_surface_behind_a_lamp_casts_no_shadow():
     assert shown.max() == pytest.approx(4.0, rel=0.2)
 
 
-@pytest.mark.parametrize("batch", [(), (2, 3)], ids=["one light", "a batch"])
-@pytest.mark.parametrize("make_mesh", [ball, ball_on_a_table], ids=["one color", "two colors"])
+@pytest.mark.parametrize(("batch", "make_mesh"), [((), ball), ((2, 3), ball_on_a_table)])
 def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
     monkeypatch, batch, make_mesh
 ):

@@ -12,21 +12,14 @@ from scipy.ndimage import map_coordinates
 from renderer.camera import OrthographicCamera
 from renderer.mesh import Mesh
 from renderer.settings import ENCODINGS, ImageSettings
-from renderer.surface.albedo import (
-    changed_albedo,
-    face_albedo,
-    paint_faces,
-    surface_albedo,
-    with_added_albedo,
-)
+from renderer.surface.albedo import face_albedo, paint_faces, surface_albedo, with_added_albedo
 from renderer.visibility import choose
 from renderer.visibility.fragments import Fragments, build_fragments
 
 EPS = torch.finfo(torch.float64).eps
 # Camera whose image shows x to the right and y up, from -1 to 1.
 ABOVE = OrthographicCamera(0, -90.0, 2.0)
-# Vertices and faces of a square that fills this image, and its texture
-# coordinates.
+# A square that fills this image, and its texture coordinates.
 SQUARE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
 SQUARE_FACES = [[0, 1, 2], [0, 2, 3]]
 UNIT_UVS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -120,17 +113,6 @@ def test_the_textures_of_a_mesh_as_parameters_give_its_albedo(mesh, camera, enco
     torch.testing.assert_close(albedo, expected, rtol=0, atol=16 * EPS)
 
 
-@pytest.mark.parametrize(("mesh", "camera"), TEXTURED)
-def test_albedo_per_texel_has_the_derivative_of_central_differences(mesh, camera):
-    fragments = view(mesh, 3, 2, camera)
-    inputs = [draw_uniform(*texture.shape).requires_grad_(True) for texture in mesh.textures]
-
-    def albedo(*textures: torch.Tensor) -> torch.Tensor:
-        return surface_albedo(mesh, fragments, "srgb", textures)
-
-    assert torch.autograd.gradcheck(albedo, inputs)
-
-
 def mid_tone_sphere() -> Mesh:
     """Return a sphere with linear colors from 0.2 to 0.8, so that adding 0.15 clamps nothing."""
     mesh = patchwork_sphere()
@@ -161,18 +143,6 @@ def test_a_painted_albedo_stays_within_zero_and_one_or_what_it_was(albedo_scale)
     brightest = paint_faces(mesh, fragments, "srgb", albedo_scale, large)
     assert brightest.min() >= 1 - 4 * EPS
     assert brightest.max() <= albedo_scale * (1 + 4 * EPS)
-
-
-def test_the_derivative_by_the_added_albedo_is_that_of_finite_differences():
-    shape = trimesh.creation.icosahedron()
-    mesh = patchwork(shape.vertices, shape.faces)
-    fragments = view(mesh, 5)
-    added = (0.3 * (draw_uniform(len(mesh.faces), 3) - 0.5)).requires_grad_()
-
-    def albedo(values: torch.Tensor) -> torch.Tensor:
-        return paint_faces(mesh, fragments, "srgb", 1.5, values)
-
-    assert torch.autograd.gradcheck(albedo, [added])
 
 
 def with_even_colors_on_textures(mesh: Mesh) -> Mesh:
@@ -221,16 +191,10 @@ def test_corners_of_different_colors_are_painted_into_the_texels_between_them():
     torch.testing.assert_close(found, expected, rtol=0, atol=1.1 / 255)
 
 
-def test_a_changed_albedo_is_at_most_1_or_what_it_was_above_1():
-    albedo = torch.tensor([[1.5, 0.5, 2.0]])
-    added = torch.tensor([[0.2, 0.7, -0.5]])
-    assert changed_albedo(albedo, None, added).tolist() == [[1.5, 1.0, 1.5]]
-
-
 def test_the_float32_gradient_of_a_painted_albedo_is_the_same_on_several_threads_and_on_one():
-    """Each value of the gradient is a sum over 147,456 samples, always in one order."""
+    """Each value of the gradient is a sum over 65,536 samples, always in one order."""
     mesh = poster(random_texture(16, 16))
-    fragments = view(mesh, 128, samples=3)
+    fragments = view(mesh, 128, samples=2)
 
     def gradient(threads: int) -> list[torch.Tensor]:
         torch.set_num_threads(threads)
@@ -242,10 +206,8 @@ def test_the_float32_gradient_of_a_painted_albedo_is_the_same_on_several_threads
 
     before = torch.get_num_threads()
     try:
-        expected = gradient(threads=1)
-        on_four_threads = [gradient(threads=4) for _ in range(2)]
+        expected, *others = [gradient(threads) for threads in (1, 4, 4)]
     finally:
         torch.set_num_threads(before)
-    for found in on_four_threads:
-        for values, expected_values in zip(found, expected, strict=True):
-            assert torch.equal(values, expected_values)
+    for found in others:
+        torch.testing.assert_close(found, expected, rtol=0, atol=0)

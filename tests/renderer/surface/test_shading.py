@@ -1,9 +1,4 @@
-"""Irradiance against SciPy, and derivatives of whole images against central differences.
-
-An image is the result of all steps from vertices, light and albedo to what a
-classifier sees: shading, the box filter, the background, the clamp and the
-encoding. Differences are taken at fixed visibility.
-"""
+"""Irradiance against SciPy, and derivatives of whole images against central differences."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -50,7 +45,7 @@ def some_normals(count: int) -> Tensor:
     return torch.cat([3 * draw(count, 3), torch.tensor(SPECIAL, dtype=torch.float64)])
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3, 6, 13, DIFFUSE_DEGREE])
+@pytest.mark.parametrize("degree", [0, 1, 3, 6, DIFFUSE_DEGREE])
 def test_irradiance_is_scipys(degree):
     normals = some_normals(100)
     light = draw((degree + 1) ** 2, 3)
@@ -58,7 +53,7 @@ def test_irradiance_is_scipys(degree):
     np.testing.assert_allclose(irradiance(normals, light), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("degree", [DIFFUSE_DEGREE + 1, DIFFUSE_DEGREE + 2, MAX_DEGREE - 1])
+@pytest.mark.parametrize("degree", [DIFFUSE_DEGREE + 1, MAX_DEGREE - 1])
 def test_light_above_the_diffuse_degree_has_the_irradiance_of_its_lower_degrees(degree):
     normals = some_normals(10)
     light = draw((degree + 1) ** 2, 3)
@@ -67,7 +62,7 @@ def test_light_above_the_diffuse_degree_has_the_irradiance_of_its_lower_degrees(
     np.testing.assert_allclose(irradiance(normals, light), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 6, DIFFUSE_DEGREE, DIFFUSE_DEGREE + 1])
+@pytest.mark.parametrize("degree", [0, 1, 2, 6, DIFFUSE_DEGREE + 1])
 def test_derivatives_of_irradiance_are_central_differences(degree):
     normals = some_normals(4).requires_grad_()
     light = draw((degree + 1) ** 2, 3, seed=1).requires_grad_()
@@ -166,11 +161,7 @@ class Image:
         self.encoding = encoding
 
     def inputs(self) -> list[Tensor]:
-        """Return vertices (V, 3), light (49, 3) and two textures.
-
-        The light leaves some values below black, some above white and most
-        between.
-        """
+        """Return vertices (V, 3), light (49, 3) and two textures; some values are clamped."""
         light = 1.5 * draw(49, 3, seed=1)
         light[0] = 1.0
         textures = [torch.from_numpy(texture / 255) for texture in self.scene.mesh.textures]

@@ -69,11 +69,10 @@ def problem_of(scene: Scene, **settings) -> SceneProblem:
 @pytest.mark.parametrize(
     ("mesh", "options"),
     [
-        (egg(Gloss(0.5, 0.3, 0.6)), {}),
         (egg(Gloss(0.5, 0.3, 0.6)), {"ground": TABLE}),
         (textured_egg(Gloss(0.5, 0.3, 0.6)), {"lamps": augment.LampsSettings()}),
     ],
-    ids=["alone", "on a table", "textured under lamps"],
+    ids=["on a table", "textured under lamps"],
 )
 def test_gradients_are_central_differences(mesh, options):
     scene = scene_of(mesh, **options)
@@ -143,7 +142,7 @@ def test_a_material_stays_in_its_norm_ball_and_physical(norm, radius):
     draws = torch.Generator().manual_seed(0)
     rows = torch.arange(2)
     candidates = []
-    for _ in range(20):
+    for _ in range(5):
         far = problem.start + 5 * torch.randn(2, 4, generator=draws)
         candidates.append(problem.project(far, rows))
         if radius is not None:
@@ -158,7 +157,7 @@ def test_a_material_stays_in_its_norm_ball_and_physical(norm, radius):
         assert gloss[0, 0, 1] == 0  # What is no metal becomes none.
 
 
-@pytest.mark.parametrize("angle", range(-180, 181, 30))
+@pytest.mark.parametrize("angle", range(-180, 181, 60))
 def test_the_hue_turns_by_the_angle_and_keeps_the_mean(angle):
     """HSV's hue runs along a hexagon, which is off by at most 1.3° at both ends."""
     orange = torch.tensor([0.5, 0.4, 0.35], dtype=torch.float64)
@@ -235,10 +234,7 @@ def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color)
 def test_mitsuba_shows_the_material_that_an_attack_leaves(tmp_path, change):
     """The table beside the object stays matte. Mitsuba's varnish has Disney's diffuse part.
 
-    That part does not lose the light that the coat reflects. By quadrature over the
-    hemisphere, a surface of the first material is 1.9% brighter than Mitsuba's if it
-    faces the camera, and 8% darker near the outline. The root mean square over a
-    ball is 3%.
+    By quadrature, the root mean square of their difference over a ball is 3%.
     """
     pytest.importorskip("mitsuba")
     options = {"ground": TABLE, "shadows": True, "samples": 8, "polar": 40.0}

@@ -1,6 +1,5 @@
 """Attack parameters have exact gradients, stay in their balls, and end where theory says."""
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -101,8 +100,7 @@ def test_each_example_starts_at_the_sky_of_the_settings_with_its_own_mean_lumina
 
 
 @pytest.mark.parametrize(
-    ("zenith", "turbidity"),
-    [*itertools.product(ZENITH, TURBIDITY), (10.0, 3.0), (45.0, 3.0), (80.0, 3.0)],
+    ("zenith", "turbidity"), [(ZENITH[0], TURBIDITY[0]), (ZENITH[1], TURBIDITY[1]), (45.0, 3.0)]
 )
 def test_without_negative_light_a_sky_keeps_its_mean_and_nearly_its_irradiance(
     make_scene, zenith, turbidity
@@ -123,14 +121,13 @@ def test_without_negative_light_a_sky_keeps_its_mean_and_nearly_its_irradiance(
     assert (without_window.amin((0, 1)) < -TOLERANCE * without_window.amax((0, 1))).any()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["lighting", "geometry", "albedo", "pixels"])
-def test_a_parameter_starts_at_the_scene_as_it_is(make_scene, name, dtype):
-    scene = make_scene(dtype=dtype)
+def test_a_parameter_starts_at_the_scene_as_it_is(make_scene, name):
+    scene = make_scene(dtype=torch.float32)
     (parameter,) = problem_of(scene, **free(name)).parameters
     conditions = parameter.apply(parameter.start, scene.conditions(EVERY), EVERY)
     expected = scene.render(scene.conditions(EVERY), EVERY)
-    rounding = 64 * torch.finfo(dtype).eps
+    rounding = 64 * torch.finfo(torch.float32).eps
     torch.testing.assert_close(scene.render(conditions, EVERY), expected, rtol=0, atol=rounding)
 
 
@@ -154,16 +151,10 @@ def fixed_visibility(monkeypatch) -> None:
 
 
 MIXTURE = ["skylight", "geometry", "albedo", "pixels"]
-SINGLE = ["lighting", *MIXTURE]
-COMBINATIONS = [*([name] for name in SINGLE), ["lighting", "geometry", "albedo"], MIXTURE]
 
 
 def derivatives(function: Callable[[Tensor], Tensor], at: Tensor, directions: Tensor) -> Tensor:
-    """Return the derivatives of a function at a point in several directions.
-
-    Central differences at h and 2h are combined by Richardson's rule. The error is a fourth
-    power of h, times a fifth derivative, and rounding divided by h.
-    """
+    """Return derivatives in several directions: central differences by Richardson's rule."""
 
     def central(h: float) -> Tensor:
         ahead = function(at + h * directions)
@@ -175,7 +166,7 @@ def derivatives(function: Callable[[Tensor], Tensor], at: Tensor, directions: Te
 
 @pytest.mark.parametrize(
     ("names", "encoding"),
-    [*((names, "srgb") for names in COMBINATIONS), (MIXTURE, "linear")],
+    [(["lighting"], "srgb"), (MIXTURE, "srgb"), (MIXTURE, "linear")],
     ids=lambda value: value if isinstance(value, str) else "+".join(value),
 )
 def test_gradients_are_central_differences(make_scene, fixed_visibility, names, encoding):
@@ -206,7 +197,7 @@ def test_gradients_are_central_differences(make_scene, fixed_visibility, names, 
 # --------------------------------------------------------------- pixels
 
 
-@pytest.mark.parametrize("gray", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("gray", [0.0, 1.0])
 def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, gray):
     """The gradient of the cross entropy is the sum of (p_c - [c = y]) W_c over the classes c."""
     scene = make_scene(backgrounds=torch.full((3, 3, 6, 6), gray))
@@ -361,15 +352,14 @@ LINEAR_CASES = {
 BALL_RADIUS = 0.01
 
 
-@pytest.mark.parametrize("case", LINEAR_CASES.values(), ids=LINEAR_CASES)
 @pytest.mark.parametrize(
-    ("norm", "step", "step_size", "steps"),
+    ("norm", "step", "step_size", "steps", "case"),
     [
-        ("linf", "sign", 0.004, 3),
+        ("linf", "sign", 0.004, 3, "one view, untargeted"),
         # This step is so long that the smallest derivative reaches its face of the cube too.
-        ("linf", "unit", 1e5, 1),
-        ("l2", "unit", 0.004, 3),
-        ("l2", "raw", 1e5, 1),
+        ("linf", "unit", 1e5, 1, "two views"),
+        ("l2", "unit", 0.004, 3, "one view"),
+        ("l2", "raw", 1e5, 1, "two views"),
     ],
 )
 def test_the_light_of_the_lowest_cost_of_a_linear_classifier_is_reached(
@@ -379,7 +369,7 @@ def test_the_light_of_the_lowest_cost_of_a_linear_classifier_is_reached(
 
     The lowest point of the ball about U₀ is its corner U₀ - r sign(s), or U₀ - r s / |s|.
     """
-    cameras, class_count, bias, target, dtype = case
+    cameras, class_count, bias, target, dtype = LINEAR_CASES[case]
     scene = make_scene(cameras=cameras, dtype=dtype)
     model = make_linear(class_count, bias, dtype=dtype)
     problem = problem_of(scene, lighting=StepSettings(norm, BALL_RADIUS, step, step_size))
