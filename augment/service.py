@@ -156,8 +156,9 @@ class AugmentationService:
                 renders get boxes and masks. None for classification.
             classes: Names of the classes of the network.
             of_scene: Further arguments of `build_scene`. By default, there are
-                as many views as `settings.examples` needs (10 without it), 5
-                gray backgrounds, 8 × 8 samples per pixel and flat shading.
+                as many views as `settings.examples` needs (10 without it).
+                Without `scene`, there are 5 gray backgrounds, and without
+                `renderer`, 8 × 8 samples per pixel and flat shading.
 
         Returns:
             The service.
@@ -178,15 +179,20 @@ class AugmentationService:
         expected = "nb.AugmentationSettings(...) or None"
         require_kind("settings", settings, AugmentationSettings | None, expected)
         # Given cameras are the views themselves.
-        views = 1 if of_scene.get("cameras") else 10
-        paper: dict[str, Any] = {"views": views, "samples": 8, "normals": "flat"}
-        options = paper | {"backgrounds": [0.0, 0.25, 0.5, 0.75, 1.0]} | of_scene
+        options: dict[str, Any] = {"views": 1 if of_scene.get("cameras") else 10}
+        if of_scene.get("scene") is None:
+            options["backgrounds"] = [0.0, 0.25, 0.5, 0.75, 1.0]
+        if of_scene.get("renderer") is None:
+            options |= {"samples": 8, "normals": "flat"}
+        options |= of_scene
         settings = settings or AugmentationSettings()
         count = settings.examples
         if count == 0:
             raise InputError("settings.examples is 0: give the number of renders, or None")
         if count and not {"views", "cameras"} & of_scene.keys():
-            options["views"] = views_of(count, len(meshes), len(options["backgrounds"]))
+            of_settings = getattr(options.get("scene"), "backgrounds", ())
+            backgrounds = len(options.get("backgrounds", of_settings))
+            options["views"] = views_of(count, len(meshes), backgrounds)
         scene = build_scene(meshes, size, attack=settings.attack, vary=settings.vary, **options)
         scene = scene.with_count(count) if count else scene
         task = task or Classification()

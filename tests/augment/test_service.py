@@ -19,6 +19,7 @@ from augment.scene.build import build_scene
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
+from augment.settings import SceneSettings
 from augment.tasks.classification import complementary_label
 from renderer.errors import InputError
 from renderer.light.files import probe
@@ -280,6 +281,14 @@ def test_both_arms_change_shape_and_albedo_within_their_norm_balls(model, mode):
 def test_a_service_from_meshes_without_renders_is_refused():
     with pytest.raises(InputError, match="examples is 0"):
         AugmentationService.from_meshes([("solid:cup", 0)], 8, AugmentationSettings(examples=0))
+
+
+def test_the_settings_of_a_scene_keep_their_backgrounds_in_a_service():
+    scene = SceneSettings(backgrounds=[0.25])
+    settings = AugmentationSettings("random", examples=4)
+    service = AugmentationService.from_meshes([("solid:cup", 0)], 8, settings, scene=scene)
+    assert torch.equal(service.scene.backgrounds, torch.full((1, 1, 8, 8), 0.25))
+    assert len({example.cameras for example in service.scene.examples}) == 4
 
 
 def test_a_service_from_meshes_renders_as_one_around_the_same_scene(model):
