@@ -14,16 +14,24 @@ training with three seeds. The first network and the first light are what others
     python -m benchmarks.real_light simulate PHOTOS FOLDER --lights low_light --classes orange apple
 
 writes such a folder with the photographs of PHOTOS as they are ("plain") and in simulated light.
+
+    python -m benchmarks.real_light rank real=REAL.csv simulated=SIMULATED.csv --label orange
+
+ranks the networks of files that `score --out` wrote, and says how similarly two lights rank them.
+A row of another network may stand in a further file of the same title.
 """
 
 import argparse
+import csv
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import spearmanr
 
 import norm_balls as nb
 from augment.classifier import Classifier
@@ -306,6 +314,57 @@ def simulate(options: argparse.Namespace) -> None:
             write_image(path, image.permute(1, 2, 0).numpy())
 
 
+def read_scores(words: Sequence[str], label: str, metric: str) -> dict[str, dict[str, float]]:
+    """Read a metric of each network by the light, which has the title of its file before it."""
+    scores: dict[str, dict[str, float]] = {}
+    for word in words:
+        title, _, path = word.partition("=")
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                if row["label"] == label and row[metric]:
+                    column = scores.setdefault(f"{title}: {row['light']}", {})
+                    # A cell is a value, mostly with an interval behind it.
+                    column[row["network"]] = float(row[metric].split()[0].replace("−", "-"))
+    return scores
+
+
+def rank_correlation(first: Mapping[str, float], second: Mapping[str, float]) -> Estimate:
+    """Compute Spearman's correlation over the networks of both, with a 95% interval.
+
+    The interval is that of Bonett and Wright (2000): z = artanh ρ has the standard error
+    sqrt((1 + ρ² / 2) / (n − 3)). It treats the networks as independent, and some share weights.
+    """
+    shared = sorted(first.keys() & second.keys())
+    if len(shared) < 4:
+        return Estimate()
+    value = float(spearmanr(*([scores[name] for name in shared] for scores in (first, second)))[0])
+    z = np.arctanh(np.clip(value, -1 + 1e-12, 1 - 1e-12))
+    margin = NORMAL_QUANTILE * np.sqrt((1 + value**2 / 2) / (len(shared) - 3))
+    return Estimate(value, float(np.tanh(z - margin)), float(np.tanh(z + margin)))
+
+
+def rank(options: argparse.Namespace) -> None:
+    """Print the metric of all networks in all lights, best first, and the rank correlations."""
+    scores = read_scores(options.scores, options.label, options.metric)
+    if not scores:
+        raise SystemExit(f"no file has {options.metric} for the label {options.label}")
+    first = next(iter(scores.values()))
+    networks = dict.fromkeys(name for column in scores.values() for name in column)
+    ordered = sorted(networks, key=lambda name: -first.get(name, -1.0))
+    lines = [
+        [name, *(f"{column[name]:.3f}" if name in column else "" for column in scores.values())]
+        for name in ordered
+    ]
+    print(Table(f"{options.metric}, {options.label}", ["network", *scores], lines), end="\n\n")
+    pairs = []
+    for one, other in combinations(scores, 2):
+        count = len(scores[one].keys() & scores[other].keys())
+        correlation = rank_correlation(scores[one], scores[other])
+        pairs.append([one, other, str(count), format_interval(correlation)])
+    header = ["light", "light", "networks", "rank correlation"]
+    print(Table("Spearman's rank correlation, 95% intervals over networks", header, pairs))
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command."""
     parser = argparse.ArgumentParser(
@@ -329,6 +388,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     simulating.add_argument("--exclude", nargs="*", default=[], help="sources of photos.csv")
     simulating.add_argument("--size", type=int, default=160, help="pixels per side")
     simulating.add_argument("--seed", type=int, default=0)
+    ranking = commands.add_parser("rank", help="rank networks by their scores in several lights")
+    ranking.set_defaults(body=rank)
+    ranking.add_argument("scores", nargs="+", help="TITLE=FILE of score --out")
+    ranking.add_argument("--label", required=True, help="positive class")
+    ranking.add_argument("--metric", default="recall at 5% FPR", choices=METRICS)
     options = parser.parse_args(arguments)
     options.body(options)
 

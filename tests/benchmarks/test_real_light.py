@@ -1,6 +1,7 @@
 """Scores of photographs in several lights, with intervals over photographs or objects."""
 
 import csv
+import math
 
 import numpy as np
 import pytest
@@ -110,3 +111,31 @@ def test_photographs_are_written_in_each_light(folder, monkeypatch, tmp_path_fac
     for light, level in (("plain", 40), ("highlights", 90)):
         image = np.asarray(Image.open(out / f"orange/{light}__plain__p0_1.png"))
         assert image.shape == (160, 160, 3) and (image == level).all()
+
+
+def test_networks_that_two_lights_rank_alike_have_a_rank_correlation_of_one(tmp_path):
+    values = {"a": 0.2, "b": 0.3, "c": 0.7, "d": 0.9, "e": 0.95}
+    for title, power in (("real", 1), ("alike", 3), ("other", -1)):
+        rows = [
+            ["orange", name, "dim", *[""] * 4, f"{x**power:.4f} [0, 1]"]
+            for name, x in values.items()
+        ]
+        real_light.write_csv(tmp_path / title, [["label", *real_light.HEADER], *rows])
+    words = [f"{title}={tmp_path / title}" for title in ("real", "alike", "other")]
+    scores = real_light.read_scores(words, "orange", "AUC")
+    real, alike, other = (scores[f"{title}: dim"] for title in ("real", "alike", "other"))
+    assert real == values
+    assert real_light.rank_correlation(real, alike).value == pytest.approx(1)
+    assert real_light.rank_correlation(real, other).value == pytest.approx(-1)
+
+
+def test_the_interval_of_a_rank_correlation_is_that_of_bonett_and_wright():
+    first = dict(zip("abcdef", (1, 2, 3, 4, 5, 6), strict=True))
+    second = dict(zip("abcdef", (2, 1, 4, 3, 6, 5), strict=True))
+    # The ranks differ by 1 six times: 1 − 6 · 6 / (6 · 35).
+    expected = 1 - 36 / 210
+    half = 1.959964 * math.sqrt((1 + expected**2 / 2) / 3)
+    estimate = real_light.rank_correlation(first, second)
+    assert estimate.value == pytest.approx(expected)
+    assert estimate.low == pytest.approx(math.tanh(math.atanh(expected) - half), abs=1e-6)
+    assert estimate.high == pytest.approx(math.tanh(math.atanh(expected) + half), abs=1e-6)
