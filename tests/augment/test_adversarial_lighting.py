@@ -57,36 +57,39 @@ def test_each_image_is_seen_as_often_as_stated_and_the_network_stays_as_it_was(i
     assert model.training and model.scale.requires_grad and model.scale.grad is None
 
 
+DETECTOR = BrightBox((2.0, 2.0, 12.0, 12.0))
+
+
+def hiding(**options):
+    """Return light that hides a lamp from the detector."""
+    classes = ["background", "lamp"]
+    return nb.AdversarialLighting(DETECTOR, nb.Detection(), classes=classes, **options)
+
+
 def test_light_hides_boxes_from_a_detector(images):
-    detector = BrightBox((2.0, 2.0, 12.0, 12.0))
     target = {"boxes": torch.tensor([[2.0, 2.0, 12.0, 12.0]]), "labels": torch.tensor([1])}
-    lighting = nb.AdversarialLighting(
-        detector, nb.Detection(), steps=2, lights="low_light", classes=["background", "lamp"]
-    )
+    lighting = hiding(steps=2, lights="low_light")
     torch.manual_seed(0)
     start = nb.RandomLighting("low_light")(images)
     torch.manual_seed(0)
     found = lighting(images, [target] * 8)
-    scores = [[item["scores"] for item in detector(shown / 255)] for shown in (start, found)]
+    scores = [[item["scores"] for item in DETECTOR(shown / 255)] for shown in (start, found)]
     assert torch.cat(scores[1]).mean() < torch.cat(scores[0]).mean()
 
 
 @pytest.mark.parametrize(
-    ("options", "word"),
+    ("options", "targets", "word"),
     [
-        ({"steps": 0}, "steps"),
-        ({"task": nb.Detection()}, "classes"),
-        ({"strength": 2.0}, "strength"),
+        ({"steps": 0}, None, "steps"),
+        ({"task": nb.Detection()}, None, "classes"),
+        ({"strength": 2.0}, None, "strength"),
+        ({}, torch.zeros(3, dtype=torch.int64), "3 targets"),
+        ({}, torch.full((8,), -1), "-1"),
     ],
 )
-def test_wrong_settings_are_refused_in_a_sentence(options, word):
+def test_wrong_settings_and_targets_are_refused(images, options, targets, word):
     with pytest.raises(InputError, match=word):
-        nb.AdversarialLighting(Mean(), **options)
-
-
-def test_targets_of_another_number_are_refused(images):
-    with pytest.raises(InputError, match="3 targets"):
-        nb.AdversarialLighting(Mean())(images, torch.zeros(3, dtype=torch.int64))
+        nb.AdversarialLighting(Mean(), **options)(images, targets)
 
 
 def test_gradients_need_not_be_enabled_and_bits_of_a_pixel_do_not_matter(images):
@@ -111,15 +114,10 @@ def test_labels_may_be_lists_arrays_and_tensors_of_any_integers(images, given):
 
 def test_boxes_may_be_whole_numbers_lists_or_those_of_a_sample(images):
     box, size = [2, 2, 12, 12], images.shape[-2:]
-    detector, classes = BrightBox([float(number) for number in box]), ["background", "lamp"]
+    of_a_sample = tv_tensors.BoundingBoxes([box], format="XYXY", canvas_size=size)
     found = []
-    for boxes in (
-        torch.tensor([box]).float(),
-        torch.tensor([box]),
-        [box],
-        tv_tensors.BoundingBoxes([box], format="XYXY", canvas_size=size),
-    ):
-        lighting = nb.AdversarialLighting(detector, nb.Detection(), classes=classes)
+    for boxes in (torch.tensor([box]).float(), torch.tensor([box]), [box], of_a_sample):
+        lighting = hiding(steps=1)
         targets = [{"boxes": boxes, "labels": [1]}] * 7 + [{"boxes": [], "labels": []}]
         torch.manual_seed(0)
         found.append(lighting(images, targets))
@@ -128,10 +126,8 @@ def test_boxes_may_be_whole_numbers_lists_or_those_of_a_sample(images):
 
 @pytest.mark.parametrize("targets", [3, {"boxes": []}, [{"boxes": []}]])
 def test_targets_of_a_detector_without_boxes_or_labels_are_refused(images, targets):
-    detector = BrightBox((2.0, 2.0, 12.0, 12.0))
-    lighting = nb.AdversarialLighting(detector, nb.Detection(), classes=["background", "lamp"])
     with pytest.raises(InputError, match="targets"):
-        lighting(images, targets)
+        hiding()(images, targets)
 
 
 class Pixels(nn.Module):
@@ -162,11 +158,6 @@ def test_pixels_without_a_class_count_as_background(images, label):
 def test_label_maps_of_other_classes_are_refused(images, label):
     with pytest.raises(InputError, match="classes"):
         segment(images, torch.full((8, 16, 16), label))
-
-
-def test_negative_labels_of_images_are_refused(images):
-    with pytest.raises(InputError, match="-1"):
-        nb.AdversarialLighting(Mean())(images, torch.full((8,), -1))
 
 
 def test_under_inference_mode_the_light_is_the_same(images):

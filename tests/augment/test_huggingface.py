@@ -300,16 +300,3 @@ def test_missing_weights_are_refused(save, tmp_path):
     safetensors.torch.save_file(state, path, {"format": "pt"})
     with pytest.raises(InputError, match=r"classifier\.weight"):
         nb.load_classifier(f"hf:{folder}")
-
-
-def test_logits_of_a_plain_model_of_transformers_are_read_in_an_attack(save):
-    folder = save(CLASSIFIERS["vit"])
-    network = transformers.ViTForImageClassification.from_pretrained(folder).eval()
-    scene = nb.build_scene([("solid:orange", "orange")], SIZE)
-    settings = nb.AttackSettings(lighting=nb.StepSettings(), max_steps=2)
-    options = {"settings": settings, "force": True}
-    result = nb.attack(
-        network, scene, classes=CLASSES, normalization=([0.5] * 3, [0.5] * 3), **options
-    )
-    expected = nb.attack(nb.load_classifier(f"hf:{folder}"), scene, **options)
-    torch.testing.assert_close(result.logits, expected.logits, rtol=1e-3, atol=1e-4)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scipy import integrate, spatial, stats
+from scipy import integrate, stats
 from torch.utils.data import DataLoader
 from torchvision import tv_tensors
 
@@ -168,10 +168,6 @@ def test_the_limits_of_half_precision_stay_finite(name):
     for value in (-65504.0, 65504.0, 6e-8):
         image = torch.full((3, 4, 4), value, dtype=torch.float16)
         assert nb.RandomLighting(name)(image).isfinite().all()
-
-
-def test_an_image_without_memory_keeps_its_device():
-    assert nb.RandomLighting()(torch.rand(3, 4, 4, device="meta")).is_meta
 
 
 @pytest.mark.parametrize("settings", [{"p": 0.0}, {"strength": 0.0}])
@@ -338,19 +334,6 @@ def test_noisy_bytes_equal_what_the_camera_measures():
     assert (relit / 255 - exact).abs().max() < 0.51 / 255
 
 
-def test_a_pixel_of_a_slide_belongs_to_the_cell_whose_center_is_nearest():
-    [shown] = patterns.draw_cells(1, (30, 50), torch.Generator().manual_seed(3))
-    draws = torch.Generator().manual_seed(3)
-    count = int(torch.randint(patterns.MIN_CELLS, patterns.MAX_CELLS + 1, (1,), generator=draws))
-    centers = 2 * torch.rand(patterns.MAX_CELLS, 2, generator=draws)[:count] - 1
-    centers[:, 1] *= 30 / 50
-    points = patterns.pixel_centers((30, 50)).flatten(1).T
-    _, nearest = spatial.cKDTree(centers.numpy()).query(points.numpy())
-    colors = shown.flatten(1).T.numpy()
-    for cell in range(count):
-        assert len(np.unique(colors[nearest == cell], axis=0)) <= 1
-
-
 @pytest.mark.parametrize("distance", [-1.5, -1.0, -0.6, -0.1, 0.0, 0.3, 0.99, 1.0, 2.0])
 def test_the_penumbra_is_the_visible_area_of_a_disc(distance):
     edge = min(max(distance, -1), 1)
@@ -446,16 +429,6 @@ def test_the_light_is_differentiable_after_inference(name):
     assert values.grad.isfinite().all()
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_the_light_is_differentiable_in_its_numbers(name):
-    model = MODELS[name]()
-    values = draw_values(model, seed=2).requires_grad_()
-    drawn = model.draw(values, (6, 6), seeds=[0])
-    relit = model.camera(0.1 * model.illumination(drawn).total(), drawn, 1.0, torch.tensor(1.0))
-    (gradient,) = torch.autograd.grad(relit.sum(), values)
-    assert gradient.isfinite().all() and gradient[:, : model.dimensions].abs().sum() > 0
-
-
 @pytest.mark.parametrize(
     "name", [*sorted(MODELS.keys() - {"low_light"}), *lights.CastShadow().kinds]
 )
@@ -508,16 +481,3 @@ def test_albumentations_keeps_lights_in_dictionaries_and_random_numbers_in_pickl
     copy, array = pickle.loads(pickle.dumps(compose)), picture(6, 8, 3).numpy()
     for _ in range(3):
         assert np.array_equal(compose(image=array)["image"], copy(image=array)["image"])
-
-
-def test_a_compiled_model_may_hold_the_transform():
-    class Model(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.light = nb.RandomLighting("linear")
-
-        def forward(self, images):
-            return self.light(images * 1.0) + 1
-
-    compiled = torch.compile(Model(), backend="eager")
-    assert compiled(torch.rand(2, 3, 4, 4)).shape == (2, 3, 4, 4)

@@ -4,14 +4,11 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from urllib.error import URLError
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image, ImageOps
 from torch import nn
 from torchvision.models import get_model, get_model_weights, squeezenet1_0, squeezenet1_1
 
@@ -19,7 +16,6 @@ from augment.classifier import Classifier
 from augment.sources import imagenet_classes, load_classifier
 from renderer.errors import InputError
 
-DATA = Path(__file__).parents[4] / "shared" / "data"
 CLASSES = imagenet_classes()
 EPS32 = torch.finfo(torch.float32).eps
 LITE_SIZES = {0: 224, 2: 260}
@@ -248,48 +244,6 @@ def test_a_function_in_the_current_folder_makes_a_classifier(own_networks):
 def test_a_function_that_makes_no_classifier_is_refused(own_networks, name, message):
     with pytest.raises(InputError, match=f"^(name=|classifier )python:{name}.*{message}"):
         load_classifier(f"python:{name}")
-
-
-@pytest.fixture(scope="module")
-def oranges() -> Callable[[int], torch.Tensor]:
-    """Return a function that reads every twelfth photograph of an orange at any size."""
-    if not DATA.is_dir():
-        pytest.skip("../shared/data is absent")
-    folder = DATA / "photos" / "orange"
-    paths = sorted(path for path in folder.iterdir() if not path.name.startswith("tiny"))[::12]
-
-    def read(size: int) -> torch.Tensor:
-        squares = [ImageOps.fit(Image.open(path).convert("RGB"), (size, size)) for path in paths]
-        return torch.from_numpy(np.stack(squares)).permute(0, 3, 1, 2).float() / 255
-
-    return read
-
-
-@torch.no_grad()
-def fraction_of_oranges(classifier: Classifier, images: torch.Tensor) -> float:
-    predicted = torch.cat([classifier(batch).argmax(1) for batch in images.split(16)])
-    return float((predicted == classifier.label("orange")).float().mean())
-
-
-@pytest.mark.realdata
-@pytest.mark.parametrize(
-    ("name", "weights", "least", "most_in_bgr"),
-    [
-        # The network is right about 72 % of all 255 photographs, and about 18 % with red and
-        # blue exchanged.
-        ("efficientnet_lite0", None, 0.6, 0.35),
-        # The network is right about 53 % of all 255 photographs, and about 0.4 % with red and
-        # blue exchanged.
-        ("squeezenet_caffe", DATA / "weights" / "squeezenet1_0.pth", 0.4, 0.05),
-    ],
-)
-def test_most_oranges_are_classified_correctly_unless_red_and_blue_are_exchanged(
-    oranges, name, weights, least, most_in_bgr
-):
-    classifier = load_classifier(name, weights)
-    images = oranges(classifier.size)
-    assert fraction_of_oranges(classifier, images) > least
-    assert fraction_of_oranges(classifier, images.flip(1)) < most_in_bgr
 
 
 def test_a_network_of_timm_comes_from_a_repository_of_the_hub(tmp_path, monkeypatch, caplog):

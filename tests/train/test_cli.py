@@ -133,13 +133,13 @@ def test_a_stopped_run_is_resumed_by_its_folder_alone(
     """The folder was moved; only settings that do not affect the result may change."""
     folder = tmp_path / "begun"
     overrides = [*two_methods, f"photos={photos}", "seed=3", *SMALL, "train.epochs=2"]
+
+    def save_and_stop(*arguments):
+        patch.undo()
+        torch.save(*arguments)
+        signal.raise_signal(signal.SIGTERM)
+
     with pytest.MonkeyPatch.context() as patch:
-
-        def save_and_stop(*arguments):
-            patch.undo()
-            torch.save(*arguments)
-            signal.raise_signal(signal.SIGTERM)
-
         patch.setattr(torch, "save", save_and_stop)
         assert call("train", f"out={folder}", *overrides) == 128 + signal.SIGTERM
     advice = shlex.split(capsys.readouterr().out.splitlines()[-1])
@@ -231,18 +231,12 @@ def test_a_full_disk_is_noticed_before_the_work(tmp_path, monkeypatch):
         writable_folder(tmp_path, "out")
 
 
-@pytest.mark.parametrize(
-    ("words", "printed"),
-    [(["seed=1"], "result\n"), (["-v", "seed=1"], "detail\nresult\n")],
-    ids=["plain", "verbose"],
-)
-def test_details_are_in_the_log_and_printed_if_asked_for(
-    capsys, monkeypatch, tmp_path, words, printed
-):
+def test_details_are_in_the_log_and_printed_if_asked_for(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "environ", dict(os.environ))
-    assert take_flag(words) == ["seed=1"]
-    with logged_to(tmp_path / "train.log"):
-        console.debug("detail")
-        console.info("result")
-    assert capsys.readouterr().out == printed
-    assert (tmp_path / "train.log").read_text() == "detail\nresult\n"
+    for words, printed in (["seed=1"], "result\n"), (["-v", "seed=1"], "detail\nresult\n"):
+        assert take_flag(words) == ["seed=1"]
+        with logged_to(tmp_path / printed[0]):
+            console.debug("detail")
+            console.info("result")
+        assert capsys.readouterr().out == printed
+        assert (tmp_path / printed[0]).read_text() == "detail\nresult\n"

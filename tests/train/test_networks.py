@@ -273,14 +273,6 @@ def test_a_description_that_does_not_fit_the_weights_is_refused_in_one_sentence(
             load_run(tmp_path / name)
 
 
-def test_a_network_starts_with_the_weights_and_the_normalization_of_another(network, tmp_path):
-    fresh = WideResNet(3, 10, 1, 0.3, mean=(0.5, 0.5, 0.5))
-    initial = initial_of(write(tmp_path, network))
-    initial.copy_to(fresh, description_of(fresh, dropout=0.3))
-    images = torch.rand(3, 3, 32, 32)
-    assert torch.equal(fresh.eval()(images), network(images))
-
-
 def test_an_initial_network_that_contradicts_the_run_is_refused(network, tmp_path):
     initial = initial_of(write(tmp_path, network))
     other_classes = {"classes": ["pear", "apple", "orange"]}

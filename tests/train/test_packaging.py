@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import sys
 import tomllib
-import venv
 from pathlib import Path
 
 import pytest
@@ -78,12 +77,6 @@ def write_modules_of_the_same_names(folder: Path) -> None:
         (folder / name).write_text("raise SystemExit('not this')")
 
 
-def venv_python(site: Path) -> Path:
-    """Return the interpreter of the environment that has a folder site-packages."""
-    root = next(path for path in site.parents if (path / "pyvenv.cfg").exists())
-    return next(path for path in root.glob("*/python*") if path.is_file())
-
-
 @pytest.mark.slow
 class TestAnInstallation:
     @pytest.fixture
@@ -110,26 +103,6 @@ class TestAnInstallation:
         self.run(target, user, "pnb-train", "--multirun", "launcher=joblib", "seed=0,1", *TINY)
         config = yaml.safe_load((user / "out" / "config.yaml").read_text())
         assert config["command"].startswith("pnb-attack ")
-
-    def test_shows_its_types_to_mypy(self, target, tmp_path):
-        pytest.importorskip("mypy")
-        # mypy ignores PYTHONPATH, and reads the .pth files of an environment.
-        venv.create(tmp_path / "environment", symlinks=os.name == "posix")
-        (site,) = (tmp_path / "environment").rglob("site-packages")
-        folders = [target, *(path for path in sys.path if path.endswith("site-packages"))]
-        (site / "folders.pth").write_text("\n".join(map(str, folders)))
-        user = tmp_path / "user.py"
-        user.write_text(
-            "import norm_balls as nb\nnb.orbit_cameras('ten', width=2.0)\n"
-            "reveal_type(nb.normalize(nb.load_mesh('orange.glb')))\n"
-        )
-        program = ["-m", "mypy", "--python-executable", venv_python(site), user]
-        done = subprocess.run(
-            [sys.executable, *program], cwd=tmp_path, capture_output=True, text=True
-        )
-        mistake, revealed, *_ = done.stdout.splitlines()
-        assert "user.py:2" in mistake and 'incompatible type "str"; expected "int"' in mistake
-        assert '"renderer.mesh.Mesh"' in revealed
 
     def run(self, target: Path, folder: Path, command: str, *arguments: str) -> str:
         done = subprocess.run(

@@ -75,11 +75,8 @@ def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
 @pytest.mark.parametrize(
     "override",
     [
-        *("meshes=[{}]", "hard_negatives=[{{mesh: {}, label: apple}}]"),
-        *("meshes=[[solid:orange, {{mesh: {}, at: [1, 1]}}]]", "scene.light={}"),
-        *("scene.backgrounds=[0.5,{}]", "augment.vary.environments=[{}]", "network={}"),
-        *("network={0.parent}", "data.path={}", "data.path={0.parent}"),
-        "augment.folder={0.parent}",
+        *("meshes=[[solid:orange, {{mesh: {}, at: [1, 1]}}]]", "scene.backgrounds=[0.5,{}]"),
+        *("augment.vary.environments=[{}]", "network={0.parent}", "data.path={0.parent}"),
     ],
 )
 def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
@@ -126,18 +123,14 @@ AUDIT = {"network": "c", "meshes": ["solid:orange"], "out": "audit"}
     ("given", "changed"),
     [
         (AUDIT | {"meshes": [], "unlabeled": "photographs"}, "photographs/orange/a.png"),
-        (AUDIT | {"photos": "photographs"}, "photographs/orange/a.png"),
         (AUDIT | {"photos": "photographs"}, "linked/b.png"),
         (AUDIT | {"laboratory": "photographs"}, "photographs/orange/a.png"),
-        (AUDIT | {"meshes": ["mesh.obj"]}, "mesh.obj"),
-        (AUDIT | {"meshes": ["mesh.obj"]}, "my mesh.mtl"),
         (AUDIT | {"meshes": ["mesh.obj"]}, "my skin.png"),
         (AUDIT | {"meshes": [{"mesh": "mesh.gltf"}]}, "mesh.bin"),
         (AUDIT | {"hard_negatives": ["mesh.gltf"]}, "textures/my skin.png"),
         (AUDIT | {"network": "python:network:build"}, "network.py"),
         (AUDIT | {"hardened": "run:photographs"}, "photographs/orange/a.png"),
         (AUDIT | {"environments": ["wall.png"]}, "wall.png"),
-        (AUDIT | {"weights": "wall.png"}, "wall.png"),
         (AUDIT | {"classes": "classes.txt"}, "classes.txt"),
     ],
 )
@@ -150,7 +143,6 @@ def test_an_input_whose_content_alone_changed_is_refused(tmp_path, monkeypatch, 
     monkeypatch.syspath_prepend(tmp_path)
     settings = AuditSettings(**given)
     write_config(tmp_path / "audit", settings)
-    require_same(tmp_path / "audit", settings, "out=", lambda *_: False)
     (tmp_path / "unrelated.png").write_text("new")
     require_same(tmp_path / "audit", settings, "out=", lambda *_: False)
     replace_content(tmp_path / changed)
@@ -202,10 +194,8 @@ def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(
     assert [(event.step, event.value) for event in board.Scalars("test/accuracy")] == [(4, 0.25)]
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "expected"), [(0.2, 0.6, 4 / 8), (1.0, 1.0, None), (None, None, None)]
-)
-def test_attack_success_is_the_fraction_of_the_clean_correct_examples(before, after, expected):
-    """For example, of ten examples, two were wrong before, and six are wrong after the attack."""
-    diagnostics = {"attack_success_before": before, "attack_success": after} if before else {}
-    assert attack_success(diagnostics) == (expected and pytest.approx(expected))
+def test_attack_success_is_the_fraction_of_the_clean_correct_examples():
+    """Of ten examples, two were wrong before, and six are wrong after the attack."""
+    of_ten = {"attack_success_before": 0.2, "attack_success": 0.6}
+    assert attack_success(of_ten) == pytest.approx(4 / 8)
+    assert attack_success({"attack_success_before": 1.0, "attack_success": 1.0}) is None

@@ -1,18 +1,14 @@
 """A detector is scored on photographs with boxes."""
 
 import json
-from collections import defaultdict
-from itertools import product
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from torchvision import ops
 
 import norm_balls as nb
 from renderer.errors import InputError
-from tests.augment.tasks.test_real_detector import DATA, SIZE, FastestDet, decode
 
 CLASSES = ["cat", "dog", "cow"]
 
@@ -89,59 +85,3 @@ def test_a_class_that_the_network_lacks_is_not_scored(photographs):
         nb.evaluate(_find_white, photographs, "yak", classes=CLASSES, size=120)
     with pytest.raises(InputError, match="marks no cat"):
         nb.evaluate(_find_white, photographs, "cat", classes=CLASSES, size=120)
-
-
-@pytest.mark.ecosystem
-@pytest.mark.realdata
-@pytest.mark.skipif(not DATA.exists(), reason="needs ../shared/data")
-def test_low_light_hides_real_fruit_from_fastestdet():
-    folder = DATA / "real_light/low_light_detection"
-    names = (DATA / "weights/coco.names").read_text().split("\n")[:80]
-    task = nb.Detection(decode=decode)
-    network = FastestDet().eval()
-    scores = nb.evaluate(network, folder, classes=names, size=SIZE, fit="stretch", task=task)
-    recalls = {
-        (light, name): scores.by_source[light][name].recall.value
-        for light, name in product(("plain", "low_light"), ("orange", "apple", "banana"))
-    }
-    assert recalls == pytest.approx(_recalls(network, folder, names))
-    assert recalls["plain", "orange"] > 0.95
-    assert recalls["plain", "apple"] > 0.9
-    assert recalls["plain", "banana"] > 0.7
-    assert recalls["low_light", "orange"] == recalls["low_light", "apple"] == 0
-    assert recalls["low_light", "banana"] < 0.5
-
-
-@torch.no_grad()
-def _recalls(network, folder, names):
-    """Compute the recall of each class in each light with the functions of torchvision."""
-    content = json.loads((folder / "annotations.json").read_text())
-    classes = {item["id"]: item["name"] for item in content["categories"]}
-    counts = defaultdict(lambda: np.zeros(2))
-    for image in content["images"]:
-        with Image.open(folder / image["file_name"]) as file:
-            resized = file.convert("RGB").resize((SIZE, SIZE), Image.Resampling.LANCZOS)
-        pixels = torch.from_numpy(np.array(resized)).permute(2, 0, 1) / 255
-        (output,) = decode(network(pixels[None]))
-        best, labels = output["scores"].max(1)
-        kept = ops.batched_nms(output["boxes"], best, labels, 0.5)
-        kept = kept[best[kept] >= 0.4]
-        scale = torch.tensor([image["width"], image["height"]] * 2) / SIZE
-        for key, name in classes.items():
-            items = [
-                item["bbox"]
-                for item in content["annotations"]
-                if (item["image_id"], item["category_id"]) == (image["id"], key)
-            ]
-            if not items:
-                continue
-            found = scale * output["boxes"][kept[labels[kept] == names.index(name)]]
-            truth = ops.box_convert(torch.tensor(items, dtype=torch.float32), "xywh", "xyxy")
-            overlaps = ops.box_iou(found, truth)
-            # Detections are in descending order, and each takes the best object that is left.
-            for row in overlaps:
-                if row.max() >= 0.5:
-                    counts[image["file_name"].split("/")[0], name][0] += 1
-                    overlaps[:, row.argmax()] = 0
-            counts[image["file_name"].split("/")[0], name][1] += len(truth)
-    return {key: hits / count for key, (hits, count) in counts.items() if key[0] != "motion_blur"}

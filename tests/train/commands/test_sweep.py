@@ -108,7 +108,7 @@ def test_a_run_keeps_its_folder_when_a_sweep_gets_more_values(tmp_path):
 PARSER = OverridesParser.create()
 
 
-@settings(max_examples=settings.default.max_examples // 4)  # Hydra's parser is slow.
+@settings(max_examples=settings.default.max_examples // 8)  # Hydra's parser is slow.
 @given(st.dictionaries(st.sampled_from(["seed", "data.path", "meshes"]), st.text(max_size=90)))
 def test_file_systems_and_command_lines_take_the_name_of_a_run(values):
     name = run_name([f"{key}={value}" for key, value in values.items()], ["data.path"])

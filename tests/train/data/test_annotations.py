@@ -45,18 +45,9 @@ def _write_coco(file, names=("a.png",), size=(80, 40), box=BOX, **changes):
     file.write_text(json.dumps(content | changes))
 
 
-def test_labels_of_coco_are_those_of_categories_with_gaps(tmp_path):
-    _draw(tmp_path / "a.png")
-    _write_coco(tmp_path / "labels.json")
-    read = read_annotations(tmp_path)
-    assert read.classes == ("cat", "dog")
-    assert read.photographs[0].labels.tolist() == [1]
-
-
 @pytest.mark.parametrize(
     ("file", "image", "name"),
     [
-        ("a.json", "a.png", "a.png"),
         ("a.json", "plain/a.png", "plain/a.png"),
         ("a.json", "plain/a.png", "a.png"),
         ("annotations/a.json", "val/a.png", "a.png"),
@@ -66,8 +57,11 @@ def test_labels_of_coco_are_those_of_categories_with_gaps(tmp_path):
 def test_images_of_coco_are_found_in_subfolders(tmp_path, file, image, name):
     _draw(tmp_path / image)
     _write_coco(tmp_path / file, [name])
-    (photograph,) = read_annotations(tmp_path / file).photographs
+    read = read_annotations(tmp_path / file)
+    (photograph,) = read.photographs
     assert photograph.path == tmp_path / image
+    # The identifiers of the categories have gaps.
+    assert (read.classes, photograph.labels.tolist()) == (("cat", "dog"), [1])
 
 
 def test_missing_images_of_coco_are_named_and_ambiguous_ones_refused(tmp_path):
@@ -81,15 +75,13 @@ def test_missing_images_of_coco_are_named_and_ambiguous_ones_refused(tmp_path):
         read_annotations(tmp_path / "a.json")
 
 
-@pytest.mark.parametrize(
-    ("orientation", "is_stored"), [*((n, False) for n in range(1, 9)), (3, True), (6, True)]
-)
+@pytest.mark.parametrize(("orientation", "is_stored"), [(3, False), (6, False), (6, True)])
 def test_boxes_fit_photographs_that_a_camera_has_turned(tmp_path, orientation, is_stored):
     _draw(tmp_path / "a.png", orientation=orientation)
     with Image.open(tmp_path / "a.png") as image:
         upright = np.array(ImageOps.exif_transpose(image))[..., 0]
     height, width = upright.shape
-    if is_stored and (width, height) != (80, 40):
+    if is_stored:
         _write_coco(tmp_path / "a.json")
     else:
         _write_coco(tmp_path / "a.json", size=(width, height), box=[*map(int, _bounds(upright))])
@@ -184,7 +176,6 @@ def test_a_wrong_line_of_yolo_is_refused_by_its_number(tmp_path, line):
         ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [0, 0, 1, 1]}]}, "category_id"),
         ({"annotations": [{"image_id": 7, "category_id": 3, "bbox": [0, 0, -1, 1]}]}, "bbox"),
         ({"annotations": [{"image_id": 7, "category_id": 3}]}, "no key 'bbox'"),
-        ({"images": []}, "image_id 7"),
         ({"images": 2 * [{"id": 7, "file_name": "a.png"}]}, "two of the images"),
         ({"images": [{"id": i, "file_name": "a.png"} for i in (7, 8)]}, "two of the images"),
         ({"categories": [{"id": 90, "name": name} for name in "ab"]}, "two of the categories"),

@@ -93,19 +93,6 @@ def test_the_degrees_of_freedom_do_not_exceed_those_of_a_group_of_units(spread, 
     assert (found.estimate.low, found.estimate.high) == pytest.approx(ends, abs=1e-4)
 
 
-@pytest.mark.parametrize("repeats", [1, 4])
-def test_intervals_do_not_depend_on_how_often_an_image_repeats(repeats):
-    generator = np.random.default_rng(3)
-    positives = generator.normal(1, 1, 12)
-    negatives = generator.normal(0, 1.5, 40)
-    statistic = partial(auc_and_recalls, positives.repeat(repeats), negatives.repeat(repeats))
-    units = Units([np.arange(12).repeat(repeats), np.arange(40).repeat(repeats)], "objects")
-    once = partial(auc_and_recalls, positives, negatives)
-    expected = leave_out(once, Units([np.arange(12), np.arange(40)], "objects"))[0].estimate
-    found = leave_out(statistic, units)[0].estimate
-    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
-
-
 def runs_of(values: np.ndarray) -> list[Jackknife]:
     return [Jackknife(value, [np.full(9, value)], 9, "objects") for value in values]
 

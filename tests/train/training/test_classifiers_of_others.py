@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import safetensors.torch
 import torch
 from torch import Tensor, nn
 from torchvision.models import get_model
@@ -171,15 +170,3 @@ def test_labeled_folders_are_scored_in_the_classes_of_the_network_before_and_aft
 def test_settings_that_do_not_fit_the_network_are_refused(tuned, change, message):
     with pytest.raises(InputError, match=message):
         tuned("unlabeled", "augment=random", change)
-
-
-def test_a_network_of_timm_has_its_own_normalization_and_weights(tmp_path):
-    timm = pytest.importorskip("timm")
-    torch.manual_seed(0)
-    network = timm.create_model("mobilenetv3_small_050")
-    safetensors.torch.save_file(network.state_dict(), tmp_path / "network.safetensors")
-    images = torch.rand(1, 3, 224, 224)
-    facts = network.pretrained_cfg
-    expected = normalized_logits(network, images, facts["mean"], facts["std"])
-    classifier = load_classifier("timm:mobilenetv3_small_050", tmp_path / "network.safetensors")
-    torch.testing.assert_close(classifier(images), expected, rtol=1e-4, atol=1e-5)

@@ -142,15 +142,10 @@ def test_a_step_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tm
 
 @pytest.mark.parametrize(("settings", "expected"), [({}, 40), ({"images_per_epoch": 9}, 9)])
 def test_a_batch_larger_than_the_data_is_the_data(tmp_path, settings, expected):
-    """A batch of 960,000 was filled up with copies of 40 images."""
     trainer = make_trainer(tmp_path, color_network(), epochs=1, batch_size=960_000, **settings)
+    steps = states_after_steps(trainer)
     fit_noise(trainer)
-    assert trainer.settings.batch_size == expected
-    settings |= {"epochs": 1, "batch_size": expected}
-    (tmp_path / "same").mkdir()
-    same = make_trainer(tmp_path / "same", color_network(), **settings)
-    fit_noise(same)
-    torch.testing.assert_close(trainer.model.state_dict(), same.model.state_dict(), rtol=0, atol=0)
+    assert (trainer.settings.batch_size, len(steps)) == (expected, 1)
 
 
 def test_a_step_keeps_the_inputs_of_each_layer_that_learns():
@@ -324,25 +319,6 @@ def test_a_soup_is_the_mean_of_the_ends_of_its_epochs(tmp_path, ema_decay):
     assert not torch.equal(states[2]["head.weight"], states[5]["head.weight"])
     # The last network of a soup is kept, whatever its validation.
     assert load(tmp_path, run_folder.BEST)["epoch"] == 3
-
-
-def test_each_epoch_of_a_soup_begins_with_the_initial_network_and_the_whole_schedule(tmp_path):
-    trainer = make_trainer(tmp_path, soup=True, schedule="one_cycle")
-    initial = copy.deepcopy(trainer.model.state_dict())
-    begun = []
-    rates = []
-
-    def record(model: nn.Module, *_) -> None:
-        if model.training:
-            begun.append(copy.deepcopy(model.state_dict()))
-            rates.append(trainer.step.optimizer.param_groups[0]["lr"])
-
-    trainer.model.register_forward_pre_hook(record)
-    fit_noise(trainer)
-    for state in begun[::STEPS_PER_EPOCH]:
-        torch.testing.assert_close(state, initial, rtol=0, atol=0)
-    assert len(set(rates)) == STEPS_PER_EPOCH
-    assert rates == 3 * rates[:STEPS_PER_EPOCH]
 
 
 def test_best_pt_holds_the_first_epoch_of_the_highest_validation_accuracy(tmp_path, monkeypatch):

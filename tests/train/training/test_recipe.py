@@ -187,7 +187,6 @@ def test_draws_of_an_image_do_not_depend_on_the_number_of_processes(
 
 
 def test_pgd_stays_within_its_radius_and_raises_the_loss(images, model):
-    """The loss rises much more than by noise of the same size."""
     adversarial = augmentation("pgd", model, 0).apply(images, LABELS, 0)
     changes = to_unit(adversarial) - to_unit(images)
     assert changes.abs().max() <= PGD.radius + 1e-6
@@ -227,23 +226,18 @@ class HeadFirst(nn.Module):
         return self.head(self.body(images.flatten(1)))
 
 
-def test_the_layer_that_is_called_last_learns_even_if_it_is_defined_first():
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_the_matrix_that_is_called_last_learns_wherever_it_stands():
     network = HeadFirst()
     assert learning_layers(network) == {"head"}
-    images = torch.full((1, 3, 2, 2), 0.5)
+    images = torch.rand(2, 3, 2, 2)
     features = network.body(images.flatten(1))
-    assert feature_norm(network, images) == pytest.approx(features.norm().item(), rel=1e-6)
-
-
-@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
-def test_only_the_last_layer_of_a_script_learns():
-    network = torch.jit.script(nn.Sequential(nn.Flatten(), nn.Linear(12, 4), nn.Linear(4, 2)))
-    assert learning_layers(network) == {"2"}
-
-
-@pytest.mark.parametrize("last", [nn.BatchNorm1d(4), nn.LayerNorm(4), nn.PReLU(), nn.Softmax(1)])
-def test_the_last_layer_with_a_matrix_learns_whatever_is_called_after_it(last):
-    assert learning_layers(nn.Sequential(nn.Flatten(), nn.Linear(12, 4), last)) == {"1"}
+    expected = features.square().sum(1).mean().sqrt().item()
+    assert feature_norm(network, images) == pytest.approx(expected, rel=1e-6)
+    for last in (nn.BatchNorm1d(4), nn.PReLU()):
+        assert learning_layers(nn.Sequential(nn.Flatten(), nn.Linear(12, 4), last)) == {"1"}
+    script = torch.jit.script(nn.Sequential(nn.Flatten(), nn.Linear(12, 4), nn.Linear(4, 2)))
+    assert learning_layers(script) == {"2"}
 
 
 def test_a_network_that_cannot_learn_in_its_last_layer_is_refused():
@@ -271,21 +265,13 @@ class Scaled(nn.Module):
         return self.head(self.factor * F.adaptive_avg_pool2d(images, 2).flatten(1))
 
 
-def test_the_norm_of_the_features_is_that_of_the_pooled_image(images):
-    units = to_unit(images)
-    pooled = F.avg_pool2d(units, 8).flatten(1)
-    expected = pooled.square().sum(1).mean().sqrt().item()
-    assert feature_norm(Scaled(3.0), units) == pytest.approx(3 * expected, rel=1e-6)
-
-
-@pytest.mark.parametrize("factor", [0.1, 30.0])
-def test_the_scale_of_the_features_does_not_change_the_training_of_the_last_layer(images, factor):
+def test_the_scale_of_the_features_does_not_change_the_training_of_the_last_layer(images):
     units = to_unit(images)
     settings = TrainSettings(
         freeze="all_but_last", feature_norm=5.0, learning_rate=3.0, weight_decay=0.0
     )
     logits = []
-    for network in (Scaled(1.0), Scaled(factor)):
+    for network in (Scaled(1.0), Scaled(30.0)):
         rate = scale_learning_rate(settings, network, units)
         optimizer = build_optimizer(network, replace(settings, learning_rate=rate))
         for _ in range(5):
@@ -298,7 +284,7 @@ def test_the_scale_of_the_features_does_not_change_the_training_of_the_last_laye
     assert not torch.allclose(logits[0], Scaled(1.0)(units), atol=0.1)
 
 
-@pytest.mark.parametrize("brightness", [0.0, 1e-9, math.nan, math.inf])
+@pytest.mark.parametrize("brightness", [1e-9, math.nan, math.inf])
 def test_features_whose_norm_is_about_zero_or_not_finite_have_no_learning_rate(images, brightness):
     settings = TrainSettings(freeze="all_but_last", feature_norm=5.0)
     features = torch.full_like(to_unit(images), brightness)
