@@ -2,17 +2,11 @@
 
 import doctest
 import importlib
-import inspect
-import io
 from pathlib import Path
 from types import FunctionType, ModuleType
 
 import pytest
 import torch
-from docutils.frontend import get_default_settings
-from docutils.parsers.rst import Parser
-from docutils.utils import new_document
-from sphinx.ext.napoleon import Config, GoogleDocstring
 from torch import Tensor
 
 import norm_balls as nb
@@ -74,31 +68,3 @@ def test_examples_run(name, result, tmp_path, monkeypatch):
 def test_every_public_function_has_an_example():
     functions = {name: value for name, value in PUBLIC.items() if isinstance(value, FunctionType)}
     assert [name for name, value in functions.items() if ">>>" not in value.__doc__] == []
-
-
-def public_docstrings() -> dict[str, str]:
-    """Return the docstrings of the public names, and of the members of public classes."""
-    found = {}
-    for name, value in PUBLIC.items():
-        found[name] = value.__doc__
-        for base in getattr(value, "__mro__", ()):
-            if base.__module__.partition(".")[0] not in PACKAGES:
-                continue
-            for member, item in vars(base).items():
-                if not member.startswith("_") and isinstance(item, FunctionType | property):
-                    found[f"{name}.{member}"] = item.__doc__ or ""
-    return found
-
-
-def markup_problems(docstring: str) -> str:
-    """Return what docutils reports about a docstring that napoleon has converted."""
-    settings = get_default_settings(Parser())
-    settings.warning_stream = io.StringIO()
-    text = str(GoogleDocstring(inspect.cleandoc(docstring), Config(napoleon_use_ivar=True)))
-    Parser().parse(text, new_document("docstring", settings))
-    return settings.warning_stream.getvalue()
-
-
-def test_the_site_can_show_the_docstrings_of_public_names():
-    problems = {name: markup_problems(text) for name, text in public_docstrings().items()}
-    assert {name: problem for name, problem in problems.items() if problem} == {}

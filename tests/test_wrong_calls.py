@@ -90,6 +90,10 @@ def scene(meshes: Any = ((MESH, "orange"),), size: Any = SIZE, **changed: Any) -
     return augment.build_scene(meshes, size, **{"samples": 1, "light": "uniform", **changed})
 
 
+def changed_scene(**changed: Any) -> augment.Scene:
+    return small_scene().changed(**changed)
+
+
 def projected(**changed: Any) -> augment.Scene:
     return scene(projector=augment.ProjectorSettings(**changed))
 
@@ -256,11 +260,11 @@ SCENES = [
     *by_name(augment.VariationSettings, environments=["grace"], instances=["yes"]),
     *by_name(augment.VariationSettings, gloss=[0.3], camera=[0.3]),
     *by_name(augment.CameraEffectSettings, noise=[2.0, NAN], pattern_fill=[0.5, [0, 2]]),
-    *by_name(small_scene().changed, backgrounds=["gray", BYTES, 0.5], settings=[None, 8]),
-    *by_name(small_scene().changed, lights=["grace", LIGHT[:9], LIGHT * NAN]),
-    *by_name(small_scene().changed, examples=[[], [3]], objects=[[MESH], None, []]),
-    *by_name(small_scene().changed, rasterizer=["numpy"], basis=["harmonics"]),
-    *by_name(small_scene().changed, camera_effects=[3, "blur"]),
+    *by_name(changed_scene, backgrounds=["gray", BYTES, 0.5], settings=[None, 8]),
+    *by_name(changed_scene, lights=["grace", LIGHT[:9], LIGHT * NAN]),
+    *by_name(changed_scene, examples=[[], [3]], objects=[[MESH], None, []]),
+    *by_name(changed_scene, rasterizer=["numpy"], basis=["harmonics"]),
+    *by_name(changed_scene, camera_effects=[3, "blur"]),
     *calls_of("light", lambda x: renderer.light_sphere(x, 8), "grace", 96),
     *calls_of("photograph", lambda x: renderer.fit_scene(x, torch.ones(8, 8), MESH), BYTES[0]),
     *calls_of("mask", lambda x: renderer.fit_scene(IMAGES[0], x, MESH), "mask.png", BYTES[0, 0]),

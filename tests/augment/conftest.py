@@ -29,7 +29,6 @@ FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth 
 
 @pytest.fixture(scope="session")
 def stone() -> Mesh:
-    """Return a turned icosahedron whose faces have different colors."""
     solid = trimesh.creation.icosahedron()
     turn = Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix()
     vertices = solid.vertices @ turn * [1.0, 0.9, 0.8]
@@ -92,7 +91,6 @@ def make_linear() -> Callable[..., nn.Module]:
 
 
 def logits_of_mean_color(images: Tensor) -> Tensor:
-    """Return the logits (N, 4) of red, green, blue and dark images."""
     means = 30 * images.mean((2, 3))
     darkness = 12 - means.sum(1, keepdim=True)
     return torch.cat([means, darkness], dim=1)

@@ -1,5 +1,3 @@
-"""Light that is found by gradient among the models of random light."""
-
 import numpy as np
 import pytest
 import torch

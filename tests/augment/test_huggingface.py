@@ -39,10 +39,6 @@ CROPPED = {"crop_size": {"height": SIZE, "width": SIZE}}
 # image that the processor crops to SIZE without interpolation.
 CLASSIFIERS = {
     "vit": ("ViTForImageClassification", SMALL | PATCHES, "ViT", SQUARE, SIZE),
-    "deit": (
-        *("DeiTForImageClassification", SMALL | PATCHES, "DeiT"),
-        *({"size": {"height": 80, "width": 80}} | CROPPED, 80),
-    ),
     "swin": (
         "SwinForImageClassification",
         STAGES | {"image_size": SIZE, "patch_size": 4},
@@ -57,10 +53,6 @@ CLASSIFIERS = {
     "dinov2": (
         *("Dinov2ForImageClassification", SMALL | PATCHES, "Bit"),
         *({"size": {"shortest_edge": 80}} | CROPPED, 80),
-    ),
-    "resnet": (
-        *("ResNetForImageClassification", WIDTHS | {"embedding_size": 16}, "ConvNext"),
-        *({"size": {"shortest_edge": SIZE}, "crop_pct": 0.8}, 80),
     ),
     "mobilevit": (  # Blue is the first channel, and nothing is normalized.
         "MobileViTForImageClassification",
@@ -131,7 +123,6 @@ def save(tmp_path):
 
 @pytest.fixture
 def tokenizer(tmp_path):
-    """Save a tokenizer of a made vocabulary."""
     from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
     words = ["<pad>", "<unk>", "<start>", "<end>", "a", "photo", "of", "the", *CLASSES]

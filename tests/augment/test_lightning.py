@@ -1,5 +1,3 @@
-"""Tests of the callback for PyTorch Lightning."""
-
 import pytest
 import torch
 from torch import nn
@@ -54,7 +52,6 @@ def test_workers_of_a_resumed_run_get_the_renders_of_its_epoch(tmp_path):
 
 
 def fit(tmp_path, max_epochs=2, enable_checkpointing=False, ckpt_path=None, **of_loader):
-    """Train for some epochs, and return the service and the module."""
     settings = nb.AugmentationSettings(mode="random")
     meshes = [("solid:orange", 0), ("solid:cup", 1)]
     options = {"views": 2, "backgrounds": [0.5], "samples": 1}

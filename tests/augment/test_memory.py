@@ -1,6 +1,5 @@
 import itertools
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -18,35 +17,17 @@ CPU = torch.device("cpu")
 ORANGE = [("solid:orange", "orange")]
 
 
-@pytest.fixture
-def system(tmp_path, monkeypatch) -> Path:
-    """Return the folder that stands for the system's files on memory, which is empty."""
+def test_more_than_the_free_memory_of_the_system_and_of_the_group_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(errors, "MEMORY", tmp_path / "meminfo")
     monkeypatch.setattr(errors, "GROUP", tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
-def with_4_gigabytes(system) -> Path:
-    """Write that 4 GB of the system's memory are free, without a limit of the group."""
-    (system / "meminfo").write_text("MemTotal: 8388608 kB\nMemAvailable: 4194304 kB\n")
-    (system / "memory.max").write_text("max\n")
-    (system / "memory.current").write_text("5\n")
-    return system
-
-
-def test_any_memory_is_granted_on_a_system_that_does_not_say_how_much_is_free(system):
-    require_memory("renders", 2**60, CPU)
-
-
-def test_more_than_the_free_memory_is_refused(with_4_gigabytes):
+    require_memory("renders", 2**60, CPU)  # The system does not say how much is free.
+    (tmp_path / "meminfo").write_text("MemTotal: 8388608 kB\nMemAvailable: 4194304 kB\n")
+    (tmp_path / "memory.max").write_text("max\n")
+    (tmp_path / "memory.current").write_text("5\n")
     require_memory("renders", 2**32, CPU)
     with pytest.raises(InputError, match=r"^renders .* 8\.0 GB .* 4\.0 GB"):
         require_memory("renders", 2**33, CPU)
-
-
-def test_more_than_a_group_of_processes_may_use_is_refused(with_4_gigabytes):
-    (with_4_gigabytes / "memory.max").write_text(f"{2**30 + 5}\n")
+    (tmp_path / "memory.max").write_text(f"{2**30 + 5}\n")
     with pytest.raises(InputError, match=r"1\.0 GB"):
         require_memory("renders", 2**32, CPU)
 

@@ -1,5 +1,3 @@
-"""Normalized light: closed forms, gradients by finite differences, and images without light."""
-
 import numpy as np
 import pytest
 import torch

@@ -1,5 +1,3 @@
-"""Photographs in the light of a projector, against hand computations, and the attack on them."""
-
 import math
 from dataclasses import replace
 from itertools import product

@@ -1,5 +1,3 @@
-"""A service renders examples for training, in random or adversarial light."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Networks of each source get images in their own units, and wrong files are refused."""
-
 import importlib
 import os
 import re
@@ -45,7 +43,6 @@ def file_name(weights) -> str:
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch) -> Path:
-    """Return the empty folder in which torchvision looks for a file before it downloads it."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     folder = tmp_path / "hub" / "checkpoints"
     folder.mkdir(parents=True)
@@ -215,7 +212,6 @@ def broken(): return 1 / 0
 
 @pytest.fixture
 def own_networks(tmp_path, monkeypatch) -> None:
-    """Write a module into the current folder, and forget it after the test."""
     (tmp_path / "own_networks.py").write_text(SOURCE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)

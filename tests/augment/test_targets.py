@@ -1,5 +1,3 @@
-"""For a detector, renders have the boxes, labels and masks of their objects as targets."""
-
 import pytest
 import torch
 from torch.utils.data import DataLoader

@@ -78,14 +78,6 @@ def test_the_benchmarks_reference_is_what_more_samples_converge_to(view):
     assert fine < middle / 4
 
 
-def test_the_benchmarks_plain_autograd_is_the_analytic_gradient(view):
-    light = scene.coefficients(6)
-    analytic = steps.VertexStep(view, 3, light, steps.SHADINGS[steps.ANALYTIC])().gradient
-    plain = steps.VertexStep(view, 3, light, steps.SHADINGS[steps.AUTOGRAD])().gradient
-    tolerance = 1e3 * torch.finfo(torch.float64).eps * float(analytic.abs().max())
-    torch.testing.assert_close(plain, analytic, rtol=0, atol=tolerance)
-
-
 @pytest.mark.parametrize(("samples", "count"), [(1, 5), (scene.SAMPLES, 4)])
 def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples(samples, count):
     view = scene.View(scene.ellipsoid(2), 16, choose("numpy"))
@@ -120,35 +112,6 @@ def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
     for row in costs:
         assert all(float(row[name]) > 0 for name in ("step_ms", "build_s", "megabytes"))
         assert all(0 < float(row[name]) < 0.4 for name in ("image_error", "gradient_error"))
-
-
-def save_random_data(path: Path) -> None:
-    rng = np.random.default_rng(0)
-    arrays = {"classes": np.array(["other", "orange"])}
-    for split in ("train", "test"):
-        arrays[f"{split}_images"] = rng.integers(0, 256, (200, 3, 32, 32), dtype=np.uint8)
-        arrays[f"{split}_labels"] = np.arange(200) % 2
-    np.savez(path, **arrays)
-
-
-@pytest.mark.slow
-def test_training_is_timed_beside_a_plain_loop(tmp_path):
-    save_random_data(tmp_path / "data.npz")
-    arguments = ["speed", "--data", str(tmp_path / "data.npz")]
-    arguments += ["--images", "32", "--rounds", "1", "--depth", "10", "--width", "1"]
-    arguments += ["--workers", "0", "--csv", str(tmp_path / "speed.csv"), "--overrides"]
-    arguments += ["renderer.rasterizer=numpy", "renderer.samples=1", "augment.examples=10"]
-    arguments += ["train.threads=1", "augment.attack.max_steps=2"]
-    first, median = training.main(arguments)
-    assert first | {"round": "median"} == median
-    # The attacked network is so certain that all attacks take both steps.
-    assert first["attack_steps"] == 2
-    for loop in ("float32", "bfloat16", "data"):
-        ratio = first["train_images_per_second"] / first[f"{loop}_images_per_second"]
-        assert ratio > 0
-        assert first[f"{loop}_ratio"] == pytest.approx(ratio)
-    assert 0 < first["attack_fraction_of_epoch"] < 1
-    assert len(read(tmp_path / "speed.csv")) == 2
 
 
 def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, monkeypatch):

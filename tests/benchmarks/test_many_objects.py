@@ -1,5 +1,3 @@
-"""Networks are scored on objects that no training shows. Intervals are over objects and setups."""
-
 import zipfile
 from pathlib import Path
 

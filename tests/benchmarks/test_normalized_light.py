@@ -1,5 +1,3 @@
-"""The settings of normalized light are chosen on a split that shares nothing with the test."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""The paper's benchmarks, at a tiny size."""
-
 import json
 import math
 from pathlib import Path
@@ -20,7 +18,6 @@ from benchmarks.paper import (
     norm_balls,
     rendering_quality,
     run_time,
-    survival,
     table,
     transfer,
 )
@@ -49,7 +46,6 @@ def classify_by_brightness(
 
 
 def make_scene(view_count: int) -> Scene:
-    """Make a scene of the ball from several cameras before a gray."""
     views = [common.View(camera, 0.5) for camera in orbit_cameras(view_count, 3.0)]
     return common.make_scene(SUBJECT, SIZE, views)
 
@@ -92,32 +88,6 @@ def test_a_script_appends_records_whose_table_has_all_rows(
     header, line, *rows = capsys.readouterr().out.strip().splitlines()
     assert len(rows) == row_count
     assert {row.count(" | ") for row in (header, line, *rows)} == {column_count - 1}
-
-
-@pytest.mark.slow  # Two processes import everything.
-def test_adversaries_are_found_and_rendered_again_by_the_attack_script(tmp_path, capsys):
-    out = tmp_path / "records.jsonl"
-    arguments = ["--attacks", "lighting", "--examples", "1"]
-    arguments += ["--classifier", "run:pretrained/none"]
-    # The network does not predict a lamp for an orange, so that the attack on the
-    # second mesh is refused.
-    arguments += ["--meshes", "solid:orange:0", "{mesh: 'solid:orange:0', label: lamp}"]
-    # attack.verify=reload leaves out the render by Mitsuba.
-    arguments += ["--overrides", "attack.max_steps=1", "scene.search=0"]
-    arguments += ["renderer.shadows=false", "attack.verify=reload"]
-    survival.main(["--out", str(out), *arguments])
-
-    _, records = common.last_run(out)
-    orange, lamp = records
-    assert set(orange["versions"]) == {"float", "8 bits", "JPEG 90", "reload"}
-    assert "refusal" not in orange
-    assert orange["versions"]["reload"]["largest_difference"] <= 1 / 255
-    assert lamp["refusal"].startswith("error: ")
-    assert "versions" not in lamp
-
-    table.main([str(out)])
-    row = capsys.readouterr().out.splitlines()[2]
-    assert row.split()[:4] == ["|", "lighting", "|", "1"]
 
 
 def test_the_change_of_light_is_a_mean_over_the_renders_that_are_attacked(tmp_path):

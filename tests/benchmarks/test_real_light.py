@@ -1,5 +1,3 @@
-"""Scores of photographs in several lights, with intervals over photographs or objects."""
-
 import csv
 import math
 
@@ -34,7 +32,6 @@ def folder(tmp_path):
 
 
 def score(folder, monkeypatch, *words):
-    """Score two networks, and return the rows of the table by network and light."""
     networks = {"half": darker_than(0.5), "never": darker_than(-1.0)}
     monkeypatch.setattr(real_light, "load", networks.__getitem__)
     out = folder.parent / "scores.csv"

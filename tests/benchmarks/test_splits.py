@@ -1,5 +1,3 @@
-"""The validation split and the test split share nothing, and evaluations are logged."""
-
 import csv
 import zipfile
 from functools import partial
@@ -63,7 +61,6 @@ def write_photographs(rng: np.random.Generator) -> None:
 
 @pytest.fixture
 def made_splits(data, monkeypatch) -> None:
-    """Make both splits with few renders of 8 × 8 pixels."""
     pytest.importorskip("mitsuba")
     all_parts = splits.parts
 
@@ -81,12 +78,10 @@ def made_splits(data, monkeypatch) -> None:
 
 
 def images_of(split: str) -> set[bytes]:
-    """Return the contents of all renders and photographs of a split."""
     return {path.read_bytes() for path in Path("splits", split).glob("*/*/*.png")}
 
 
 def names_of(split: str) -> set[str]:
-    """Return the names of the meshes, patterns and maps of the renders of a split."""
     names = set()
     for part in ("laboratory", "hdri"):
         with Path("splits", split, part, "photos.csv").open() as file:
@@ -97,7 +92,6 @@ def names_of(split: str) -> set[str]:
 
 
 def photographs_of(split: str) -> set[str]:
-    """Return the file names of the photographs of a split."""
     return {path.name for path in Path("splits", split, "photographs").glob("*/*.png")}
 
 

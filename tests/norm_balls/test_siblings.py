@@ -6,9 +6,6 @@ from pathlib import Path
 
 import pytest
 
-nbformat = pytest.importorskip("nbformat")
-nbclient = pytest.importorskip("nbclient")
-
 OTHER_PREFIX = ("renderer.py", "augment.py", "train.py", "conf/__init__.py")
 USE = """
 import norm_balls as nb
@@ -40,14 +37,6 @@ def test_a_script_named_train_uses_the_library(folder):
     (folder / "train.py").write_text(USE)
     done = run(folder, "train.py")
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.slow
-def test_a_notebook_beside_such_modules_uses_the_library(folder):
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(USE)])
-    context = {"metadata": {"path": str(folder)}}
-    # The call raises the error of a cell.
-    nbclient.NotebookClient(notebook, resources=context).execute()
 
 
 @pytest.mark.parametrize("name", ["renderer", "augment", "train", "conf"])

@@ -92,6 +92,5 @@ def test_every_training_has_valid_settings_and_tables_compare_all_runs_of_an_exp
 
 
 def first_of_sweep(word: str) -> str:
-    """Return a setting with the first of the values that a sweep gives it."""
     swept = ("seed=", "augment=", "train.augmentation=")
     return word.split(",")[0] if word.startswith(swept) else word

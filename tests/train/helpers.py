@@ -1,5 +1,3 @@
-"""Functions that tests of several modules of training use."""
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -41,7 +41,6 @@ def own_models(tmp_path, monkeypatch) -> None:
 
 @pytest.fixture
 def network() -> WideResNet:
-    """Make a network with running statistics as after training."""
     torch.manual_seed(0)
     network = WideResNet(3, 10, 1, 0.0, MEAN, STD)
     with torch.no_grad():
@@ -56,20 +55,17 @@ def description_of(network: nn.Module, **changes) -> dict:
 
 
 def initial_of(path: Path) -> Initial:
-    """Load the network of a file as the initial network of a run."""
     source, state = load_selected(path)
     return Initial(source, state["architecture"], state["model"])
 
 
 def normalize(images: Tensor) -> Tensor:
-    """Subtract the mean from each channel of images (N, 3, H, W), and divide by its deviation."""
     mean = torch.tensor(MEAN).view(3, 1, 1)
     std = torch.tensor(STD).view(3, 1, 1)
     return (images - mean) / std
 
 
 def write(folder: Path, network: nn.Module, description: dict | None = None, **changes) -> Path:
-    """Write best.pt and model.safetensors of a network."""
     architecture = description_of(network) if description is None else description
     state = {"model": network.state_dict(), "architecture": architecture | changes}
     save(folder / BEST, state)
@@ -137,7 +133,6 @@ class PublishedWideResNet:
 
 
 def randomize_normalization(network: nn.Module) -> None:
-    """Draw the statistics and the weights of all batch normalizations."""
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.running_mean.uniform_(-1, 1)

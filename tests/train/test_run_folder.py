@@ -1,5 +1,3 @@
-"""A run's folder, also where others write to it or have damaged its files."""
-
 import itertools
 import os
 import time
@@ -13,14 +11,6 @@ from renderer.errors import InputError
 from train import run_config
 from train.cli import read_settings
 from train.command_settings import AuditSettings
-from train.run_config import (
-    CONFIG,
-    decisive_settings,
-    read_config,
-    require_same,
-    require_same_run,
-    write_config,
-)
 from train.run_folder import METRICS, attack_success, read_metrics
 from train.settings import ExperimentSettings
 from train.training.run_log import RunLog
@@ -28,8 +18,10 @@ from train.training.run_log import RunLog
 
 def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny, tmp_path):
     settings = tiny("train.learning_rate=3e-7", "label=pear", "scene.lamps={power: 3}")
-    write_config(tmp_path, settings, precision="bfloat16", command="python -m train 'out=${label}'")
-    config = read_config(tmp_path / CONFIG)
+    run_config.write_config(
+        tmp_path, settings, precision="bfloat16", command="python -m train 'out=${label}'"
+    )
+    config = run_config.read_config(tmp_path / run_config.CONFIG)
     assert "command" not in config  # An interpolation would be refused.
     assert config.pop("precision") == "bfloat16"
     assert config.pop("working_folder") == os.getcwd()
@@ -47,10 +39,10 @@ for number in range(9):
 @pytest.mark.parametrize(
     "file, content",
     [
-        (CONFIG, "- 1"),
-        (CONFIG, BOMB),
-        (CONFIG, "!!python/object/apply:os.system [touch hacked]"),
-        (CONFIG, "a: ${oc.env:HOME}"),
+        (run_config.CONFIG, "- 1"),
+        (run_config.CONFIG, BOMB),
+        (run_config.CONFIG, "!!python/object/apply:os.system [touch hacked]"),
+        (run_config.CONFIG, "a: ${oc.env:HOME}"),
         (METRICS, "{\n"),
         (METRICS, '{"test/accuracy": "high"}\n'),
         (METRICS, '{"epoch": 1}\n[]\n'),
@@ -60,14 +52,16 @@ for number in range(9):
 def test_a_damaged_file_is_one_sentence_that_names_it(tmp_path, file, content):
     (tmp_path / file).write_text(content)
     with pytest.raises(InputError, match=rf"^{tmp_path / file} is damaged [^\n]*$"):
-        read_config(tmp_path / file) if file == CONFIG else read_metrics(tmp_path)
+        run_config.read_config(tmp_path / file) if file == run_config.CONFIG else read_metrics(
+            tmp_path
+        )
 
 
 def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
     photos = "photos=${out}/images"
-    here = decisive_settings(tiny(photos, "out=here"))
+    here = run_config.decisive_settings(tiny(photos, "out=here"))
     elsewhere = ("out=there/a", "sweep=x", "train.resume=true", "train.cache=null")
-    assert decisive_settings(tiny(photos, *elsewhere)) == here
+    assert run_config.decisive_settings(tiny(photos, *elsewhere)) == here
     assert here["photos"] == "<run>/images"
     assert here["augment.attack.max_steps"] == 3
 
@@ -85,13 +79,13 @@ def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
     file.parent.mkdir()
     file.write_bytes(b"one")
     settings = tiny(override.format(file), "augment.examples=null", "scene.views=1")
-    write_config(folder, settings)
-    require_same_run(folder, settings)
+    run_config.write_config(folder, settings)
+    run_config.require_same_run(folder, settings)
     file.write_bytes(b"another")
     with pytest.raises(
         InputError, match=rf"{file.parent}\S* has changed since {folder} began: put it back"
     ):
-        require_same_run(folder, settings)
+        run_config.require_same_run(folder, settings)
 
 
 def replace_content(file: Path) -> None:
@@ -142,12 +136,12 @@ def test_an_input_whose_content_alone_changed_is_refused(tmp_path, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     settings = AuditSettings(**given)
-    write_config(tmp_path / "audit", settings)
+    run_config.write_config(tmp_path / "audit", settings)
     (tmp_path / "unrelated.png").write_text("new")
-    require_same(tmp_path / "audit", settings, "out=", lambda *_: False)
+    run_config.require_same(tmp_path / "audit", settings, "out=", lambda *_: False)
     replace_content(tmp_path / changed)
     with pytest.raises(InputError, match="has changed since"):
-        require_same(tmp_path / "audit", settings, "out=", lambda *_: False)
+        run_config.require_same(tmp_path / "audit", settings, "out=", lambda *_: False)
 
 
 def test_a_folder_too_large_to_read_is_told_by_the_times_of_its_files(tmp_path, monkeypatch):

@@ -27,10 +27,9 @@ def test_every_experiment_takes_other_data(experiment):
     assert settings.network == "b"
 
 
-@pytest.mark.parametrize("experiment", ["harden", "photographs"])
-def test_an_experiment_that_fine_tunes_asks_for_the_initial_network(experiment):
+def test_an_experiment_that_fine_tunes_asks_for_the_initial_network():
     with pytest.raises(InputError, match=r"^network is not set"):
-        train_command.read([f"experiment={experiment}", *OTHER_DATA])
+        train_command.read(["experiment=harden", *OTHER_DATA])
 
 
 def test_a_classifier_of_another_library_needs_no_class_but_the_label():
@@ -65,7 +64,6 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["attack@augment.attack=[lightning]"], "attack=lightning is not a choice"),
         (["~seed"], "~seed: a setting cannot be removed"),
         (["out="], "out is empty"),
-        (["scene.ground=[a]"], "scene.ground[0]"),
         (["augment.attack.geometry.radius=1"], "augment.attack.geometry is null"),
         (
             ["attack@augment.attack=[geometry]", "augment.attack.geometry.radius=-1"],
@@ -85,7 +83,7 @@ def test_a_wrong_setting_is_one_sentence_that_starts_with_its_key(overrides, sta
     assert "\n" not in sentence
 
 
-@pytest.mark.parametrize("path", ["solid:lemon", "/a folder/örange.glb", "'a, b'"])
+@pytest.mark.parametrize("path", ["/a folder/örange.glb", "'a, b'"])
 def test_a_single_value_for_a_list_is_a_list_of_one(path):
     meshes = train_command.read([f"hard_negatives={path}"]).hard_negatives
     assert [str(mesh) for mesh in meshes] == [path.strip("'")]
@@ -111,9 +109,7 @@ TWO_CLASSES += ["scene.views=1", "augment.examples=null"]
             ["hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
             "hard_negatives[0] is solid:orange, of the positive class orange",
         ),
-        (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["label=null"], "label is not set: set it to the class of the meshes, one of the 3 class"),
-        (["label=ornage"], "'ornage' is not a class of the model"),
         ([*TWO_CLASSES, "label=[orange,pear,orange]"], "a list of several, each once"),
         (["label=[orange,apple]"], "label=['orange', 'apple'] has no mesh of apple"),
         ([*TWO_CLASSES, "meshes=[a.glb,'solid:pear']"], "meshes[0] has no class"),
@@ -151,12 +147,9 @@ KEYS = train_command.keys | evaluate_command.keys
 @pytest.mark.parametrize(
     ("argument", "override"),
     [
-        ("photos=2024", "photos='2024'"),
         ("photos=2024,2025", "photos='2024','2025'"),
-        ("label=true,false", "label='true','false'"),
         ("label=[1, cup]", "label=['1',cup]"),
         ("label=null,1.10, cup", "label=null,'1.10',cup"),
-        ("photos=1.10", "photos='1.10'"),
         ("+data.path=1e3", "data.path='1e3'"),
         ("out=a\udcff", "out='a\udcff'"),
         ("out=a;b", "out='a;b'"),

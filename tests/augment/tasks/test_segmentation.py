@@ -1,5 +1,3 @@
-"""Segmentation: when an object is lost, the gradient of the cost, and outputs of libraries."""
-
 import pytest
 import torch
 from torch import Tensor

@@ -20,15 +20,6 @@ from renderer.light.files import load_light
 from tests.helpers import darker_than
 from train.auditing import audit, lights
 from train.auditing.audit import run_audit
-from train.auditing.lights import (
-    KINDS,
-    Views,
-    adversaries,
-    find_plain_views,
-    frames_of,
-    success_by_light,
-    transfer_success,
-)
 from train.auditing.network import RECOGNIZED, AuditedNetwork
 from train.command_settings import AuditSettings
 from train.results.tables import fraction
@@ -43,18 +34,17 @@ def guessing() -> augment.Classifier:
 
 @pytest.fixture(autouse=True)
 def few_small_frames(monkeypatch) -> None:
-    """Draw a slider of three small frames, because most tests do not look at them."""
     for name, number in {"FRAME_COUNT": 3, "BALL_SIDE": 8, "SIDE": 8}.items():
         monkeypatch.setattr(lights, name, number)
 
 
 @pytest.fixture(scope="module")
-def views() -> Views:
+def views() -> lights.Views:
     orange = load_object(ObjectSettings("solid:orange:0", label="orange"))
-    return Views([orange], 4, 0, torch.device("cpu"))
+    return lights.Views([orange], 4, 0, torch.device("cpu"))
 
 
-def mean_values(views: Views, power: float) -> torch.Tensor:
+def mean_values(views: lights.Views, power: float) -> torch.Tensor:
     """Render the views with all lamps at a power, and average each image."""
     scene = views.scene(8, "lamps")
     ((rows, _),) = [part for part in scene.basis.lights if part[1].name == "lamps"]
@@ -68,17 +58,17 @@ def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp
     """Each lamp adds light, so no light within a radius is brighter than all lamps at it."""
     # Steps of a quarter of the radius reach a corner of the norm-ball in four.
     monkeypatch.setattr(lights, "STEPS", 5)
-    monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(1.0, 10.0)))
+    monkeypatch.setitem(lights.KINDS, "lamps", lights.KINDS["lamps"]._replace(radii=(1.0, 10.0)))
     middle_two = mean_values(views, 2.0).sort().values[1:3]
     limit = float(middle_two.mean())
     is_correct = mean_values(views, 0.0) < limit
     expected = []
-    for radius in KINDS["lamps"].radii:
+    for radius in lights.KINDS["lamps"].radii:
         is_wrong = mean_values(views, radius) > limit
         expected.append(int((is_correct & is_wrong).sum()))
     assert 0 < expected[0] < expected[1]
 
-    counts = success_by_light(darker_than(limit), views, "lamps", tmp_path)
+    counts = lights.success_by_light(darker_than(limit), views, "lamps", tmp_path)
 
     assert counts["correct"] == int(is_correct.sum())
     assert counts["adversarial"] == expected
@@ -86,8 +76,7 @@ def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp
         assert random <= hits
 
 
-def mean_values_of(views: Views) -> torch.Tensor:
-    """Render the views in their own light, and average each image."""
+def mean_values_of(views: lights.Views) -> torch.Tensor:
     scene = views.scene(8)
     light = load_light(views.light) * views.exposure
     conditions = Conditions(light.expand(len(scene), -1, -1))
@@ -98,7 +87,7 @@ def test_views_are_attacked_at_an_exposure_at_which_they_are_recognized(views):
     limit = float(mean_values_of(views).min()) - 1e-3
     network = darker_than(limit)
 
-    plain = find_plain_views(network, views)
+    plain = lights.find_plain_views(network, views)
 
     assert plain.recognized_as_given == 0
     assert plain.recognized >= 3
@@ -108,7 +97,7 @@ def test_views_are_attacked_at_an_exposure_at_which_they_are_recognized(views):
 
 
 def test_views_that_are_recognized_as_they_are_stay_so(views):
-    plain = find_plain_views(darker_than(1.0), views)
+    plain = lights.find_plain_views(darker_than(1.0), views)
     assert plain.recognized == plain.recognized_as_given == views.count
     assert (plain.light, plain.exposure, plain.size) == (views.light, views.exposure, views.size)
 
@@ -118,15 +107,15 @@ def lamps_alone(monkeypatch) -> None:
     monkeypatch.setattr(lights, "STEPS", 3)
     monkeypatch.setattr(lights, "ADDITIONAL_STEPS", 5)
     for kind in ("skylight", "projector", "lighting"):
-        monkeypatch.delitem(KINDS, kind)
-    monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(10.0,)))
+        monkeypatch.delitem(lights.KINDS, kind)
+    monkeypatch.setitem(lights.KINDS, "lamps", lights.KINDS["lamps"]._replace(radii=(10.0,)))
 
 
 def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views, lamps_alone):
     middle_two = mean_values(views, 2.0).sort().values[1:3]
-    result = adversaries(darker_than(float(middle_two.mean())), views, "lamps")
+    result = lights.adversaries(darker_than(float(middle_two.mean())), views, "lamps")
     example = int((result.clean_correct & result.success).nonzero()[0])
-    slider = frames_of(result, example)
+    slider = lights.frames_of(result, example)
     ends = [slider["frames"][index]["probabilities"] for index in (0, -1)]
     expected = [result.logits_before[example], result.logits[example]]
     assert slider["classes"] == ["orange", "other"]
@@ -137,9 +126,11 @@ def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views, l
 def test_views_that_fool_a_network_are_counted_if_the_other_recognizes_them(views, lamps_alone):
     """The other network errs in less light. No light is bright enough for the last attack."""
     views = replace(views, count=2)
-    counts = transfer_success(darker_than(0.5), darker_than(0.515, size=12), views)
+    counts = lights.transfer_success(darker_than(0.5), darker_than(0.515, size=12), views)
     assert counts == {"lamps": [2, 2, 2]}
-    assert transfer_success(darker_than(2.0), darker_than(0.5), views) == {"lamps": [0, 0, 0]}
+    assert lights.transfer_success(darker_than(2.0), darker_than(0.5), views) == {
+        "lamps": [0, 0, 0]
+    }
 
 
 def test_classifiers_of_all_sizes_get_the_same_views_unlike_those_of_another_seed(views):
@@ -159,7 +150,7 @@ def given(monkeypatch, tmp_path) -> dict[str, Any]:
     monkeypatch.setattr(lights, "ADDITIONAL_STEPS", 2)
     monkeypatch.setattr(lights, "STEPS", 2)
     for kind in ("skylight", "projector", "lamps"):
-        monkeypatch.delitem(KINDS, kind)
+        monkeypatch.delitem(lights.KINDS, kind)
     monkeypatch.setattr(audit, "PATTERNS", ("solid", "rings"))
     counts = {"VIEW_COUNT": 2, "ATTACKED_COUNT": 2, "RANDOM_LIGHT_COUNT": 1}
     for name, count in {"SPP": 1, "SETUPS": 1, **counts}.items():
@@ -247,7 +238,6 @@ def test_an_audit_killed_while_it_removes_results_leaves_no_part_of_them(
 def test_an_audit_without_mitsuba_leaves_the_laboratory_out_and_says_so(
     given, tmp_path, monkeypatch
 ):
-    """The attacks are replaced by fixed counts."""
     counts = {"n": 2, "correct": 2}
     for method in ("adversarial", "random"):
         counts |= {method: [0, 0, 0, 0], f"{method}_without_noise": [0, 0, 0, 0]}
@@ -285,11 +275,10 @@ def test_what_cannot_be_audited_is_refused_before_anything_is_written(
 
 
 def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None:
-    """Write what the answer of an audit is computed from."""
     is_recognized = [True] * hits + [False] * (n - hits)
     recognized = {"uniform": is_recognized, "random 1": is_recognized}
     (folder / RECOGNIZED).write_text(json.dumps(recognized))
-    for kind in KINDS:
+    for kind in lights.KINDS:
         counts = {"correct": 4, "adversarial": adversarial}
         (folder / f"{kind}.json").write_text(json.dumps(counts))
     scores = {
@@ -332,7 +321,7 @@ def test_no_interval_of_an_audit_has_zero_width(tmp_path):
 def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_path):
     write_parts(tmp_path, 400, 400, adversarial=[0, 1, 2, 4])
     text = AuditedNetwork("orange", "dark", tmp_path).answer
-    for light in KINDS.values():
+    for light in lights.KINDS.values():
         assert f"{light.title} of radius {light.radii[2]:g} loses 2 of 4 views" in text
 
 

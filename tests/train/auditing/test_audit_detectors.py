@@ -1,5 +1,3 @@
-"""An audit of a detector: recall and AP50 in plain light, in other light and after attacks."""
-
 import json
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""The attack command makes scenes from its configuration, and prints what it found."""
-
 from dataclasses import replace
 from unittest.mock import Mock
 

@@ -1,5 +1,3 @@
-"""Any network is audited in one call, which returns the numbers of the page."""
-
 import json
 from pathlib import Path
 

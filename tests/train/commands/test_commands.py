@@ -54,22 +54,14 @@ def test_an_evaluation_writes_the_log_odds_of_the_network_for_each_photograph(ca
     log_odds = float(orange - torch.logaddexp(fig, lime))
     found = float(rows["orange/a.png"]["orange_log_odds"])
     assert found == pytest.approx(log_odds, abs=1e-4)
-    # A classifier that is named by its run is the same.
-    assert call(*EVALUATE_CLASSIFIER, "network=run:1.10", "out=classifier") == 0
-    same = (here / "classifier" / "predictions.csv").read_bytes()
-    assert (scores / "predictions.csv").read_bytes() == same
 
 
 class TestEvaluationWithoutALabel:
-    """60 bottles in a folder without class folders were scored as oranges."""
-
     def test_needs_one_for_a_folder_without_class_folders(self, call, here, capsys):
         save_noise(here / "bottles" / "a.png", np.random.default_rng(0), (64, 64))
         words = [*EVALUATE[:2], "photos=bottles", *EVALUATE[3:]]
         assert call(*words) == USER_ERROR
         assert "give classes or label" in capsys.readouterr().err
-        assert call(*words, "label=fig", "out=scores") == 0
-        assert "1 images of fig" in capsys.readouterr().out
 
     @pytest.mark.parametrize("recorded", [False, True])
     def test_takes_the_class_of_the_run_or_else_those_with_a_folder(
@@ -99,14 +91,12 @@ MISTAKES = [
     ),
     ([*EVALUATE_CLASSIFIER, "network=python:nowhere:build"], "network=python:nowhere:build"),
     ([*EVALUATE, "weights=b"], "weights=b"),
-    ([*EVALUATE, "out=file"], "out=file"),
     (["compare", "runs=[2024]"], "runs: 2024 holds no run"),
     (["lab", "out=file/out"], "out=file/out"),
     ([*ATTACK, "transfer.networks=[resnet18]"], "transfer.networks=resnet18"),
     ([*ATTACK, "transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "'paer' is not a class"),
     ([*ATTACK, "attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry"),
     ([*ATTACK, "attack=pixels", "transfer.azimuths=[3]"], "azimuths: attacked pixels"),
-    ([*ATTACK, "attack=[]"], "attack: "),
     ([*ATTACK, "reload=absent"], "absent/adversary.json does not exist"),
 ]
 

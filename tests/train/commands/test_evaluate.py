@@ -26,8 +26,6 @@ def photographs(tmp_path) -> Path:
 
 
 class Brightness(nn.Module):
-    """A network that takes images in 0..255 and calls those above 127 bright."""
-
     def __init__(self):
         super().__init__()
         self.weight = nn.Parameter(torch.ones(()))
@@ -52,9 +50,8 @@ def test_scores_count_the_photographs_of_each_class(photographs):
     assert scores.overall.class_top5.value == 1
 
 
-@pytest.mark.parametrize("label", ["bright", 1])
-def test_a_label_is_a_name_or_an_index(photographs, label):
-    scores = nb.evaluate(Brightness().eval(), photographs, label, **OPTIONS)
+def test_a_label_may_be_an_index(photographs):
+    scores = nb.evaluate(Brightness().eval(), photographs, 1, **OPTIONS)
     assert (scores.overall.recall.hits, scores.overall.recall.n) == (2, 3)
     assert (scores.overall.false_positive_rate.hits, scores.overall.false_positive_rate.n) == (1, 4)
 

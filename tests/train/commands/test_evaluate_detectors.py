@@ -1,5 +1,3 @@
-"""A detector is scored on photographs with boxes."""
-
 import json
 
 import numpy as np

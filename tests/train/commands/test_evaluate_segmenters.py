@@ -1,5 +1,3 @@
-"""A segmenter is scored on photographs with masks."""
-
 import json
 from itertools import product
 

@@ -1,6 +1,3 @@
-"""Tests of pnb-render: data sets of labeled renders that other programs read."""
-
-import gc
 import json
 import tarfile
 from collections.abc import Iterator
@@ -263,24 +260,6 @@ def test_ultralytics_reads_boxes_and_classes(groups, tmp_path, splits):
         corners = [x - width / 2, y - height / 2, x + width / 2, y + height / 2]
         expected = [item["box"] for item in objects]
         assert np.allclose(np.stack(corners, 1) * [32, 20, 32, 20], expected, atol=1e-3)
-
-
-@pytest.mark.ecosystem
-@pytest.mark.filterwarnings("ignore")
-def test_webdataset_reads_images_classes_and_details(groups, tmp_path):
-    webdataset = pytest.importorskip("webdataset")
-    folder = write(groups, tmp_path / "out", format="webdataset", size=[20, 32])
-    expected = write(groups, tmp_path / "folder", size=[20, 32])
-    tars = sorted(map(str, folder.glob("*.tar")))
-    found = list(webdataset.WebDataset(tars, shardshuffle=False).decode("pil"))
-    assert sorted(sample["__key__"] for sample in found) == [f"{i:06d}" for i in range(COUNT)]
-    for sample in found:
-        assert sample["png"].size == (32, 20)
-        objects = sample["json"]["objects"]
-        assert objects == details(expected, sample["json"]["index"])["objects"]
-        assert ["box", "a ball: 2", "7"][sample["cls"]] == objects[0]["class"]
-    # webdataset leaves files open, whose warnings are ignored in this test only.
-    gc.collect()
 
 
 @pytest.mark.parametrize("size", [[40, 40], [24, 40], [40, 24]])

@@ -90,14 +90,10 @@ def test_every_command_refuses_the_folder_of_another_command_and_leaves_it_as_it
     assert contents(here) == before
 
 
-def test_older_scores_are_replaced_by_overwrite_alone(call, here):
-    command = ["evaluate", *COMMANDS["evaluate"], "out=scores"]
-    assert call(*command, "label=orange") == 0
-    first = contents(here / "scores")
-    assert call(*command, "label=fig") == USER_ERROR
-    assert contents(here / "scores") == first
-    assert call(*command, "label=fig", "overwrite=true") == 0
-    assert json.loads((here / "scores" / "summary.json").read_text())["label"] == "fig"
+def test_older_scores_are_replaced_by_overwrite(call, here):
+    write_results(here / "out", "evaluate")
+    assert call("evaluate", *COMMANDS["evaluate"], "label=fig", "out=out", "overwrite=true") == 0
+    assert json.loads((here / "out" / "summary.json").read_text())["label"] == "fig"
 
 
 @pytest.mark.slow

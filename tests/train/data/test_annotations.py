@@ -1,5 +1,3 @@
-"""Tests of photographs with boxes, in the forms of COCO and YOLO."""
-
 import json
 
 import numpy as np
@@ -23,7 +21,6 @@ def _draw(path, size=(80, 40), box=BOX, orientation=1):
 
 
 def _bounds(pixels):
-    """Return the box of the white pixels of an image (H, W)."""
     rows, columns = (np.flatnonzero((pixels > 200).any(axis)) for axis in (1, 0))
     return [columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]
 

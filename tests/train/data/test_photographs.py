@@ -10,13 +10,7 @@ from PIL import Image
 from augment.classifier import class_index
 from renderer.errors import InputError
 from train.class_names import classes_of_meshes
-from train.data.photographs import (
-    Photograph,
-    class_folders,
-    find_photographs,
-    load_photographs,
-    unsupported_files,
-)
+from train.data import photographs
 
 CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
 
@@ -39,14 +33,14 @@ def touch(folder: Path, *names: str) -> Path:
 
 
 def load_one(path: Path) -> np.ndarray:
-    _, images, _ = load_photographs(
-        path.parent, [Photograph(PurePosixPath(path.name), "orange", None)]
+    _, images, _ = photographs.load_photographs(
+        path.parent, [photographs.Photograph(PurePosixPath(path.name), "orange", None)]
     )
     return images[0].permute(1, 2, 0).numpy().astype(int)
 
 
 def find(folder: Path, label: str = "orange") -> list[tuple[str, str]]:
-    found = find_photographs(folder, CLASSES, label)
+    found = photographs.find_photographs(folder, CLASSES, label)
     assert {photograph.source for photograph in found} == {None}
     return [(str(photograph.path), photograph.label) for photograph in found]
 
@@ -88,7 +82,7 @@ def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
     (tmp_path / "orange" / "folder.jpg").mkdir()
     (tmp_path / "photos.csv").write_text("path,source_tag\n")
     assert find(tmp_path) == [("orange/a.jpg", "orange")]
-    assert [*map(str, unsupported_files(tmp_path))] == others
+    assert [*map(str, photographs.unsupported_files(tmp_path))] == others
 
 
 @pytest.mark.parametrize(("of_classes", "of_files"), [("NFC", "NFD"), ("NFD", "NFC")])
@@ -101,12 +95,12 @@ def test_names_with_accents_are_equal_in_both_forms_of_unicode(tmp_path, of_clas
     lines = ["path,source_tag,hard_negatives", normalize(of_others, "crème brûlée/é.png,Zürich,")]
     lines.append(normalize(of_files, "orange/b.png,a,Zürich"))
     (tmp_path / "photos.csv").write_text("\n".join(lines), encoding="utf-8")
-    found = find_photographs(tmp_path, classes, normalize(of_others, "crème brûlée"))
+    found = photographs.find_photographs(tmp_path, classes, normalize(of_others, "crème brûlée"))
     first = next(photograph for photograph in found if photograph.label != "orange")
     assert first.label == normalize("NFC", "crème brûlée")
     assert first.source == normalize("NFC", "Zürich")
     assert (tmp_path / first.path).exists()
-    assert class_folders(tmp_path, classes) == sorted([classes[0], classes[2]])
+    assert photographs.class_folders(tmp_path, classes) == sorted([classes[0], classes[2]])
     assert class_index(classes, normalize(of_others, "açaí"), "label") == 1
     mesh = normalize(of_others, "crème_brûlée.glb")
     assert classes_of_meshes([mesh], classes, "meshes") == [classes[2]]
@@ -125,9 +119,9 @@ def test_names_with_accents_are_equal_in_both_forms_of_unicode(tmp_path, of_clas
 def test_a_folder_of_another_layout_is_refused(tmp_path, files, label, message):
     touch(tmp_path, *files)
     with pytest.raises(InputError, match=message):
-        find_photographs(tmp_path, CLASSES, label)
+        photographs.find_photographs(tmp_path, CLASSES, label)
     with pytest.raises(InputError, match="is not a folder"):
-        find_photographs(tmp_path / files[0], CLASSES, "orange")
+        photographs.find_photographs(tmp_path / files[0], CLASSES, "orange")
 
 
 def test_folders_of_no_class_of_the_model_count_as_other_things_and_are_named(tmp_path, caplog):
@@ -151,7 +145,7 @@ def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns
     ]  # fmt: skip
     (tmp_path / "photos.csv").write_text("\ufeff" + "\n".join(rows), encoding="utf-8")
     with caplog.at_level(logging.WARNING):
-        found = find_photographs(tmp_path, CLASSES, "orange")
+        found = photographs.find_photographs(tmp_path, CLASSES, "orange")
     assert [photograph.source for photograph in found] == ["sun", "web", "lab", None]
     assert [photograph.hard_negatives for photograph in found] == [("lab", "web"), (), (), ()]
     assert "photos.csv names a missing file in 1 of 5 rows, such as fig/gone.jpg" in caplog.text
@@ -229,16 +223,16 @@ def test_unreadable_images_are_named_or_skipped(tmp_path):
     (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
     (tmp_path / "text.png").write_text("not an image")
     broken = sorted(path.name for path in tmp_path.iterdir())
-    found = find_photographs(tmp_path, CLASSES, "orange")
+    found = photographs.find_photographs(tmp_path, CLASSES, "orange")
     for skip_unreadable in (False, True):  # nothing is left when all of them are skipped
         with pytest.raises(InputError, match=r"3 of 3 .*cut\.jpg .*replace them$"):
-            load_photographs(tmp_path, found, skip_unreadable=skip_unreadable)
+            photographs.load_photographs(tmp_path, found, skip_unreadable=skip_unreadable)
 
     save(tmp_path / "good.png", plain())
-    found = find_photographs(tmp_path, CLASSES, "orange")
+    found = photographs.find_photographs(tmp_path, CLASSES, "orange")
     with pytest.raises(InputError, match=r"3 of 4 .*cut\.jpg .* set skip_unreadable=True"):
-        load_photographs(tmp_path, found)
-    loaded, images, unreadable = load_photographs(tmp_path, found, skip_unreadable=True)
+        photographs.load_photographs(tmp_path, found)
+    loaded, images, unreadable = photographs.load_photographs(tmp_path, found, skip_unreadable=True)
     assert [str(photograph.path) for photograph in loaded] == ["good.png"]
     assert (images.permute(0, 2, 3, 1) == torch.tensor([255, 128, 0])).all()
     assert unreadable == broken

@@ -8,13 +8,6 @@ import torch
 import renderer
 from renderer.errors import InputError
 from train.data import rendered_shapes
-from train.data.rendered_shapes import (
-    cache_folder,
-    load_shapes,
-    read_cached,
-    source_key,
-    write_cached,
-)
 from train.data.sets import relabeled
 
 SIZE = 8
@@ -23,7 +16,6 @@ FEW = ("apple", "orange", "plate")
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
-    """Render few classes and images with one sample per pixel."""
     monkeypatch.setattr(rendered_shapes, "CLASSES", FEW)
     monkeypatch.setattr(rendered_shapes, "SETTINGS", rendered_shapes.ImageSettings(samples=1))
 
@@ -43,7 +35,7 @@ def instances(monkeypatch) -> list[tuple[str, int]]:
 
 
 def test_every_class_has_the_images_asked_for_of_instances_that_no_other_part_shows(instances):
-    data = load_shapes(train=21, test=2, size=SIZE, seed=0)
+    data = rendered_shapes.load_shapes(train=21, test=2, size=SIZE, seed=0)
     assert data.classes == FEW
     assert data.train.images.shape == (63, 3, SIZE, SIZE)
     assert data.train.images.dtype == torch.uint8
@@ -60,7 +52,7 @@ def test_images_are_rendered_again_for_other_settings_or_other_code_alone(
     def load(**settings):
         before = len(instances)
         arguments = {"train": 1, "test": 2, "size": SIZE, "seed": 0} | settings
-        return load_shapes(**arguments, cache=tmp_path), len(instances) - before
+        return rendered_shapes.load_shapes(**arguments, cache=tmp_path), len(instances) - before
 
     first, rendered = load()
     again, cached = load()
@@ -72,7 +64,7 @@ def test_images_are_rendered_again_for_other_settings_or_other_code_alone(
 
 
 def test_labels_count_the_classes_of_another_network():
-    shapes = load_shapes(train=1, test=1, size=SIZE, seed=0)
+    shapes = rendered_shapes.load_shapes(train=1, test=1, size=SIZE, seed=0)
     data = relabeled(shapes, ("plate", "lamp", "orange", "apple"), "data=shapes")
     assert data.train.labels.tolist() == data.test.labels.tolist() == [3, 2, 0]
     with pytest.raises(InputError, match="lamp"):
@@ -84,36 +76,38 @@ def test_any_change_of_the_sources_is_another_key(tmp_path):
     shutil.copytree(
         Path(renderer.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
     )
-    assert source_key(package) == source_key(Path(renderer.__file__).parent)
+    assert rendered_shapes.source_key(package) == rendered_shapes.source_key(
+        Path(renderer.__file__).parent
+    )
     module = package / "camera.py"
-    keys = {source_key(package)}
+    keys = {rendered_shapes.source_key(package)}
     for change in (
         lambda: module.write_text(module.read_text() + "\n"),
         lambda: module.rename(package / "other.py"),
         lambda: (package / "new.py").touch(),
     ):
         change()
-        keys.add(source_key(package))
+        keys.add(rendered_shapes.source_key(package))
     assert len(keys) == 4
 
 
 def test_no_flipped_bit_and_no_cut_of_a_cached_file_gives_other_images(tmp_path):
     """Every bit of some bytes, one bit of a third of the others, and as many lengths."""
     images = torch.arange(48, dtype=torch.uint8).view(1, 3, 4, 4)
-    write_cached(tmp_path, "key", images)
+    rendered_shapes.write_cached(tmp_path, "key", images)
     (path,) = tmp_path.iterdir()
     content = path.read_bytes()
     for position in range(0, len(content), 3):
         path.write_bytes(content[:position])
-        assert read_cached(tmp_path, "key") is None, position
+        assert rendered_shapes.read_cached(tmp_path, "key") is None, position
         for bit in range(8) if position % 96 == 0 else [position % 8]:
             flipped = content[position] ^ 1 << bit
             path.write_bytes(content[:position] + bytes([flipped]) + content[position + 1 :])
-            read = read_cached(tmp_path, "key")
+            read = rendered_shapes.read_cached(tmp_path, "key")
             # Some bits, such as those of the date, do not matter.
             assert read is None or torch.equal(read, images), (position, bit)
     path.write_bytes(content)
-    assert torch.equal(read_cached(tmp_path, "key"), images)
+    assert torch.equal(rendered_shapes.read_cached(tmp_path, "key"), images)
 
 
 def test_a_full_disk_stops_no_run(tmp_path, monkeypatch, caplog):
@@ -121,7 +115,7 @@ def test_a_full_disk_stops_no_run(tmp_path, monkeypatch, caplog):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    load_shapes(train=1, test=1, size=SIZE, seed=0, cache=tmp_path)
+    rendered_shapes.load_shapes(train=1, test=1, size=SIZE, seed=0, cache=tmp_path)
     assert "No space left on device" in caplog.text
     assert not list(tmp_path.iterdir())
 
@@ -139,4 +133,4 @@ def test_a_full_disk_stops_no_run(tmp_path, monkeypatch, caplog):
 def test_the_folder_is_the_users_cache_folder_unless_chosen(choice, caches, folder, monkeypatch):
     monkeypatch.setenv("HOME", "/home/user")
     monkeypatch.setenv("XDG_CACHE_HOME", caches)
-    assert cache_folder(choice) == (folder and Path(folder))
+    assert rendered_shapes.cache_folder(choice) == (folder and Path(folder))

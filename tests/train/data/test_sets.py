@@ -9,14 +9,7 @@ import torch
 from PIL import Image
 
 from renderer.errors import InputError
-from train.data.sets import (
-    Split,
-    channel_statistics,
-    held_out_rows,
-    load_cifar100,
-    load_folder,
-    load_npz,
-)
+from train.data import sets
 
 
 def arrays(**changes) -> dict[str, np.ndarray]:
@@ -32,10 +25,10 @@ def arrays(**changes) -> dict[str, np.ndarray]:
     return {name: array for name, array in (good | changes).items() if array is not None}
 
 
-def numbered(count: int, classes: int = 1) -> Split:
+def numbered(count: int, classes: int = 1) -> sets.Split:
     """Make images (N, 3, 1, 1) whose values are their rows, with labels in turn."""
     rows = torch.arange(count)
-    return Split(rows.view(-1, 1, 1, 1).expand(-1, 3, 1, 1).to(torch.uint8), rows % classes)
+    return sets.Split(rows.view(-1, 1, 1, 1).expand(-1, 3, 1, 1).to(torch.uint8), rows % classes)
 
 
 def test_a_sample_is_spread_evenly_over_the_images():
@@ -50,7 +43,7 @@ def save_image(path: Path, value: int, size: tuple[int, int] = (8, 8)) -> None:
 
 def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
     np.savez(tmp_path / "data.npz", **arrays())
-    data = load_npz(str(tmp_path / "data.npz"))
+    data = sets.load_npz(str(tmp_path / "data.npz"))
     assert data.classes == ("lime", "fig")
     assert data.size == 8
     for name in ("train", "test"):
@@ -78,7 +71,7 @@ def test_a_fault_in_an_npz_file_is_named(tmp_path, changes, fault):
     path = tmp_path / "data.npz"
     np.savez(path, **arrays(**changes))
     with pytest.raises(InputError, match=f"^path={re.escape(str(path))}.*{fault}"):
-        load_npz(str(path))
+        sets.load_npz(str(path))
 
 
 def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_path):
@@ -86,7 +79,7 @@ def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_pat
         value = number + 100 * (name == "fig")
         save_image(tmp_path / name / f"{number}.png", value, size=(20 + number, 30))
     (tmp_path / ".thumbnails").mkdir()
-    data = load_folder(str(tmp_path), size=8, test_fraction=0.2)
+    data = sets.load_folder(str(tmp_path), size=8, test_fraction=0.2)
     assert data.classes == ("fig", "lime")
     assert data.train.images.shape == (16, 3, 8, 8)
     assert data.test.images.shape == (4, 3, 8, 8)
@@ -101,7 +94,7 @@ def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_pat
 def test_train_and_test_folders_are_the_splits(tmp_path):
     for part, name, value in [("train", "fig", 1), ("train", "lime", 2), ("test", "lime", 3)]:
         save_image(tmp_path / part / name / "a.png", value)
-    data = load_folder(str(tmp_path), size=8, test_fraction=0.1)
+    data = sets.load_folder(str(tmp_path), size=8, test_fraction=0.1)
     assert data.train.images[:, 0, 0, 0].tolist() == [1, 2]
     assert data.train.labels.tolist() == [0, 1]
     assert data.test.images[:, 0, 0, 0].tolist() == [3]
@@ -122,7 +115,7 @@ def test_a_fault_in_a_folder_is_named(tmp_path, images, fault):
     for name in images:
         save_image(tmp_path / "data" / name, 0)
     with pytest.raises(InputError, match=fault):
-        load_folder(str(tmp_path / "data"), 8, 0.1)
+        sets.load_folder(str(tmp_path / "data"), 8, 0.1)
 
 
 def test_torchvisions_data_become_splits_with_the_channels_first(monkeypatch):
@@ -132,7 +125,7 @@ def test_torchvisions_data_become_splits_with_the_channels_first(monkeypatch):
         return SimpleNamespace(data=pixels[int(train)], targets=[3] * 10, classes=["fig", "lime"])
 
     monkeypatch.setattr("torchvision.datasets.CIFAR100", cifar100)
-    data = load_cifar100("here")
+    data = sets.load_cifar100("here")
     assert data.classes == ("fig", "lime")
     assert data.train.labels.tolist() == [3] * 10
     np.testing.assert_array_equal(data.train.images, pixels[1].transpose(0, 3, 1, 2))
@@ -141,23 +134,23 @@ def test_torchvisions_data_become_splits_with_the_channels_first(monkeypatch):
 
 def test_the_fraction_of_every_class_is_held_out_within_that_of_a_larger_fraction():
     split = numbered(200, classes=4)
-    rows = held_out_rows(split, 0.1)
+    rows = sets.held_out_rows(split, 0.1)
     assert split[rows].labels.bincount().tolist() == [5] * 4
     torch.manual_seed(1)
-    assert torch.equal(rows, held_out_rows(split, 0.1))
-    assert (held_out_rows(split, 0.2) >= rows).all()
+    assert torch.equal(rows, sets.held_out_rows(split, 0.1))
+    assert (sets.held_out_rows(split, 0.2) >= rows).all()
 
 
 @pytest.mark.parametrize("fraction", [0.001, 0.999])
 def test_a_fraction_that_leaves_a_split_empty_is_an_error(fraction):
     with pytest.raises(InputError, match=f"^fraction={fraction} "):
-        held_out_rows(numbered(200, classes=4), fraction)
+        sets.held_out_rows(numbered(200, classes=4), fraction)
 
 
 def test_channel_statistics_are_those_of_float64():
     images = np.random.default_rng(0).beta(0.5, 2, (40, 3, 9, 9)) * [[[[250]], [[255]], [[20]]]]
     images = images.astype(np.uint8)
-    means, deviations = channel_statistics(torch.from_numpy(images))
+    means, deviations = sets.channel_statistics(torch.from_numpy(images))
     # the sums differ in order alone
     np.testing.assert_allclose(means, (images / 255).mean((0, 2, 3)), rtol=1e-12)
     np.testing.assert_allclose(deviations, (images / 255).std((0, 2, 3)), rtol=1e-12)

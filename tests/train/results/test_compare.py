@@ -85,7 +85,6 @@ def differences(folders: list[Path], name: str = "photographs") -> dict[str, lis
 
 @pytest.fixture
 def compared_sources(scored_run, made_up_run, tmp_path) -> dict[str, list[list[str]]]:
-    """Compare two scored runs and one without scores."""
     better_on_web = STUDIO_AND_WEB | {"web": ([4, 4, 4, -1, -1], [-2, 3])}
     folders = [
         scored_run("none", STUDIO_AND_WEB),
@@ -180,13 +179,30 @@ class TestAHardenedNetwork:
             folders.append(folder)
         return folders
 
-    def test_stands_in_one_table_with_the_network_it_started_from(self, hardened):
+    def test_stands_beside_the_network_it_started_from_in_tables_and_differences(
+        self, initial, hardened, tmp_path
+    ):
         _, *rows = compare(hardened)[""]
         assert [row[:3] for row in rows] == [
             ["the initial network", "", "0.500"],
             ["random", "0", "0.765"],
             ["adversarial", "0", "0.765"],
         ]
+        text = format_short_comparison([summarize(hardened[0])])
+        ((header, *rows),) = read_markdown(text).values()
+        assert [row[0] for row in rows] == ["before hardening", "after hardening"]
+        assert [row[header.index("recall")] for row in rows] == ["0.250", "0.500"]
+        found = differences(hardened)
+        assert {pair.partition(" (")[0]: rows[0][1][:6] for pair, rows in found.items()} == {
+            "random minus the initial network": "+0.250",
+            "adversarial minus the initial network": "+0.750",
+            "adversarial minus random": "+0.500",
+        }
+        # A folder of scores takes the place of a run.
+        folder = copytree(initial, tmp_path / "scores" / "base")
+        found = differences([folder, hardened[1]])
+        ((_, recall, *_), *_) = found["adversarial minus scores/base (1 and 1 seeds, paired)"]
+        assert recall.startswith("+0.750")
 
     def test_has_an_initial_network_of_its_own_if_it_began_with_other_weights(self, hardened):
         config = hardened[1] / "config.yaml"
@@ -196,43 +212,18 @@ class TestAHardenedNetwork:
         tables = compare(hardened)
         _, *rows = tables[""]
         assert [row[0].startswith("the initial network") for row in rows].count(True) == 2
-        found = differences(hardened)
-        pairs = [pair.partition(" (")[0] for pair in found if "minus the initial" in pair]
+        pairs = [pair for pair in differences(hardened) if "minus the initial" in pair]
         assert len(pairs) == 2
         assert all("weights=other.pth" in pair for pair in pairs if pair.startswith("adversarial"))
-
-    def test_has_its_scores_on_all_images_in_the_table_of_a_command(self, hardened):
-        text = format_short_comparison([summarize(hardened[0])])
-        ((header, *rows),) = read_markdown(text).values()
-        assert [row[0] for row in rows] == ["before hardening", "after hardening"]
-        assert [row[header.index("recall")] for row in rows] == ["0.250", "0.500"]
-
-    def test_is_compared_with_the_network_it_started_from_and_with_the_other_run(self, hardened):
-        found = differences(hardened)
-        assert {pair.partition(" (")[0]: rows[0][1][:6] for pair, rows in found.items()} == {
-            "random minus the initial network": "+0.250",
-            "adversarial minus the initial network": "+0.750",
-            "adversarial minus random": "+0.500",
-        }
 
     def test_began_with_one_network_also_if_the_runs_were_scored_on_other_folders(self, hardened):
         for folder in (hardened[1], hardened[1] / "before"):
             summary = copytree(folder / "photographs", folder / "more") / "summary.json"
             text = summary.read_text()
             summary.write_text(re.sub('"images": ".*?"', '"images": "others"', text))
-        assert "after hardening" in format_short_comparison([summarize(hardened[1])])
-        tables = compare(hardened)
-        assert [row[0] for row in tables[""]].count("the initial network") == 1
-        found = differences(hardened)
-        assert "random minus the initial network (1 and 1 seeds, paired)" in found
+        assert [row[0] for row in compare(hardened)[""]].count("the initial network") == 1
         more = differences(hardened, "more")
         assert "adversarial minus the initial network (1 and 1 seeds, paired)" in more
-
-    def test_is_compared_with_a_folder_of_scores(self, initial, hardened, tmp_path):
-        folder = copytree(initial, tmp_path / "scores" / "base")
-        found = differences([folder, hardened[1]])
-        ((_, recall, *_), *_) = found["adversarial minus scores/base (1 and 1 seeds, paired)"]
-        assert recall.startswith("+0.750")
 
 
 def test_a_difference_of_three_seeds_is_that_of_their_means_and_paired(scored_run):

@@ -1,5 +1,3 @@
-"""Tests of the scores of detections against closed forms and the evaluation of COCO."""
-
 import contextlib
 import io
 

@@ -12,18 +12,7 @@ from scipy.stats import t as student_t
 
 from benchmarks.coverage import Setup, heavy_tails, measure
 from train.data.photo import Photograph
-from train.results.intervals import (
-    RATES,
-    Jackknife,
-    Units,
-    auc_and_recalls,
-    change,
-    class_means,
-    leave_out,
-    leave_out_of_roc,
-    thresholds,
-    weighted_means,
-)
+from train.results import intervals
 from train.results.metrics import Pool
 from train.results.scoring import rank_classes
 from train.results.tables import OBJECTS, THESE_OBJECTS
@@ -36,7 +25,7 @@ SCORES = st.lists(st.integers(-4, 4).map(float), min_size=1, max_size=30)
 def test_auc_is_the_mann_whitney_statistic_in_which_ties_count_half(positives, negatives):
     statistic = mannwhitneyu(positives, negatives, method="asymptotic").statistic
     expected = statistic / (len(positives) * len(negatives))
-    auc, *_ = auc_and_recalls(np.array(positives), np.array(negatives))
+    auc, *_ = intervals.auc_and_recalls(np.array(positives), np.array(negatives))
     assert auc == pytest.approx(expected, rel=0, abs=1e-12)
 
 
@@ -52,16 +41,18 @@ def lowest_threshold(positives: list[float], negatives: list[float], rate: str) 
 
 @given(positives=SCORES, negatives=SCORES)
 def test_recall_at_a_rate_is_that_at_the_lowest_threshold_within_the_rate(positives, negatives):
-    _, *recalls = auc_and_recalls(np.array(positives), np.array(negatives))
-    found = thresholds(np.array(negatives), np.ones(len(negatives), int))
-    for rate, recall, threshold in zip(RATES, recalls, found, strict=True):
+    _, *recalls = intervals.auc_and_recalls(np.array(positives), np.array(negatives))
+    found = intervals.thresholds(np.array(negatives), np.ones(len(negatives), int))
+    for rate, recall, threshold in zip(intervals.RATES, recalls, found, strict=True):
         expected = lowest_threshold(positives, negatives, rate)
         assert threshold == expected
         assert recall == sum(score > expected for score in positives) / len(positives)
 
 
-def mean_of(values: np.ndarray, units: np.ndarray) -> Jackknife:
-    (mean,) = leave_out(partial(weighted_means, values[None]), Units([units], "units"))
+def mean_of(values: np.ndarray, units: np.ndarray) -> intervals.Jackknife:
+    (mean,) = intervals.leave_out(
+        partial(intervals.weighted_means, values[None]), intervals.Units([units], "units")
+    )
     return mean
 
 
@@ -84,31 +75,33 @@ def test_the_degrees_of_freedom_do_not_exceed_those_of_a_group_of_units(spread, 
     negatives = generator.normal(-0.25, spread, 6)
 
     def difference(positive_counts, negative_counts):
-        first = weighted_means(positives[None], positive_counts)
-        return first - weighted_means(negatives[None], negative_counts)
+        first = intervals.weighted_means(positives[None], positive_counts)
+        return first - intervals.weighted_means(negatives[None], negative_counts)
 
-    (found,) = leave_out(difference, Units([np.arange(6), np.arange(6)], "objects"))
+    (found,) = intervals.leave_out(
+        difference, intervals.Units([np.arange(6), np.arange(6)], "objects")
+    )
     error = np.hypot(sem(positives), sem(negatives))
     ends = found.value + student_t(degrees).ppf(0.975) * error * np.array([-1, 1])
     assert (found.estimate.low, found.estimate.high) == pytest.approx(ends, abs=1e-4)
 
 
-def runs_of(values: np.ndarray) -> list[Jackknife]:
-    return [Jackknife(value, [np.full(9, value)], 9, "objects") for value in values]
+def runs_of(values: np.ndarray) -> list[intervals.Jackknife]:
+    return [intervals.Jackknife(value, [np.full(9, value)], 9, "objects") for value in values]
 
 
 SCORE_OF_SEED = np.array([0.48, 0.49, 0.51, 0.52])
 
 
 def test_pairing_cancels_what_both_groups_of_runs_share():
-    gain = change(runs_of(SCORE_OF_SEED + 0.02), runs_of(SCORE_OF_SEED))
+    gain = intervals.change(runs_of(SCORE_OF_SEED + 0.02), runs_of(SCORE_OF_SEED))
     assert gain.value == pytest.approx(0.02)
     assert gain.high - gain.low < 0.002
 
 
 def test_without_pairs_the_interval_over_seeds_adds_the_variances_of_both_means():
     """Compare with t(3 degrees of freedom) · √(2 · variance / 4)."""
-    gain = change(runs_of(SCORE_OF_SEED + 0.02), runs_of(SCORE_OF_SEED), is_paired=False)
+    gain = intervals.change(runs_of(SCORE_OF_SEED + 0.02), runs_of(SCORE_OF_SEED), is_paired=False)
     half_width = student_t(3).ppf(0.975) * np.sqrt(2 * SCORE_OF_SEED.var(ddof=1) / 4)
     assert gain.high - gain.low == pytest.approx(2 * half_width, rel=0.01)
     assert gain.over == "seeds and objects"
@@ -117,11 +110,11 @@ def test_without_pairs_the_interval_over_seeds_adds_the_variances_of_both_means(
 def test_two_runs_of_other_seeds_are_still_paired_by_their_images():
     draws = np.random.default_rng(0)
     positives, negatives = draws.normal(1, 1, 40), draws.normal(0, 1, 40)
-    units = Units([np.arange(40), np.arange(40)], "images")
-    after = leave_out_of_roc(positives + 0.1 * draws.normal(size=40), negatives, units)
-    before = leave_out_of_roc(positives, negatives, units)
+    units = intervals.Units([np.arange(40), np.arange(40)], "images")
+    after = intervals.leave_out_of_roc(positives + 0.1 * draws.normal(size=40), negatives, units)
+    before = intervals.leave_out_of_roc(positives, negatives, units)
     for one, other in zip(after, before, strict=True):
-        assert change([one], [other], is_paired=False) == change([one], [other])
+        assert intervals.change([one], [other], is_paired=False) == intervals.change([one], [other])
 
 
 def test_intervals_of_few_objects_cover_the_truth():
@@ -139,9 +132,9 @@ def test_intervals_of_few_photographs_cover_the_recall_at_a_false_positive_rate(
     assert min(*values, *gains) >= 0.92
 
 
-def roc_of(positives: np.ndarray, negatives: np.ndarray) -> list[Jackknife]:
-    units = Units([np.arange(len(positives)), np.arange(len(negatives))], "images")
-    return leave_out_of_roc(positives, negatives, units)
+def roc_of(positives: np.ndarray, negatives: np.ndarray) -> list[intervals.Jackknife]:
+    units = intervals.Units([np.arange(len(positives)), np.arange(len(negatives))], "images")
+    return intervals.leave_out_of_roc(positives, negatives, units)
 
 
 def test_the_threshold_of_a_recall_has_woodruffs_interval():
@@ -172,7 +165,7 @@ def test_a_recall_has_no_lower_limit_if_too_few_negatives_set_the_threshold():
 def test_equal_networks_have_equal_recalls():
     scores = np.random.default_rng(0).normal(size=(2, 40))
     recall = roc_of(*scores)[1]
-    gain = change([recall], [recall])
+    gain = intervals.change([recall], [recall])
     wilson = binomtest(0, 40).proportion_ci(method="wilson")
     assert (gain.low, gain.high) == pytest.approx((-wilson.high, wilson.high))
 
@@ -207,7 +200,9 @@ def test_means_over_drawn_classes_count_repeated_images():
         weights = np.array([1 / sizes[image] for image in drawn])
         for way in range(2):
             expected = np.average(hits[way, drawn], weights=weights)
-            assert class_means(hits, names, counts)[way, replicate] == pytest.approx(expected)
+            assert intervals.class_means(hits, names, counts)[way, replicate] == pytest.approx(
+                expected
+            )
 
 
 @pytest.mark.parametrize("labels", [["orange"], ["orange", "lemon"]])
@@ -238,15 +233,3 @@ def test_a_recall_of_1_has_wilsons_interval_for_the_objects_with_students_quanti
     found = mean_of(np.ones(140), np.arange(140) % 7).estimate
     quantile = student_t(6).ppf(0.975)
     assert (found.low, found.high) == pytest.approx((7 / (7 + quantile**2), 1))
-
-
-def test_the_interval_of_a_recall_is_wilsons_if_each_image_shows_another_object():
-    photographs = [
-        Photograph(PurePosixPath(f"{number}.png"), "orange", None, (), f"{number}.glb")
-        for number in range(8)
-    ]
-    logits = torch.tensor([[1.0, 0.0]] * 3 + [[0.0, 1.0]] * 5)
-    scored = Pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
-    metric = scored.metrics.recall
-    wilson = binomtest(3, 8).proportion_ci(method="wilson")
-    assert (metric.low, metric.high) == pytest.approx((wilson.low, wilson.high))

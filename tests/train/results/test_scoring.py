@@ -14,20 +14,10 @@ from scipy.special import logsumexp, softmax
 
 from renderer.errors import InputError
 from train.data.photo import Photograph
+from train.results import scoring
 from train.results.metrics import AT_THRESHOLD, METRICS
 from train.results.pictures import FRAME_WIDTH, IMAGE_SIZE
 from train.results.predictions import read_predictions, write_predictions
-from train.results.scoring import (
-    Predictor,
-    Scores,
-    choose_operating_points,
-    evaluate_photographs,
-    format_overall,
-    format_scores,
-    rank_classes,
-    score,
-    write,
-)
 from train.results.tables import THESE_OBJECTS, fraction
 
 
@@ -123,7 +113,6 @@ def fruit(known_model) -> tuple[TableModel, list[str], Path]:
 
 @pytest.fixture(autouse=True)
 def no_figure(monkeypatch) -> None:
-    """Draw no figure, except for the one test that opens it."""
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_: None)
 
 
@@ -135,18 +124,17 @@ def scored(
     out: Path,
     skip_unreadable: bool = False,
     **options,
-) -> Scores:
+) -> scoring.Scores:
     """Write scores into a folder, as pnb-evaluate does with options, or as pnb-train without."""
-    predictor = Predictor(model, classes)
+    predictor = scoring.Predictor(model, classes)
     if not options:
-        return evaluate_photographs(predictor, folder, label, out, skip_unreadable)
-    scores = score(predictor.predict(folder, label, skip_unreadable), **options)
-    write(scores, out)
+        return scoring.evaluate_photographs(predictor, folder, label, out, skip_unreadable)
+    scores = scoring.score(predictor.predict(folder, label, skip_unreadable), **options)
+    scoring.write(scores, out)
     return scores
 
 
 def evaluate(*arguments, **options) -> dict:
-    """Write scores as `scored` does, and return what summary.json has."""
     return json.loads(json.dumps(scored(*arguments, **options).to_summary()))
 
 
@@ -224,7 +212,7 @@ class TestMeshes:
     MESH_OF_LETTER: ClassVar = {"a": "m", "c": "m", "b": "n", "f": "k", "h": "k"}
 
     @pytest.fixture
-    def scores(self, fruit, tmp_path) -> Scores:
+    def scores(self, fruit, tmp_path) -> scoring.Scores:
         *_, folder = fruit
         meshes = [self.MESH_OF_LETTER.get(item.letter, "") for item in FRUIT]
         write_table(folder, mesh=meshes)
@@ -235,7 +223,7 @@ class TestMeshes:
         assert auc["positive_objects"] == 4  # m, n, d, e
         assert auc["negative_objects"] == 4  # k, g, i, j
         assert auc["over"] == THESE_OBJECTS
-        assert THESE_OBJECTS in format_scores(scores)
+        assert THESE_OBJECTS in scoring.format_scores(scores)
 
     def test_are_ranked_against_all_images_of_the_other_kind(self, scores):
         for mesh, is_orange in (("k", False), ("m", True)):
@@ -258,7 +246,9 @@ class TestAnOperatingPoint:
         self, fruit, tmp_path, rate, recall, false_positives, is_in_sample
     ):
         model, classes, folder = fruit
-        (point,) = choose_operating_points(Predictor(model, classes), folder, "orange", rate)
+        (point,) = scoring.choose_operating_points(
+            scoring.Predictor(model, classes), folder, "orange", rate
+        )
         if not is_in_sample:
             # Another image that has the same predictions takes the place of an orange.
             Image.new("RGB", (32, 32), (1, 1, 0)).save(folder / "orange" / "b.png")
@@ -270,7 +260,9 @@ class TestAnOperatingPoint:
     def test_needs_a_negative_per_step_of_its_rate(self, fruit):
         model, classes, folder = fruit
         with pytest.raises(InputError, match=r"5 negatives .* at least 10 .*=0\.1$"):
-            choose_operating_points(Predictor(model, classes), folder, "orange", 0.1)
+            scoring.choose_operating_points(
+                scoring.Predictor(model, classes), folder, "orange", 0.1
+            )
 
 
 def pooled_auc(labels: list[str], own_letters: str, source: str | None = None) -> float:
@@ -297,7 +289,9 @@ class TestSeveralClasses:
     def points(self, fruit) -> list:
         model, classes, folder = fruit
         write_table(folder, mesh=["m" if item.letter in "ac" else "" for item in FRUIT])
-        return choose_operating_points(Predictor(model, classes), folder, self.LABELS, 0.4)
+        return scoring.choose_operating_points(
+            scoring.Predictor(model, classes), folder, self.LABELS, 0.4
+        )
 
     @pytest.fixture
     def summary(self, fruit, points, tmp_path) -> dict:
@@ -392,7 +386,7 @@ def test_photographs_that_cannot_be_read_are_counted_and_named_if_they_are_skipp
     summary = scores.to_summary()
     assert summary["unreadable"] == ["orange/broken.jpg"]
     assert summary["n"] == COUNTS | {"unreadable": 1, "left_out": 1}
-    for text in (format_scores(scores), format_overall(scores)):
+    for text in (scoring.format_scores(scores), scoring.format_overall(scores)):
         assert "orange/broken.jpg" in text
         assert "orange/photo.HEIC" in text
 
@@ -439,7 +433,7 @@ def test_columns_of_any_class_name_are_read_bit_by_bit(tmp_path):
             ]
         )
     ]
-    predictions = rank_classes(photographs, logits, AWKWARD_CLASSES, AWKWARD_CLASSES)
+    predictions = scoring.rank_classes(photographs, logits, AWKWARD_CLASSES, AWKWARD_CLASSES)
     write_predictions(tmp_path / "a.csv", predictions)
     found = read_predictions(tmp_path / "a.csv", AWKWARD_CLASSES)
     for column, values in vars(predictions).items():

@@ -1,7 +1,7 @@
-import os
 import subprocess
 import sys
 from dataclasses import asdict
+from pathlib import Path
 
 import pytest
 
@@ -12,7 +12,7 @@ from train.results.store import finished_runs, summarize
 from train.results.tables import format_interval, fraction
 
 
-@pytest.mark.parametrize("lines", [None, "", '{"epoch": 1}\n', '{"epoch": 1}\n{"test/accuracy": 1'])
+@pytest.mark.parametrize("lines", [None, "", '{"epoch": 1}\n{"test/accuracy": 1'])
 def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
     if lines is not None:
         (tmp_path / "metrics.jsonl").write_text(lines)
@@ -20,60 +20,55 @@ def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
         summarize(tmp_path)
 
 
-class TestRunsBelowFolders:
-    @pytest.fixture(autouse=True)
-    def nested_sweeps(self, made_up_run, tmp_path) -> None:
-        """Make up two sweeps, one inside the other, with an unfinished run, and an evaluation."""
-        for name in ("sweep/a", "sweep/inner/b", "sweep/inner/c", "d"):
-            made_up_run(tmp_path / name, "random", {}, f"seed={ord(name[-1])}")
-        (tmp_path / "sweep/unfinished").mkdir()
-        (tmp_path / "sweep/unfinished/metrics.jsonl").write_text('{"epoch": 1}\n')
-        (tmp_path / "sweep/photographs").mkdir()
-        (tmp_path / "sweep/photographs/a.png").touch()
-
-    @pytest.mark.parametrize(
-        ("given", "expected"),
-        [
-            (["d"], "d"),
-            (["sweep"], "abc"),
-            (["d", "sweep/inner"], "dbc"),
-            (["sweep/inner/c", "sweep"], "cab"),
-            (["sweep", "sweep/../d", "d"], "abcd"),
-        ],
-    )
-    def test_are_found_once_and_in_the_order_of_the_folders(self, tmp_path, given, expected):
-        runs = finished_runs([tmp_path / name for name in given])
-        assert [run.folder.name for run in runs] == [*expected]
-
-    @pytest.mark.parametrize("given", [["sweep/unfinished"], ["d", "sweep/photographs"], ["no"]])
-    def test_are_missed_if_there_are_none_in_one_of_the_folders(self, tmp_path, given):
-        with pytest.raises(InputError, match=f"^runs: {tmp_path / given[-1]} "):
-            finished_runs([tmp_path / name for name in given])
+@pytest.fixture(scope="module")
+def parent(made_up_run, tmp_path_factory) -> Path:
+    """Make up two sweeps, one inside the other, with an unfinished run, and an evaluation."""
+    parent = tmp_path_factory.mktemp("runs")
+    for name in ("sweep/a", "sweep/inner/b", "sweep/inner/c", "d"):
+        made_up_run(parent / name, "random", {}, f"seed={ord(name[-1])}")
+    (parent / "sweep/unfinished").mkdir()
+    (parent / "sweep/unfinished/metrics.jsonl").write_text('{"epoch": 1}\n')
+    (parent / "sweep/photographs").mkdir()
+    return parent
 
 
-@pytest.fixture
-def tables(tmp_path, made_up_run) -> dict[str, list[list[str]]]:
-    """Read the tables of recalls 0.2, 0.4 and 0.9 of 3 epochs, and of 0.5 of 9 epochs."""
-    runs = []
-    for hits, overrides in [
-        (2, ["seed=0"]),
-        (4, ["seed=1"]),
-        (9, ["seed=2"]),
-        (5, ["seed=0", "train.epochs=9"]),
-    ]:
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (["sweep"], "abc"),
+        (["sweep/inner/c", "sweep"], "cab"),
+        (["sweep", "sweep/../d", "d"], "abcd"),
+    ],
+)
+def test_runs_below_folders_are_found_once_and_in_the_order_of_the_folders(parent, given, expected):
+    runs = finished_runs([parent / name for name in given])
+    assert [run.folder.name for run in runs] == [*expected]
+
+
+@pytest.mark.parametrize("given", [["sweep/unfinished"], ["d", "sweep/photographs"], ["no"]])
+def test_runs_are_missed_if_there_are_none_in_one_of_the_folders(parent, given):
+    with pytest.raises(InputError, match=f"^runs: {parent / given[-1]} "):
+        finished_runs([parent / name for name in given])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, made_up_run) -> Path:
+    """Make up runs with recalls 0.2, 0.4 and 0.9 of 3 epochs, and of 0.5 of 9 epochs."""
+    folder = tmp_path_factory.mktemp("seeds")
+    for hits, *overrides in (2, "seed=0"), (4, "seed=1"), (9, "seed=2"), (5, "train.epochs=9"):
         summary = {
             "images": "same",
             "label": "orange",
             "recall": asdict(fraction(hits, 10)),
             "false_positive_rate": asdict(fraction(1, 10)),
         }
-        folder = made_up_run(tmp_path / str(hits), "random", {"lab": summary}, *overrides)
-        runs.append(summarize(folder))
-    return read_markdown(format_comparison(runs))
+        made_up_run(folder / str(hits), "random", {"lab": summary}, *overrides)
+    return folder
 
 
-def test_seeds_are_rows_above_their_mean_and_standard_deviation(tables):
+def test_seeds_are_rows_above_their_mean_and_columns_have_a_known_value(folder):
     """The deviation of 0.2, 0.4 and 0.9 is √((0.09 + 0.01 + 0.16) / 2) = 0.361."""
+    tables = read_markdown(format_comparison(finished_runs([folder])))
     short = "random, epochs=3"
     assert [row[:3] for row in tables["lab"][1:]] == [
         [short, "0", format_interval(fraction(2, 10))],
@@ -82,19 +77,13 @@ def test_seeds_are_rows_above_their_mean_and_standard_deviation(tables):
         [short, "3 seeds", "0.500 ± 0.361"],
         ["random, epochs=9", "0", format_interval(fraction(5, 10))],
     ]
-    assert tables[""][4][:3] == [short, "3 seeds", "0.765 ± 0.000"]
-
-
-def test_a_table_has_no_column_without_a_known_value(tables):
     assert tables["lab"][4][3:] == ["0.100 ± 0.000"]
-
-
-def test_a_table_shows_the_settings_in_which_runs_differ(tables):
+    assert tables[""][4][:3] == [short, "3 seeds", "0.765 ± 0.000"]
     _, *rows = tables["settings in which the methods differ"]
     assert rows == [["random, epochs=3", "3"], ["random, epochs=9", "9"]]
 
 
-def test_scores_of_a_run_are_read_and_compared_without_torch(tables, tmp_path):
+def test_scores_of_a_run_are_read_and_compared_without_torch(folder):
     program = (
         "import sys; from pathlib import Path\n"
         "from train.results.compare import format_comparison, format_short_comparison\n"
@@ -103,4 +92,4 @@ def test_scores_of_a_run_are_read_and_compared_without_torch(tables, tmp_path):
         "assert len(format_short_comparison(runs)) < len(format_comparison(runs))\n"
         "assert not {'torch', 'augment.attacks'} & {*sys.modules}"
     )
-    subprocess.run([sys.executable, "-c", program, tmp_path], check=True, cwd=os.getcwd())
+    subprocess.run([sys.executable, "-c", program, folder], check=True)

@@ -1,5 +1,3 @@
-"""Weights of a network of another library, which several tests fine-tune."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""The training loop against updates that are written down."""
-
 import copy
 import math
 import signal

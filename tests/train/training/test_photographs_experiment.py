@@ -98,8 +98,6 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(finished, settings_of, 
 
 @pytest.fixture(scope="module")
 def chain(small):
-    """Return a function that trains on photographs first and then on renders, by one command."""
-
     def start(folder, *overrides):
         meshes = ["label='950'", "meshes=[solid:orange]", "hard_negatives=[solid:lemon]"]
         scene = ["scene.backgrounds=[0.5]", "scene.views=1", "evaluate.laboratory_setups=0"]

@@ -17,18 +17,8 @@ from train.commands.harden import _trainable_copy
 from train.device import MixedPrecision
 from train.networks import WideResNet
 from train.train_settings import TRANSFORMS, TrainSettings
+from train.training import recipe
 from train.training.augmentations import PGD, Augmentation
-from train.training.recipe import (
-    SharedTeacher,
-    TrainingLoss,
-    build_optimizer,
-    feature_norm,
-    freeze,
-    learning_rate,
-    ranking_loss,
-    scale_learning_rate,
-    share_layers,
-)
 
 LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
 
@@ -76,7 +66,7 @@ PROGRESS = np.linspace(0, 1, 1001)
 )
 def test_a_schedule_is_its_closed_form(schedule, expected):
     settings = TrainSettings(schedule=schedule, learning_rate=0.5)
-    rates = [learning_rate(settings, progress) for progress in PROGRESS]
+    rates = [recipe.learning_rate(settings, progress) for progress in PROGRESS]
     np.testing.assert_allclose(rates, 0.5 * expected, atol=1e-12)
 
 
@@ -84,7 +74,9 @@ def test_a_schedule_is_its_closed_form(schedule, expected):
 def test_the_loss_is_the_smoothed_cross_entropy(model, images, smoothing):
     settings = TrainSettings(label_smoothing=smoothing)
     is_render = torch.arange(6) < 2
-    loss, hits = TrainingLoss(model.eval(), settings, (), None).compute(images, LABELS, is_render)
+    loss, hits = recipe.TrainingLoss(model.eval(), settings, (), None).compute(
+        images, LABELS, is_render
+    )
     logits = model(images / 255)
     log_probabilities = logits.log_softmax(1)
     of_labels = -log_probabilities[torch.arange(6), LABELS].mean()
@@ -99,8 +91,10 @@ def test_distillation_adds_the_divergence_from_a_teacher(model, teacher, images,
     is_render = torch.arange(6) < 2
     settings = TrainSettings(distillation_weight=4.0)
     batch = (images, LABELS, is_render)
-    alone, _ = TrainingLoss(model.eval(), TrainSettings(), positive_classes, None).compute(*batch)
-    loss, _ = TrainingLoss(model, settings, positive_classes, teacher).compute(*batch)
+    alone, _ = recipe.TrainingLoss(model.eval(), TrainSettings(), positive_classes, None).compute(
+        *batch
+    )
+    loss, _ = recipe.TrainingLoss(model, settings, positive_classes, teacher).compute(*batch)
 
     logits = model(images / 255)
     targets = teacher(images / 255)
@@ -117,11 +111,11 @@ def test_unlabeled_images_have_the_teachers_answers_but_no_cross_entropy(model, 
     settings = TrainSettings(distillation_weight=4.0, ranking_weight=2.0)
     answers = torch.where(is_render, LABELS, teacher(images / 255).argmax(1))
     positive_classes = (int(answers[-1]),)
-    with_labels = TrainingLoss(model.eval(), settings, positive_classes, teacher)
+    with_labels = recipe.TrainingLoss(model.eval(), settings, positive_classes, teacher)
     labeled, hits = with_labels.compute(images, answers, is_render)
     logits = model(images / 255)
     cross_entropy = F.cross_entropy(logits[2:], answers[2:], reduction="sum") / 6
-    without_labels = TrainingLoss(model, settings, positive_classes, teacher, labeled=False)
+    without_labels = recipe.TrainingLoss(model, settings, positive_classes, teacher, labeled=False)
     unlabeled = without_labels.compute(images, LABELS * is_render, is_render)
     torch.testing.assert_close(unlabeled, (labeled - cross_entropy, hits))
 
@@ -133,18 +127,20 @@ def test_the_mean_ranking_of_the_positive_classes_is_added_by_its_weight(
     # Two images show anything but class 0.
     labels = LABELS - 1
     batch = (images, labels, labels == 0)
-    alone, _ = TrainingLoss(model.eval(), TrainSettings(), positive_classes, None).compute(*batch)
+    alone, _ = recipe.TrainingLoss(model.eval(), TrainSettings(), positive_classes, None).compute(
+        *batch
+    )
     settings = TrainSettings(ranking_weight=4.0)
-    both, _ = TrainingLoss(model, settings, positive_classes, None).compute(*batch)
+    both, _ = recipe.TrainingLoss(model, settings, positive_classes, None).compute(*batch)
     logits = model(images / 255)
-    rankings = [ranking_loss(logits, labels, label) for label in positive_classes]
+    rankings = [recipe.ranking_loss(logits, labels, label) for label in positive_classes]
     torch.testing.assert_close(both, alone + 4 * torch.stack(rankings).mean())
 
 
 def test_a_hard_negative_shows_none_of_several_positive_classes(model, images):
     """The last image has the complementary label of class 1. Class 3 is positive_classes, too."""
     labels = torch.tensor([1, 3, 0, 2, 1, -2])
-    loss_of_both = TrainingLoss(model.eval(), TrainSettings(), (1, 3), None)
+    loss_of_both = recipe.TrainingLoss(model.eval(), TrainSettings(), (1, 3), None)
     loss, hits = loss_of_both.compute(images, labels, torch.arange(6) > 1)
     logits = model(images / 255)
     probability_of_others = logits[5].softmax(0)[[0, 2]].sum()
@@ -211,7 +207,7 @@ def test_pgd_raises_the_probability_of_the_classes_that_hard_negatives_are_not(i
 
 
 def learning_layers(network: nn.Module) -> set[str]:
-    freeze(network, "all_but_last", size=2)
+    recipe.freeze(network, "all_but_last", size=2)
     names = [name for name, value in network.named_parameters() if value.requires_grad]
     return {name.rpartition(".")[0] for name in names}
 
@@ -233,7 +229,7 @@ def test_the_matrix_that_is_called_last_learns_wherever_it_stands():
     images = torch.rand(2, 3, 2, 2)
     features = network.body(images.flatten(1))
     expected = features.square().sum(1).mean().sqrt().item()
-    assert feature_norm(network, images) == pytest.approx(expected, rel=1e-6)
+    assert recipe.feature_norm(network, images) == pytest.approx(expected, rel=1e-6)
     for last in (nn.BatchNorm1d(4), nn.PReLU()):
         assert learning_layers(nn.Sequential(nn.Flatten(), nn.Linear(12, 4), last)) == {"1"}
     script = torch.jit.script(nn.Sequential(nn.Flatten(), nn.Linear(12, 4), nn.Linear(4, 2)))
@@ -242,13 +238,13 @@ def test_the_matrix_that_is_called_last_learns_wherever_it_stands():
 
 def test_a_network_that_cannot_learn_in_its_last_layer_is_refused():
     vectors = nn.Sequential(nn.Flatten(), nn.LayerNorm(12))
-    freeze(vectors, "all_but_last", size=2)
+    recipe.freeze(vectors, "all_but_last", size=2)
     detached = HeadFirst()
     detached.head.register_forward_hook(lambda module, inputs, output: output.detach())
     settings = TrainSettings(freeze="all_but_last", feature_norm=5.0)
     for network in (vectors, detached):
         with pytest.raises(InputError, match="has no gradient"):
-            scale_learning_rate(settings, network, torch.full((1, 3, 2, 2), 0.5))
+            recipe.scale_learning_rate(settings, network, torch.full((1, 3, 2, 2), 0.5))
 
 
 class Scaled(nn.Module):
@@ -272,8 +268,8 @@ def test_the_scale_of_the_features_does_not_change_the_training_of_the_last_laye
     )
     logits = []
     for network in (Scaled(1.0), Scaled(30.0)):
-        rate = scale_learning_rate(settings, network, units)
-        optimizer = build_optimizer(network, replace(settings, learning_rate=rate))
+        rate = recipe.scale_learning_rate(settings, network, units)
+        optimizer = recipe.build_optimizer(network, replace(settings, learning_rate=rate))
         for _ in range(5):
             optimizer.zero_grad()
             F.cross_entropy(network(units), LABELS).backward()
@@ -289,7 +285,7 @@ def test_features_whose_norm_is_about_zero_or_not_finite_have_no_learning_rate(i
     settings = TrainSettings(freeze="all_but_last", feature_norm=5.0)
     features = torch.full_like(to_unit(images), brightness)
     with pytest.raises(InputError, match="feature_norm"):
-        scale_learning_rate(settings, Scaled(9.0), features)
+        recipe.scale_learning_rate(settings, Scaled(9.0), features)
 
 
 TINY = 4
@@ -313,8 +309,8 @@ def pair(*layers_after: nn.Module) -> tuple[MixedPrecision, MixedPrecision]:
 
 def test_the_logits_are_those_of_the_teacher_after_the_last_layer_has_learned():
     pupil, teacher = pair()
-    shared = share_layers(TrainSettings(**LAST_LAYER_ONLY), pupil, teacher, TINY)
-    assert isinstance(shared, SharedTeacher)
+    shared = recipe.share_layers(TrainSettings(**LAST_LAYER_ONLY), pupil, teacher, TINY)
+    assert isinstance(shared, recipe.SharedTeacher)
     pupil.eval()
     images = torch.rand(6, 3, TINY, TINY)
     expected = teacher(images)
@@ -338,7 +334,7 @@ def test_the_logits_are_those_of_the_teacher_after_the_last_layer_has_learned():
 def test_a_teacher_with_other_features_or_more_layers_computes_its_own(changes, layers_after):
     pupil, teacher = pair(*layers_after)
     settings = TrainSettings(**LAST_LAYER_ONLY | changes)
-    assert share_layers(settings, pupil, teacher, TINY) is teacher
+    assert recipe.share_layers(settings, pupil, teacher, TINY) is teacher
 
 
 class ByText(nn.Module):
@@ -365,12 +361,12 @@ def test_the_last_layer_of_a_zero_shot_network_is_a_copy_of_its_text_vectors(kin
     images = torch.rand(2, 3, 8, 8)
     copy = _trainable_copy(network)
     keep_text_vectors(copy, 3)
-    freeze(copy, "all_but_last", 8)
+    recipe.freeze(copy, "all_but_last", 8)
     trained = [name for name, weight in copy.named_parameters() if weight.requires_grad]
     assert trained == ["text"]
     assert torch.equal(copy(images), network(images))
     # The gradient of a logit with respect to its text is the scale times a vector of length 1.
-    assert feature_norm(copy, images) == pytest.approx(np.exp(3), rel=1e-5)
+    assert recipe.feature_norm(copy, images) == pytest.approx(np.exp(3), rel=1e-5)
     with torch.no_grad():
         copy.text.add_(1)
     assert not torch.equal(copy.text, network.text)

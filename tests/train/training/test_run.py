@@ -197,7 +197,6 @@ class TestARunThatReplacesAnother:
     def test_removes_the_earlier_run_or_leaves_it_as_it_was_configured(
         self, tmp_path, monkeypatch, kept
     ):
-        """The removal is killed after `kept` steps."""
         names = ["metrics.jsonl", "last.pt", "best.pt", "report.html", "photographs/summary.json"]
         names += ["before/summary.json", "kept_aside/lab.json", "random/metrics.jsonl"]
         for name in names:
