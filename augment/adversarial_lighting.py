@@ -15,6 +15,7 @@ from augment.classifier import CheckedNetwork, TaskNetwork
 from augment.lighting import Light, RandomLighting
 from augment.network import frozen_eval_mode
 from augment.scene.lights import LightModel
+from augment.settings import NO_CLASS_PIXEL
 from augment.tasks.classification import Classification
 from augment.tasks.detection import Detection
 from augment.tasks.segmentation import BACKGROUND, Segmentation
@@ -22,8 +23,6 @@ from augment.tasks.task import Criterion, Task
 from renderer import errors
 from renderer.errors import InputError
 
-# Label of pixels without a class, as in VOC.
-IGNORED = 255
 # A step changes each number in [0, 1] by this, divided by the number of steps.
 STEP = 0.5
 
@@ -186,7 +185,7 @@ class AdversarialLighting:
         is_wrong = ~has_class
         # Pixels of a map may have no class.
         if is_map:
-            is_wrong &= (targets >= 0) & (targets != IGNORED)
+            is_wrong &= (targets >= 0) & (targets != NO_CLASS_PIXEL)
         if is_wrong.any():
             label = int(targets[is_wrong][0])
             raise InputError(f"targets has the label {label}: give those of {count} classes")

@@ -14,6 +14,9 @@ from renderer import settings as base
 from renderer.errors import MAX_SCALE, InputError, is_number, require_choice, require_range
 from renderer.settings import REQUIRED, ImageSettings, Settings, Size, setting, setting_like
 
+# Value of the pixels of a mask or a label map that have no class, as in VOC. They do not count.
+NO_CLASS_PIXEL = 255
+
 
 @dataclass
 class MeshSettings(Settings):

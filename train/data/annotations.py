@@ -17,6 +17,7 @@ import yaml
 from jaxtyping import Bool, Float, Int, UInt8
 from PIL import ExifTags, Image
 
+from augment.settings import NO_CLASS_PIXEL
 from renderer.errors import InputError, single_line
 from renderer.io.images import open_image, read_rgb
 from train import console
@@ -34,8 +35,6 @@ MAX_RATIO = 1.02
 CLASS_FILES = ("classes.txt", "obj.names")
 # Folders of photographs and of their masks, the latter as in VOC.
 MASK_FOLDERS = (("images", "masks"), ("JPEGImages", "SegmentationClass"))
-# Pixels of this class in a mask are not scored.
-UNSCORED = 255
 # Coordinates may leave the image by this fraction of a side.
 ROUNDING = 1e-3
 # Images are read at full size.
@@ -158,7 +157,7 @@ def _annotated(
 def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, "H W"]:
     """Read the classes of the pixels of a photograph, and bring them to its size for the network.
 
-    Pixels of borders are UNSCORED.
+    Pixels of borders are NO_CLASS_PIXEL.
     """
     try:
         with open_image(path) as image:
@@ -169,14 +168,14 @@ def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, 
     if labels.shape != (height, width):
         advice = f"give a gray or palette image of {width:g} × {height:g} indices of classes"
         raise InputError(f"{path} has the shape {labels.shape}: {advice}")
-    highest = int(labels[labels != UNSCORED].max(initial=0))
+    highest = int(labels[labels != NO_CLASS_PIXEL].max(initial=0))
     if highest >= class_count:
-        advice = f"use 0 to {class_count - 1}, and {UNSCORED} for pixels that do not count"
+        advice = f"use 0 to {class_count - 1}, and {NO_CLASS_PIXEL} for pixels that do not count"
         raise InputError(f"{path} has the value {highest}: {advice}")
     # Width and height of the photograph in the image of the network, without borders.
     shown = (fitted.scale * fitted.size).round().astype(int)
     reduced = Image.fromarray(labels.astype(np.uint8)).resize((*shown,), Image.Resampling.NEAREST)
-    result = np.full(fitted.pixels.shape[1:], UNSCORED, np.uint8)
+    result = np.full(fitted.pixels.shape[1:], NO_CLASS_PIXEL, np.uint8)
     # The photograph begins at `shift`, after the border.
     left, top = fitted.shift.astype(int)
     result[top : top + shown[1], left : left + shown[0]] = np.array(reduced)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from augment.classifier import TaskNetwork
 from augment.network import compute_outputs
+from augment.settings import NO_CLASS_PIXEL
 from augment.tasks.detection import Detection
 from renderer.errors import InputError, ShortRepr
 from renderer.image import to_unit
@@ -23,7 +24,6 @@ from train import console
 from train.class_names import class_of_name
 from train.data.annotations import (
     FITS,
-    UNSCORED,
     Annotated,
     Annotations,
     Fitted,
@@ -313,9 +313,11 @@ def evaluate_segmenter(
     network: TaskNetwork, folder: Path, how: str, skip_unreadable: bool, device: torch.device
 ) -> SegmentationScores:
     """Segment photographs, and compare the classes of the pixels with those of masks."""
-    if len(network.classes) > UNSCORED:
+    if len(network.classes) > NO_CLASS_PIXEL:
         reason = f"{network.title} has {len(network.classes)} classes"
-        raise InputError(f"{reason}: masks can have at most {UNSCORED}, as {UNSCORED} is no class")
+        raise InputError(
+            f"{reason}: masks can have at most {NO_CLASS_PIXEL}, as {NO_CLASS_PIXEL} is no class"
+        )
     photographs, masks, missing = read_masks(folder)
     pictures: dict[str, Tensor] = {}
     count = 0

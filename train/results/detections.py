@@ -7,11 +7,12 @@ unit. Detections are matched as the evaluation of COCO does.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from train.data.annotations import UNSCORED
+from augment.settings import NO_CLASS_PIXEL
 from train.results.intervals import Units, leave_out
 from train.results.tables import Estimate
 
@@ -19,6 +20,9 @@ from train.results.tables import Estimate
 PHOTOGRAPHS = "photographs"
 # Index of the object of a detection: it is of no object, or of a crowd, which does not count.
 NO_OBJECT, CROWD = -1, -2
+# Fields of `Matches` that have an entry for each detection, and those with one for each object.
+DETECTION_COLUMNS = ("label", "image", "score", "is_right")
+OBJECT_COLUMNS = ("object_label", "object_image", "object_score")
 # Recalls at which the average precision averages the precision, as COCO does.
 RECALLS = np.linspace(0, 1, 101)
 
@@ -103,12 +107,12 @@ class Matches:
 
     def of(self, labels: Sequence[int]) -> "Matches":
         """Return the matches of some classes."""
-        return self._choose(np.isin(self.label, labels), np.isin(self.object_label, labels))
+        return self.choose(np.isin(self.label, labels), np.isin(self.object_label, labels))
 
     def in_images(self, is_chosen: Bool[np.ndarray, " image_count"]) -> "Matches":
         """Return the matches in some of the images, whose indices then count these alone."""
         index = np.cumsum(is_chosen) - 1
-        chosen = self._choose(is_chosen[self.image], is_chosen[self.object_image])
+        chosen = self.choose(is_chosen[self.image], is_chosen[self.object_image])
         return replace(
             chosen,
             image_count=int(is_chosen.sum()),
@@ -116,14 +120,11 @@ class Matches:
             object_image=index[chosen.object_image],
         )
 
-    def _choose(
-        self, is_detection: Bool[np.ndarray, " N"], is_object: Bool[np.ndarray, " M"]
-    ) -> "Matches":
-        """Return the matches of the chosen detections and objects."""
-        detections = self.label, self.image, self.score, self.is_right
-        objects = self.object_label, self.object_image, self.object_score
-        columns = [column[is_detection] for column in detections]
-        return Matches(self.image_count, *columns, *(column[is_object] for column in objects))
+    def choose(self, detections: Any, objects: Any) -> "Matches":
+        """Return the matches of some detections and objects, by masks or indices of NumPy."""
+        of_detections = {name: getattr(self, name)[detections] for name in DETECTION_COLUMNS}
+        of_objects = {name: getattr(self, name)[objects] for name in OBJECT_COLUMNS}
+        return replace(self, **of_detections, **of_objects)
 
     def recall(self, threshold: float, counts: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
         """Compute the fraction of the objects that are detected with at least a score.
@@ -164,31 +165,35 @@ class Matches:
 
 def match_images(found: Sequence[Found], marked: Sequence[Marked], iou: float = 0.5) -> Matches:
     """Match the detections in all images."""
-    # The columns of a detection and of an object are those of `Matches`.
-    detections, objects = [np.empty((4, 0))], [np.empty((3, 0))]
-    for image, (item, truth) in enumerate(zip(found, marked, strict=True)):
-        index = match(item, truth, iou)
-        is_counted, is_right = index != CROWD, index >= 0
-        columns = [item.labels, np.full(len(index), image), item.scores, is_right]
-        detections.append(np.stack(columns)[:, is_counted])
-        # Objects without a detection have the score -inf.
-        score_of_object = np.full(len(truth.labels), -np.inf)
-        score_of_object[index[is_right]] = item.scores[is_right]
-        columns = [truth.labels, np.full(len(truth.labels), image), score_of_object]
-        objects.append(np.stack(columns)[:, ~truth.is_crowd])
-    joined, of_objects = np.hstack(detections), np.hstack(objects)
+    images = zip(found, marked, strict=True)
+    parts = [_match_image(image, *pair, iou) for image, pair in enumerate(images)]
+    columns = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in (*DETECTION_COLUMNS, *OBJECT_COLUMNS)
+    }
+    matches = Matches(len(parts), **columns)
     # In descending order of the scores, as `Matches` says.
-    joined = joined[:, np.argsort(-joined[2], kind="stable")]
-    return Matches(
-        len(found),
-        label=joined[0].astype(int),
-        image=joined[1].astype(int),
-        score=joined[2],
-        is_right=joined[3] > 0,
-        object_label=of_objects[0].astype(int),
-        object_image=of_objects[1].astype(int),
-        object_score=of_objects[2],
+    return matches.choose(np.argsort(-matches.score, kind="stable"), ...)
+
+
+def _match_image(image: int, found: Found, marked: Marked, iou: float) -> Matches:
+    """Match the detections in the image with this index, without crowds and what is of them."""
+    index = match(found, marked, iou)
+    is_right = index >= 0
+    # Objects without a detection have the score -inf.
+    score_of_object = np.full(len(marked.labels), -np.inf)
+    score_of_object[index[is_right]] = found.scores[is_right]
+    matches = Matches(
+        1,
+        label=found.labels,
+        image=np.full(len(index), image),
+        score=found.scores,
+        is_right=is_right,
+        object_label=marked.labels,
+        object_image=np.full(len(marked.labels), image),
+        object_score=score_of_object,
     )
+    return matches.choose(index != CROWD, ~marked.is_crowd)
 
 
 @dataclass(frozen=True)
@@ -304,11 +309,11 @@ def mean_iou(
 
     An image has the predicted classes of its pixels and the true ones. The IoU of a class is
     computed from the pixels of all images. It is NaN, and does not count, if no pixel has or is
-    given the class. Pixels of the class UNSCORED are left out.
+    given the class. Pixels of the class NO_CLASS_PIXEL are left out.
     """
     counted = []
     for image, mask in images:
-        is_scored = mask != UNSCORED
+        is_scored = mask != NO_CLASS_PIXEL
         guess, truth = image[is_scored], mask[is_scored]
         # Classes of correct pixels, of predicted pixels and of true pixels.
         kinds = truth[guess == truth], guess, truth

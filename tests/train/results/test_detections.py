@@ -139,9 +139,9 @@ def test_no_false_detection_has_an_upper_limit_like_the_rule_of_three():
 def test_mean_iou_is_that_of_the_confusion_matrix():
     rng = np.random.default_rng(0)
     masks, predicted = rng.integers(0, 3, (2, 4, 5, 6))
-    masks[0, 0] = detections.UNSCORED
+    masks[0, 0] = detections.NO_CLASS_PIXEL
     mean, by_class = detections.mean_iou(zip(predicted, masks, strict=True), 4)
-    is_scored = masks != detections.UNSCORED
+    is_scored = masks != detections.NO_CLASS_PIXEL
     confusion = np.zeros((4, 4))
     np.add.at(confusion, (masks[is_scored], predicted[is_scored]), 1)
     shared = np.diag(confusion)[:3]
