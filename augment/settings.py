@@ -16,6 +16,8 @@ from renderer.settings import REQUIRED, ImageSettings, Settings, Size, setting, 
 
 # Value of the pixels of a mask or a label map that have no class, as in VOC. They do not count.
 NO_CLASS_PIXEL = 255
+# The name of a network begins with this text if a Python function of the user makes it.
+PYTHON = "python:"
 
 
 @dataclass

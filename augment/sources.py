@@ -23,7 +23,7 @@ from augment import network as wrappers
 from augment.classifier import Classifier, Normalization, as_network, mean_and_std, nearest
 from augment.files import NetworkFacts, State
 from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network, unwrapped
-from augment.settings import NormalizeLight
+from augment.settings import PYTHON, NormalizeLight
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
 from renderer.settings import Size, height_and_width
@@ -33,8 +33,6 @@ from renderer.settings import Size, height_and_width
 _TRANSFORMS_INPUT = ("googlenet", "inception_v3")
 # Function that makes a classifier with random weights.
 Build = Callable[[NetworkFacts], Classifier]
-# A classifier with this prefix is loaded by a Python function, as in python:my_module.load.
-PYTHON = "python:"
 SQUEEZENET_CAFFE = "squeezenet_caffe"
 # A network of timm whose name begins so is that of a repository of the Hugging Face Hub.
 HUB = "hf-hub:"

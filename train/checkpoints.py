@@ -24,12 +24,12 @@ from torch import Tensor, cuda, nn
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.files import as_facts, is_network_file, require_no_facts
 from augment.network import FROM_FILE, Inputs, say_inputs, unwrapped, with_normalized_light
-from augment.settings import NormalizeLight
+from augment.settings import PYTHON, NormalizeLight
 from augment.sources import SOURCES, import_function, load_classifier
 from augment.tasks.detection import Detection
 from renderer.errors import InputError, as_path, keyed, require_file, require_kind, single_line
 from renderer.io.files import atomic_write
-from train.networks import DETECTOR, PYTHON, VERSION, WIDERESNET, build_network
+from train.networks import DETECTOR, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
 from train.settings import NetworkSettings, TaskSettings, published_folder
 

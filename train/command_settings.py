@@ -23,8 +23,6 @@ from train.settings import LABEL, MESHES, NETWORKS, PROBABILITY, TIME_FOLDER, Ta
 SCALES = (1 / MAX_SCALE, MAX_SCALE)
 # Default environment maps of an audit.
 ENVIRONMENTS = ("grace", "eucalyptus", "st_peters")
-# Renderers that can verify written adversaries.
-RENDERERS = ("reload", "mitsuba")
 # Power with which each default lamp starts (`LampsSettings.start`) if an attack moves the
 # lamps, but does not change their power.
 LAMP_POWER = 2.0
@@ -69,12 +67,6 @@ class AttackCommandSettings(AttackSettings):
     verify: str | None = setting(
         "reload", "Render the written files again: reload (here), mitsuba, reload+mitsuba or null."
     )
-
-    def __post_init__(self) -> None:
-        """Check all values, and that the renderers in `verify` exist."""
-        super().__post_init__()
-        for name in self.renderers:
-            require_choice("verify", name, RENDERERS)
 
     @property
     def renderers(self) -> list[str]:
@@ -337,7 +329,7 @@ class EvaluateSettings(TaskSettings):
         if self.label is not None:
             common.label_names(self.label)  # This call only checks the label.
         # With `run`, `network` may only name the function that built the network of the run.
-        builds_run = bool(self.network and self.network.startswith("python:"))
+        builds_run = bool(self.network and self.network.startswith(scenes.PYTHON))
         if (self.run is None) == (self.network is None) and not (self.run and builds_run):
             raise InputError(f"run={self.run} and network={self.network} do not match: give one")
 
@@ -480,9 +472,7 @@ class CompareSettings(Settings):
     runs: list[str] = setting(
         REQUIRED, "Folders of runs and sweeps, or folders above them.", is_filled=True
     )
-    by: str = setting(
-        "source", "Groups of the tables: a column of photos.csv, or class.", choices=common.GROUPS
-    )
+    by: str = setting_like(EvaluateSettings, "by", "source")
 
 
 @dataclass

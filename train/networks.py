@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.files import as_facts
 from augment.network import ChannelNormalization, Network, eval_mode, plain_outputs
+from augment.settings import PYTHON
 from augment.sources import build_classifier, call_python, require_architecture
 from renderer.errors import InputError, single_line
 from renderer.settings import Size
@@ -24,8 +25,6 @@ from train.train_settings import WIDERESNET
 TORCHVISION = "torchvision:"
 # Name of the detector that is published with the library.
 DETECTOR = "small_detector"
-# The name of a network begins with this text if a Python function of the user builds it.
-PYTHON = "python:"
 # Version of the description that is stored with the weights of a network. Version 1
 # lacked the size and the normalization of images, and the encoding of renders.
 VERSION = 2

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
+from augment.settings import PYTHON
 from renderer.errors import InputError, as_path, keyed, require_choice
 from train.checkpoints import load_run, load_selected, write_published
 from train.command_settings import require_calibration
-from train.networks import PYTHON
 from train.results.metrics import METRICS, Metrics
 from train.results.overwrite import require_replaceable
 from train.results.scoring import Predictor, choose_operating_points

@@ -24,6 +24,7 @@ from urllib.parse import unquote
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
+from augment.settings import PYTHON
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.run_folder import opened_text
@@ -241,7 +242,7 @@ def _collect_texts(value: Any) -> set[str]:
 
 def _path_of(text: str) -> Path:
     """Return the file or folder that a setting such as run:FOLDER names, which may be missing."""
-    if text.startswith("python:"):
+    if text.startswith(PYTHON):
         # `find_spec` imports the packages above the module, which can raise errors of any type.
         with suppress(Exception):
             spec = find_spec(text.split(":")[1])

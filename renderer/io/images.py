@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 # Suffixes of the files in a folder that count as images.
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 # Formats of Pillow that are read, whatever the name of the file. Others can run programs:
 # Pillow passes an EPS file to Ghostscript. "TGA" is last, because it has no signature.
 FORMATS = [

@@ -18,7 +18,6 @@ from train.results.compare import ALL, Difference, Evaluation, Evaluations, diff
 from train.results.first_screen import EQUAL_RATE, gain_sentence
 from train.results.intervals import Units, leave_out, weighted_means
 from train.results.metrics import METRICS, metric_title
-from train.results.predictions import Predictions
 from train.results.store import RunSummary, ScoredRun, read_summaries
 from train.results.tables import Estimate, Proportion, Table, fraction
 from train.run_folder import read_json
@@ -223,10 +222,6 @@ class AuditedNetwork:
     def evaluation(self, images: str) -> Evaluation:
         """Predictions for a folder of test images in groups, for comparisons."""
         return Evaluation(self.run, ScoredRun(self.run, images).pooled())
-
-    def predictions(self, images: str) -> Predictions:
-        """Predictions for a folder of test images, in the order of the images."""
-        return self.evaluation(images).pooled.predictions
 
     @cached_property
     def rates(self) -> dict[str, Estimate]:

@@ -312,7 +312,7 @@ def _worst(
     """Make galleries of each network's WORST misses and false alarms in each folder."""
     galleries = {}
     for network, (images, folder) in product(networks, folders.items()):
-        predictions = network.predictions(images)
+        predictions = network.evaluation(images).pooled.predictions
         # Log-odds in ascending order: missed positives come first, and false alarms last.
         order = predictions.log_odds.argsort(kind="stable")
         is_positive = predictions.positive[order]

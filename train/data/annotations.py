@@ -19,9 +19,9 @@ from PIL import ExifTags, Image
 
 from augment.settings import NO_CLASS_PIXEL
 from renderer.errors import InputError, single_line
-from renderer.io.images import open_image, read_rgb
+from renderer.io.images import SUFFIXES, open_image, read_rgb
 from train import console
-from train.data.photographs import SUFFIXES, find_unlabeled, visible_files
+from train.data.photographs import find_unlabeled, visible_files
 
 # Ways to bring a photograph to the size of a network.
 LETTERBOX = "letterbox"

@@ -18,13 +18,12 @@ from torch import Tensor
 from augment.classifier import Label, class_index, nearest
 from augment.progress import progress
 from renderer.errors import InputError, composed, require_memory, single_line
-from renderer.io.images import read_center
+from renderer.io.images import SUFFIXES, read_center
 from renderer.settings import Size, height_and_width
 from train import console
 from train.data.photo import DESCRIPTION, TABLE, Photograph, split_sources
 from train.settings import OTHER_PREFIX, label_names
 
-SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 # macOS adds a folder of this name to zip archives. It has no photographs.
 MACOS_FOLDER = "__MACOSX"
 # Largest number of classes that are positive because they have a sub-folder. The scores of each

@@ -16,6 +16,7 @@ from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
+from augment.settings import PYTHON
 from augment.sources import load_source
 from augment.tasks.classification import Classification, complementary_label
 from augment.tasks.task import Task
@@ -27,7 +28,7 @@ from train.data import sets
 from train.data.photographs import find_photographs, load_photographs
 from train.data.rendered_shapes import cache_folder, load_shapes
 from train.device import choose_rasterizer, main_process_first
-from train.networks import CLASSIFIER, PYTHON, describe
+from train.networks import CLASSIFIER, describe
 from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, label_names
 
 # Default fraction of the training images that validate the network.

@@ -67,14 +67,6 @@ class LightParameter(Parameter):
         return self._basis.nearest_nonnegative(coefficients, ball).flatten(1)
 
 
-def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
-    """Find the environment lighting among the lights of a scene.
-
-    Return its rows in the coefficients of all lights, and its basis.
-    """
-    return scene.basis.lights[0]
-
-
 def replace_light(
     conditions: Conditions, rows: slice, coefficients: Float[Tensor, "A K 3"]
 ) -> Conditions:
@@ -103,7 +95,8 @@ class Lighting(LightParameter):
     name = "lighting"
 
     def __init__(self, scene: Scene, settings: StepSettings, nonnegative: bool = False):
-        rows, basis = environment_light(scene)
+        # The first light of a scene is its environment.
+        rows, basis = scene.basis.lights[0]
         super().__init__(scene, settings, rows=rows, basis=basis, nonnegative=nonnegative)
 
 
@@ -152,7 +145,8 @@ class Skylight(Parameter):
 
     def __init__(self, scene: Scene, settings: SkylightSettings, nonnegative: bool = False):
         """Compute the initial sky and its brightness."""
-        self._rows, self._basis = environment_light(scene)
+        # The first light of a scene is its environment, which the sky replaces.
+        self._rows, self._basis = scene.basis.lights[0]
         initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
         sky_luminance = mean_luminance(initial_sky)
         replaced_lights = scene.lights[:, self._rows]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -91,8 +91,8 @@ class Material(Parameter):
             materials = [material.first_face() for material in materials]
         # F is the number of faces of the largest mesh, or 1 if the faces of each object are
         # alike. The shapes are (objects, F, 3) and (objects, F).
-        face_gloss = _stack_padded([material.face_gloss for material in materials])
-        object_mask = _stack_padded([material.object_mask for material in materials])
+        face_gloss = pad_sequence([each.face_gloss for each in materials], batch_first=True)
+        object_mask = pad_sequence([each.object_mask for each in materials], batch_first=True)
         self._face_gloss = face_gloss.to(scene.lights)
         self._object_mask = object_mask.to(scene.lights)
 
@@ -149,8 +149,3 @@ class Material(Parameter):
     ) -> Float[Tensor, "A 4"]:
         """Find the nearest values whose gloss the renderer can show."""
         return nearest_in_box(values, self._lowest_values, self._highest_values, within)
-
-
-def _stack_padded(tensors: list[Tensor]) -> Shaped[Tensor, "objects _ ..."]:
-    """Stack tensors of several objects, and append zeros to those of objects with fewer faces."""
-    return pad_sequence(tensors, batch_first=True)
