@@ -406,3 +406,14 @@ def test_the_table_under_an_environment_has_the_brightness_times_its_albedo_at_e
     expected = np.broadcast_to(0.7 * shot.table, image.shape)
     # Bilinear interpolation spreads the lamp over two texels.
     np.testing.assert_allclose(image, expected, rtol=0.02)
+
+
+def test_paths_of_a_pixel_are_stratified_so_that_their_noise_is_below_that_of_independent_ones():
+    """The noise of N independent samples is that of one, divided by the root of N."""
+    parts, shot = lab_parts(solid("orange"), 1.0), frontal(ambient=np.ones(3), table=np.ones(3))
+
+    def noise(spp: int) -> float:
+        first, second = (path_traced(parts, shot, 24, spp, bounces=2, seed=seed) for seed in (0, 1))
+        return float((first - second).std())
+
+    assert noise(16) < 0.75 * noise(1) / 16**0.5
