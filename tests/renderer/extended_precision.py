@@ -150,24 +150,20 @@ def vertex_gradient(
 def _weighted_irradiance(
     view: View, weight: np.ndarray, light: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> np.ndarray:
-    """Compute the weighted sum (G,) of the colors of each face's irradiance, for other edges."""
     normals = unit(cross(first, second)) * view.side
     return (irradiance(normals, light) * weight).sum(axis=1)
 
 
 def _face_weight(view: View, upstream: np.ndarray) -> np.ndarray:
-    """Compute Σ upstream × image per unit of each face's irradiance, shape (G, 3)."""
     by_face = added(len(view.corners), view.face, upstream[view.pixel])
     return by_face / view.samples * view.albedo
 
 
 def normals_of(view: View) -> np.ndarray:
-    """Compute the unit normals (3, G) on the side that is seen."""
     return unit(cross(view.first, view.second)) * view.side
 
 
 def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the edges (3, F) from the first corner of each face to the others."""
     first, second, third = vertices[faces].transpose(1, 2, 0)
     return second - first, third - first
 
@@ -176,7 +172,6 @@ def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def irradiance(normals: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """Compute the irradiance (N, 3) on surfaces with unit normals (3, N)."""
     degree = round(len(light) ** 0.5) - 1
     terms = reflected(normals, degree)
     return sum(value[:, None] * light[index] for index, value in terms.items())
@@ -339,7 +334,6 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def added(count: int, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Add rows with the same index, and return the sums (count, ...)."""
     total = np.zeros((count, *rows.shape[1:]), dtype=rows.dtype)
     np.add.at(total, index, rows)
     return total
@@ -353,5 +347,4 @@ def as_in(like: np.ndarray, number: Any) -> Any:
 
 
 def _number(fraction: Fraction) -> Any:
-    """Convert a fraction to a 256-bit number."""
     return MP.mpf(fraction.numerator) / fraction.denominator

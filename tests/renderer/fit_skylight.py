@@ -58,7 +58,6 @@ MIN_COSINE = 1e-3
 
 
 def main(out: str = "renderer/light/skylight_fit.safetensors") -> None:
-    """Fit the sky, write the fit, and print its error."""
     fit = fit_polynomials(*DEGREES).float()
     save_file({"fit": fit}, out)
     error = fit_error(fit, 50, np.random.default_rng(0))
@@ -166,7 +165,6 @@ def radiance(cosine: np.ndarray, angle: np.ndarray, zenith: float, turbidity: fl
 
 
 def _chromaticity_overhead(rows: list[list[float]], zenith: float, turbidity: float) -> float:
-    """Evaluate a chromaticity overhead from its table."""
     by_turbidity = [np.polyval(row, zenith) for row in rows]
     return np.polyval(by_turbidity, turbidity)
 

@@ -21,8 +21,6 @@ SQUARE_FACES = np.uint16([0, 1, 2, 0, 2, 3])
 
 
 class Gltf:
-    """Tree of a .gltf file with one buffer."""
-
     def __init__(self) -> None:
         self.buffer = b""
         self.tree: dict[str, Any] = {
@@ -45,7 +43,6 @@ class Gltf:
         return len(self.tree["bufferViews"]) - 1
 
     def array(self, values: np.ndarray, normalized: bool = False) -> int:
-        """Append an array, and return the index of its accessor."""
         values = np.asarray(values)
         width = values[0].size
         accessor = {
@@ -94,14 +91,12 @@ class Gltf:
         return {"index": index}
 
     def square(self, **material: Any) -> "Gltf":
-        """Append a square with texture coordinates and a material."""
         attributes = {"POSITION": SQUARE, "TEXCOORD_0": SQUARE_UVS}
         self.mesh(attributes, SQUARE_FACES, material=len(self.tree["materials"]))
         self.tree["materials"].append(material)
         return self
 
     def text(self) -> str:
-        """Return the JSON text with the buffer as a data URI."""
         uri = "data:application/octet-stream;base64," + base64.b64encode(self.buffer).decode()
         return json.dumps(self.tree | {"buffers": [{"byteLength": len(self.buffer), "uri": uri}]})
 
@@ -117,5 +112,4 @@ class Gltf:
         return path
 
     def load(self, folder: Path, gloss: bool = False) -> Mesh:
-        """Write the file and load it, with the axes of the file."""
         return load_mesh(self.write(folder / "mesh.gltf"), up="z", gloss=gloss)

@@ -97,13 +97,11 @@ def with_faces_without_area(mesh: Mesh) -> Mesh:
 
 
 def box() -> Mesh:
-    """Create a box. Its normals are the axes, which contain the poles of the harmonics."""
     shape = trimesh.creation.box((1.2, 1.0, 0.8))
     return painted(shape.vertices, shape.faces)
 
 
 def opened(mesh: Mesh) -> Mesh:
-    """Remove the upper faces of a mesh, so that its inside is visible."""
     heights = mesh.vertices[mesh.faces][:, :, 2].mean(axis=1)
     return painted(mesh.vertices, mesh.faces[heights < 0.2])
 
@@ -121,7 +119,6 @@ def heap() -> Mesh:
 
 
 def boards() -> Mesh:
-    """Create five boards of thickness 0.02 with gaps of 0.03 between them."""
     board = trimesh.creation.box((0.8, 0.8, 0.02))
     heights = [0.0, 0.05, 0.1, 0.15, 0.2]
     lifted = [board.vertices + np.array([0, 0, height]) for height in heights]

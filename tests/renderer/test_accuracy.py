@@ -104,7 +104,6 @@ class Setup:
         return torch.from_numpy(vertices).to(self.dtype)
 
     def view(self) -> wide.View:
-        """Rasterize the mesh for the reference."""
         mesh = self.mesh
         samples = self.settings.samples
         points = self.camera.project(mesh.vertices)
@@ -169,7 +168,6 @@ def harmonics_cases(degree: int) -> Iterator[Case]:
 
 
 def directions_near_poles() -> Tensor:
-    """Return directions (6, 3) at small angles from the poles."""
     angles = torch.tensor([0, 0, 1e-1, 1e-4, 1e-8, 1e-300], dtype=torch.float64)
     poles = torch.tensor([1, -1, 1, -1, 1, -1], dtype=torch.float64)
     return torch.stack([0.6 * angles, 0.8 * angles, poles], dim=1)
@@ -326,7 +324,6 @@ def units(ours: Tensor, reference: np.ndarray) -> float:
 
 
 def all_errors(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
-    """Measure the errors of an operator in a number type, and of the shading."""
     return operator_errors(setup, dtype) | geometry_errors(setup)
 
 
@@ -363,7 +360,6 @@ def operator_errors(
 
 
 def geometry_errors(setup: Setup) -> Errors:
-    """Measure the errors of the shading's image and of its gradient by the vertices."""
     view = setup.view()
     vertices = setup.shaded_vertices().requires_grad_()
     light = setup.light.to(setup.dtype)

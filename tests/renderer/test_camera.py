@@ -105,7 +105,6 @@ def open_torus() -> Mesh:
 
 
 def rays(size: int) -> np.ndarray:
-    """Return vectors from CAMERA through pixel centers to the plane of the origin, (size², 3)."""
     centers = (2 * np.arange(size) + 1) / size - 1
     y, x = np.meshgrid(-centers, centers, indexing="ij")
     half_width = CAMERA.width / 2

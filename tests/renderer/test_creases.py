@@ -23,7 +23,6 @@ def lids(mesh: nb.Mesh) -> np.ndarray:
 
 
 def is_same_partition(ids: np.ndarray, others: np.ndarray) -> bool:
-    """Tell whether two arrays of indices divide their entries into the same groups."""
     pairs = np.stack([ids.ravel(), others.ravel()], axis=1)
     return len(np.unique(pairs, axis=0)) == len(np.unique(ids)) == len(np.unique(others))
 
@@ -181,7 +180,6 @@ def test_moved_vertices_keep_the_sharp_edges_of_the_mesh():
 
 
 def obj_of(mesh: nb.Mesh, normals: np.ndarray) -> str:
-    """Write a welded mesh with a normal at each corner, in four digits."""
     lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices]
     lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in normals.reshape(-1, 3)]
     for face, corners in enumerate(mesh.faces + 1):

@@ -31,7 +31,6 @@ def positive_light(name: str) -> Tensor:
 
 
 def coverage_of(mesh: renderer.Mesh, camera: Camera, size: int) -> Tensor:
-    """Render the part of each pixel that a mesh covers, shape (size, size)."""
     black = torch.zeros(49, 3, dtype=torch.float64)
     background = renderer.render(mesh, camera, black, size, 1.0, samples=8)
     return 1 - background[0]
@@ -57,7 +56,6 @@ def test_the_brightest_channel_is_fitted_alone_and_the_others_are_pulled_toward_
 
 
 def require_same_camera(found: Camera, expected: Camera) -> None:
-    """Require axes within 1°, and a size and a position within 1 % of the image."""
     cosines = (found.axes() * expected.axes()).sum(1)
     assert min(cosines) > math.cos(math.radians(1))
     assert found.width == pytest.approx(expected.width, rel=0.01)
@@ -69,7 +67,6 @@ def require_same_camera(found: Camera, expected: Camera) -> None:
 def irradiance_error(
     found: FittedScene, mesh: renderer.Mesh, camera: Camera, light: Tensor
 ) -> float:
-    """Compare the irradiance of the visible surface under the light found and the true light."""
     white = renderer.Mesh.plain(mesh.vertices, mesh.faces)
     operator = renderer.precompute_transfer(white, camera, 64)
     expected = operator.radiance(light)
@@ -113,7 +110,6 @@ def test_a_renders_camera_and_light_are_found_before_any_background():
 
 
 def path_traced(folder: Path, mesh: renderer.Mesh, camera: Camera, light: Tensor) -> Tensor:
-    """Render a mesh with Mitsuba and three bounces, shape (4 channels with alpha, 64, 64)."""
     write_map(folder / "light.exr", mitsuba_map(light, 192))
     settings = ImageSettings(64, bounces=3)
     write_mitsuba_scene(folder, mesh, 1.0, [camera], settings, "light.exr")

@@ -105,14 +105,11 @@ def vessel() -> Mesh:
 
 
 def our_image(mesh: Mesh, camera: Camera, settings: ImageSettings) -> np.ndarray:
-    """Render radiance and coverage with an operator, shape (size, size, 4)."""
     [operator] = build_operators(mesh, [camera], settings, choose("numpy"))
     return image_of(operator, LIGHT).permute(1, 2, 0).numpy()
 
 
 class NoisyImage(NamedTuple):
-    """Mean of several images of Mitsuba, radiance and coverage, and its standard error."""
-
     mean: np.ndarray
     noise: np.ndarray
 

@@ -50,7 +50,6 @@ CAMERAS = [
 
 
 def ball() -> Mesh:
-    """Return a ball with a texture times one color above, and corner colors below."""
     sphere = trimesh.creation.icosphere(subdivisions=3)
     draws = np.random.default_rng(0)
     mesh = Mesh.plain(sphere.vertices, sphere.faces, draws.uniform(0.2, 1, sphere.vertices.shape))

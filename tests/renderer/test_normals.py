@@ -23,7 +23,6 @@ both_functions = pytest.mark.parametrize("function", [face_normals, vertex_norma
 
 
 def dented(shape: trimesh.Trimesh) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the vertices (V, 3) and faces (F, 3) of a shape whose vertices are moved."""
     dents = np.random.default_rng(0).normal(scale=0.1, size=shape.vertices.shape)
     return torch.from_numpy(shape.vertices + dents), torch.from_numpy(shape.faces)
 

@@ -33,14 +33,12 @@ def view_matrix(seed: int) -> np.ndarray:
 
 
 def pixels_of(points: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """Project points (V, 3) to pixels, x to the right and y down, shape (V, 2)."""
     in_camera = points @ view[:3, :3].T + view[:3, 3]
     positions = in_camera @ INTRINSICS.T
     return positions[:, :2] / positions[:, 2:]
 
 
 def as_pixels(image_positions: np.ndarray) -> np.ndarray:
-    """Convert positions in [-1, 1] with y up to pixels with y down."""
     return SIZE / 2 * (1 + image_positions * [1, -1])
 
 

@@ -29,7 +29,6 @@ FACE_COUNT = 20
 
 @pytest.fixture(scope="module")
 def stone() -> renderer.Mesh:
-    """Return a mesh without symmetry, with a color per face."""
     shape = trimesh.creation.icosahedron()
     plain = renderer.Mesh.plain(shape.vertices * [1.0, 0.9, 0.8], shape.faces)
     colors = np.random.default_rng(0).uniform(0.2, 0.8, (FACE_COUNT, 1, 3))
@@ -59,7 +58,6 @@ def test_an_operators_image_is_the_rendered_one(stone, light, encoding, normals)
 
 @pytest.fixture
 def variables(stone, light) -> dict[str, Tensor]:
-    """Return the inputs of `render` that have gradients."""
     albedo = torch.full((FACE_COUNT, 3), 0.5, dtype=torch.float64)
     values = {"light": light, "vertices": torch.from_numpy(stone.vertices), "albedo": albedo}
     return {name: value.clone().requires_grad_() for name, value in values.items()}
@@ -205,7 +203,6 @@ def test_lamps_and_projectors_are_rendered_as_by_operators(sky, samples):
 
 
 def ball_from_above(size: int) -> tuple[Tensor, Tensor]:
-    """Compute normals (size, size, 3) of a ball from above, +y right, and a mask of its inside."""
     centers = (torch.arange(size).double() + 0.5) * 2 / size - 1
     y = centers.expand(size, -1)
     # The top of the image lies at -x.

@@ -18,7 +18,6 @@ SPHERE = 2
 
 
 def shells(mesh: Mesh) -> list[np.ndarray]:
-    """Return the faces (F, 3) of each connected component."""
     a, b, c = mesh.faces.T
     rows = np.concatenate([a, b])
     columns = np.concatenate([b, c])

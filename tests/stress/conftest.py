@@ -49,7 +49,6 @@ def write_data(folder: Path) -> None:
 
 
 def write_sources(folder: Path) -> None:
-    """Write photos.csv, which says that all photographs are from the web."""
     lines = ["path,source_tag"]
     for path in sorted(folder.glob("*/*")):
         lines.append(f"{path.relative_to(folder).as_posix()},web")
@@ -57,7 +56,6 @@ def write_sources(folder: Path) -> None:
 
 
 def write_textured_mesh(folder: Path) -> None:
-    """Write a sphere with the files of its material and its texture."""
     sphere = trimesh.creation.icosphere(subdivisions=2)
     lines = ["mtllib mesh.mtl"]
     lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in sphere.vertices]
@@ -69,7 +67,6 @@ def write_textured_mesh(folder: Path) -> None:
 
 
 def write_scene_files(folder: Path) -> None:
-    """Write meshes, lights, lamps, a pattern of a projector and a background."""
     export_mesh(solid("lemon", 0), folder / "mesh.glb")
     for name in ("mesh.ply", "mesh.stl", "mesh.off"):
         trimesh.creation.icosphere(subdivisions=2).export(folder / name)

@@ -146,7 +146,6 @@ def arrays_changed(draw: st.DrawFn, good: bytes) -> bytes:
 
 @st.composite
 def checkpoint_changed(draw: st.DrawFn, good: bytes) -> bytes:
-    """Replace one value of a checkpoint."""
     state = torch.load(io.BytesIO(good), weights_only=True)
     node = state
     key = draw(st.sampled_from(sorted(state)))
@@ -279,7 +278,6 @@ def pickled_code(path: Path) -> None:
 
 
 def npy_header(shape: str) -> bytes:
-    """Make a file that ends after the header."""
     header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
 
@@ -313,7 +311,6 @@ def huge_png() -> bytes:
 
 
 def safetensors(**header: object) -> bytes:
-    """Make a file that ends after the header."""
     text = json.dumps(header).encode()
     return struct.pack("<Q", len(text)) + text
 

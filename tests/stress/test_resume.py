@@ -46,7 +46,6 @@ def epochs_done(run: Path) -> int:
 
 
 def without_seconds(value: Any) -> Any:
-    """Copy nested values without the entries that are times."""
     if isinstance(value, Mapping):
         kept = [key for key in value if not str(key).startswith("seconds/")]
         return {key: without_seconds(value[key]) for key in kept}

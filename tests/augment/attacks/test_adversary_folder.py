@@ -53,7 +53,6 @@ def adversary_of(done: augment.AttackResult) -> Adversary:
 
 
 def tolerance(kinds: set[str]) -> float:
-    """Return the error of 8 bits of painted textures, or of float32."""
     return 1 / 255 if kinds & CHANGE_TEXTURES else 1e-5
 
 
@@ -161,7 +160,6 @@ def pear_with_prop() -> SceneObject:
 
 
 def points(item: SceneObject, own: bool) -> set[tuple[float, ...]]:
-    """Return the places of the vertices of an object itself, or of its props and table."""
     used = np.unique(item.mesh.faces[item.own_faces == own])
     return set(map(tuple, item.mesh.vertices[used].astype(np.float32).tolist()))
 

@@ -136,7 +136,6 @@ def sheet_of(result: AttackResult) -> np.ndarray:
 
 
 def shown(sheet: np.ndarray, view: int, column: int, size: int, lines: int) -> torch.Tensor:
-    """Return the enlarged image (3, size, size) of a view in a column, above its captions."""
     scale = math.ceil(SIDE / size)
     top = MARGIN + TITLE_HEIGHT + view * (scale * size + 2 + lines * LINE_HEIGHT + GAP)
     left = MARGIN + column * (scale * size + GAP)

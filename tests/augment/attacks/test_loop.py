@@ -27,8 +27,6 @@ def random(*shape: int, seed: int) -> Tensor:
 
 
 class Linear(nn.Module):
-    """Two classes whose logits are linear in the image."""
-
     def __init__(self, bias: float = 0.0):
         super().__init__()
         self.weight = nn.Parameter(WEIGHT)
@@ -83,7 +81,6 @@ def descend(model: nn.Module, problem, criterion: ClassCriterion, settings, rest
 
 
 def attack(model: nn.Module, problem, labels: Tensor, steps: int = 30, **settings) -> Minimum:
-    """Run an untargeted descent on examples of one view each."""
     return descend(model, problem, ClassCriterion(labels[:, None]), settings_of(steps, **settings))
 
 
@@ -183,8 +180,6 @@ def test_descent_ends_when_every_view_is_misclassified_by_the_margin():
 
 
 class OfValue(nn.Module):
-    """Network whose logits are a function of the image's value (N,)."""
-
     def __init__(self, logits):
         super().__init__()
         self.logits = logits
@@ -194,7 +189,6 @@ class OfValue(nn.Module):
 
 
 def two_classes(lead) -> OfValue:
-    """Return a network whose first class leads the second by a function of the value."""
     return OfValue(lambda value: torch.stack([lead(value), torch.zeros_like(value)], dim=1))
 
 
@@ -217,8 +211,6 @@ def ridge(value: Tensor) -> Tensor:
 
 @dataclass
 class Axis:
-    """Images of one value, which steps of 1.5 change."""
-
     start: Tensor
     group_size: int = 1000
 
@@ -267,7 +259,6 @@ def test_a_step_that_does_not_lower_the_cost_is_taken_back_and_tried_at_half_its
 
 
 def attack_from_one(model: nn.Module, **settings) -> tuple[Minimum, list[float]]:
-    """Attack the value 1, and return the values that were rendered, too."""
     axis = Axis(torch.ones(1, 1, dtype=torch.float64))
     result = attack(model, axis, torch.zeros(1, dtype=torch.int64), **settings)
     assert result.success.tolist() == [True]
@@ -302,8 +293,6 @@ def test_of_several_successes_the_one_of_the_lowest_cost_is_kept():
 
 
 class ClampedScene(LinearScene):
-    """A scene whose values are pixels, clamped to [0, 1]."""
-
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
         return values.view(-1, 1, *IMAGE_SHAPE).clamp(0, 1)
 
@@ -454,7 +443,6 @@ class Watched(nn.Module):
         return self.network(images)
 
     def state(self) -> dict:
-        """Return a copy of everything that an attack could change."""
         return {
             "modes": [module.training for module in self.modules()],
             "requires_grad": [parameter.requires_grad for parameter in self.parameters()],

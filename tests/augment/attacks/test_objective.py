@@ -141,8 +141,6 @@ def test_the_cost_without_any_class_is_zero():
 
 
 class Means(nn.Module):
-    """A classifier by the channels' means, which records its images."""
-
     def __init__(self):
         super().__init__()
         self.seen = []
@@ -153,7 +151,6 @@ class Means(nn.Module):
 
 
 def random_images(*shape: int) -> Tensor:
-    """Draw images in [0, 1]."""
     return torch.rand(*shape, generator=torch.Generator().manual_seed(0))
 
 

@@ -64,7 +64,6 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
 
 
 def nearest_distance(name: str, radius: float, *points: np.ndarray) -> float:
-    """Return the distance of a point (D,) to what a box and a norm-ball share, by scipy."""
     point, center, low, high = points
     ball = {
         "type": "ineq",

@@ -42,7 +42,6 @@ def nervous(threshold: float) -> augment.Classifier:
 def counted(
     images: Tensor, classifier: augment.Classifier, criterion: ClassCriterion | None = None
 ) -> Tensor:
-    """Return which images (A, V, 3, SIZE, SIZE) count, by default as no orange."""
     views = images.shape[:2]
     criterion = criterion or ClassCriterion(torch.zeros(views, dtype=torch.long))
     predicted = classifier(images.flatten(0, 1)).argmax(1).view(views)
@@ -142,7 +141,6 @@ FINE = {
 
 
 def small_attack(attacked, parameter: str = "lighting", **settings) -> AttackResult:
-    """Attack a few images of an orange to close beyond the threshold."""
     is_light = parameter == "lighting"
     scene = {"backgrounds": [0.3, 0.4, 0.5, 0.6] if is_light else [0.3, 0.4]}
     far = attacked(parameter, scene, nervous(1e3), max_steps=8, force=True)

@@ -34,7 +34,6 @@ ON_UNLIMITED_MATERIAL = augment.AttackSettings(material=UNLIMITED)
 
 
 def recorded(build: Callable, *arguments, **options) -> tuple[Any, str]:
-    """Return the result of a call and the text of its warnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         result = build(*arguments, **options)
@@ -42,7 +41,6 @@ def recorded(build: Callable, *arguments, **options) -> tuple[Any, str]:
 
 
 def scene_of(*items, **options) -> tuple[Scene, str]:
-    """Build a scene of 8 pixels, and return the text of the warnings too."""
     return recorded(build_scene, list(items), 8, **OPTIONS | options)
 
 
@@ -137,7 +135,6 @@ def test_the_gloss_of_single_faces_and_of_other_objects_counts(single_glossy_fac
 
 
 def always_a_pear(images: Tensor) -> Tensor:
-    """Return logits (N, 2) of which the first is much higher."""
     mean = images.mean((1, 2, 3))
     return torch.stack([9 + mean, 0 * mean], dim=1)
 
@@ -146,7 +143,6 @@ CLASSIFIER = augment.Classifier(always_a_pear, size=8, classes=["pear", "other"]
 
 
 def attacked_scene(scene: Scene, settings: augment.AttackSettings) -> tuple[Scene, str]:
-    """Attack a scene, and return the scene that was shown and the text of the warnings."""
     result, told = recorded(augment.attack, CLASSIFIER, scene, settings=settings)
     return result.problem.scene, told
 
@@ -230,7 +226,6 @@ def test_light_whose_irradiance_changes_as_it_is_made_physical_is_told(sky, is_t
 
 @pytest.fixture
 def sun_map(tmp_path) -> str:
-    """Write an environment map of a single bright texel."""
     radiance = torch.zeros(64, 128, 3)
     radiance[20, 30] = 100
     write_map(tmp_path / "sun.npy", radiance)

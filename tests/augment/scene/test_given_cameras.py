@@ -18,7 +18,6 @@ INTRINSICS = [[40.0, 0.0, 10.0], [0.0, 42.0, 13.0], [0.0, 0.0, 1.0]]
 
 
 def placed(name: str = "cup") -> renderer.Mesh:
-    """Return a solid far from the origin, seven times as large as usual."""
     mesh = renderer.solid(name)
     return replace(mesh, vertices=SCALE * mesh.vertices + PLACE)
 
@@ -38,7 +37,6 @@ def cameras() -> list[renderer.Camera]:
 
 
 def images_of(scene: augment.Scene) -> torch.Tensor:
-    """Render all examples."""
     examples = torch.arange(len(scene))
     return scene.render(scene.conditions(examples), examples)
 
@@ -63,7 +61,6 @@ def test_a_scene_shows_a_mesh_in_its_world_as_a_render_does():
 
 
 def placed_scene(count: int = 1, **options) -> augment.Scene:
-    """Build a scene of a cup where it is, seen by the first cameras."""
     return augment.build_scene(
         [(placed(), "cup")], SIZE, cameras=cameras()[:count], normalize=False, **options
     )

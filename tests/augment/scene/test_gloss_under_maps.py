@@ -91,7 +91,6 @@ def brdf(
 
 
 def rendered(path: Path, mesh: Mesh) -> tuple[np.ndarray, Camera]:
-    """Return the radiance (P, 3) of the pear's pixels in a scene, and the scene's camera."""
     scene = build_scene([(mesh, "pear")], SIZE, light=str(path), rasterizer="numpy")
     camera = scene.cameras[0][0]
     [operator] = build_operators(mesh, [camera], SETTINGS, choose("numpy"), basis=scene.basis)
@@ -131,7 +130,6 @@ def integrated(
 
 
 def require_close(path: Path, largest_error: float, roughness: float, metallic: float) -> None:
-    """Require that both images agree and that hardly any lit pixel has a black channel."""
     pear = normalize(solid("pear"))
     gray = replace(pear, corner_colors=np.full_like(pear.corner_colors, ALBEDO))
     mesh = Gloss(roughness, metallic).on(gray)

@@ -18,7 +18,6 @@ SIZE = (32, 32)
 
 
 def drawn_of(model: lights.LightModel, first: dict[int, float], size=SIZE) -> lights.Drawn:
-    """Draw the numbers of a light, of which some are given."""
     draws = torch.Generator().manual_seed(0)
     values = torch.rand(1, model.dimensions + model.constants, generator=draws)
     values[0, [*first]] = torch.tensor([*first.values()], dtype=torch.float32)
@@ -26,7 +25,6 @@ def drawn_of(model: lights.LightModel, first: dict[int, float], size=SIZE) -> li
 
 
 def irradiance_of_mitsuba(surface: Surface, emitter: dict, folder) -> np.ndarray:
-    """Render a white matte surface from straight above."""
     pytest.importorskip("mitsuba")
     x, y, height = (
         part.expand(1, 1, *SIZE).flatten().double().numpy() for part in surface.position

@@ -40,12 +40,10 @@ def scene(size: int = SIZE, solid: str = "solid:orange", **choices) -> Scene:
 
 
 def rendered(shown: Scene, conditions: Conditions | None = None) -> Tensor:
-    """Render both examples; None for the scene as it is."""
     return shown.render(conditions or shown.conditions(BOTH), BOTH)
 
 
 def by_mean_color() -> augment.Classifier:
-    """Return a classifier whose logits are the means of the channels."""
     return augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
 
 

@@ -17,7 +17,6 @@ GRAY = (0.5, 0.5, 0.5)
 
 @pytest.fixture
 def plain_mesh(tmp_path) -> str:
-    """Write a mesh without colors."""
     path = str(tmp_path / "plain.stl")
     trimesh.creation.icosphere(1).export(path)
     return path

@@ -56,7 +56,6 @@ def around(camera, shape):
 
 
 def center(image, shape):
-    """Cut out the center of an image."""
     top, left = ((side - cut) // 2 for side, cut in zip(image.shape[-2:], shape, strict=True))
     return image[..., top : top + shape[0], left : left + shape[1]]
 
@@ -99,7 +98,6 @@ VIEW = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
 
 
 def ball_seen_at(camera, shape, radius, place):
-    """Return the column and the row at which the image shows a ball."""
     ball = nb.solid("ball")
     small = replace(ball, vertices=radius * ball.vertices + place)
     image = 1 - nb.render(small, camera, 0 * LIGHT, shape, 1.0, samples=8)[0]
@@ -187,13 +185,11 @@ def test_varied_scenes_have_tables_and_effects_of_the_size(shape):
 
 
 def logits(images):
-    """Return logits that depend on the brightness of the images."""
     mean = images.mean((1, 2, 3))
     return torch.stack([mean, 0.3 + 0 * mean], dim=1)
 
 
 def attacked(shape, **settings):
-    """Attack a cup in images of this shape."""
     scene = nb.build_scene([("solid:cup", "0")], shape, rasterizer="numpy", samples=1)
     return nb.attack(logits, scene, settings=nb.AttackSettings(max_steps=2, **settings))
 

@@ -26,14 +26,12 @@ ROUNDING = 13 * 8 * EPS
 
 
 def own_lights(scene: Scene) -> Tensor:
-    """Return a light (E, 49, 3) for each example."""
     draws = torch.Generator().manual_seed(0)
     offsets = torch.randn(len(scene), 49, 3, generator=draws)
     return scene.lights + 0.01 * offsets.to(scene.lights)
 
 
 def images_of_operators(scene: Scene, lights: Tensor) -> Tensor:
-    """Render all views (E, V, 3, H, W) by the operator of each."""
     item = scene.objects[0]
     images = []
     for row, cameras in enumerate(scene.cameras):
@@ -173,7 +171,6 @@ def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(
 
 
 def cup_image(gray: float, added: float, shadows: bool) -> Tensor:
-    """Render a cup, which shades itself inside."""
     cup = solid("cup")
     mesh = Mesh.plain(cup.vertices, cup.faces, (gray, gray, gray))
     view = {"width": 2.4, "polar": 35.0, "backgrounds": [0.0], "rasterizer": "numpy"}

@@ -41,14 +41,12 @@ FIRST = torch.arange(1)
 
 
 def random_lights(count: int) -> torch.Tensor:
-    """Draw lights (count, 49, 3) about an even one."""
     draws = torch.Generator().manual_seed(0)
     even = ambient(torch.full((3,), 0.3))
     return 0.3 * torch.randn(count, 49, 3, generator=draws) + even
 
 
 def built(*names: str, views: int = 2, **options) -> Scene:
-    """Build a scene of all solids from all cameras before GRAYS."""
     choices = {"backgrounds": GRAYS, "normals": "flat", "rasterizer": "numpy"}
     meshes = [(f"solid:{name}", name) for name in names]
     return build_scene(meshes, 8, views, **choices | options)
@@ -137,7 +135,6 @@ MATTE = ("solid:orange", "pear")
 
 @pytest.fixture(scope="module")
 def map_options(tmp_path_factory) -> dict:
-    """Return the options of a scene that an environment map lights."""
     path = tmp_path_factory.mktemp("map") / "map.exr"
     write_map(path, to_map(probe("grace"), 64).clamp(min=0))
     return {"light": str(path), "rasterizer": "numpy", "samples": 1}
@@ -145,7 +142,6 @@ def map_options(tmp_path_factory) -> dict:
 
 @pytest.fixture(scope="module")
 def glossy(map_options) -> Scene:
-    """Return a scene with a matte and a shiny example."""
     with pytest.warns(UserWarning, match="gloss of roughness 0.35, which takes light of degree 12"):
         return build_scene([MATTE, SHINY], 16, **map_options)
 
@@ -323,7 +319,6 @@ def test_shadows_are_computed_anew_for_large_changes_of_shape_and_kept_for_small
 def images_of_moved(
     scene: Scene, mesh: Mesh, vertices: np.ndarray, lights: torch.Tensor
 ) -> torch.Tensor:
-    """Render each example (E, 3, H, W) by the operator of its own moved mesh."""
     images = []
     for row, example in enumerate(scene.examples):
         moved = replace(mesh, vertices=vertices[row].astype(np.float64))

@@ -32,7 +32,6 @@ each_surface = pytest.mark.parametrize(
 
 
 def square(middle: list[float], first: list[float], second: list[float]) -> Mesh:
-    """Return a square with sides of length 12 along two unit vectors."""
     x = 6 * np.array(first)
     y = 6 * np.array(second)
     corners = np.add(middle, [-x - y, x - y, x + y, y - x])
@@ -41,15 +40,12 @@ def square(middle: list[float], first: list[float], second: list[float]) -> Mesh
 
 @dataclass
 class Place:
-    """A table or a wall, as a room has it and as a mesh."""
-
     height: float  # of the table; -50 is out of sight
     wall: float  # distance of the wall behind the object; 50 is out of sight
     mesh: Mesh
 
 
 def place(surface: str, camera: PerspectiveCamera | OrthographicCamera) -> Place:
-    """Return a table below the ball, or a wall behind it."""
     azimuth = math.radians(camera.azimuth)
     towards = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     aside = [-towards[1], towards[0], 0.0]
@@ -80,7 +76,6 @@ class Comparison:
 
 
 def compare(surface, camera, sky=None, lamps=(), light=(), scale: float = 1.0) -> Comparison:
-    """Compute the irradiance of a surface behind or below a ball."""
     placed = place(surface, camera)
     camera = camera.with_clip_range(9.0)
     even = ambient(torch.full((3,), 0.2))
@@ -121,7 +116,6 @@ def test_table_and_wall_are_lit_by_a_far_lamp_as_meshes_are(surface, camera):
 
 
 def distance_to_pixel(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Return how far from its pixel (SIZE, SIZE) each point (3, SIZE, SIZE) is seen."""
     middles = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
     pixels = np.stack(np.meshgrid(middles, -middles), axis=-1)
     projected = camera.project(points.reshape(3, -1).T)[:, :2]

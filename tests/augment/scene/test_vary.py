@@ -40,7 +40,6 @@ def built(*meshes: str, views: int = 1, **options) -> Scene:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Return a scene of a plate in twelve views, on black."""
     return built("solid:plate", views=12, width=6.0)
 
 
@@ -50,7 +49,6 @@ def drawn(scene: Scene, seed: int = 0, **settings) -> Scene:
 
 
 def images_of(scene: Scene) -> Tensor:
-    """Render the first view (E, 3, H, W) of all examples."""
     rows = torch.arange(len(scene))
     return scene.render(scene.conditions(rows), rows)[:, 0]
 
@@ -146,7 +144,6 @@ VARNISHED = {"gloss": SPECULAR_LAYER, "rotation": 90.0, "instances": True}
 
 @pytest.fixture(scope="module")
 def pears() -> Scene:
-    """Return a scene of four views of a pear with a glossy prop."""
     prop = ObjectSettings(mesh="solid:ball", at=[2.0, 0.0], gloss=[0.9])
     pear = ObjectSettings("solid:pear", "pear", others=[prop])
     return augment.build_scene([pear], 8, 4, rasterizer="numpy", samples=1)
@@ -231,7 +228,6 @@ def test_views_with_shadows_have_operators_even_if_they_are_shown_once():
 
 @pytest.fixture(scope="module")
 def degree_6_and_9() -> list[Scene]:
-    """Return the same scene in light of degree 6 and of degree 9."""
     pear = [("solid:pear", "pear")]
     options = {"rasterizer": "numpy", "samples": 1}
     return [augment.build_scene(pear, 8, 4, degree=degree, **options) for degree in (6, 9)]

@@ -64,7 +64,6 @@ def write_transforms(path: Path, **entries: object) -> None:
 
 
 def require_expected(path: Path, focal_y: float = FOCAL_Y) -> None:
-    """Check that points are where the formulas put them."""
     cameras = renderer.load_cameras(path)
     assert [*cameras] == NAMES
     for view, camera in enumerate(cameras.values()):

@@ -45,7 +45,6 @@ def painted(mesh: Mesh, textures: int, seed: int = 0) -> Mesh:
 
 
 def box() -> Mesh:
-    """Return a box with three different sides, above the origin."""
     geometry = trimesh.creation.box((1, 2, 3))
     return Mesh.plain(geometry.vertices + np.array([0, 0, 0.25]), geometry.faces)
 
@@ -89,7 +88,6 @@ def read_glb(path: Path) -> list[trimesh.Trimesh]:
 
 @pytest.fixture(scope="module")
 def painted_box() -> Mesh:
-    """Return a box on which some faces have a texture and others do not."""
     mesh = painted(box(), 1)
     assert (mesh.texture_ids < 0).any()
     assert (mesh.texture_ids >= 0).any()
@@ -180,7 +178,6 @@ def test_the_cameras_of_a_glb_project_as_ours(tmp_path):
 
 
 def read_tree(path: Path) -> dict:
-    """Read the JSON chunk of a .glb file, after a header of 20 bytes."""
     content = path.read_bytes()
     (length,) = struct.unpack_from("<I", content, 12)
     return json.loads(content[20 : 20 + length])
@@ -215,7 +212,6 @@ def test_faces_are_ordered_by_texture_and_textures_of_no_face_left_out(tmp_path)
 
 
 def glossy(mesh: Mesh) -> Mesh:
-    """Give each face one of three kinds of gloss, and each texture a gloss texture."""
     rng = np.random.default_rng(3)
     kinds = rng.random((3, 3), dtype=np.float32)
     shapes = [(5, 3 + number, 2) for number in range(len(mesh.textures))]

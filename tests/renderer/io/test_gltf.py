@@ -137,7 +137,6 @@ def color_texels(height: int, width: int, channels: int = 3) -> np.ndarray:
 
 
 def wrapped(index: np.ndarray, count: int, mode: int) -> np.ndarray:
-    """Return the texel of an index in the way of OpenGL."""
     if mode == 33071:
         return index.clip(0, count - 1)
     if mode == 33648:

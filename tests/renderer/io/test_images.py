@@ -49,7 +49,6 @@ def stored(primaries: tuple[float, ...], gamma: float | None, color=COLOR) -> np
 
 
 def fixed(*numbers: float) -> bytes:
-    """Write numbers of the type s15Fixed16 of ICC profiles."""
     return struct.pack(f">{len(numbers)}i", *(round(number * 65536) for number in numbers))
 
 
@@ -320,7 +319,6 @@ def test_tiff_files_whose_white_is_unknown_are_refused(tmp_path, dtype):
 
 @pytest.fixture
 def eps(tmp_path, monkeypatch) -> Path:
-    """Write an EPS file named .png, and a program in the place of Ghostscript."""
     ran = tmp_path / "ran"
     program = tmp_path / "gs"
     program.write_text(f"#!/bin/sh\ntouch {ran}\n")

@@ -48,7 +48,6 @@ end_header
 
 
 def assert_close(found: np.ndarray, expected: Any) -> None:
-    """Compare values with float32 precision. The expected ones may be broadcast."""
     assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-6, atol=1e-6)
 
 
@@ -90,7 +89,6 @@ def has_texture(mesh: Mesh) -> bool:
 
 
 def faces_point_outward(corners: np.ndarray) -> bool:
-    """Return whether the faces (F, 3 corners, 3) of a box point away from its center."""
     a, b, c = corners.swapaxes(0, 1)
     from_center = corners.mean(axis=1) - corners.mean(axis=(0, 1))
     return bool(((from_center * np.cross(b - a, c - a)).sum(axis=1) > 0).all())
@@ -113,7 +111,6 @@ UVS_OF_FRUIT = np.random.default_rng(2).random((8, 2))
 
 
 def fruit_and_leaf() -> trimesh.Scene:
-    """Return a scene with a mirrored and textured box, and a smaller box that is moved."""
     fruit = trimesh.creation.box()
     fruit.visual = TextureVisuals(uv=UVS_OF_FRUIT, material=textured_material())
     leaf = trimesh.creation.box((0.2, 0.4, 0.6))

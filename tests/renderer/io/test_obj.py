@@ -50,7 +50,6 @@ def face_colors(mesh: Mesh) -> list[tuple[float, ...]]:
 
 
 def lines_with_relative_indices(order: str) -> str:
-    """Write three tetrahedra at x = 0, 3 and 6, with the indices that `order` names."""
     lines = []
     for number in range(3):
         lines += [f"v {x + 3 * number} {y} {z}" for x, y, z in TETRAHEDRON]

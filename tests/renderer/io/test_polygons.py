@@ -30,13 +30,11 @@ def comb(rng: np.random.Generator) -> np.ndarray:
 
 
 def in_space(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Place a polygon in a random plane, or in one parallel to two axes."""
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0] if rng.random() < 0.5 else np.eye(3)
     return points @ rng.permutation(axes)[:2] + rng.normal(size=3)
 
 
 def areas_of(triangles: np.ndarray) -> np.ndarray:
-    """Compute the area vectors of triangles (T, 3 corners, 3), shape (T, 3)."""
     a, b, c = triangles.swapaxes(0, 1)
     return np.cross(b - a, c - a) / 2
 

@@ -92,7 +92,6 @@ def test_a_hdr_file_that_was_written_byte_by_byte_is_read(tmp_path):
 
 
 def write_exr(path: Path, texels: np.ndarray, names: tuple[str, ...], **attributes) -> None:
-    """Write half floats (H, W, C) to an .exr file by OpenImageIO."""
     height, width, channels = texels.shape
     spec = OpenImageIO.ImageSpec(width, height, channels, "half")
     spec.channelnames = names
@@ -156,7 +155,6 @@ LIGHT = np.array([1, 0.5, 0.1])
 
 
 def write_hdr(path: Path, header: str, rgb: np.ndarray) -> Path:
-    """Write a map of 3 × 2 equal texels with additional lines in its header."""
     exponent = math.ceil(math.log2(rgb.max())) + 1
     texel = bytes([*np.round(rgb * 2.0 ** (8 - exponent)).astype(int), exponent + 128])
     path.write_bytes(HDR_HEADER.replace(b"\n\n", f"\n{header}\n\n".encode(), 1) + 6 * texel)

@@ -34,7 +34,6 @@ PUBLISHED = """
 
 
 def irradiance(light: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
-    """Compute the irradiance (N, 3) of a light of degree 6 at unit normals (N, 3)."""
     return HARMONICS.irradiance(normals) @ light.double()[nonzero_coefficients(6)]
 
 

@@ -44,7 +44,6 @@ def test_the_basis_is_scipys_without_the_condon_shortley_sign(degree):
 
 
 def clamped_cosine_factor(l: int) -> float:
-    """Integrate the Legendre polynomial of band l times the clamped cosine over the sphere."""
     integral, _ = quad(lambda cosine: cosine * eval_legendre(l, cosine), 0, 1, epsabs=1e-13)
     return 2 * math.pi * integral
 

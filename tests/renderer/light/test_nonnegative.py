@@ -22,7 +22,6 @@ GRACE = load_light("grace").double()
 
 
 def icosphere_basis(subdivisions: int) -> Tensor:
-    """Evaluate the harmonics of degree 6 at the vertices of an icosphere, shape (N, 49)."""
     vertices = trimesh.creation.icosphere(subdivisions=subdivisions).vertices
     return basis(torch.from_numpy(np.array(vertices)), 6)
 
@@ -32,7 +31,6 @@ DENSE = icosphere_basis(5)
 
 
 def random_lights(count: int, amplitude: float) -> Tensor:
-    """Add normal noise of some amplitude to the grace probe, shape (count, 49, 3)."""
     return GRACE + amplitude * draw(count, 49, 3, seed=round(100 * amplitude))
 
 
@@ -162,7 +160,6 @@ POWERS = {
 
 
 def concentrated_light(name: str, degree: int) -> Tensor:
-    """Return the coefficients (K, 3) of point sources. Two suns shine in a dim sky."""
     powers = torch.tensor(POWERS[name], dtype=torch.float64)
     light = basis(random_directions(3, seed=4), degree).T @ powers
     if name == "two suns":

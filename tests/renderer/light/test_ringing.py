@@ -39,7 +39,6 @@ def band_factors(degree: int) -> np.ndarray:
 
 
 def kernel(factors: np.ndarray, cosines: np.ndarray) -> np.ndarray:
-    """Evaluate 4π times the kernel with given factors at the cosines of angles."""
     return legendre.legval(cosines, (2 * np.arange(len(factors)) + 1) * factors)
 
 

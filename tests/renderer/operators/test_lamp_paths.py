@@ -137,7 +137,6 @@ class LitView:
         return lit.radiance(self.basis, self.albedo, powers, positions)
 
     def changed_surface(self, vertices: Tensor, albedo: Tensor) -> Tensor:
-        """Return the radiance (3, P) of other vertices (V, 3) and albedo (S, 3)."""
         surface = Surface(self.mesh, self.view, self.settings, vertices)
         lit = LocalLightView(Rays(self.mesh), surface)
         return lit.radiance(self.basis, albedo, draw_uniform(self.basis.size, 3))

@@ -43,7 +43,6 @@ def operators_of(
 
 
 def sparse_operators() -> TransferOperators:
-    """Build operators of a light whose entries are mostly zero."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("renderer.operators.build.SMALL_MATRIX_SIZE", 0)
         operators = operators_of(basis=SumBasis((HARMONICS, Projector(16))))

@@ -57,7 +57,6 @@ LAYOUTS = {
 
 
 def multiply(operator: TransferOperator, lights: Tensor) -> Tensor:
-    """Multiply lights (..., coefficients, 3) with the whole transfer, shape (..., 3, P)."""
     reaching = lights[..., operator.nonzero, :].to(operator.transfer.dtype)
     return torch.einsum("...kc,ckp->...cp", reaching, operator.by_channel)
 

@@ -103,7 +103,6 @@ def octahedron() -> Mesh:
 
 
 def points_on_octahedron(operator: TransferOperator, camera: OrthographicCamera) -> np.ndarray:
-    """Return the points (P, 3) of the octahedron at the centers of pixels, from above."""
     size = operator.settings.size
     row, column = np.divmod(operator.pixels.numpy(), size)
     x = (column + 0.5) / size - 0.5

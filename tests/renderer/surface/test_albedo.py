@@ -36,7 +36,6 @@ def random_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
 
 
 def poster(texture: np.ndarray, uvs=UNIT_UVS, color=(1.0, 1.0, 1.0)) -> Mesh:
-    """Return the square that fills the image of ABOVE, with a texture."""
     return replace(
         Mesh.plain(SQUARE, SQUARE_FACES, color),
         corner_uvs=np.asarray(uvs, dtype=np.float32)[SQUARE_FACES],
@@ -46,13 +45,11 @@ def poster(texture: np.ndarray, uvs=UNIT_UVS, color=(1.0, 1.0, 1.0)) -> Mesh:
 
 
 def patchwork_sphere() -> Mesh:
-    """Return a sphere whose faces have different colors and textures, or no texture."""
     sphere = trimesh.creation.icosphere(subdivisions=1)
     return patchwork(sphere.vertices, sphere.faces)
 
 
 def decoded(colors: np.ndarray, encoding: str) -> np.ndarray:
-    """Decode colors by the formula of the standard."""
     return linear_of(colors) if encoding == "srgb" else colors
 
 
@@ -146,7 +143,6 @@ def test_a_painted_albedo_stays_within_zero_and_one_or_what_it_was(albedo_scale)
 
 
 def with_even_colors_on_textures(mesh: Mesh) -> Mesh:
-    """Give all corners of each textured face the color of its first corner."""
     first_colors = mesh.corner_colors[:, :1].repeat(3, axis=1)
     has_texture = (mesh.texture_ids >= 0)[:, None, None]
     return replace(mesh, corner_colors=np.where(has_texture, first_colors, mesh.corner_colors))

@@ -45,7 +45,6 @@ UP = torch.tensor([[0.0, 0, 1]], dtype=DOUBLE)
 
 
 def double(value: float) -> Tensor:
-    """Return a number as a float64 tensor of shape (1,)."""
     return torch.tensor([value], dtype=DOUBLE)
 
 
@@ -194,7 +193,6 @@ def test_lobes_and_roughness_gradients_are_those_of_quadrature_in_float32(degree
         return frame.to_world(colored if part == "colored" else white)[:, 0]
 
     def require_close(found: Tensor, expected: Tensor, tolerance: float) -> None:
-        """Compare the three parts (3, K) of lobes, or of derivatives."""
         whole = torch.stack([expected[0] + expected[1]] * 2 + [expected[2]])
         assert ((found - expected).norm(dim=1) <= tolerance * whole.norm(dim=1)).all()
 
@@ -236,7 +234,6 @@ def test_the_reflectance_has_gltfs_terms_and_fresnels(cosine, roughness):
 
 
 def zonal_amplitudes(roughness: float, degree: int, rings: int) -> np.ndarray:
-    """Project a lobe that is seen head-on onto Legendre polynomials, shape (degree + 1,)."""
     directions, solid_angles = hemisphere(rings)
     lobe = Lobe(roughness, 1, 0).reflectance(1.0, directions)
     polynomials = legendre.legvander(directions[:, 2], degree)
@@ -319,18 +316,15 @@ class WhiteSurface:
     specular_factor: float
 
     def transmitted(self, cosine: float) -> float:
-        """Return the fraction of a beam that passes the specular layer."""
         return 1 - self.specular_factor * coat_albedo_by_quadrature(cosine, self.roughness)
 
     def mean_transmitted(self) -> float:
-        """Return the fraction of diffuse light that passes the specular layer."""
         node, weight = legendre.leggauss(12)
         cosines = (node + 1) / 2
         fractions = np.array([self.transmitted(cosine) for cosine in cosines])
         return float(weight / 2 @ (2 * cosines * fractions))
 
     def reflectance(self, cosine: float, light: np.ndarray) -> np.ndarray:
-        """Evaluate the reflectance (N,) for light from directions (N, 3)."""
         heights, ring_of_light = np.unique(light[:, 2], return_inverse=True)
         entering = np.array([self.transmitted(height) for height in heights])[ring_of_light]
         diffuse = self.transmitted(cosine) * entering / self.mean_transmitted()
@@ -362,7 +356,6 @@ class FloorView:
     azimuth: float
 
     def reflectance(self, light: LocalBasis, coefficient: float, gloss: Gloss) -> float:
-        """Measure the reflectance in a light with one coefficient for all functions."""
         camera = OrthographicCamera(math.degrees(self.seen), 0.0, 1e-3)
         [operator] = operators_of(FLOOR, [camera], ImageSettings(1, 1), light, gloss)
         coefficients = UP.new_full((light.size, 3), coefficient)
@@ -498,7 +491,6 @@ def mitsuba_radiance(
 
 
 def our_radiance(mesh: Mesh, light: Tensor, gloss: Gloss, shadows: bool = False) -> Tensor:
-    """Render a mesh in environment light by an operator, shape (3, 16, 16)."""
     settings = ImageSettings(16, 8, normals="smooth", shadows=shadows)
     light_basis = Harmonics(math.isqrt(len(light)) - 1)
     [operator] = operators_of(mesh, [CAMERA], settings, light_basis, gloss)

@@ -36,12 +36,10 @@ SPECIAL = [
 
 
 def irradiance(normals: Tensor, light: Tensor) -> Tensor:
-    """Compute the irradiance (3, N) at normals (N, 3), in the precision of the light."""
     return shading.irradiance(normals.T, light, light.dtype)
 
 
 def some_normals(count: int) -> Tensor:
-    """Return normals of other lengths than 1, and special ones of length 1."""
     return torch.cat([3 * draw(count, 3), torch.tensor(SPECIAL, dtype=torch.float64)])
 
 
@@ -185,7 +183,6 @@ class Image:
         return canvas.index_copy(1, self.scene.fragments.pixels, tonemap(*arguments))
 
     def is_clamped(self, *inputs: Tensor) -> Tensor:
-        """Return a mask (3, P) of the values that the clamp changes."""
         values, *around = self.tonemap_arguments(*inputs)
         composite = values + background_term(*around)
         return (composite < 0) | (composite > 1)
@@ -201,7 +198,6 @@ def fourth_order_difference(
     steps: Sequence[Tensor],
     length: float,
 ) -> Tensor:
-    """Differentiate a function along steps, with an error of the order of length⁴."""
     near = function(*move(inputs, steps, length)) - function(*move(inputs, steps, -length))
     far = function(*move(inputs, steps, 2 * length)) - function(*move(inputs, steps, -2 * length))
     return (8 * near - far) / (12 * length)

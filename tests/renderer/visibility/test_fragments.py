@@ -19,14 +19,12 @@ CAMERAS = [CAMERA, OrthographicCamera(143.2, -114.6, 1.6)]
 
 
 def dented_sphere() -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) and faces (F, 3) of a closed sphere with dents."""
     sphere = trimesh.creation.icosphere(subdivisions=1)
     radii = np.random.default_rng(0).uniform(0.7, 1, (len(sphere.vertices), 1))
     return sphere.vertices * radii, np.array(sphere.faces)
 
 
 def open_shell() -> tuple[np.ndarray, np.ndarray]:
-    """Return two thirds of the dented sphere, so that some faces are seen from behind."""
     vertices, faces = dented_sphere()
     return vertices, faces[: 2 * len(faces) // 3]
 
@@ -43,7 +41,6 @@ def fragments_of(
 
 
 def covered_samples(ids: np.ndarray, size: int, samples: int) -> np.ndarray:
-    """Return the indices of the covered samples of an image of face ids, pixel by pixel."""
     indices = np.arange(ids.size).reshape(size, samples, size, samples).swapaxes(1, 2).ravel()
     return indices[ids.ravel()[indices] >= 0]
 

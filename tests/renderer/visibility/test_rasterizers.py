@@ -50,13 +50,11 @@ class Scene(NamedTuple):
 
 
 def scene_of(*corners: list[float]) -> Scene:
-    """Return one view of triangles, each of three successive corners."""
     faces = np.arange(len(corners)).reshape(-1, 3)
     return Scene(np.array([corners], dtype=np.float64), faces)
 
 
 def rectangle(left: float, right: float, bottom: float, top: float, z: float) -> list[list[float]]:
-    """Return the six corners of two triangles that form a rectangle."""
     a, b, c, d = (
         [x, y, z] for x, y in ((left, bottom), (right, bottom), (right, top), (left, top))
     )
@@ -64,7 +62,6 @@ def rectangle(left: float, right: float, bottom: float, top: float, z: float) ->
 
 
 def random_triangles(seed: int, count: int, reach: float = 1, depth: float = 0.9) -> Scene:
-    """Draw one view of triangles with corners at |x|, |y| < reach and |z| < depth."""
     corners = np.random.default_rng(seed).uniform(-1, 1, (1, count * 3, 3))
     faces = np.arange(count * 3).reshape(-1, 3)
     return Scene(corners * [reach, reach, depth], faces)
@@ -143,13 +140,11 @@ def coordinates(resolution: int) -> st.SearchStrategy[float]:
 
 
 def depths() -> st.SearchStrategy[float]:
-    """Draw z: in and out of the range, and far away."""
     quarter = st.integers(-5, 5).map(lambda index: index / 4)
     return st.one_of(quarter, st.floats(-1.1, 1.1), FAR_AWAY)
 
 
 def nearly_equal_depths() -> st.SearchStrategy[float]:
-    """Draw z so that depths differ by less than they are rounded."""
     return st.integers(-8, 8).map(lambda steps: steps / FAR / 4)
 
 

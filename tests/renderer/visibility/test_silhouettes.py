@@ -49,7 +49,6 @@ def rendered(
 
 
 def soft_front_light(radiance: float) -> Tensor:
-    """Return light under which a white surface has a radiance, in float64."""
     return ambient(torch.full((3,), radiance / math.pi).double())
 
 
@@ -71,7 +70,6 @@ def smooth_sums(image: Tensor) -> Tensor:
 
 
 def derivatives(image: ChangedImage, directions: Tensor, samples: int) -> Tensor:
-    """Compute the derivative of each sum along each direction from gradients, shape (D, 3)."""
     change = torch.zeros_like(directions[0]).requires_grad_()
     columns = []
     for value in smooth_sums(image(change, samples)):
@@ -82,7 +80,6 @@ def derivatives(image: ChangedImage, directions: Tensor, samples: int) -> Tensor
 
 @torch.no_grad()
 def differences(image: ChangedImage, directions: Tensor, samples: int, step: float) -> Tensor:
-    """Compute central differences of the sums, with the shapes of `derivatives`."""
     rows = []
     for direction in directions:
         forward = smooth_sums(image(step * direction, samples))
@@ -96,8 +93,6 @@ def relative_error(found: Tensor, expected: Tensor) -> float:
 
 
 def moved_vertices(mesh: renderer.Mesh, camera: Camera, size: int, normals: str) -> ChangedImage:
-    """Return the image of a mesh whose vertices are moved by a change (V, 3)."""
-
     def image(change: Tensor, samples: int) -> Tensor:
         vertices = torch.from_numpy(mesh.vertices) + change
         options = {"vertices": vertices, "normals": normals, "silhouettes": change.requires_grad}
@@ -109,8 +104,6 @@ def moved_vertices(mesh: renderer.Mesh, camera: Camera, size: int, normals: str)
 def moved_camera(
     mesh: renderer.Mesh, camera: Camera, names: list[str], size: int, gloss=None
 ) -> ChangedImage:
-    """Return the image of a mesh from a camera whose fields are changed by a vector."""
-
     def image(change: Tensor, samples: int) -> Tensor:
         values = {
             name: getattr(camera, name) + amount for name, amount in zip(names, change, strict=True)

@@ -31,7 +31,6 @@ def problem_of(scene: Scene, **units) -> SceneProblem:
 def costs(
     result: augment.AttackResult, classifier: augment.Classifier, values: torch.Tensor
 ) -> torch.Tensor:
-    """Return the log-probability (N,) of the right class for poses (N, D)."""
     rows = torch.zeros(len(values), dtype=torch.int64)
     logits = classifier(result.problem.render(values, rows)[:, 0])
     return logits.log_softmax(1)[:, result.criterion.source[0, 0]]
