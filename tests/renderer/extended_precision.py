@@ -8,7 +8,7 @@ Derivatives are complex steps, Im f(x + ih) / h, which lose no digits (Squire an
 Trapp 1998). Vectors are columns: N vectors have the shape (3, N).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
@@ -46,9 +46,6 @@ def is_exact(values: np.ndarray) -> bool:
     return values.dtype == object
 
 
-# ---------------------------------------------------------------------------- images
-
-
 @dataclass(frozen=True)
 class View:
     """S samples of the P covered pixels of an image, and the G faces that they show.
@@ -69,16 +66,7 @@ class View:
     samples: int
 
 
-def view(
-    ids: np.ndarray,
-    samples: int,
-    placed: np.ndarray,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    albedo: np.ndarray,
-    towards: np.ndarray,
-    lift: Callable[[np.ndarray], np.ndarray],
-) -> View:
+def view(ids, samples, placed, vertices, faces, albedo, towards, lift) -> View:
     """Create a view from the index of the face at each sample, or a negative number, (R, R).
 
     The camera sees the vertices `placed`, and `vertices` are shaded.
@@ -123,9 +111,7 @@ def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
     return gradient
 
 
-def vertex_gradient(
-    view: View, upstream: np.ndarray, light: np.ndarray, vertex_count: int
-) -> np.ndarray:
+def vertex_gradient(view, upstream, light, vertex_count) -> np.ndarray:
     """Compute the gradient (V, 3) of Σ upstream × image by the shaded vertices.
 
     Faces without area do not contribute.
@@ -147,9 +133,7 @@ def vertex_gradient(
     return added(vertex_count, view.corners.ravel(), by_corner.reshape(-1, 3))
 
 
-def _weighted_irradiance(
-    view: View, weight: np.ndarray, light: np.ndarray, first: np.ndarray, second: np.ndarray
-) -> np.ndarray:
+def _weighted_irradiance(view, weight, light, first, second) -> np.ndarray:
     normals = unit(cross(first, second)) * view.side
     return (irradiance(normals, light) * weight).sum(axis=1)
 
@@ -166,9 +150,6 @@ def normals_of(view: View) -> np.ndarray:
 def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first, second, third = vertices[faces].transpose(1, 2, 0)
     return second - first, third - first
-
-
-# ---------------------------------------------------------------------------- harmonics
 
 
 def irradiance(normals: np.ndarray, light: np.ndarray) -> np.ndarray:
@@ -266,12 +247,7 @@ def _legendre(l: int, m: int) -> list[tuple[int, Fraction]]:
     return terms
 
 
-# ---------------------------------------------------------------------------- shadows
-
-
-def shadow(
-    view: View, points: np.ndarray, corners: np.ndarray, directions: np.ndarray, degree: int
-) -> np.ndarray:
+def shadow(view, points, corners, directions, degree) -> np.ndarray:
     """Compute the radiance (P, (degree + 1)², 3) that shadows take from each pixel.
 
     The rays and their origins (S, 3) are those of the renderer. Which rays are blocked,
@@ -300,9 +276,6 @@ def is_blocked(point: np.ndarray, directions: np.ndarray, corners: np.ndarray) -
     volume = (a * np.cross(b, c)).sum(axis=1)
     is_met = (passed * np.sign(volume) > 0).all(axis=0)
     return is_met.any(axis=1)
-
-
-# ---------------------------------------------------------------------------- numbers
 
 
 def stepped(values: np.ndarray, along: np.ndarray) -> np.ndarray:

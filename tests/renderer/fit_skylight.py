@@ -97,9 +97,7 @@ def fit_error(fit: torch.Tensor, skies: int, rng: np.random.Generator) -> float:
     return float(relative_errors.max())
 
 
-def coefficients_by_quadrature(
-    zenith: float, azimuth: float, turbidity: float, nodes: int = 48
-) -> np.ndarray:
+def coefficients_by_quadrature(zenith, azimuth, turbidity, nodes=48) -> np.ndarray:
     """Integrate the sky's radiance times harmonics over the upper hemisphere, shape (49, 3).
 
     The quadrature has 4 · nodes² directions in polar coordinates around the sun, whose cusp is an

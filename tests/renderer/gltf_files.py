@@ -65,9 +65,7 @@ class Gltf:
             "values": {"bufferView": self.view(values.tobytes())},
         }
 
-    def mesh(
-        self, attributes: dict[str, Any], indices: np.ndarray | None = None, **entries: Any
-    ) -> dict[str, Any]:
+    def mesh(self, attributes, indices=None, **entries) -> dict[str, Any]:
         """Append a mesh with one primitive, and return the primitive."""
         accessors = {
             name: values if isinstance(values, int) else self.array(values)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from renderer.camera import Points
 from renderer.mesh import Mesh, concatenate
-from renderer.settings import Size, height_and_width
+from renderer.settings import height_and_width
 from renderer.visibility import Rasterizer
 
 NO_FACE = -1
@@ -25,9 +25,7 @@ class Chart(Rasterizer):
     name: str = "chart"
     description: str = "a chart of the faces"
 
-    def rasterize(
-        self, points: Points, faces: np.ndarray, resolution: Size, closed: bool = False
-    ) -> Points:
+    def rasterize(self, points, faces, resolution, closed=False) -> Points:
         shape = height_and_width(resolution)
         ids = np.full((len(points), math.prod(shape)), NO_FACE, dtype=np.int32)
         ids[:, : len(faces)] = np.arange(len(faces))

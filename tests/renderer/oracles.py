@@ -2,13 +2,15 @@
 
 import io
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 from PIL import Image
 from scipy.special import sph_harm_y_all
@@ -58,9 +60,7 @@ def scipy_basis(directions: np.ndarray | torch.Tensor, degree: int) -> np.ndarra
     return real_harmonics(sph_harm_y_all(degree, degree, polar, azimuth)).T
 
 
-def scipy_irradiance(
-    normals: np.ndarray | torch.Tensor, light: np.ndarray | torch.Tensor
-) -> np.ndarray:
+def scipy_irradiance(normals, light) -> np.ndarray:
     """Compute the irradiance Σ A_l U_lm Y_lm(n), (N, 3). test_harmonics.py checks the factors."""
     degree = math.isqrt(len(light)) - 1
     factors = lambertian_factors(degree).numpy()
@@ -151,3 +151,64 @@ def dielectric_fresnel(cosine: np.ndarray, index: float = 1.5) -> np.ndarray:
     across = (cosine - index * inside) / (cosine + index * inside)
     along = (index * cosine - inside) / (index * cosine + inside)
     return (across**2 + along**2) / 2
+
+
+def toward(cosine: float) -> torch.Tensor:
+    """Return the direction (1, 3) to a camera on the -x side, at a cosine from +z."""
+    return torch.tensor([[-math.sqrt(1 - cosine**2), 0, cosine]], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """A microfacet lobe by the appendix of glTF 2.0.
+
+    f0 and f90 are Fresnel terms at normal and grazing incidence. Without f0 it is a dielectric
+    with a refractive index of 1.5, by Fresnel's equations.
+    """
+
+    roughness: float
+    f0: float | None = None
+    f90: float = 1.0
+
+    def reflectance(self, cosine: float, light: np.ndarray) -> np.ndarray:
+        """Evaluate the reflectance (N,) for light (N, 3), and a camera at a cosine from +z."""
+        view = toward(cosine)[0].numpy()
+        half = (light + view) / np.linalg.norm(light + view, axis=1, keepdims=True)
+        return self.of_cosines(light[:, 2], cosine, half[:, 2], np.clip(half @ view, 0, 1))
+
+    def of_cosines(self, n_dot_l, n_dot_v, n_dot_h, v_dot_h) -> np.ndarray:
+        """Evaluate the reflectance for the cosines between normal, light, camera and their half."""
+        alpha = self.roughness**2
+        distribution = alpha**2 / (np.pi * (n_dot_h**2 * (alpha**2 - 1) + 1) ** 2)
+        masking = smith_masking(n_dot_l, self.roughness) * smith_masking(n_dot_v, self.roughness)
+        if self.f0 is None:
+            fresnel = dielectric_fresnel(v_dot_h)
+        else:
+            fresnel = self.f0 + (self.f90 - self.f0) * (1 - v_dot_h) ** 5  # by Schlick
+        return np.pi * fresnel * distribution * masking / (4 * n_dot_l * n_dot_v)
+
+
+def directions_of(z: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    radius = np.sqrt(1 - z**2)
+    x = radius * np.cos(azimuth)
+    y = radius * np.sin(azimuth)
+    return np.stack(np.broadcast_arrays(x, y, z), axis=-1).reshape(-1, 3)
+
+
+@cache
+def half_hemisphere() -> tuple[np.ndarray, np.ndarray]:
+    """Return directions with y > 0, densest where lobes are narrow, and twice their weights."""
+    node, weight = legendre.leggauss(100)
+    around, step = legendre.leggauss(50)
+    root = (node[:, None] + 1) / 2
+    fraction = (around + 1) / 2
+    solid_angles = weight[:, None] * root * 3 * math.pi * fraction**2 * step
+    return directions_of(root**2, math.pi * fraction**3), solid_angles.ravel()
+
+
+@cache
+def coat_albedo(cosine: float, roughness: float) -> float:
+    """Integrate the fraction of a beam that the specular layer of a dielectric reflects."""
+    directions, solid_angles = half_hemisphere()
+    lobe = Lobe(roughness).reflectance(cosine, directions)
+    return float(lobe * directions[:, 2] @ solid_angles) / math.pi

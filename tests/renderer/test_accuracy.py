@@ -136,9 +136,6 @@ class Setup:
         return self.lift(values.double().numpy())
 
 
-# ---------------------------------------------------------------------------- conditions
-
-
 def harmonics_cases(degree: int) -> Iterator[Case]:
     directions = torch.from_numpy(np.random.default_rng(0).normal(size=(6, 3)))
     every_degree = partial(harmonics_errors, degrees=range(1, degree + 1))
@@ -303,9 +300,6 @@ def moved(vertices: np.ndarray) -> Setup:
     return Setup(normalize(replace(hard.sphere(), vertices=vertices)), vertices=vertices)
 
 
-# ---------------------------------------------------------------------------- measurement
-
-
 def units(ours: Tensor, reference: np.ndarray) -> float:
     """Return the largest error divided by the largest magnitude, in units of ε.
 
@@ -327,9 +321,7 @@ def all_errors(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
     return operator_errors(setup, dtype) | geometry_errors(setup)
 
 
-def operator_errors(
-    setup: Setup, dtype: torch.dtype = torch.float32, lost: np.ndarray | None = None
-) -> Errors:
+def operator_errors(setup, dtype=torch.float32, lost=None) -> Errors:
     """Measure the errors of an operator's image and of its gradient by the light.
 
     Shadows take the radiance `lost` (P, (degree + 1)², 3) from each pixel.
@@ -432,9 +424,6 @@ def random_upstream(rows: int) -> Tensor:
     return torch.randint(-64, 65, (rows, 3), generator=generator) / 64.0
 
 
-# ---------------------------------------------------------------------------- tests
-
-
 @pytest.mark.parametrize(
     "case",
     [
@@ -458,9 +447,6 @@ def test_the_references_harmonics_are_scipys_without_the_condon_shortley_sign(li
     values = wide.basis(lift(directions.T), 6).astype(float)
     # The tolerance is the rounding error of SciPy.
     np.testing.assert_allclose(values, scipy_basis(directions, 6), rtol=0, atol=1e-14)
-
-
-# ---------------------------------------------------------------------------- the tables
 
 
 def main() -> int:

@@ -64,9 +64,7 @@ def require_same_camera(found: Camera, expected: Camera) -> None:
     assert found.up == pytest.approx(expected.up, abs=tolerance)
 
 
-def irradiance_error(
-    found: FittedScene, mesh: renderer.Mesh, camera: Camera, light: Tensor
-) -> float:
+def irradiance_error(found, mesh, camera, light) -> float:
     white = renderer.Mesh.plain(mesh.vertices, mesh.faces)
     operator = renderer.precompute_transfer(white, camera, 64)
     expected = operator.radiance(light)

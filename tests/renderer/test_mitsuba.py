@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import hard_meshes as hard
@@ -114,9 +113,7 @@ class NoisyImage(NamedTuple):
     noise: np.ndarray
 
 
-def mitsuba_image(
-    folder: Path, mesh: Mesh, camera: Camera, settings: ImageSettings, ray_count: int
-) -> NoisyImage:
+def mitsuba_image(folder, mesh, camera, settings, ray_count) -> NoisyImage:
     """Render the files of a scene with Mitsuba, several times with `ray_count` rays per pixel."""
     write_map(folder / "light.exr", mitsuba_map(LIGHT, MAP_ROWS))
     write_mitsuba_scene(folder, mesh, 1.0, [camera], settings, "light.exr")

@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
@@ -95,9 +94,7 @@ def run_here(name: str, *arguments: str, folder: Path) -> int:
     return 0
 
 
-def start_command(
-    *arguments: str, folder: Path, limit: Callable[[], object] | None = None, **environment: str
-) -> Process:
+def start_command(*arguments, folder, limit=None, **environment) -> Process:
     """Start `python` with these arguments in a process of its own, in a folder.
 
     The process calls `limit` before Python starts.

@@ -96,9 +96,7 @@ def assert_resumed(data, uninterrupted, capfd) -> Callable[[Path], str]:
     return resumed
 
 
-def interrupt(
-    data: Path, run: Path, signals: tuple[signal.Signals, ...], rng: np.random.Generator
-) -> None:
+def interrupt(data, run, signals, rng) -> None:
     """Continue a run up to a random epoch, send it signals, and check how it ends."""
     done_before = epochs_done(run)
     process = start(data, run, rng.integers(done_before + 1, EPOCHS + 1))

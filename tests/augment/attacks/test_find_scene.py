@@ -37,9 +37,7 @@ def built(settings: SceneSettings, shared: bool = False) -> augment.Scene:
     return augment.build_scene(meshes, 16, settings.views, **options)
 
 
-def found(
-    score: Score, settings: SceneSettings, cameras: int = 40, shared: bool = False
-) -> SceneSettings:
+def found(score, settings, cameras=40, shared=False) -> SceneSettings:
     build = partial(built, shared=shared)
     classifier = classifier_of(score)
     return find_scene(classifier, settings, LIGHTING, build, cameras, generator(0))[0]

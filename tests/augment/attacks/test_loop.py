@@ -84,9 +84,6 @@ def attack(model: nn.Module, problem, labels: Tensor, steps: int = 30, **setting
     return descend(model, problem, ClassCriterion(labels[:, None]), settings_of(steps, **settings))
 
 
-# --------------------------------------------------------------- known minima
-
-
 @pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
 def test_the_lowest_point_of_a_ball_is_found_from_anywhere_in_it(optimizer, norm):
@@ -174,9 +171,6 @@ def test_descent_ends_when_every_view_is_misclassified_by_the_margin():
     has_ended = result.steps < 30
     assert has_ended.sum() > 4
     assert (leads[has_ended] >= 0.5).all()
-
-
-# --------------------------------------------------------------- shorter steps
 
 
 class OfValue(nn.Module):
@@ -312,9 +306,6 @@ def test_a_zero_gradient_leaves_the_values_and_is_reported(step):
     assert torch.equal(result.values[1], start[1])
 
 
-# --------------------------------------------------------------- examples by themselves
-
-
 def small_network() -> nn.Sequential:
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -418,9 +409,6 @@ def test_restarts_go_on_with_the_examples_without_success_and_keep_the_first_suc
         assert int(problem.render_counts[row]) == step_count + last + 1
     for name in ("cost_before", "success_before", "zero_gradient"):
         assert torch.equal(getattr(result, name), getattr(single[0], name))
-
-
-# --------------------------------------------------------------- what is left as it was
 
 
 class Watched(nn.Module):

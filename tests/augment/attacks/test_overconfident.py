@@ -21,9 +21,7 @@ def scene(network) -> nb.Scene:
     return nb.build_scene([("solid:orange:7", "orange")], network.size, **options)
 
 
-def attack(
-    network: nb.Classifier, scene: nb.Scene, factor: float, optimizer: str
-) -> nb.AttackResult:
+def attack(network, scene, factor, optimizer) -> nb.AttackResult:
     def logits(images: torch.Tensor) -> torch.Tensor:
         return factor * network.network(images)
 

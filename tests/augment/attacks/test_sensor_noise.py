@@ -39,9 +39,7 @@ def nervous(threshold: float) -> augment.Classifier:
     return augment.Classifier(logits, SIZE, ("orange", "other"), "nervous")
 
 
-def counted(
-    images: Tensor, classifier: augment.Classifier, criterion: ClassCriterion | None = None
-) -> Tensor:
+def counted(images, classifier, criterion=None) -> Tensor:
     views = images.shape[:2]
     criterion = criterion or ClassCriterion(torch.zeros(views, dtype=torch.long))
     predicted = classifier(images.flatten(0, 1)).argmax(1).view(views)

@@ -2,13 +2,12 @@
 
 import math
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from oracles import dielectric_fresnel, smith_masking
+from oracles import Lobe, coat_albedo
 
 from augment.scene.build import build_scene
 from renderer.camera import Camera
@@ -36,58 +35,23 @@ METALLIC = {"varnish": 0.0, "metal": 1.0}
 pytestmark = pytest.mark.filterwarnings("ignore:.*takes light of degree")
 
 
-@cache
-def varnish_reflectance(roughness: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return cosines, and the fraction of light from there that a varnish reflects.
-
-    Half vectors are drawn from GGX at 100 × 100 stratified points.
-    """
-    alpha = roughness**2
-    count = 100
-    cosines = np.linspace(0, 1, 101) ** 2
-    cosines[0] = 1e-6
-    strata = (np.arange(count) + 0.5) / count
-    fraction, azimuth = np.meshgrid(strata, 2 * np.pi * strata)
-    height = np.sqrt((1 - fraction) / (1 + (alpha**2 - 1) * fraction))
-    reflectance = []
-    for cosine in cosines:
-        across = np.sqrt(1 - cosine**2) * np.sqrt(1 - height**2) * np.cos(azimuth)
-        facing = cosine * height + across
-        leaving = 2 * facing * height - cosine
-        weight = dielectric_fresnel(np.clip(facing, 0, 1)) * facing / (cosine * height)
-        weight = (
-            weight * smith_masking(cosine, roughness) * smith_masking(leaving.clip(1e-9), roughness)
-        )
-        is_reflected = (leaving > 0) & (facing > 0)
-        reflectance.append(np.where(is_reflected, weight, 0).mean())
-    return cosines, np.array(reflectance)
-
-
-def brdf(
-    normals: np.ndarray, view: np.ndarray, light: np.ndarray, roughness: float, metallic: float
-) -> np.ndarray:
-    """Return π times the BRDF (S, N) of glTF for a gray surface.
-
-    The diffuse part below a varnish is that of Kulla and Conty (2017).
-    """
-    alpha = roughness**2
+def brdf(normals, view, light, roughness, metallic) -> np.ndarray:
+    """Return π times the BRDF (S, N) of a gray surface, after Kulla and Conty (2017)."""
     half = light + view
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     light_cosine = (normals @ light.T).clip(1e-9)
     view_cosine = (normals @ view[None].T).clip(1e-9)
-    half_cosine = normals @ half.T
-    view_half_cosine = half @ view
-    distribution = alpha**2 / (half_cosine**2 * (alpha**2 - 1) + 1) ** 2
-    shadowing = smith_masking(light_cosine, roughness) * smith_masking(view_cosine, roughness)
-    specular = distribution * shadowing / (4 * light_cosine * view_cosine)
+    lobe = Lobe(roughness, ALBEDO if metallic else None)
+    specular = lobe.of_cosines(light_cosine, view_cosine, normals @ half.T, half @ view)
     if metallic:
-        return specular * (ALBEDO + (1 - ALBEDO) * (1 - view_half_cosine) ** 5)
-    cosines, reflectance = varnish_reflectance(roughness)
+        return specular
+    cosines = np.linspace(0, 1, 101) ** 2
+    reflectance = np.array([coat_albedo(max(cosine, 1e-6), roughness) for cosine in cosines])
     mean = np.trapezoid(2 * reflectance * cosines, cosines)
     entering = 1 - np.interp(light_cosine, cosines, reflectance)
     leaving = 1 - np.interp(view_cosine, cosines, reflectance)
     diffuse = entering * leaving / (1 - mean)
-    return specular * dielectric_fresnel(view_half_cosine) + ALBEDO * diffuse
+    return specular + ALBEDO * diffuse
 
 
 def rendered(path: Path, mesh: Mesh) -> tuple[np.ndarray, Camera]:
@@ -110,9 +74,7 @@ def texels(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return directions.flatten(0, 1).numpy(), power.flatten(0, 1).numpy() * scale
 
 
-def integrated(
-    path: Path, mesh: Mesh, camera: Camera, roughness: float, metallic: float
-) -> np.ndarray:
+def integrated(path, mesh, camera, roughness, metallic) -> np.ndarray:
     """Return the radiance (P, 3) of the pear's pixels by quadrature over all texels."""
     rasterizer = choose("numpy")
     [view] = build_fragments(mesh.vertices, mesh.faces, [camera], SETTINGS, rasterizer)

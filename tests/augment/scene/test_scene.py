@@ -27,7 +27,6 @@ from augment.settings import ObjectSettings
 from renderer.camera import orbit_cameras
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import ambient, probe
-from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.visibility import choose
@@ -316,9 +315,7 @@ def test_shadows_are_computed_anew_for_large_changes_of_shape_and_kept_for_small
         assert least <= error < most
 
 
-def images_of_moved(
-    scene: Scene, mesh: Mesh, vertices: np.ndarray, lights: torch.Tensor
-) -> torch.Tensor:
+def images_of_moved(scene, mesh, vertices, lights) -> torch.Tensor:
     images = []
     for row, example in enumerate(scene.examples):
         moved = replace(mesh, vertices=vertices[row].astype(np.float64))

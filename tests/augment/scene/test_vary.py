@@ -57,9 +57,6 @@ def cameras_of(scene: Scene) -> list:
     return [camera for (camera,) in scene.cameras]
 
 
-# --------------------------------------------------------------- cameras
-
-
 def outlines(scene: Scene) -> tuple[Tensor, Tensor]:
     """Measure what the object covers, in fractions of the image's width.
 
@@ -111,9 +108,6 @@ def test_views_in_perspective_have_the_lens_drawn_and_the_width_of_their_own():
     assert 28 < max(lenses) <= 35
     for camera in cameras:
         assert 2 <= camera.width <= 4
-
-
-# --------------------------------------------------------------- objects and props
 
 
 def test_each_object_is_turned_about_an_axis_of_its_own_and_its_props_stay_on_the_ground():
@@ -188,8 +182,6 @@ def test_each_view_shows_another_instance_before_all_backgrounds():
     assert len({item.mesh.corner_colors.tobytes() for item in varied.objects}) == 6
 
 
-# --------------------------------------------------------------- views that are shown once
-
 ONCE = VariationSettings(shift=0.1, instances=True, azimuth=30.0)
 
 
@@ -223,9 +215,6 @@ def test_views_with_shadows_have_operators_even_if_they_are_shown_once():
     assert not vary(scene, VariationSettings(shift=0.1), generator(0), True).one_light
 
 
-# --------------------------------------------------------------- light of a higher degree
-
-
 @pytest.fixture(scope="module")
 def degree_6_and_9() -> list[Scene]:
     pear = [("solid:pear", "pear")]
@@ -255,9 +244,6 @@ def test_an_environment_beyond_the_degree_of_the_scene_is_refused(degree_6_and_9
     assert torch.equal(load_light(path, 9), light)
     with pytest.raises(InputError, match=r"light.json has harmonics beyond degree=6"):
         drawn(low, environments=[path])
-
-
-# --------------------------------------------------------------- tables
 
 
 @pytest.fixture(scope="module")
@@ -327,9 +313,6 @@ def test_local_lights_light_a_drawn_table_as_they_do_a_ground_of_triangles():
     assert errors[:, is_covered].median() < 1e-3
     # The samples of a pixel differ at the edge of a shadow.
     assert errors[:, is_covered].quantile(0.97) < 0.05
-
-
-# --------------------------------------------------------------- light and exposure
 
 
 def test_light_is_drawn_as_without_local_lights_and_these_stay():
@@ -404,9 +387,6 @@ def test_an_object_on_a_table_is_not_lit_from_below(scene):
     assert torch.equal(standing, free.abs())
 
 
-# --------------------------------------------------------------- backgrounds
-
-
 def test_backgrounds_take_colors_up_to_the_saturation():
     white = built("solid:plate", views=60, backgrounds=[1.0], encoding="srgb")
     backgrounds = drawn(white, background_saturation=0.3).backgrounds
@@ -447,8 +427,6 @@ def test_a_lit_background_is_shaded_as_a_wall_facing_the_camera():
     torch.testing.assert_close(wall[::2], middle[::2], rtol=0.01, atol=0)
     torch.testing.assert_close(wall[1::2] / gray, middle[1::2], rtol=0.01, atol=0)
 
-
-# --------------------------------------------------------------- camera effects
 
 WIDTH = 12
 COUNT = 40

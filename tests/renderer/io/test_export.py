@@ -25,10 +25,7 @@ EPS32 = np.finfo(np.float32).eps
 
 
 def painted(mesh: Mesh, textures: int, seed: int = 0) -> Mesh:
-    """Give each corner its own color and texture coordinates, so that every edge is a seam.
-
-    Faces have one of several textures of different sizes, or none.
-    """
+    """Give each corner its own color and texture coordinates, and each face a texture or none."""
     rng = np.random.default_rng(seed)
     face_count = len(mesh.faces)
     ids = np.sort(rng.integers(-1, textures, face_count)).astype(np.int32)
@@ -58,11 +55,7 @@ MESHES = {
 
 
 def assert_same_surface(loaded: Mesh, mesh: Mesh) -> None:
-    """Compare two meshes up to the rounding to float32.
-
-    Positions are rounded once. Colors are rounded twice, as linear and as
-    encoded values. The file holds 1 - v, which is at most 2.
-    """
+    """Colors are rounded twice, as linear and as encoded values. The file holds 1 - v."""
     assert_array_equal(corners_of(loaded), corners_of(mesh).astype(np.float32))
     assert_allclose(loaded.corner_colors, mesh.corner_colors, rtol=2 * EPS32, atol=0)
     assert_allclose(loaded.corner_uvs, mesh.corner_uvs, rtol=0, atol=2 * EPS32)
@@ -86,47 +79,25 @@ def read_glb(path: Path) -> list[trimesh.Trimesh]:
     return list(trimesh.load(path, force="scene", process=False).geometry.values())
 
 
-@pytest.fixture(scope="module")
-def painted_box() -> Mesh:
+def test_a_glb_has_y_up_linear_colors_and_diffuse_materials_seen_from_both_sides(tmp_path):
     mesh = painted(box(), 1)
-    assert (mesh.texture_ids < 0).any()
-    assert (mesh.texture_ids >= 0).any()
-    return mesh
-
-
-@pytest.fixture
-def parts(painted_box, tmp_path) -> list[tuple[trimesh.Trimesh, np.ndarray]]:
-    """Export the box. Return each part with the mask of its faces, the untextured part first."""
-    export_mesh(painted_box, tmp_path / "mesh.glb")
-    is_untextured = painted_box.texture_ids < 0
-    masks = [is_untextured, ~is_untextured]
-    return list(zip(read_glb(tmp_path / "mesh.glb"), masks, strict=True))
-
-
-def test_a_glb_holds_positions_with_y_up(painted_box, parts):
-    for part, mask in parts:
-        x, y, z = np.moveaxis(corners_of(painted_box)[mask], -1, 0)
+    export_mesh(mesh, tmp_path / "mesh.glb")
+    is_untextured = mesh.texture_ids < 0
+    untextured, textured = read_glb(tmp_path / "mesh.glb")
+    for part, mask in ((untextured, is_untextured), (textured, ~is_untextured)):
+        x, y, z = np.moveaxis(corners_of(mesh)[mask], -1, 0)
         expected = np.stack([x, z, -y], axis=-1).astype(np.float32)
         assert_array_equal(part.triangles, expected)
-
-
-def test_a_glb_holds_linear_colors_and_texture_coordinates(painted_box, parts):
-    for part, mask in parts:
-        expected = linear_of(painted_box.corner_colors[mask].astype(np.float64))
+        expected = linear_of(mesh.corner_colors[mask].astype(np.float64))
         colors = part.visual.vertex_attributes["color"][part.faces]
         assert_allclose(colors, expected, rtol=EPS32, atol=0)
         uvs = part.visual.uv[part.faces]
-        assert_allclose(uvs, painted_box.corner_uvs[mask], rtol=0, atol=2 * EPS32)
-
-
-def test_a_glb_has_diffuse_materials_that_are_seen_from_both_sides(parts):
-    for part, _ in parts:
+        assert_allclose(uvs, mesh.corner_uvs[mask], rtol=0, atol=2 * EPS32)
         material = part.visual.material
         assert material.doubleSided
         assert material.metallicFactor == 0
         assert material.roughnessFactor == 1
         assert material.baseColorFactor is None
-    (untextured, _), (textured, _) = parts
     assert untextured.visual.material.baseColorTexture is None
     assert textured.visual.material.baseColorTexture is not None
 

@@ -43,9 +43,6 @@ def albedo_at(mesh: Mesh, uvs: np.ndarray) -> np.ndarray:
     return total
 
 
-# Arrays
-
-
 def triangle_corners(folder: Path, gltf: Gltf) -> np.ndarray:
     return corners_of(gltf.load(folder))
 
@@ -60,16 +57,9 @@ def test_arrays_may_be_interleaved_and_have_no_indices(tmp_path):
     records["color"] = [[51, 102, 255, 0]] * 3
     view = gltf.view(records.tobytes(), byteStride=16)
     for offset, kind, component in ((0, "VEC3", 5126), (12, "VEC4", 5121)):
-        gltf.tree["accessors"].append(
-            {
-                "bufferView": view,
-                "byteOffset": offset,
-                "componentType": component,
-                "count": 3,
-                "type": kind,
-                "normalized": component == 5121,
-            }
-        )
+        accessor = {"bufferView": view, "byteOffset": offset, "componentType": component}
+        accessor |= {"count": 3, "type": kind, "normalized": component == 5121}
+        gltf.tree["accessors"].append(accessor)
     gltf.mesh({"POSITION": 0, "COLOR_0": 1})
     mesh = gltf.load(tmp_path)
     assert_array_equal(corners_of(mesh), POINTS[None, :3])
@@ -88,7 +78,7 @@ def test_sparse_arrays_replace_rows_of_an_array_or_of_zeros(tmp_path, has_base):
     assert_array_equal(triangle_corners(tmp_path, gltf), [expected])
 
 
-@pytest.mark.parametrize("dtype", [np.int8, np.uint8, np.int16, np.uint16, np.float32])
+@pytest.mark.parametrize("dtype", [np.int8, np.uint16, np.float32])
 def test_quantized_positions_are_the_integers_of_the_file(tmp_path, dtype):
     gltf = Gltf()
     gltf.tree["extensionsUsed"] = gltf.tree["extensionsRequired"] = ["KHR_mesh_quantization"]
@@ -105,9 +95,6 @@ def test_normalized_integers_are_those_of_the_specification(tmp_path):
     gltf.mesh({"POSITION": gltf.array(points, normalized=True)})
     expected = [[-1, 0, 0], [1, 0, 0], [0, 64 / 127, 0]]
     assert_allclose(triangle_corners(tmp_path, gltf), [expected], rtol=1e-12)
-
-
-# Colors
 
 
 @pytest.mark.parametrize(
@@ -187,9 +174,6 @@ def test_texture_coordinates_are_scaled_then_rotated_then_shifted(tmp_path):
     assert_array_equal(corners_of(mesh).reshape(-1, 3), SQUARE[SQUARE_FACES])
 
 
-# Alpha
-
-
 def hole(size: int, radius: float, width: float = 1) -> np.ndarray:
     """Return texels with alpha 0 in a circle in the middle, whose border has a width in texels."""
     position = np.arange(size) + 0.5 - size / 2
@@ -230,21 +214,6 @@ def test_alpha_is_cut_at_the_cutoff_of_the_file(tmp_path, cutoff, radius):
     mesh = masked(hole(32, 10, width=8), **entries).load(tmp_path)
     circle = math.pi * (radius / 32) ** 2
     assert 1 - mesh.face_areas().sum() == pytest.approx(circle, rel=0.01)
-
-
-def test_alpha_of_single_texels_is_cut_out(tmp_path):
-    """A transparent texel among opaque ones leaves a hole whose border is at alpha .5.
-
-    With bilinear interpolation, alpha is 1 - (1 - |x|) (1 - |y|) around it, so the
-    hole has the area 4 ∫ (1 - .5 / (1 - x)) dx from 0 to .5 = 2 - 2 ln 2 = .614.
-    """
-    texels = np.full((16, 16, 4), 255, np.uint8)
-    for row, column in ((3, 5), (10, 2), (0, 15)):
-        texels[row, column, 3] = 0
-    mesh = masked(texels).load(tmp_path)
-    area = 3 * (2 - 2 * math.log(2))
-    # The border is straight within each texel, so each hole is off by a part of a texel.
-    assert 256 * (1 - mesh.face_areas().sum()) == pytest.approx(area, abs=0.6)
 
 
 def test_a_mask_with_too_long_a_border_is_refused(tmp_path, monkeypatch):
@@ -297,8 +266,6 @@ def test_transparent_surfaces_are_refused(tmp_path, gltf):
     with pytest.raises(InputError, match=r"mesh\.gltf.*(transparent|lets light pass)"):
         gltf.load(tmp_path)
 
-
-# Specular and glossiness
 
 SPECULAR_GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 
@@ -356,9 +323,6 @@ def test_a_specular_color_that_gloss_cannot_hold_is_named(tmp_path):
     assert mesh.gloss[0].tolist() == [0, 0, 1]
 
 
-# Morph targets
-
-
 @pytest.mark.parametrize(
     ("mesh_weights", "node_weights", "height"),
     [([1.0], None, 3), ([0.5], None, 2), ([1.0], [0.25], 1.5), (None, None, 1), (None, [1.0], 3)],
@@ -403,9 +367,6 @@ def test_morph_targets_are_added_to_each_attribute(tmp_path):
     _, normals = part.placed()
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     assert_allclose(normals, [[[math.sqrt(0.5), 0, math.sqrt(0.5)]] * 3])
-
-
-# Nodes
 
 
 def test_nodes_with_translation_rotation_and_scale_place_their_meshes(tmp_path):
@@ -470,9 +431,6 @@ def test_data_uris_have_the_encodings_of_rfc_2397(tmp_path, form):
     assert_allclose(corners_of(load_mesh(tmp_path / "mesh.gltf", up="z")), [POINTS[:3]])
 
 
-# Files
-
-
 def test_a_text_file_reads_its_buffer_and_its_images_below_its_folder(tmp_path):
     gltf = masked(hole(8, -1), "OPAQUE")
     folder = tmp_path / "mesh"
@@ -522,7 +480,7 @@ def small_file_of_many_zeros() -> Gltf:
 def small_file_of_a_large_image() -> Gltf:
     gltf = Gltf()
     texture = gltf.texture(np.zeros((1, 1), np.uint8))
-    gltf.tree["images"][0]["bufferView"] = gltf.view(encoded(Image.new("L", (9000, 9000))))
+    gltf.tree["images"][0]["bufferView"] = gltf.view(encoded(Image.new("L", (5000, 5000))))
     return gltf.square(pbrMetallicRoughness={"baseColorTexture": texture})
 
 
@@ -532,16 +490,13 @@ def small_file_of_a_large_image() -> Gltf:
     ids=["copies", "zeros", "image"],
 )
 def test_a_small_file_that_needs_more_memory_than_is_free_is_refused(tmp_path, monkeypatch, create):
-    (tmp_path / "meminfo").write_text("MemAvailable: 400000 kB\n")
+    (tmp_path / "meminfo").write_text("MemAvailable: 100000 kB\n")
     monkeypatch.setattr(errors, "MEMORY", tmp_path / "meminfo")
     monkeypatch.setattr(errors, "GROUP", tmp_path)
     create().write(tmp_path / "mesh.glb")
     assert (tmp_path / "mesh.glb").stat().st_size < 400_000
-    with pytest.raises(InputError, match=r"need .* GB of memory, and 0\.4 GB are free"):
+    with pytest.raises(InputError, match=r"need .* GB of memory, and 0\.1 GB are free"):
         load_mesh(tmp_path / "mesh.glb")
-
-
-# Classes of features
 
 
 def plain(**entries: Any) -> Gltf:

@@ -40,9 +40,7 @@ def color_of(folder: Path, files: Files) -> np.ndarray:
     return mesh.corner_colors * texels[mesh.texture_ids][:, None]
 
 
-def obj(
-    statements: str = "", face: str = "f 1 2 3", mtl: str | None = None, vertex: str = ""
-) -> dict[str, str | bytes]:
+def obj(statements="", face="f 1 2 3", mtl=None, vertex="") -> dict[str, str | bytes]:
     """Return an .obj file, with a material library if `mtl` has the properties of a material."""
     corners = ("0 0 0", "1 0 0", "0 1 0")
     lines = [f"v {corner} {vertex}" for corner in corners]
@@ -58,15 +56,7 @@ def obj(
     }
 
 
-def ply(
-    vertex: str = "",
-    face: str = "",
-    header: str = "",
-    at: str = "",
-    of: str = "",
-    corners: tuple[str, ...] = ("0 0 0", "1 0 0", "0 1 0"),
-    tail: str = "",
-) -> dict[str, str | bytes]:
+def ply(vertex="", face="", header="", at="", of="", corners=("0 0 0", "1 0 0", "0 1 0"), tail=""):
     """Return a .ply file with more properties, and values at each vertex and of the face."""
     lines = ["ply", "format ascii 1.0", *header.split(";")]
     lines += ["element vertex 3", *(f"property float {axis}" for axis in "xyz")]

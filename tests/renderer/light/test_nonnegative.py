@@ -49,9 +49,7 @@ def test_degree_1_is_projected_into_a_second_order_cone():
     torch.testing.assert_close(nearest_nonnegative(lights), expected, rtol=0, atol=TOLERANCE)
 
 
-def best_on_grid(
-    target: np.ndarray, weights: np.ndarray, start: np.ndarray, grid: np.ndarray, **options
-) -> float:
+def best_on_grid(target, weights, start, grid, **options) -> float:
     """Return the weighted distance of SciPy's nearest light that is nowhere negative on a grid.
 
     Its light is slightly nearer than the one that is nowhere negative between the nodes, too.
@@ -231,11 +229,3 @@ def test_scipy_finds_no_light_of_the_same_mean_with_a_closer_irradiance(degree):
     found = best_on_grid(given.numpy(), factors, physical.numpy(), grid, constraints=[same_mean])
     error = float((torch.from_numpy(factors) * (physical - given)).norm())
     assert error <= 1.03 * found + 1e-3 * float(given[0])
-
-
-def test_channels_without_a_positive_mean_become_dark():
-    light = draw(49, 3)
-    light[0] = torch.tensor([-1.0, 0.0, 5.0])
-    projected = project_nonnegative(light)
-    assert torch.equal(projected[:, :2], torch.zeros(49, 2, dtype=torch.float64))
-    assert projected[:, 2].any()

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from renderer import mitsuba_scene
 from renderer.camera import OrthographicCamera
-from renderer.light.basis import HARMONICS, Basis, LocalBasis, SumBasis
+from renderer.light.basis import HARMONICS, LocalBasis, SumBasis
 from renderer.light.environment import write_map
 from renderer.light.lamps import Lamps, Projector
 from renderer.mesh import Mesh, concatenate
@@ -52,9 +52,7 @@ def ball_on_a_table() -> Mesh:
     return concatenate([mesh_of(shape, ORANGE), table])
 
 
-def operator_of(
-    mesh: Mesh, basis: Basis, size: int = SIZE, samples: int = SAMPLES
-) -> TransferOperator:
+def operator_of(mesh, basis, size=SIZE, samples=SAMPLES) -> TransferOperator:
     settings = ImageSettings(size, samples)
     options = {"basis": basis, "dtype": torch.float64}
     [operator] = build_operators(mesh, [CAMERA], settings, choose("numpy"), **options)
@@ -120,9 +118,7 @@ def test_a_screen_at_the_origin_shows_the_pattern_upright_and_with_its_brightnes
 class LitView:
     """Radiance of a view under local light, at fixed visibility."""
 
-    def __init__(
-        self, mesh: Mesh, basis: LocalBasis, size: int, samples: int, normals: str = "flat"
-    ) -> None:
+    def __init__(self, mesh, basis, size, samples, normals="flat") -> None:
         self.mesh = mesh
         self.basis = basis
         self.settings = ImageSettings(size, samples, normals=normals)
@@ -178,9 +174,7 @@ def test_derivatives_by_vertices_and_albedo_are_finite_differences(basis, normal
     assert gradient.abs().max() > 1e-3
 
 
-def irradiance_of_lamp(
-    position: list[float], radius: float, points: Tensor, normals: Tensor
-) -> Tensor:
+def irradiance_of_lamp(position, radius, points, normals) -> Tensor:
     paths = Lamps((tuple(position),), radius=radius).connect(points, normals)
     total = torch.zeros(len(points), dtype=torch.float64)
     return total.index_add(0, paths.point, paths.irradiance)

@@ -7,7 +7,7 @@ import trimesh
 from oracles import draw, mesh_of, patchwork
 from torch import Tensor
 
-from renderer.camera import Camera, OrthographicCamera, orbit_cameras
+from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.image import decode, encode
 from renderer.mesh import Mesh
@@ -23,9 +23,7 @@ ABOVE = OrthographicCamera(0, 0, 2.0)
 SIZE = 6
 
 
-def operator_of(
-    mesh: Mesh, camera: Camera, settings: ImageSettings, dtype: torch.dtype = torch.float32
-) -> TransferOperator:
+def operator_of(mesh, camera, settings, dtype=torch.float32) -> TransferOperator:
     [operator] = build_operators(mesh, [camera], settings, choose("numpy"), dtype=dtype)
     return operator
 

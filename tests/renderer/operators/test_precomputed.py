@@ -13,7 +13,7 @@ import trimesh
 from oracles import mesh_of, scipy_basis
 from torch import Tensor
 
-from renderer.camera import Camera, OrthographicCamera, orbit_cameras
+from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.light.files import ambient, load_light
 from renderer.light.harmonics import nonzero_coefficients, quadrature
@@ -33,15 +33,7 @@ EPS32 = torch.finfo(torch.float32).eps
 QUADRATURE_ERROR = 0.015
 
 
-def operator_of(
-    mesh: Mesh,
-    camera: Camera = ABOVE,
-    size: int = 6,
-    samples: int = 1,
-    shadows: bool = True,
-    bounces: int = 0,
-    normals: str = "flat",
-) -> TransferOperator:
+def operator_of(mesh, camera=ABOVE, size=6, samples=1, shadows=True, bounces=0, normals="flat"):
     settings = ImageSettings(size, samples, normals=normals, shadows=shadows, bounces=bounces)
     [operator] = build_operators(mesh, [camera], settings, choose("numpy"), dtype=torch.float64)
     return operator

@@ -5,21 +5,21 @@ A reflectance is always π f, the reflected radiance per irradiance.
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.polynomial import legendre
-from oracles import dielectric_fresnel, draw, draw_uniform, image_of, smith_masking
+from oracles import Lobe, coat_albedo, directions_of, draw, draw_uniform, image_of, toward
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
-from renderer.light.basis import Basis, Harmonics, LocalBasis, SplitLight
+from renderer.light.basis import Harmonics, LocalBasis, SplitLight
 from renderer.light.files import load_light
 from renderer.light.harmonics import bands, basis, lambertian_factors
 from renderer.light.lamps import Lamps, Projector
@@ -48,49 +48,10 @@ def double(value: float) -> Tensor:
     return torch.tensor([value], dtype=DOUBLE)
 
 
-def toward(cosine: float) -> Tensor:
-    """Return the direction (1, 3) to a camera on the -x side, at a cosine from +z."""
-    return torch.tensor([[-math.sqrt(1 - cosine**2), 0, cosine]], dtype=DOUBLE)
-
-
 def unit_vector(polar: float, azimuth: float = 0.0) -> np.ndarray:
     x = math.sin(polar) * math.cos(azimuth)
     y = math.sin(polar) * math.sin(azimuth)
     return np.array([x, y, math.cos(polar)])
-
-
-# Reference: the reflectance of glTF.
-
-
-@dataclass(frozen=True)
-class Lobe:
-    """A microfacet lobe by the appendix of glTF 2.0.
-
-    f0 and f90 are Fresnel terms at normal and grazing incidence. Without f0 it is a dielectric
-    with a refractive index of 1.5, by Fresnel's equations.
-    """
-
-    roughness: float
-    f0: float | None = None
-    f90: float = 1.0
-
-    def reflectance(self, cosine: float, light: np.ndarray) -> np.ndarray:
-        """Evaluate the reflectance (N,) for light (N, 3), and a camera at a cosine from +z."""
-        view = toward(cosine)[0].numpy()
-        alpha = self.roughness**2
-        half = (light + view) / np.linalg.norm(light + view, axis=1, keepdims=True)
-        n_dot_l = light[:, 2]
-        n_dot_h = half[:, 2]
-        v_dot_h = np.clip(half @ view, 0, 1)
-        distribution = alpha**2 / (np.pi * (n_dot_h**2 * (alpha**2 - 1) + 1) ** 2)
-        masking = smith_masking(n_dot_l, self.roughness) * smith_masking(cosine, self.roughness)
-        fresnel = self._fresnel(v_dot_h)
-        return np.pi * fresnel * distribution * masking / (4 * n_dot_l * cosine)
-
-    def _fresnel(self, cosine: np.ndarray) -> np.ndarray:
-        if self.f0 is None:
-            return dielectric_fresnel(cosine)
-        return self.f0 + (self.f90 - self.f0) * (1 - cosine) ** 5  # by Schlick
 
 
 def hemisphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
@@ -104,26 +65,6 @@ def hemisphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
     azimuth = 2 * np.pi * (np.arange(azimuth_count) + 0.5) / azimuth_count
     solid_angles = np.repeat(weight / 2 * 2 * np.pi / azimuth_count, azimuth_count)
     return directions_of(z, azimuth), solid_angles
-
-
-def directions_of(z: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-    radius = np.sqrt(1 - z**2)
-    x = radius * np.cos(azimuth)
-    y = radius * np.sin(azimuth)
-    return np.stack(np.broadcast_arrays(x, y, z), axis=-1).reshape(-1, 3)
-
-
-def half_hemisphere() -> tuple[np.ndarray, np.ndarray]:
-    """Return directions with y > 0, densest where lobes are narrow, and twice their weights."""
-    node, weight = legendre.leggauss(100)
-    around, step = legendre.leggauss(50)
-    root = (node[:, None] + 1) / 2
-    fraction = (around + 1) / 2
-    solid_angles = weight[:, None] * root * 3 * math.pi * fraction**2 * step
-    return directions_of(root**2, math.pi * fraction**3), solid_angles.ravel()
-
-
-# Lobes
 
 
 COSINES = [1e-3, 0.02, 0.07, 0.2, 0.37, 0.6, 0.9, 0.99, 1 - 1e-5]
@@ -273,9 +214,6 @@ def test_a_highlight_under_its_window_is_nowhere_negative(roughness):
     assert radiance.min() >= -1e-3 * radiance.max()
 
 
-# Energy
-
-
 def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_it():
     """This is a white furnace for all roughness, metallic and specular_factor, from all sides."""
     grid = torch.meshgrid(
@@ -299,14 +237,6 @@ def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_
     torch.testing.assert_close(of_dielectrics, torch.ones_like(of_dielectrics))
 
 
-@cache
-def coat_albedo_by_quadrature(cosine: float, roughness: float) -> float:
-    """Integrate the fraction of a beam that the specular layer of a dielectric reflects."""
-    directions, solid_angles = half_hemisphere()
-    lobe = Lobe(roughness).reflectance(cosine, directions)
-    return float(lobe * directions[:, 2] @ solid_angles) / math.pi
-
-
 @dataclass(frozen=True)
 class WhiteSurface:
     """Reference for a white surface with gloss, after Kulla and Conty (2017)."""
@@ -316,7 +246,7 @@ class WhiteSurface:
     specular_factor: float
 
     def transmitted(self, cosine: float) -> float:
-        return 1 - self.specular_factor * coat_albedo_by_quadrature(cosine, self.roughness)
+        return 1 - self.specular_factor * coat_albedo(cosine, self.roughness)
 
     def mean_transmitted(self) -> float:
         node, weight = legendre.leggauss(12)
@@ -339,9 +269,7 @@ FLOOR = Mesh.plain(
 )
 
 
-def operators_of(
-    mesh: Mesh, cameras: Sequence[Camera], settings: ImageSettings, light_basis: Basis, gloss: Gloss
-) -> list[TransferOperator]:
+def operators_of(mesh, cameras, settings, light_basis, gloss) -> list[TransferOperator]:
     return build_operators(
         mesh, cameras, settings, choose("numpy"), basis=light_basis, dtype=DOUBLE, gloss=gloss
     )
@@ -457,9 +385,6 @@ def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty():
     assert found == pytest.approx(radiance[is_visible].sum(), rel=0.02)
 
 
-# Images against Mitsuba
-
-
 def positive_light(degree: int) -> Tensor:
     """Draw a light whose radiance is nowhere negative, with less power in higher bands."""
     count = (degree + 1) ** 2
@@ -471,9 +396,7 @@ def positive_light(degree: int) -> Tensor:
     return light / (-1.1 * lowest) + mean
 
 
-def mitsuba_radiance(
-    mesh: Mesh, light: Tensor, surface: dict[str, Any], sample_count: int
-) -> Tensor:
+def mitsuba_radiance(mesh, light, surface, sample_count) -> Tensor:
     """Render a mesh with interpolated normals in environment light, shape (3, 16, 16)."""
     pytest.importorskip("mitsuba")
     with mitsuba() as module:
@@ -546,9 +469,6 @@ def test_no_highlight_shines_through_the_wall_of_a_cup():
     assert relative_error(shadowed, expected) < 0.1
     unshadowed = our_radiance(white_cup, light, gloss)
     assert relative_error(unshadowed, expected) > 0.2
-
-
-# Gradients and consistency
 
 
 class GlossyView:

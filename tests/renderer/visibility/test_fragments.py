@@ -29,12 +29,7 @@ def open_shell() -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces[: 2 * len(faces) // 3]
 
 
-def fragments_of(
-    mesh: tuple[np.ndarray, np.ndarray],
-    settings: ImageSettings,
-    camera: OrthographicCamera = CAMERA,
-    closed: bool = False,
-) -> Fragments:
+def fragments_of(mesh, settings, camera=CAMERA, closed=False) -> Fragments:
     vertices, faces = mesh
     [fragments] = build_fragments(vertices, faces, [camera], settings, RASTERIZER, closed)
     return fragments

@@ -41,18 +41,13 @@ LIGHT = 0.4 * load_light("grace").double()
 ChangedImage = Callable[[Tensor, int], Tensor]
 
 
-def rendered(
-    mesh: renderer.Mesh, camera: Camera, size: int, samples: int | None, **options
-) -> Tensor:
+def rendered(mesh, camera, size, samples, **options) -> Tensor:
     choices = {"light": LIGHT, "background": 0.3, "albedo_scale": 0.8, "silhouettes": True}
     return renderer.render(mesh, camera, size=size, samples=samples, **choices | options)
 
 
 def soft_front_light(radiance: float) -> Tensor:
     return ambient(torch.full((3,), radiance / math.pi).double())
-
-
-# ---------------------------------------------------------------------------- differences
 
 
 def smooth_weights(size: int) -> Tensor:
@@ -101,9 +96,7 @@ def moved_vertices(mesh: renderer.Mesh, camera: Camera, size: int, normals: str)
     return image
 
 
-def moved_camera(
-    mesh: renderer.Mesh, camera: Camera, names: list[str], size: int, gloss=None
-) -> ChangedImage:
+def moved_camera(mesh, camera, names, size, gloss=None) -> ChangedImage:
     def image(change: Tensor, samples: int) -> Tensor:
         values = {
             name: getattr(camera, name) + amount for name, amount in zip(names, change, strict=True)
@@ -175,9 +168,6 @@ def test_gradients_by_the_camera_include_the_movement_of_highlights():
     # A smaller turn moves outlines across too few samples.
     expected = differences(image, directions, samples=14, step=0.5)
     assert relative_error(found, expected) < 0.1
-
-
-# ---------------------------------------------------------------------------- closed forms
 
 
 def square(half: float, height: float) -> renderer.Mesh:
@@ -282,9 +272,6 @@ def test_gradients_by_single_vertices_converge_to_those_of_areas_as_samples_grow
         assert relative_error(found[:, :2], expected[:, :2]) < bound
 
 
-# ---------------------------------------------------------------------------- shadows
-
-
 def test_a_growing_square_in_shadow_gains_its_perimeter_times_its_dark_radiance():
     """High walls around the square, outside of the image, hide most of the sky."""
     floor = square(0.5, 0.0)
@@ -307,9 +294,6 @@ def test_a_growing_square_in_shadow_gains_its_perimeter_times_its_dark_radiance(
     assert gained == pytest.approx(4 * radiance * pixels_per_area, rel=0.05)
 
 
-# ---------------------------------------------------------------------------- local light
-
-
 def test_local_light_and_shadows_move_with_the_outline():
     """A shift in the image's plane changes the distance to the lamp, too, by less than a tenth."""
     lamps = Lamps(((2.0, 1.0, 2.5),), radius=0.0)
@@ -327,9 +311,6 @@ def test_local_light_and_shadows_move_with_the_outline():
     shifted_left = smooth_sums(lit_by_a_lamp(replace(FAR, right=-0.03), 24, 12))[1]
     expected = float(shifted_right - shifted_left) / 0.06
     assert found == pytest.approx(expected, rel=0.1)
-
-
-# ---------------------------------------------------------------------------- hidden parts
 
 
 def box(low: list[float], high: list[float]) -> renderer.Mesh:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor, nn
+from torch import Tensor
 
 from augment.attack_settings import AttackSettings, SkylightSettings, StepSettings
 from augment.attacks.loop import Minimum, minimize
@@ -64,9 +64,7 @@ def free(*names: str) -> dict[str, StepSettings]:
     return settings
 
 
-def attack(
-    model: nn.Module, problem: SceneProblem, criterion: ClassCriterion, steps: int
-) -> Minimum:
+def attack(model, problem, criterion, steps) -> Minimum:
     settings = AttackSettings(max_steps=steps, margin=0.0, quantized=False)
     return minimize(problem, Objective(model, criterion, settings))
 
@@ -81,9 +79,6 @@ def towards(problem: SceneProblem, target: int | None = 1) -> ClassCriterion:
 
 def float64_noise(*shape: int, draws: torch.Generator) -> Tensor:
     return torch.randn(*shape, generator=draws, dtype=torch.float64)
-
-
-# --------------------------------------------------------------- settings and starting points
 
 
 def test_each_example_starts_at_the_sky_of_the_settings_with_its_own_mean_luminance(make_scene):
@@ -129,9 +124,6 @@ def test_a_parameter_starts_at_the_scene_as_it_is(make_scene, name):
     expected = scene.render(scene.conditions(EVERY), EVERY)
     rounding = 64 * torch.finfo(torch.float32).eps
     torch.testing.assert_close(scene.render(conditions, EVERY), expected, rtol=0, atol=rounding)
-
-
-# --------------------------------------------------------------- gradients
 
 
 @pytest.fixture
@@ -194,9 +186,6 @@ def test_gradients_are_central_differences(make_scene, fixed_visibility, names, 
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9 * largest)
 
 
-# --------------------------------------------------------------- pixels
-
-
 @pytest.mark.parametrize("gray", [0.0, 1.0])
 def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, gray):
     """The gradient of the cross entropy is the sum of (p_c - [c = y]) W_c over the classes c."""
@@ -215,9 +204,6 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
     assert torch.equal(images, expected)
     is_changed = (images - before).abs() > 0.99 * epsilon
     assert is_changed.double().mean() > 0.4
-
-
-# --------------------------------------------------------------- nonnegative light
 
 
 def in_sunlight(scene: Scene) -> Scene:
@@ -273,8 +259,6 @@ def test_an_attack_in_nonnegative_light_ends_in_light_that_a_map_holds(
     torch.testing.assert_close(images, result.images, rtol=0, atol=0.5 / 255)
 
 
-# --------------------------------------------------------------- skies
-
 SKY_STARTS = st.tuples(st.floats(*ZENITH), st.floats(-400, 400), st.floats(*TURBIDITY))
 FINITE = st.floats(-50, 50)
 RADII = st.one_of(st.none(), st.floats(0, 4))
@@ -322,9 +306,6 @@ def test_a_sky_stays_in_its_domain_and_its_ball(
         if radius is not None:
             rounding = 20 * 64 * torch.finfo(dtype).eps
             assert (norms(candidate - center, norm) <= radius + rounding).all()
-
-
-# --------------------------------------------------------------- light and a linear classifier
 
 
 def light_slope(scene: Scene, weight: Tensor) -> Tensor:
@@ -416,9 +397,6 @@ def test_one_light_shows_each_view_as_another_class(make_scene, make_linear):
     assert torch.equal(result.predicted, TARGETS_OF_VIEWS)
 
 
-# --------------------------------------------------------------- several parameters
-
-
 def test_each_parameter_is_projected_and_steps_as_if_it_were_alone(make_scene):
     mixed = problem_of(
         make_scene(),
@@ -459,9 +437,6 @@ def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):
         assert (random[0] != attacked[0]).all()
         assert not random[1].any()
     assert (drawn_parts[2].norm(dim=1) <= 0.1 + 1e-6).all()
-
-
-# --------------------------------------------------------------- rasterization
 
 
 @pytest.mark.parametrize(

@@ -28,9 +28,7 @@ def problem_of(scene: Scene, **units) -> SceneProblem:
     return SceneProblem(scene, [Pose(scene, settings)])
 
 
-def costs(
-    result: augment.AttackResult, classifier: augment.Classifier, values: torch.Tensor
-) -> torch.Tensor:
+def costs(result, classifier, values) -> torch.Tensor:
     rows = torch.zeros(len(values), dtype=torch.int64)
     logits = classifier(result.problem.render(values, rows)[:, 0])
     return logits.log_softmax(1)[:, result.criterion.source[0, 0]]
