@@ -67,10 +67,7 @@ class View:
 
 
 def view(ids, samples, placed, vertices, faces, albedo, towards, lift) -> View:
-    """Create a view from the index of the face at each sample, or a negative number, (R, R).
-
-    The camera sees the vertices `placed`, and `vertices` are shaded.
-    """
+    """Create a view from the face at each sample (R, R); the camera sees `placed` vertices."""
     size = len(ids) // samples
     row, column = np.nonzero(ids >= 0)
     pixel_in_image = row // samples * size + column // samples
@@ -112,10 +109,7 @@ def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
 
 
 def vertex_gradient(view, upstream, light, vertex_count) -> np.ndarray:
-    """Compute the gradient (V, 3) of Σ upstream × image by the shaded vertices.
-
-    Faces without area do not contribute.
-    """
+    """Compute the gradient (V, 3) of Σ upstream × image by the shaded vertices."""
     weight = _face_weight(view, upstream)
     by_first = []
     by_second = []
@@ -177,10 +171,7 @@ def basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def harmonics(directions: np.ndarray, bands: Sequence[int]) -> dict[int, np.ndarray]:
-    """Compute harmonics as √(…) dᵐP_l/dzᵐ times Re or Im of (x + iy)ᵐ, by the index l² + l + m.
-
-    There is no Condon-Shortley sign. Directions are unit vectors (3, N).
-    """
+    """Compute √(…) dᵐP_l/dzᵐ times Re or Im of (x + iy)ᵐ for unit vectors (3, N), by l² + l + m."""
     x, y, z = directions
     one = 1 + 0 * z
     powers_of_z = [one]
@@ -233,10 +224,7 @@ def _normalized_legendre(l: int, m: int) -> list[tuple[int, Any]]:
 
 
 def _legendre(l: int, m: int) -> list[tuple[int, Fraction]]:
-    """Return the powers of z and factors of dᵐP_l/dzᵐ.
-
-    The formula is 2ˡ P_l = Σ (-1)ᵏ C(l, k) C(2l - 2k, l) z^(l - 2k).
-    """
+    """Return powers and factors of dᵐP_l/dzᵐ. 2ˡ P_l = Σ (-1)ᵏ C(l, k) C(2l - 2k, l) z^(l - 2k)."""
     terms = []
     for k in range(l // 2 + 1):
         power = l - 2 * k

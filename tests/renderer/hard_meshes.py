@@ -34,10 +34,7 @@ class Chart(Rasterizer):
 
 
 def painted(vertices: ArrayLike, faces: Sequence[Sequence[int]] | np.ndarray) -> Mesh:
-    """Create a mesh with one random color per face.
-
-    Colors are multiples of 1/64, which every number type holds exactly.
-    """
+    """Create a mesh with one random color per face, a multiple of 1/64, which every type holds."""
     colors = np.random.default_rng(0).integers(16, 65, (len(faces), 1, 3)) / 64
     corner_colors = colors.repeat(3, axis=1).astype(np.float32)
     return replace(Mesh.plain(vertices, faces), corner_colors=corner_colors)
@@ -51,12 +48,7 @@ def sphere(subdivisions: int = 2, lowest: float = 0.8) -> Mesh:
 
 
 def slivers(height: float, count: int, towards: np.ndarray) -> Mesh:
-    """Create thin triangles whose longest edges have a length of about 1.
-
-    The third corner of a needle is beside the second corner. The third corner
-    of a flat cap is between the first two. Each of the `count` needles and caps
-    occurs in all three orders of corners.
-    """
+    """Create needles and caps in all orders of corners, whose longest edges are about 1."""
     rng = np.random.default_rng(2)
     shape = (2 * count, 3)
     normal = _unit(rng.normal(size=shape) + 3 * towards)
@@ -74,11 +66,7 @@ def slivers(height: float, count: int, towards: np.ndarray) -> Mesh:
 
 
 def with_faces_without_area(mesh: Mesh) -> Mesh:
-    """Add three faces without area for each face of a mesh.
-
-    The first is the first edge of the face. The second is a point. The third
-    has its third corner in the center of the edge.
-    """
+    """Add an edge, a point, and an edge with its center as faces for each face of a mesh."""
     # Sums of two float32 numbers are exact in float64, and so are the centers.
     vertices = mesh.vertices.astype(np.float32).astype(np.float64)
     first = mesh.faces[:, 0]
@@ -105,10 +93,7 @@ def opened(mesh: Mesh) -> Mesh:
 
 
 def heap() -> Mesh:
-    """Create a ball that touches a plate, and a thin wall beside it.
-
-    The mesh is open, touches itself and has several parts.
-    """
+    """Create a ball that touches a plate, and a thin wall beside it."""
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.4)
     lifted_ball = painted(ball.vertices + np.array([0, 0, 0.4]), ball.faces)
     plate = painted([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])

@@ -78,12 +78,7 @@ def random_light(degree: int = 6) -> Tensor:
 
 @dataclass(frozen=True)
 class Setup:
-    """Scene that is rendered, and computed by the reference.
-
-    The mesh has a color for each face. The vertices are those that are shaded, by default the
-    mesh's. The renderer takes vertices and light in `dtype`, and the reference takes them as
-    this type rounds them.
-    """
+    """Scene that is rendered in `dtype`, and computed by the reference from rounded values."""
 
     mesh: Mesh
     light: Tensor = field(default_factory=random_light)
@@ -293,19 +288,12 @@ def rounded(mesh: Mesh, dtype: torch.dtype) -> Mesh:
 
 
 def moved(vertices: np.ndarray) -> Setup:
-    """Return the sphere with other vertices.
-
-    The camera sees a normalized mesh, and the shading takes the vertices as they are.
-    """
+    """Return the sphere with other vertices, which the shading takes as they are."""
     return Setup(normalize(replace(hard.sphere(), vertices=vertices)), vertices=vertices)
 
 
 def units(ours: Tensor, reference: np.ndarray) -> float:
-    """Return the largest error divided by the largest magnitude, in units of ε.
-
-    If all magnitudes are zero, the error is not divided. If a value is not
-    finite, the error is infinite.
-    """
+    """Return the largest error by the largest magnitude, in ε, or infinity if not finite."""
     values = ours.detach().double().numpy()
     if values.shape != reference.shape or not np.isfinite(values).all():
         return math.inf
@@ -322,10 +310,7 @@ def all_errors(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
 
 
 def operator_errors(setup, dtype=torch.float32, lost=None) -> Errors:
-    """Measure the errors of an operator's image and of its gradient by the light.
-
-    Shadows take the radiance `lost` (P, (degree + 1)², 3) from each pixel.
-    """
+    """Measure the errors of an operator's image and light gradient; shadows take `lost` radiance."""
     [operator] = build_operators(
         setup.mesh,
         [setup.camera],
@@ -372,11 +357,7 @@ def geometry_errors(setup: Setup) -> Errors:
 
 
 def shadow_errors(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
-    """Measure the errors of an operator with shadows.
-
-    With one sample per pixel, the renderer casts all rays. The reference takes
-    the origins of the rays from the renderer.
-    """
+    """Measure the errors of an operator with shadows, from the renderer's origins of rays."""
     mesh = setup.mesh
     settings = replace(setup.settings, samples=1, shadows=True)
     setup = replace(setup, settings=settings)
@@ -393,11 +374,7 @@ def shadow_errors(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
 
 
 def harmonics_errors(directions: Tensor, degrees: Sequence[int]) -> Errors:
-    """Measure the largest errors of the harmonics, and of the gradient of a sum of them.
-
-    An error of a gradient is relative to the gradient at the same direction, because
-    gradients fall with the length of a direction.
-    """
+    """Measure the largest errors of the harmonics, and of a gradient relative to its direction."""
     wide_directions = exact(directions.double().numpy()).T
     wide_values = wide.basis(wide_directions, max(degrees))
     wide_gradient = wide.basis_gradient(wide_directions, max(degrees))

@@ -73,10 +73,7 @@ def irradiance_error(found, mesh, camera, light) -> float:
 
 
 def nearby_fit(brightness: float) -> tuple[FittedScene, float]:
-    """Fit a mushroom in a render, from 3° beside its camera, and return the irradiance's error.
-
-    An image shows values up to 1 of the light, which is multiplied by a brightness.
-    """
+    """Fit a mushroom in a render, from 3° beside its camera, and return the irradiance's error."""
     mesh = renderer.normalize(renderer.solid("mushroom"))
     light = brightness * positive_light("eucalyptus")
     image = renderer.render(mesh, FAR, light, 32, 0.0, samples=8)
@@ -140,10 +137,7 @@ def test_a_path_traced_images_camera_and_light_are_found(tmp_path, name, camera,
 
 @pytest.mark.slow
 def test_the_polar_angle_of_the_camera_is_found_from_an_image_of_a_round_object():
-    """All azimuths fit equally well.
-
-    So all of the best cameras of the first search may have the same wrong polar angle.
-    """
+    """All azimuths fit equally well, so that the best cameras may share a wrong polar angle."""
     mesh = renderer.normalize(renderer.solid("bottle", 3))
     camera = PerspectiveCamera(31.5, 286.5, 2.6, 0.1, 0.1, distance=4.0)
     image = renderer.render(mesh, camera, positive_light("st_peters"), 64, 0.0, samples=8)

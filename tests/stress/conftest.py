@@ -80,10 +80,7 @@ def write_scene_files(folder: Path) -> None:
 
 
 def run_here(name: str, *arguments: str, folder: Path) -> int:
-    """Run a command in this process, in a folder, and return its exit status.
-
-    Training writes no report.
-    """
+    """Run a command in this process, in a folder, without a report, and return its exit status."""
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
         patch.setattr(sys, "argv", [f"{name}.py", *arguments])
         patch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
@@ -95,10 +92,7 @@ def run_here(name: str, *arguments: str, folder: Path) -> int:
 
 
 def start_command(*arguments, folder, limit=None, **environment) -> Process:
-    """Start `python` with these arguments in a process of its own, in a folder.
-
-    The process calls `limit` before Python starts.
-    """
+    """Start `python` with these arguments in a process that calls `limit` first."""
     defaults = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
         [sys.executable, *arguments],
@@ -112,10 +106,7 @@ def start_command(*arguments, folder, limit=None, **environment) -> Process:
 
 
 def end(process: Process) -> tuple[int, str, str]:
-    """Wait for a process, and return its status, its output and its errors.
-
-    The errors are without the lines that announce what takes long.
-    """
+    """Wait for a process, and return its status, its output, and its errors without progress."""
     try:
         output, errors = process.communicate(timeout=MAX_SECONDS)
     finally:
@@ -132,10 +123,7 @@ def data(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def corpus(tmp_path_factory) -> Path:
-    """Return a folder of good files.
-
-    The finished run of two epochs is in finished/, its network also in published/.
-    """
+    """Return a folder of good files with the run finished/, whose network is in published/."""
     folder = tmp_path_factory.mktemp("corpus")
     write_data(folder)
     write_scene_files(folder)

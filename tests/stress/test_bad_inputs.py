@@ -205,11 +205,7 @@ def time_out(*_) -> None:
 
 @pytest.fixture
 def outcome(corpus, tmp_path, capfd) -> Callable[[str, Callable[[Path], object]], str | None]:
-    """Return a function that edits a file of a copy of the corpus, and reads it.
-
-    The function returns the sentence of a refusal, or None for a good result.
-    It fails in all other cases.
-    """
+    """Return a function that edits and reads a file of a copy, and returns the refusal or None."""
     folder = tmp_path / "copy"
 
     def read(file: str, edit: Callable[[Path], object]) -> str | None:

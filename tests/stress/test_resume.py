@@ -55,10 +55,7 @@ def without_seconds(value: Any) -> Any:
 
 
 def contents(run: Path) -> dict[str, Any]:
-    """Return what the files of a run contain, except for times.
-
-    Checkpoints are represented by hashes of their entries.
-    """
+    """Return what the files of a run contain, except for times; checkpoints as hashes."""
     result: dict[str, Any] = {METRICS: without_seconds(read_metrics(run))}
     for name in (run_folder.LAST, run_folder.BEST):
         for part, value in checkpoints.load(run / name).items():

@@ -100,11 +100,7 @@ def linear(make_scene, make_linear) -> AttackResult:
 
 
 def smallest_radii(linear: AttackResult) -> Tensor:
-    """Return the radius (E,) from which on each example has an adversary.
-
-    Within ε in every pixel, the gap of two logits falls by at most ε times |w₀ - w₁|₁.
-    Each view has pixels of its own, and the worse of both decides.
-    """
+    """Return the radius (E,) of an adversary: the gap falls by at most ε times |w₀ - w₁|₁."""
     weight = linear.classifier.network[1].weight
     gap = linear.logits_before[..., 0] - linear.logits_before[..., 1]
     slope = (weight[0] - weight[1]).abs().sum()

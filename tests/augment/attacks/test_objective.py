@@ -74,6 +74,7 @@ def test_a_complementary_label_excludes_the_other_studied_classes_too():
     expected = torch.from_numpy(-np.log1p(-excluded))
     torch.testing.assert_close(label_loss(LOGITS, labels, absent=[4]), expected)
     predicted = torch.arange(5)
+    assert is_correct(predicted, torch.full((5,), 1)).tolist() == [False, True, False, False, False]
     of_all = torch.full((5,), complementary_label(1))
     assert is_correct(predicted, of_all, [4]).tolist() == [True, False, True, True, False]
 
@@ -90,12 +91,6 @@ def test_the_gradient_is_finite_if_the_excluded_class_is_certain():
     certain = torch.tensor([[100.0, 0.0, 0.0]], requires_grad=True)
     label_loss(certain, torch.tensor([complementary_label(0)])).sum().backward()
     torch.testing.assert_close(certain.grad, torch.tensor([[1.0, -0.5, -0.5]]))
-
-
-def test_a_class_is_right_for_its_label_and_for_complementary_labels_of_others():
-    labels = torch.tensor([2, 2, complementary_label(2), complementary_label(2)])
-    predicted = torch.tensor([2, 1, 2, 0])
-    assert is_correct(predicted, labels).tolist() == [True, False, False, True]
 
 
 def test_log_odds_are_the_logit_of_the_probability():
@@ -155,10 +150,7 @@ def random_images(*shape: int) -> Tensor:
 
 
 def transformed(images: Tensor, seed: int = 0, **settings) -> tuple[Tensor, list[Tensor]]:
-    """Return the expectation, and the images that the classifier was given for it.
-
-    Keywords are those of `EOTSettings`. Without them, one draw changes nothing.
-    """
+    """Return the expectation, and the images given to the classifier; one draw changes nothing."""
     nothing = {"draws": 1, "jitter": 0.0, "exposure": 0.0, "noise": 0.0, "jpeg": 100}
     chosen = EOTSettings(**nothing | settings)
     means = Means()

@@ -42,10 +42,7 @@ PAIRS = arrays(np.float64, (2, 4, 6), elements=COORDINATES)  # values and center
 @pytest.mark.parametrize("name", NORMS)
 @given(pair=PAIRS, radius=RADII, dtype=DTYPES)
 def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radius):
-    """The nearest point p to v is in the ball and has (v - p)·(q - p) ≤ 0 for all its points q.
-
-    The largest of these products is (v - p)·(c - p) + radius × the dual norm of v - p.
-    """
+    """The largest (v - p)·(q - p) in the ball is (v - p)·(c - p) + radius × the dual norm."""
     values, center = torch.from_numpy(pair).to(dtype)
     nearest = project(name, radius, values, center)
     assert nearest.dtype == dtype
@@ -112,11 +109,7 @@ def test_within_a_box_no_descent_by_scipy_gets_nearer_than_the_projection(
 @pytest.mark.parametrize("dimensions", [1, 12])
 @pytest.mark.parametrize("name", NORMS)
 def test_draws_are_uniform_in_the_ball(name, dimensions):
-    """In D dimensions (norm / radius)^D is uniform in [0, 1], and no direction is preferred.
-
-    The variance along an axis is radius² / 3 in a cube and radius² / (D + 2) in a sphere.
-    Means and covariances agree to five standard errors.
-    """
+    """(norm / radius)^D is uniform, and variances are radius² / 3 or radius² / (D + 2)."""
     radius = 0.3
     center = torch.linspace(-1, 1, dimensions, dtype=torch.float64).expand(DRAW_COUNT, -1)
     drawn = sample(StepSettings(name, radius), center, torch.Generator().manual_seed(1))

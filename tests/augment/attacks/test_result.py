@@ -19,20 +19,15 @@ def result() -> augment.AttackResult:
     return augment.attack(classifier, scene, settings=settings, force=True)
 
 
-def test_a_plot_shows_the_images_and_the_light_of_its_example(result):
-    figure = result.plot(example=1)
-    before, light, after, _ = (axes for axes in figure.axes)
+def test_a_plot_shows_the_images_the_light_and_the_probabilities_of_its_example(result):
+    before, light, after, bars = result.plot(example=1).axes
     ball = renderer.light_sphere(result.conditions.light[1], 96)
     expected = (result.images_before[1], ball, result.images[1])
     for axes, image in zip((before, light, after), expected, strict=True):
         shown = axes.images[0].get_array()
         np.testing.assert_allclose(shown, image.permute(1, 2, 0).clamp(0, 1), atol=1e-6)
-
-
-def test_the_bars_are_the_probabilities_before_and_after(result):
-    bars = result.plot(example=0).axes[3]
     rows = [result.classifier.label(name.get_text()) for name in bars.get_yticklabels()]
-    expected = [result.logits_before[0].softmax(0), result.logits[0].softmax(0)]
+    expected = [result.logits_before[1].softmax(0), result.logits[1].softmax(0)]
     for container, probabilities in zip(bars.containers, expected, strict=True):
         widths = [bar.get_width() for bar in container]
         np.testing.assert_allclose(widths, probabilities[rows], atol=1e-6)

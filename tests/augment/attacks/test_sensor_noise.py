@@ -12,8 +12,6 @@ import augment
 from augment.attacks.loop import minimize
 from augment.attacks.objective import NOISE_DRAWS, Objective, add_sensor_noise
 from augment.attacks.result import AttackResult
-from augment.augmentation_settings import TrainingAttackSettings
-from augment.renders import Renders
 from augment.tasks.classification import ClassCriterion
 from augment.tasks.task import NO_CLASS
 
@@ -264,27 +262,3 @@ def test_checks_files_transfers_and_sweeps_count_as_the_attack_does(attacked, tm
     (row,) = augment.success_by_radius(result, [100.0])
     for method in ("adversarial", "random"):
         assert (row[method] <= row[f"{method}_without_noise"]).all()
-
-
-def training_renders(**settings) -> Renders:
-    attack = TrainingAttackSettings(max_steps=4, **settings)
-    service = augment.AugmentationService.from_meshes(
-        [("solid:orange:0", 0)],
-        SIZE,
-        augment.AugmentationSettings(attack=attack),
-        views=2,
-        samples=1,
-        backgrounds=[0.3, 0.6],
-        rasterizer="numpy",
-    )
-    return service.regenerate(nervous(0.2).train(), 0)
-
-
-def test_training_attacks_count_without_noise_unless_told_otherwise():
-    without = training_renders()
-    noisy = training_renders(sensor_noise=1.0)
-    assert torch.equal(without.images, noisy.images)
-    assert "attack_success_without_noise" not in without.diagnostics
-    success_without_noise = noisy.diagnostics["attack_success_without_noise"]
-    assert success_without_noise == without.diagnostics["attack_success"]
-    assert success_without_noise >= noisy.diagnostics["attack_success"]

@@ -45,10 +45,7 @@ def scene_of(*items, **options) -> tuple[Scene, str]:
 
 
 def lowest_roughness(scene: Scene, settings: MaterialSettings) -> float:
-    """Return the roughness of the object's own faces after an attack.
-
-    The attack takes the largest step towards less roughness within its norm-ball.
-    """
+    """Return the roughness of the object's own faces after the largest step towards less."""
     attacked = make_parameter("material", scene, settings)
     rows = torch.arange(len(scene))
     smoother = torch.tensor([1e3, 0, 0, 0])
@@ -192,10 +189,7 @@ def test_degree_0_is_exact_for_even_light():
 
 
 def irradiance_rms(light: Tensor) -> float:
-    """Return the root mean square of the irradiance, by quadrature.
-
-    The mean is over all normals and channels of a light (K, 3).
-    """
+    """Return the rms of the irradiance over all normals and channels, by quadrature."""
     normals, normal_weights = quadrature(16)
     directions, direction_weights = quadrature(100)
     degree = round(len(light) ** 0.5) - 1
@@ -209,10 +203,7 @@ def irradiance_rms(light: Tensor) -> float:
     ("sky", "is_told"), [(0.0, True), (1.5, False)], ids=["a sun alone", "a sun in a bright sky"]
 )
 def test_light_whose_irradiance_changes_as_it_is_made_physical_is_told(sky, is_told):
-    """A sun of degree 6 is negative in places. Removing this changes the irradiance by 17 %.
-
-    In a bright sky, the change is below the 5 % from which on it is told.
-    """
+    """Removing what is negative in a sun of degree 6 changes the irradiance by 17 %."""
     direction = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
     light = directional(direction, torch.ones(3, dtype=torch.float64)).float()
     light[0] += sky
@@ -234,10 +225,7 @@ def sun_map(tmp_path) -> str:
 
 @pytest.mark.parametrize(("degree", "told"), [(2, "irradiance that is off by 9%"), (4, "")])
 def test_a_light_that_a_low_degree_cuts_off_is_told(sun_map, degree, told):
-    """The rms irradiance of a sun is Σ (2l + 1) A_l² (Ramamoorthi and Hanrahan 2001).
-
-    Degrees above 2 have 8.7 % of it, and hardly any light is in those above 4.
-    """
+    """Degrees above 2 have 8.7 % of Σ (2l + 1) A_l² (Ramamoorthi and Hanrahan 2001)."""
     _, warned = scene_of(MATTE, light=sun_map, degree=degree)
     assert told in warned
     assert bool(told) == bool(warned)

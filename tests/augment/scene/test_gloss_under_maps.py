@@ -62,10 +62,7 @@ def rendered(path: Path, mesh: Mesh) -> tuple[np.ndarray, Camera]:
 
 
 def texels(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the directions (N, 3) of a map's texels and their power (N, 3).
-
-    The mean luminance is that of the probe to which scenes scale their maps.
-    """
+    """Return the directions (N, 3) of a map's texels, and their power (N, 3) as in scenes."""
     radiance = read_map(path).double().clamp(min=0)
     directions, solid_angles = equirectangular(*radiance.shape[:2])
     power = radiance * solid_angles[..., None]

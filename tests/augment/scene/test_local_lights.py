@@ -156,11 +156,7 @@ def test_mitsuba_renders_a_joint_attack_alike(joint_attack):
 
 
 def test_a_table_receives_the_projection_and_the_shadow():
-    """The projector stands straight above, where a screen through the origin would be white.
-
-    It is at a distance of 4. Outside the orange's shadow the table is even, and darker by
-    the square of the ratio of the distances.
-    """
+    """At a distance of 4, a screen would be white. The table is darker by the squared ratio."""
     above = ProjectorSettings(pixels=1, polar=0, pattern=1.0, fov=60)
     lights = {"light": NO_SKY, "projector": above, "lamps": None, "backgrounds": [0.0]}
     options = lights | {"width": 4.0, "polar": 0, "samples": 4}

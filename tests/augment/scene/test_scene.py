@@ -14,7 +14,6 @@ import renderer
 from augment.attack_settings import SkylightSettings, StepSettings
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.parameters import make_parameter
-from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.problem import SceneProblem
 from augment.augmentation_settings import views_of
 from augment.network import say_once
@@ -49,10 +48,6 @@ def built(*names: str, views: int = 2, **options) -> Scene:
     choices = {"backgrounds": GRAYS, "normals": "flat", "rasterizer": "numpy"}
     meshes = [(f"solid:{name}", name) for name in names]
     return build_scene(meshes, 8, views, **choices | options)
-
-
-def first_image(scene: Scene) -> torch.Tensor:
-    return scene.render(scene.conditions(FIRST), FIRST)[0, 0]
 
 
 @pytest.mark.parametrize(("examples", "meshes", "backgrounds"), [(100, 3, 5), (7, 3, 2), (2, 3, 1)])
@@ -123,9 +118,8 @@ def test_a_scene_takes_paths_as_text_and_as_path_and_cuts_the_center_out_of_a_ba
             scene = build_scene([item], 8, backgrounds=[0.5, behind], **options)
             gray = torch.full((3, 8, 8), 0.5)
             assert torch.equal(scene.backgrounds, torch.stack([gray, square]))
-            images.append(first_image(scene))
-    for image in images[1:]:
-        assert torch.equal(image, images[0])
+            images.append(scene.render(scene.conditions(FIRST), FIRST))
+    assert all(torch.equal(image, images[0]) for image in images)
 
 
 SHINY = ObjectSettings("solid:pear", "pear", gloss=[0.35])
@@ -187,10 +181,7 @@ STACK_SIZES = {"one stack": render.PIXELS_PER_STACK, "a stack per view": 1}
 
 @pytest.fixture(scope="module", params=STACK_SIZES.values(), ids=STACK_SIZES)
 def several(request) -> Iterator[Scene]:
-    """Return a scene of two meshes of different sizes in mixed order.
-
-    Each example has two views, and a light, an exposure and a background of its own.
-    """
+    """Return a scene of two meshes of different sizes in mixed order, with two views each."""
     first, second, third = orbit_cameras(3, 2.2)
     examples = [
         Example(1, (first, second), 0),
@@ -212,10 +203,7 @@ def several(request) -> Iterator[Scene]:
     ("examples", "changed"), [([0, 1, 2, 3], "light"), ([3, 0], "light"), ([2, 2, 1], "vertices")]
 )
 def test_several_meshes_are_rendered_as_each_is_alone(several, examples, changed):
-    """Changed light goes through stacked operators, and changed vertices are rasterized anew.
-
-    `renderer.render` shares no code with the stacks.
-    """
+    """Light goes through stacked operators. `renderer.render` shares no code with the stacks."""
     rows = torch.tensor(examples)
     conditions = several.conditions(rows)
     if changed == "vertices":
@@ -239,29 +227,20 @@ SIZES = {
 }
 
 
-@pytest.fixture(params=SIZES)
-def padded(request, several) -> tuple[Parameter, torch.Tensor]:
-    """Return a parameter, and the mask (E, D) of values that smaller meshes do not use."""
-    parameter = make_parameter(request.param, several, StepSettings("l2", 0.2))
-    counts = [SIZES[request.param](item.mesh) for item in several.objects]
+@pytest.mark.parametrize("name", SIZES)
+def test_a_smaller_mesh_draws_and_has_gradients_of_its_own_values_only(name, several):
+    parameter = make_parameter(name, several, StepSettings("l2", 0.2))
+    counts = [SIZES[name](item.mesh) for item in several.objects]
     assert len(set(counts)) == 2
     used = torch.tensor([counts[example.object] for example in several.examples])
     assert parameter.start.shape == (4, max(counts))
-    return parameter, torch.arange(max(counts)) >= used[:, None]
-
-
-def test_a_smaller_mesh_draws_only_its_own_values_from_its_own_ball(padded):
-    parameter, is_unused = padded
+    is_unused = torch.arange(max(counts)) >= used[:, None]
     drawn = parameter.sample(torch.Generator().manual_seed(0))
     assert not drawn[is_unused].any()
     assert (drawn[~is_unused] != 0).all()
     lengths = drawn.norm(dim=1)
     assert (lengths <= 0.2 + 1e-9).all()
     assert (lengths > 0.19).all()
-
-
-def test_values_that_a_smaller_mesh_does_not_use_have_no_gradient(several, padded):
-    parameter, is_unused = padded
     rows = torch.arange(4)
     values = parameter.start.clone().requires_grad_(True)
     conditions = parameter.apply(values, several.conditions(rows), rows)

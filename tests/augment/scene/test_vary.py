@@ -58,10 +58,7 @@ def cameras_of(scene: Scene) -> list:
 
 
 def outlines(scene: Scene) -> tuple[Tensor, Tensor]:
-    """Measure what the object covers, in fractions of the image's width.
-
-    Returns the middles (E, 2), right and up, and the extents (E,) from left to right.
-    """
+    """Return the object's middles (E, 2) and extents (E,), in fractions of the image's width."""
     middles = []
     extents = []
     for image in images_of(scene):
@@ -349,10 +346,7 @@ def test_each_example_is_in_one_of_the_environments(scene):
 
 
 def test_white_directional_light_of_unit_strength_comes_from_the_cameras_side(scene):
-    """Both angles are within 70° of the camera's.
-
-    A polar angle beyond the pole is negative, and its azimuth is turned around.
-    """
+    """Both angles are within 70° of the camera's. Beyond the pole, the azimuth is turned around."""
     lit = drawn(scene, directional_fraction=1.0, fill_light=[0.5, 0.5])
     sunlight = (lit.lights - 0.5 * scene.lights).double()
     assert torch.equal(sunlight[..., 0].float(), sunlight[..., 2].float())

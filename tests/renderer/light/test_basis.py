@@ -2,39 +2,15 @@
 
 import xml.etree.ElementTree as xml
 
-import pytest
 import torch
 
 from renderer.camera import OrthographicCamera
-from renderer.light.basis import Harmonics, SumBasis, split_light
 from renderer.light.environment import read_map
-from renderer.light.lamps import Lamps, Projector
+from renderer.light.lamps import Projector
 from renderer.mesh import Mesh
 from renderer.mitsuba_scene import SCENE, write_mitsuba_scene
 from renderer.settings import ImageSettings
 from renderer.solids import sphere
-
-# The three lights have 9, 2 and 9 coefficients.
-SKY = Harmonics(2)
-LAMPS = Lamps(((2.0, 0.0, 1.0), (0.0, 2.0, 1.0)))
-PROJECTOR = Projector(3)
-# Each order of the lights, with the first coefficient of each light.
-ORDERS = [([SKY, LAMPS, PROJECTOR], [0, 9, 11]), ([LAMPS, SKY, PROJECTOR], [0, 2, 11])]
-
-
-@pytest.mark.parametrize(("parts", "first_rows"), ORDERS)
-def test_a_light_is_split_into_environment_light_and_local_lights(parts, first_rows):
-    coefficients = torch.arange(20.0)[:, None].expand(-1, 3)
-    split = split_light(SumBasis(tuple(parts)), coefficients)
-    assert split.environment[0, 0] == first_rows[parts.index(SKY)]
-    assert len(split.environment) == SKY.size
-    (lamps, lamp_values), (projector, pattern) = split.local_lights
-    assert lamps == LAMPS
-    first_lamp = first_rows[parts.index(LAMPS)]
-    expected_values = coefficients[first_lamp : first_lamp + 2, 0]
-    assert lamp_values[:, 0].tolist() == expected_values.tolist()
-    assert projector == PROJECTOR
-    assert pattern[:, 0].tolist() == list(range(11, 20))
 
 
 def test_each_projector_has_its_own_pattern_in_a_scene_of_mitsuba(tmp_path):

@@ -207,10 +207,10 @@ def test_physical_light_keeps_the_mean_and_no_window_has_a_smaller_error(name, d
 def test_light_of_degree_2_is_closer_to_a_physical_one_with_more_degrees():
     """An attack on gloss gives degree 39 to light of degree 2."""
     given = concentrated_light("lamps", 2)
-    padded = F.pad(given, (0, 0, 0, 13**2 - len(given)))
+    padded = F.pad(given, (0, 0, 0, 9**2 - len(given)))
     physical = project_nonnegative(padded)
-    error = rms_irradiance_error(physical, padded, 12)
-    radiance = basis(random_directions(2000, seed=5), 12) @ physical
+    error = rms_irradiance_error(physical, padded, 8)
+    radiance = basis(random_directions(2000, seed=5), 8) @ physical
     assert (radiance.amin(0) >= -TOLERANCE * radiance.amax(0)).all()
     assert (error <= rms_irradiance_error(project_nonnegative(given), given, 2)).all()
 

@@ -187,15 +187,6 @@ def random_surfaces() -> tuple[Tensor, Tensor]:
 POSITION = [0.5, -0.3, 0.8]
 
 
-def test_a_lamp_without_radius_lights_by_the_cosine_over_the_squared_distance():
-    points, normals = random_surfaces()
-    to_lamp = torch.tensor(POSITION, dtype=torch.float64) - points
-    distance = to_lamp.norm(dim=1)
-    cosine = ((to_lamp * normals).sum(1) / distance).clamp(min=0)
-    found = irradiance_of_lamp(POSITION, 0.0, points, normals)
-    torch.testing.assert_close(found, cosine / distance**2, rtol=1e-12, atol=1e-14)
-
-
 def test_a_small_disc_is_a_point_times_the_cosine_to_its_axis_and_dark_behind():
     """A disc faces the origin."""
     points, normals = random_surfaces()

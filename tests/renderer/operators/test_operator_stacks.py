@@ -110,10 +110,7 @@ def test_all_views_in_one_call_are_the_single_views(
 
 @pytest.mark.parametrize("size", [SIZE, 100])
 def test_images_are_differentiable_in_the_background(size):
-    """The corner is background in all four images of two views and two lights.
-
-    Large images are computed in a loop over the views.
-    """
+    """The corner is background in all four images. Large images are computed in a loop."""
     operators = operators_of(size=size)[:2]
     lights = 0.3 * draw(2, 49, 3)
     background = torch.full((3, size, size), 0.25, dtype=torch.float64, requires_grad=True)

@@ -23,10 +23,7 @@ SAMPLES = 8
 
 
 def starts_of_rays(sample_count: int) -> Tensor:
-    """Return the sample of its pixel (pixels, DIRECTIONS) from which each ray starts.
-
-    The rays are cast from a floor beside a higher square, with some samples in each pixel.
-    """
+    """Return the sample of its pixel (pixels, DIRECTIONS) from which each ray of a floor starts."""
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     faces = [[0, 1, 2], [0, 2, 3]]
     floor = Mesh.plain(corners, faces)
@@ -53,10 +50,7 @@ def test_neighboring_pixels_cast_a_direction_from_all_of_their_samples(sample_co
 
 
 def test_each_sample_casts_rays_in_directions_all_over_the_sphere():
-    """Every 55th direction of the lattice has nearly the same azimuth.
-
-    The mean of such directions has a length of 0.75.
-    """
+    """The mean of every 55th direction of the lattice has a length of 0.75."""
     is_from_sample = starts_of_rays(55)[..., None] == torch.arange(55)
     sums = torch.einsum("pds,di->psi", is_from_sample.double(), sphere(DIRECTIONS))
     means = sums / is_from_sample.sum(1)[..., None]

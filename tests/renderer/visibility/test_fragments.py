@@ -35,47 +35,9 @@ def fragments_of(mesh, settings, camera=CAMERA, closed=False) -> Fragments:
     return fragments
 
 
-def covered_samples(ids: np.ndarray, size: int, samples: int) -> np.ndarray:
-    indices = np.arange(ids.size).reshape(size, samples, size, samples).swapaxes(1, 2).ravel()
-    return indices[ids.ravel()[indices] >= 0]
-
-
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize(("size", "samples"), [(9, 3), (1, 16)])
-def test_samples_and_faces_are_those_of_the_image_pixel_by_pixel(size, samples, camera):
-    vertices, faces = open_shell()
-    fragments = fragments_of((vertices, faces), ImageSettings(size, samples), camera)
-    points = camera.project(vertices)
-    [ids] = RASTERIZER.rasterize(points[None], faces, size * samples)
-    sample = covered_samples(ids, size, samples)
-    row, column = np.divmod(sample, size * samples)
-    pixel = row // samples * size + column // samples
-    pixels, counts = np.unique(pixel, return_counts=True)
-    np.testing.assert_array_equal(fragments.pixels, pixels)
-    np.testing.assert_array_equal(fragments.coverage, counts / samples**2)
-    np.testing.assert_array_equal(fragments.pixels[fragments.sample_to_pixel], pixel)
-    face = fragments.faces[fragments.sample_to_seen_face]
-    np.testing.assert_array_equal(face, ids.ravel()[sample])
-    centers = (2 * np.stack([column, row], axis=1) + 1) / (size * samples) - 1
-    positions = centers * [1, -1]
-    np.testing.assert_allclose(fragments.positions(), positions, rtol=0, atol=2 * EPS)
-
-    seen = np.unique(ids[ids >= 0])
-    np.testing.assert_array_equal(fragments.faces, seen)
-    np.testing.assert_array_equal(fragments.corners, faces[seen])
-    np.testing.assert_array_equal(fragments.outlines, points[faces[seen], :2])
-    a, b, c = vertices[faces[seen]].transpose(1, 0, 2)
-    toward_camera = camera.axes()[2]
-    side = np.sign(np.cross(b - a, c - a) @ toward_camera)
-    np.testing.assert_array_equal(fragments.facing[:, 0], side)
-
-
 @pytest.mark.parametrize("shift", [0.0, 0.05])
 def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(shift):
-    """The rasterizer rounds corners, so that a sample may lie just outside of its face.
-
-    With shifted corners, some samples lie well outside.
-    """
+    """Corners are rounded, so that a sample may lie just outside. With a shift, some lie far."""
     fragments = fragments_of(open_shell(), ImageSettings(8, 4))
     fragments = replace(fragments, outlines=fragments.outlines + shift)
     outside_count = 0

@@ -87,11 +87,7 @@ def doubled_area(a: Point, b: Point, c: Point) -> int:
 
 
 def reference(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
-    """Rasterize one view as the contract says, in Python's integers.
-
-    A sample on an edge counts if a point a little to
-    the right is inside or, where the edge is horizontal, a point a little below.
-    """
+    """Rasterize as the contract says: a sample on an edge counts if what is right or below does."""
     points = np.clip(points, -SPAN / resolution, SPAN / resolution)
     positions = [
         Point(rounded_coordinate(x, resolution), rounded_coordinate(-y, resolution))
@@ -274,11 +270,7 @@ def test_auto_draws_on_a_gpu_what_numpy_draws():
     closed=st.booleans(),
 )
 def test_opengl_and_numpy_agree_on_any_triangles(seed, count, resolution, lattice, closed):
-    """Coverage is equal. The faces differ at a few samples with two faces of nearly one depth.
-
-    All corners lie inside the image, because Mesa cuts triangles at its border and
-    rounds the new corners.
-    """
+    """All corners lie inside the image, because Mesa cuts triangles at its border and rounds."""
     points, faces = random_triangles(seed, count)
     if lattice is not None:
         points[..., :2] = np.round(points[..., :2] * lattice) / lattice

@@ -204,10 +204,7 @@ GROWING = {
 
 @pytest.mark.parametrize(("meshes", "jump"), GROWING.values(), ids=GROWING)
 def test_a_growing_square_gains_its_perimeter_times_the_jump_of_radiance(meshes, jump):
-    """The radiance is 0.6 on the squares and 0.1 on the background.
-
-    Each side of the first square moves outward by one, so that its area grows by its perimeter.
-    """
+    """The radiance is 0.6 on the squares and 0.1 on the background. Each side moves by one."""
     mesh = concatenate(meshes)
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
     options = {"light": soft_front_light(0.6), "background": 0.1, "albedo_scale": 1.0}
@@ -254,10 +251,7 @@ def triangle_areas(points: Tensor, faces: Tensor) -> Tensor:
     ],
 )
 def test_gradients_by_single_vertices_converge_to_those_of_areas_as_samples_grow(size, bounds):
-    """In even light, the sum of an image is that of the triangles' colors times their areas.
-
-    The parameter `bounds` maps samples per row of a pixel to the largest relative error.
-    """
+    """In even light, the sum of an image is that of the triangles' colors times their areas."""
     mesh, albedo = colored_plane(9)
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
     areas = triangle_areas(vertices, torch.from_numpy(mesh.faces))
