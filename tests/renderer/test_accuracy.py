@@ -310,7 +310,7 @@ def all_errors(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
 
 
 def operator_errors(setup, dtype=torch.float32, lost=None) -> Errors:
-    """Measure the errors of an operator's image and light gradient; shadows take `lost` radiance."""
+    """Measure the errors of an operator's image and light gradient, without `lost` radiance."""
     [operator] = build_operators(
         setup.mesh,
         [setup.camera],

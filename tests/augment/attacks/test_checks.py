@@ -50,18 +50,6 @@ def test_a_cost_that_stays_the_same_does_not_count_as_one_that_fell(attacked):
     assert checks["zero_gradient"] == 1
 
 
-def test_a_first_gradient_of_zero_is_not_called_constant_scores(attacked):
-    """The scores change only in bright images."""
-
-    def saturated(images: Tensor) -> Tensor:
-        bright = torch.relu(images.mean((1, 2, 3)) - 0.7)
-        return torch.stack([2 - bright, 0 * bright], dim=1)
-
-    classifier = augment.Classifier(saturated, 8, ("orange", "other"))
-    with pytest.warns(UserWarning, match="gradient of some examples is zero"):
-        attacked("lighting", classifier=classifier, max_steps=2)
-
-
 def test_a_success_counts_at_the_very_last_step_and_if_a_margin_sends_it_on(attacked):
     [last] = attacked(SMALL_STEPS, max_steps=60).steps.tolist()
     assert 1 < last < 60

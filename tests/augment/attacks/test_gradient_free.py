@@ -99,16 +99,6 @@ def test_all_starts_together_show_at_most_the_given_number_of_images(
         assert result.steps.item() == 3 * (share - 1)
 
 
-def test_the_queries_of_a_gradient_attack_are_limited_and_counted_alike(attacked):
-    options = {"max_steps": 50, "margin": 100.0}
-    limited = attacked("lighting", max_queries=7, **options)
-    assert limited.minimum.queries.tolist() == [7]
-    assert limited.backward_passes.tolist() == [7]
-    assert limited.steps.tolist() == [6]
-    steps = attacked("lighting", max_steps=6, margin=100.0)
-    assert torch.equal(limited.minimum.values, steps.minimum.values)
-
-
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:You are using the legacy")
 def test_a_numpy_function_and_a_file_of_onnx_give_the_adversary_of_the_torch_network(tmp_path):
     pytest.importorskip("onnxruntime")

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import norm_balls as nb
-from augment.scene.truth import NO_OBJECT, boxes_of
+from augment.scene.truth import NO_OBJECT
 from renderer.mesh import select_faces
 from train.class_names import as_mappings
 from train.settings import read_objects
@@ -27,10 +27,6 @@ def test_the_mask_of_a_ball_is_its_disc_and_the_box_contains_the_mask():
         # The area of a disc of the width of the box, to the discretization of its border.
         assert abs(mask.sum() / (math.pi / 4 * (right - left) * (bottom - top)) - 1) < 0.02
     assert truth.visible.eq(1).all()
-
-
-def test_the_box_of_an_empty_mask_is_zero():
-    assert boxes_of(torch.zeros(2, 5, 4, dtype=torch.bool)).tolist() == [[0.0] * 4] * 2
 
 
 def test_boxes_and_fractions_of_two_balls_are_those_of_overlapping_discs():

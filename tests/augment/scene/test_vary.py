@@ -133,14 +133,10 @@ SPECULAR_LAYER = SpecularLayerSettings(roughness=[0.4, 0.6], specular_factor=[0.
 VARNISHED = {"gloss": SPECULAR_LAYER, "rotation": 90.0, "instances": True}
 
 
-@pytest.fixture(scope="module")
-def pears() -> Scene:
+def test_each_view_has_one_gloss_of_its_own_within_the_range_and_its_props_keep_theirs():
     prop = ObjectSettings(mesh="solid:ball", at=[2.0, 0.0], gloss=[0.9])
     pear = ObjectSettings("solid:pear", "pear", others=[prop])
-    return augment.build_scene([pear], 8, 4, rasterizer="numpy", samples=1)
-
-
-def test_each_view_has_one_gloss_of_its_own_within_the_range_and_its_props_keep_theirs(pears):
+    pears = augment.build_scene([pear], 8, 4, rasterizer="numpy", samples=1)
     objects = drawn(pears, **VARNISHED).objects
     roughness, metallic, strength = np.stack([item.mesh.gloss[0] for item in objects]).T
     assert len(np.unique(roughness)) == 4

@@ -175,14 +175,6 @@ def test_a_map_of_acescg_becomes_rec_709(tmp_path, suffix):
     )
 
 
-def test_a_map_with_another_white_keeps_the_chromaticity_of_its_light(tmp_path):
-    """The white of Radiance's primaries has equal X, Y and Z."""
-    header = "PRIMARIES=0.640 0.330 0.290 0.600 0.150 0.060 0.333333 0.333333"
-    radiance = read_map(write_hdr(tmp_path / "map.hdr", header, np.array([1, 1, 1])))
-    expected = torch.from_numpy(XYZ_TO_REC_709.sum(axis=1)).float()
-    torch.testing.assert_close(radiance, expected.expand(2, 3, 3), rtol=0, atol=1e-3)
-
-
 def test_colors_beyond_rec_709_have_no_negative_radiance_and_a_warning(tmp_path):
     green = np.broadcast_to([0.0, 1.0, 0.0], (2, 3, 3))
     write_exr(tmp_path / "map.exr", green, ("R", "G", "B"), chromaticities=ACESCG)
