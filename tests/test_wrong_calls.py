@@ -25,6 +25,7 @@ from augment.scene.objects import Conditions
 from renderer import InputError, harmonics, skylight
 from renderer.errors import describe
 from renderer.light.lamps import Lamps, Projector
+from tests.detectors import BrightBox
 from tests.helpers import bright_or_dark
 from tests.tetrahedron import CAMERA, IMAGES, LAMP, LIGHT, MESH, SIZE, render
 from train import load_run
@@ -414,8 +415,36 @@ SCORES = [
     *calls_of("by", lambda x: evaluated(by=x), "mesh", "color"),
 ]
 
+DETECTOR = {"task": augment.Detection(), "classes": CLASSES}
+adversarial_light = partial(augment.AdversarialLighting, LINEAR)
+RELIGHTING = [
+    *by_name(augment.RandomLighting, strength=[NAN], p=[-0.1]),
+    *by_name(augment.RandomLighting, lights=["sun", [], 3, {"linear": 0.0}]),
+    *calls_of("image", augment.RandomLighting(), torch.ones(5, 4, 4), np.ones((4, 4, 3))),
+    *calls_of("image", augment.RandomLighting("low_light"), IMAGES[0] * NAN, IMAGES[0] + 3e38),
+    *calls_of("image", augment.RandomLighting(), {"image": np.ones((4, 4, 3)), "mask": IMAGES[0]}),
+    *calls_of("images", torch.vmap(augment.RandomLighting("linear")), IMAGES),
+    *calls_of(
+        "depth",
+        lambda x: augment.RandomLighting()({"image": IMAGES[0], "depth": x}),
+        torch.ones(5, 4),
+        "far",
+    ),
+    *calls_of("kinds", augment.lights.CastShadow, ("sun",)),
+    *calls_of("exposure", lambda x: augment.lights.LowLight(exposure=x), 0),
+    *by_name(adversarial_light, steps=[0], strength=[2.0]),
+    *calls_of("classes", lambda x: adversarial_light(task=x), augment.Detection()),
+    *calls_of("targets", lambda x: adversarial_light()(IMAGES, x), torch.zeros(2).long()),
+    *calls_of("-1", lambda x: adversarial_light()(IMAGES, x), torch.full((3,), -1)),
+    *calls_of(
+        "targets",
+        lambda x: augment.AdversarialLighting(BrightBox((1, 1, 4, 4)), **DETECTOR)(IMAGES, x),
+        *(3, {"boxes": []}, [{"boxes": []}]),
+    ),
+]
+
 CALLS = [*RENDERING, *CAMERAS, *LIGHTS, *MESHES, *SCENES, *ATTACKS, *CLASSIFIERS]
-CALLS += [*SERVICES, *SCORES]
+CALLS += [*SERVICES, *SCORES, *RELIGHTING]
 
 
 @pytest.fixture(scope="module")

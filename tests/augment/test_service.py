@@ -60,14 +60,8 @@ def labels(scene) -> Tensor:
 def model(scene, labels) -> nn.Module:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        network = nn.Sequential(
-            nn.Conv2d(3, 16, 3, padding=1),
-            nn.BatchNorm2d(16),
-            nn.ReLU(),
-            nn.Dropout(0.1),
-            nn.Flatten(),
-            nn.Linear(1024, 3),
-        )
+        layers = [nn.Conv2d(3, 16, 3, padding=1), nn.BatchNorm2d(16), nn.ReLU(), nn.Dropout(0.1)]
+        network = nn.Sequential(*layers, nn.Flatten(), nn.Linear(1024, 3))
         optimizer = torch.optim.Adam(network.parameters(), lr=0.003)
         images = render_in(scene, LIGHT)
         for _ in range(60):
@@ -101,9 +95,7 @@ def test_without_an_arm_or_examples_there_are_no_renders_and_no_scene_is_needed(
     choices = AugmentationSettings(**settings)
     service = AugmentationService(choices, None, no_labels, 0, Phases())
     renders = service.regenerate(model, 0)
-    assert len(renders.images) == 0
-    assert len(renders.labels) == 0
-    assert renders.diagnostics == {}
+    assert (len(renders.images), len(renders.labels), renders.diagnostics) == (0, 0, {})
 
 
 @pytest.mark.parametrize(
@@ -349,29 +341,22 @@ def test_hard_negatives_of_several_classes_are_attacked_towards_each_in_turn(
     assert (rises[~is_plate, 2] <= 1e-5).all()
 
 
-def test_attack_examples_show_the_images_and_predictions_before_and_after(serve, scene, model):
-    renders = serve(attack=LONG).regenerate(model, 0)
-    examples = renders.attack_examples
-    assert 0 < len(examples) <= 4
-    assert torch.equal(examples.lights[0], LIGHT.expand(len(examples), -1, -1))
-    for side in (0, 1):
-        images = examples.images[side]
-        predictions = examples.predictions[side]
-        torch.testing.assert_close(predictions, logits_of(model, images).softmax(1))
-        for image, light in zip(images, examples.lights[side], strict=True):
-            # The example is one of those of the scene.
-            differences = (render_in(scene, light) - image).flatten(1).abs().amax(1)
-            assert differences.min() < 100 * EPS32
-
-
-def test_attack_examples_do_not_show_those_that_were_wrong_before(serve, model, labels):
+def test_attack_examples_show_what_was_right_before_and_is_wrong_after(serve, scene, model, labels):
     """Half of the examples are given a class that the network does not see in them."""
     is_even = torch.arange(EXAMPLE_COUNT) % 2 == 0
     wrong = torch.where(is_even, labels, 1)
     renders = serve(labels=wrong, attack=LONG).regenerate(model, 0)
     examples = renders.attack_examples
-    assert renders.diagnostics["attack_success_before"] >= 0.5
-    assert len(examples) > 0
+    assert 0 < len(examples) <= 4
     assert (examples.labels != 1).all()
     assert torch.equal(examples.predictions[0].argmax(1), examples.labels)
     assert (examples.predictions[1].argmax(1) != examples.labels).all()
+    assert torch.equal(examples.lights[0], LIGHT.expand(len(examples), -1, -1))
+    for images, predictions, lights in zip(
+        examples.images, examples.predictions, examples.lights, strict=True
+    ):
+        torch.testing.assert_close(predictions, logits_of(model, images).softmax(1))
+        for image, light in zip(images, lights, strict=True):
+            # The example is one of those of the scene.
+            differences = (render_in(scene, light) - image).flatten(1).abs().amax(1)
+            assert differences.min() < 100 * EPS32

@@ -5,7 +5,6 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -22,7 +21,6 @@ from benchmarks import (
 )
 from renderer.operators import shadows as precomputed
 from renderer.visibility import choose
-from tests.helpers import save_noise
 
 PNG_SIGNATURE = b"\x89PNG"
 
@@ -137,24 +135,6 @@ def test_optimizers_are_compared_at_equal_forward_passes(capsys, monkeypatch):
     header, _, *rows = capsys.readouterr().out.splitlines()
     assert header == "|optimizer|2 passes|20 passes|"
     assert [row.split("|")[1] for row in rows] == ["gradient", "random search", "CMA-ES"]
-
-
-@pytest.mark.slow
-def test_relit_photographs_are_scored_for_each_network(tmp_path, capsys):
-    rng = np.random.default_rng(0)
-    for index in range(0, 50, 5):
-        save_noise(tmp_path / f"{index:03d}_thing.png", rng, (40, 40))
-    none, best = "run:pretrained/none", "run:pretrained/best"
-    arguments = [str(tmp_path), none, best, f"--control={none}", "--slides=2", "--passes=3"]
-    relit_photographs.main(arguments)
-    _, separator, *rows = capsys.readouterr().out.splitlines()
-    assert separator.count("|") == 1 + 8
-    assert [row.split("|")[1] for row in rows] == [none, best]
-    for row in rows:
-        values = [float(cell.split()[0].rstrip(",")) for cell in row.split("|")[2:-1]]
-        unchanged, _, _, _, one_slide, random_search, gradient = values
-        assert gradient <= one_slide <= unchanged
-        assert random_search <= one_slide
 
 
 def test_the_intervals_of_relit_photographs_are_those_of_scipy():

@@ -1,54 +1,13 @@
-import zipfile
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-import trimesh
 from torch import nn
 
 from augment.classifier import Classifier
-from augment.scene import patterns
 from benchmarks import many_objects
 from train.results.tables import Estimate, fraction
 
 CLASSES = ["orange", "lemon", "packet"]
-
-
-@pytest.fixture
-def data(tmp_path) -> Path:
-    """Write balls instead of the meshes, a wheel that holds some of them, and maps."""
-    rng = np.random.default_rng(0)
-    ball = trimesh.creation.icosphere(1)
-    for folder in ("meshes", "hdri", "packages"):
-        (tmp_path / folder).mkdir()
-    for name in ("banana", "golf_ball", "orange_studio", "orange_sketchfab"):
-        ball.export(tmp_path / f"meshes/{name}.glb")
-    for name in ("orange_leaf", "orange_scan", "apple_scan"):
-        ball.export(tmp_path / f"meshes/{name}.glb")
-    for maps in many_objects.MAPS.values():
-        for name in maps:
-            np.save(tmp_path / f"hdri/{name}.npy", rng.random((8, 16, 3), np.float32))
-    text = ball.export(file_type="obj")
-    with zipfile.ZipFile(tmp_path / "packages/objects.whl", "w") as archive:
-        for name in many_objects.PACKAGED:
-            if name.endswith(".obj"):
-                archive.writestr(name, text)
-    return tmp_path
-
-
-@pytest.mark.slow
-def test_each_class_has_equally_many_renders_in_each_light(data, monkeypatch):
-    pytest.importorskip("mitsuba")
-    monkeypatch.setattr(patterns, "LAB_RESOLUTION", 16)
-    folders = ["--data", str(data), "--packages", str(data / "packages"), "--out", str(data / "o")]
-    many_objects.main(["make", *folders, "--renders", "6", "--size", "8", "--spp", "1"])
-    found = {split: many_objects.find_renders(data / "o" / split) for split in many_objects.OBJECTS}
-    for parts in found.values():
-        assert len({(part.group, part.light) for part in parts}) == len(parts) == 3 * 4
-        for part in parts:
-            counts = [part.labels.count(label) for label in set(part.labels)]
-            assert min(counts) == max(counts) == 6 * many_objects.FACTORS[part.group]
 
 
 def test_the_splits_share_only_the_objects_of_the_training():

@@ -71,9 +71,8 @@ def counts_of(report: nb.AuditReport) -> tuple:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*deprecated")
-@pytest.mark.parametrize("suffix", ["pt", pytest.param("pt2", marks=pytest.mark.slow)])
 def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index_without_a_folder(
-    options, tmp_path, monkeypatch, suffix
+    options, tmp_path, monkeypatch
 ):
     """The numbers are those of the mesh's file and of the network itself, by name."""
     (tmp_path / "here").mkdir()
@@ -83,13 +82,8 @@ def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index_without_a
     mesh = nb.load_mesh(tmp_path / "orange.glb")
     expected = nb.audit(network, [tmp_path / "orange.glb"], **options)
 
-    path = tmp_path / f"network.{suffix}"
-    images = torch.rand(2, 3, SIZE, SIZE)
-    if suffix == "pt":
-        torch.jit.save(torch.jit.trace(network, images), path)
-    else:
-        sizes = ({0: torch.export.Dim("batch")},)
-        torch.export.save(torch.export.export(network, (images,), dynamic_shapes=sizes), path)
+    path = tmp_path / "network.pt"
+    torch.jit.save(torch.jit.trace(network, torch.rand(2, 3, SIZE, SIZE)), path)
     classifier = nb.load_classifier(str(path), classes=CLASSES, size=SIZE, trust_code=True)
     options |= {"classes": None, "size": None}
     found = nb.audit(classifier, [mesh], label=0, **options)

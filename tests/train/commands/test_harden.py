@@ -168,36 +168,16 @@ def test_a_mesh_in_memory_trains_as_its_file_does(network, photographs, tmp_path
     assert not [*(tmp_path / "run").rglob("*.glb")]
 
 
-def torchscript(network: nn.Module, path: Path) -> nn.Module:
-    torch.jit.save(torch.jit.trace(network, torch.rand(2, 3, SIZE, SIZE)), path)
-    return torch.jit.load(path)
-
-
-def exported(network: nn.Module, path: Path) -> nn.Module:
-    batch = torch.export.Dim("batch")
-    images = torch.rand(2, 3, SIZE, SIZE)
-    program = torch.export.export(network, (images,), dynamic_shapes=({0: batch},))
-    torch.export.save(program, path)
-    return program.module()
-
-
 @pytest.mark.filterwarnings("ignore:.*deprecated")
-@pytest.mark.parametrize(
-    ("write", "suffix"),
-    [(torchscript, "pt"), pytest.param(exported, "pt2", marks=pytest.mark.slow)],
-)
-def test_a_network_of_a_file_is_hardened_for_the_index_of_a_class(
-    network, photographs, tmp_path, write, suffix
-):
+def test_a_network_of_a_file_is_hardened_for_the_index_of_a_class(network, photographs, tmp_path):
     """The file has no class names. The module of the file itself cannot be trained."""
-    path = tmp_path / f"network.{suffix}"
-    module = write(network, path)
-    classifier = nb.load_classifier(str(path), size=SIZE, trust_code=True)
-    options = {"classes": None, "size": None, "label": 1}
-    hardened = harden(classifier, photographs, **options)
+    path = str(tmp_path / "network.pt")
+    torch.jit.save(torch.jit.trace(network, torch.rand(2, 3, SIZE, SIZE)), path)
+    classifier = nb.load_classifier(path, size=SIZE, trust_code=True)
+    hardened = harden(classifier, photographs, classes=None, size=None, label=1)
     expected = harden(network, photographs, classes=None, label=1)
     weights = dict(hardened.named_parameters())
     last = next(value for name, value in weights.items() if name.endswith("4.weight"))
     torch.testing.assert_close(last, expected[4].weight)
     with pytest.raises(nb.InputError, match="load_classifier"):
-        harden(module, photographs, label=1)
+        harden(torch.jit.load(path), photographs, label=1)

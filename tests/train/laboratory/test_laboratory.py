@@ -94,14 +94,8 @@ def test_a_setup_shows_an_object_of_the_label_and_another_one_in_the_same_light(
         assert 0.2 <= float(first["brightness"]) <= 2.5
 
 
-def test_the_same_settings_write_the_same_bytes(laboratory, tmp_path):
-    lab.write_laboratory(settings(tmp_path))
-    for path in ["photos.csv", *(row["path"] for row in rows(laboratory))]:
-        assert (tmp_path / path).read_bytes() == (laboratory / path).read_bytes()
-
-
 def test_only_the_object_distinguishes_the_label_from_a_hard_negative(tmp_path):
-    """Show the same mesh under both labels: the photographs of a setup are the same."""
+    """The same mesh under both labels has the same photographs."""
     meshes = ["solid:orange:7", {"mesh": "solid:orange:7", "label": "other_orange"}]
     lab.write_laboratory(settings(tmp_path, meshes=meshes))
     for path in (tmp_path / "orange").iterdir():
@@ -184,12 +178,10 @@ def test_a_pattern_is_an_image_of_the_colors_of_its_family_that_the_seed_decides
 
 
 def elevation(direction: np.ndarray) -> float:
-    """Return the angle of a direction above the horizon in degrees."""
     return np.degrees(np.arcsin(direction[2] / np.linalg.norm(direction)))
 
 
 def horizontal_cosine(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the cosine of the angle between the azimuths of two directions."""
     product = first[:2] @ second[:2]
     return product / np.linalg.norm(first[:2]) / np.linalg.norm(second[:2])
 
@@ -300,10 +292,9 @@ def directions(shot: Shot, size: int) -> np.ndarray:
     return ahead + offsets[None, :, None] * right - offsets[:, None, None] * up
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
+def test_the_table_reflects_projector_and_surroundings_as_formulas_say():
     """A projector lights planes that face it evenly, by 1 / z² at depth z."""
-    (shot,) = draw(1, ["solid"], (1.5, 1.5), seed)
+    (shot,) = draw(1, ["solid"], (1.5, 1.5), 1)
     shot = replace(shot, scale=1e-4, ambient=np.array([0.1, 0.2, 0.3]))
     image = path_traced(lab_parts(solid("orange"), 1.0), shot, 8, 4096, bounces=1, seed=0)
 
@@ -334,22 +325,16 @@ def test_a_wide_render_has_the_middle_rows_of_a_square_one():
     np.testing.assert_allclose(*means, rtol=0.05, atol=0.005)
 
 
-def test_two_projectors_at_one_place_share_the_brightness_of_one():
-    parts = lab_parts(GRAY_CARD, 1.0)
-    one = frontal(wall=np.array([0, 3.0, 1.0]), table=np.array([0.2, 0.1, 0.3]))
-    two = replace(one, patterns=2 * one.patterns, projectors=2 * one.projectors)
-    expected = path_traced(parts, one, 8, 64, bounces=1, seed=0)
-    found = path_traced(parts, two, 8, 64, bounces=1, seed=0)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-
-
-def test_a_wall_that_faces_the_projector_has_the_color_of_the_table_times_the_brightness():
-    """The wall is at distance 9 from the projector. Brightness refers to distance 6."""
+def test_a_wall_that_faces_projectors_has_the_color_of_the_table_times_the_brightness():
+    """The wall is at distance 9. Brightness refers to distance 6, and to all projectors at once."""
     table = np.array([0.2, 0.1, 0.3])
     shot = frontal(wall=np.array([0, 3.0, 1.0]), table=table, scale=1e-4)
     image = path_traced(lab_parts(GRAY_CARD, 1.0), shot, 8, 256, bounces=1, seed=0)
     expected = np.broadcast_to(6**2 / 9**2 * table, (2, 3))
     np.testing.assert_allclose(image[0, 3:5], expected, rtol=0.1)
+    two = replace(shot, patterns=2 * shot.patterns, projectors=2 * shot.projectors)
+    of_two = path_traced(lab_parts(GRAY_CARD, 1.0), two, 8, 256, bounces=1, seed=0)
+    np.testing.assert_allclose(of_two, image, rtol=1e-5)
 
 
 def test_a_texture_lies_upright_on_its_faces():
@@ -365,18 +350,13 @@ def test_a_texture_lies_upright_on_its_faces():
         np.testing.assert_array_equal(is_bright[row, column], np.array(color) > 0)
 
 
-@pytest.mark.parametrize(("albedo_scale", "brightness"), [(1, 1), (2, 1), (1, 0.5)])
-def test_a_card_reflects_its_linear_albedo_times_its_scale_and_the_brightness(
-    albedo_scale, brightness
-):
+def test_a_card_reflects_its_linear_albedo_times_its_scale_and_the_brightness():
     """Add the gloss: 4 % of the light times the peak of the GGX distribution, 1 / (4 α²)."""
-    shot = frontal(brightness=brightness)
-    image = path_traced(lab_parts(GRAY_CARD, albedo_scale), shot, 8, 16, bounces=1, seed=0)
+    shot = frontal(brightness=0.5)
+    image = path_traced(lab_parts(GRAY_CARD, 2), shot, 8, 16, bounces=1, seed=0)
     linear_gray = 0.216
-    alpha = shot.roughness**2
-    gloss = 0.04 / (4 * alpha**2)
-    expected = (linear_gray * albedo_scale + gloss) * brightness
-    assert image[3:5, 3:5].mean() == pytest.approx(expected, rel=0.05)
+    gloss = 0.04 / (4 * shot.roughness**4)
+    assert image[3:5, 3:5].mean() == pytest.approx(0.5 * (2 * linear_gray + gloss), rel=0.05)
 
 
 def test_an_object_stands_on_the_table():
@@ -394,12 +374,11 @@ def test_an_object_stands_on_the_table():
     np.testing.assert_array_equal(is_lit[is_clear], height[is_clear] > 0)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_the_table_under_an_environment_has_the_brightness_times_its_albedo_at_every_azimuth(seed):
+def test_the_table_under_an_environment_has_the_brightness_times_its_albedo():
     """A map of one direction, off the vertical, is a distant lamp: the table under it is even."""
     sky = np.zeros((64, 128, 3), np.float32)
     sky[16, 40] = 1e4
-    (shot,) = draw(1, [], (0.7, 0.7), seed, {"lamp": sky})
+    (shot,) = draw(1, [], (0.7, 0.7), 1, {"lamp": sky})
     assert shot.lighting == "lamp"
     shot = replace(shot, scale=1e-4)
     image = path_traced(lab_parts(solid("orange"), 1.0), shot, 8, 256, bounces=1, seed=0)

@@ -4,7 +4,6 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -159,36 +158,24 @@ def count_metrics(fruits: list[Fruit]) -> dict[str, object]:
     }
 
 
-class TestTheMetricsOfAKnownModel:
-    @pytest.fixture
-    def summary(self, fruit, tmp_path) -> dict:
-        return evaluate(*fruit, "orange", tmp_path / "new" / "out")
-
-    def test_count_the_photographs_and_are_written_to_a_file(self, summary, tmp_path):
-        text = (tmp_path / "new" / "out" / "summary.json").read_text(encoding="utf-8")
-        assert json.loads(text) == summary
-        assert summary["n"] == COUNTS | {"unreadable": 0, "left_out": 0}
-        counts = {source: row["n"] for source, row in summary["by_source"].items()}
-        assert counts == {"lab": 2, "shop": 2, "street": 4}
-
-    def test_are_those_of_counting_and_of_all_pairs(self, summary):
-        for source in (None, "lab", "shop", "street"):
-            metrics = summary if source is None else summary["by_source"][source]
-            expected = count_metrics([item for item in FRUIT if source in (None, item.source)])
-            auc = metrics["auc"]
-            assert auc["value"] == pytest.approx(expected.pop("auc"), abs=1e-12)
-            assert auc["value"] is None or auc["low"] <= auc["value"] <= auc["high"]
-            assert {name: metrics[name] for name in expected} == expected
-
-    def test_name_the_wrong_classes(self, summary):
-        assert summary["by_class"]["pear"]["recall"] == wilson(1, 3)
-        wrong = summary["by_class"]["orange"]["most_common_wrong"]
-        assert wrong == {"pear": 2, "apple": 1, "plum": 1}
-        assert summary["by_class"]["other_lemon"] == {
-            "n": 2,
-            "recall": wilson(0, 0),
-            "most_common_wrong": {"lime": 1, "orange": 1},
-        }
+def test_metrics_are_those_of_counting_and_of_all_pairs_and_are_written_to_a_file(fruit, tmp_path):
+    summary = evaluate(*fruit, "orange", tmp_path / "new" / "out")
+    text = (tmp_path / "new" / "out" / "summary.json").read_text(encoding="utf-8")
+    assert json.loads(text) == summary
+    assert summary["n"] == COUNTS | {"unreadable": 0, "left_out": 0}
+    for source, n in (None, summary["n"]), ("lab", 2), ("shop", 2), ("street", 4):
+        metrics = summary if source is None else summary["by_source"][source]
+        assert metrics["n"] == n
+        expected = count_metrics([item for item in FRUIT if source in (None, item.source)])
+        auc = metrics["auc"]
+        assert auc["value"] == pytest.approx(expected.pop("auc"), abs=1e-12)
+        assert auc["value"] is None or auc["low"] <= auc["value"] <= auc["high"]
+        assert {name: metrics[name] for name in expected} == expected
+    assert summary["by_class"]["pear"]["recall"] == wilson(1, 3)
+    wrong = summary["by_class"]["orange"]["most_common_wrong"]
+    assert wrong == {"pear": 2, "apple": 1, "plum": 1}
+    others = {"n": 2, "recall": wilson(0, 0), "most_common_wrong": {"lime": 1, "orange": 1}}
+    assert summary["by_class"]["other_lemon"] == others
 
 
 def test_a_source_is_ranked_against_the_hard_negatives_that_it_names(fruit, tmp_path):
@@ -206,33 +193,24 @@ def test_a_source_is_ranked_against_the_hard_negatives_that_it_names(fruit, tmp_
     assert summary["by_source"]["street"]["auc"]["value"] == 0.25
 
 
-class TestMeshes:
-    """Meshes m and n are oranges, and mesh k is another thing."""
-
-    MESH_OF_LETTER: ClassVar = {"a": "m", "c": "m", "b": "n", "f": "k", "h": "k"}
-
-    @pytest.fixture
-    def scores(self, fruit, tmp_path) -> scoring.Scores:
-        *_, folder = fruit
-        meshes = [self.MESH_OF_LETTER.get(item.letter, "") for item in FRUIT]
-        write_table(folder, mesh=meshes)
-        return scored(*fruit, "orange", tmp_path / "out", by="mesh")
-
-    def test_are_objects_like_images_without_a_mesh(self, scores):
-        auc = scores.to_summary()["auc"]
-        assert auc["positive_objects"] == 4  # m, n, d, e
-        assert auc["negative_objects"] == 4  # k, g, i, j
-        assert auc["over"] == THESE_OBJECTS
-        assert THESE_OBJECTS in scoring.format_scores(scores)
-
-    def test_are_ranked_against_all_images_of_the_other_kind(self, scores):
-        for mesh, is_orange in (("k", False), ("m", True)):
-            metrics = scores.to_summary()["by_mesh"][mesh]
-            shown = [item for item in FRUIT if self.MESH_OF_LETTER.get(item.letter) == mesh]
-            others = [item for item in FRUIT if item.is_of("orange") != is_orange]
-            expected = count_metrics(shown + others)["auc"]
-            assert metrics["auc"]["value"] == pytest.approx(expected, abs=1e-12)
-            assert counts(metrics["recall"]) == counts(count_metrics(shown)["recall"])
+def test_meshes_are_objects_and_ranked_against_all_images_of_the_other_kind(fruit, tmp_path):
+    """Meshes m and n are oranges, and mesh k is another thing. Images without one are objects."""
+    mesh_of_letter = {"a": "m", "c": "m", "b": "n", "f": "k", "h": "k"}
+    *_, folder = fruit
+    write_table(folder, mesh=[mesh_of_letter.get(item.letter, "") for item in FRUIT])
+    scores = scored(*fruit, "orange", tmp_path / "out", by="mesh")
+    summary = scores.to_summary()
+    assert summary["auc"]["positive_objects"] == 4  # m, n, d, e
+    assert summary["auc"]["negative_objects"] == 4  # k, g, i, j
+    assert summary["auc"]["over"] == THESE_OBJECTS
+    assert THESE_OBJECTS in scoring.format_scores(scores)
+    for mesh, is_orange in (("k", False), ("m", True)):
+        metrics = summary["by_mesh"][mesh]
+        shown = [item for item in FRUIT if mesh_of_letter.get(item.letter) == mesh]
+        others = [item for item in FRUIT if item.is_of("orange") != is_orange]
+        expected = count_metrics(shown + others)["auc"]
+        assert metrics["auc"]["value"] == pytest.approx(expected, abs=1e-12)
+        assert counts(metrics["recall"]) == counts(count_metrics(shown)["recall"])
 
 
 class TestAnOperatingPoint:
@@ -280,54 +258,38 @@ def pooled_auc(labels: list[str], own_letters: str, source: str | None = None) -
     return sum(wins) / len(wins)
 
 
-class TestSeveralClasses:
+def test_several_classes_are_each_scored_as_alone_and_pooled(fruit, tmp_path):
     """Pears and oranges are scored. The oranges a and c are a mesh."""
+    labels = ["pear", "orange"]
+    model, classes, folder = fruit
+    write_table(folder, mesh=["m" if item.letter in "ac" else "" for item in FRUIT])
+    predictor = scoring.Predictor(model, classes)
+    points = scoring.choose_operating_points(predictor, folder, labels, 0.4)
+    summary = evaluate(*fruit, labels, tmp_path / "both", by="mesh", points=points)
+    for point in points:
+        alone = evaluate(*fruit, point.label, tmp_path / point.label, points=[point])
+        part = summary["by_label"][point.label] | {"n": alone["n"]}
+        assert summary["by_label"][point.label]["n"] == 10
+        assert part == {name: alone[name] for name in part}
+        assert {*METRICS[:2], "auc"} < {*part}
 
-    LABELS: ClassVar = ["pear", "orange"]
+    everything = pooled_auc(labels, "abcdehij")
+    shop = pooled_auc(labels, "hi", source="shop")
+    assert summary["auc"]["value"] == pytest.approx(everything, abs=1e-12)
+    assert summary["by_mesh"]["m"]["auc"]["value"] == pytest.approx(pooled_auc(labels, "ac"))
+    assert summary["by_source"]["shop"]["auc"]["value"] == pytest.approx(shop, abs=1e-12)
 
-    @pytest.fixture
-    def points(self, fruit) -> list:
-        model, classes, folder = fruit
-        write_table(folder, mesh=["m" if item.letter in "ac" else "" for item in FRUIT])
-        return scoring.choose_operating_points(
-            scoring.Predictor(model, classes), folder, self.LABELS, 0.4
-        )
-
-    @pytest.fixture
-    def summary(self, fruit, points, tmp_path) -> dict:
-        out = tmp_path / "both"
-        return evaluate(*fruit, self.LABELS, out, by="mesh", points=points)
-
-    def test_are_each_scored_as_alone(self, fruit, points, summary, tmp_path):
-        for point in points:
-            alone = evaluate(*fruit, point.label, tmp_path / point.label, points=[point])
-            part = summary["by_label"][point.label]
-            assert part.pop("n") == 10
-            assert part == {name: alone[name] for name in part}
-            assert {*METRICS[:2], "auc"} < {*part}
-
-    def test_have_the_auc_of_all_pairs(self, summary):
-        everything = pooled_auc(self.LABELS, "abcdehij")
-        mesh = pooled_auc(self.LABELS, "ac")
-        shop = pooled_auc(self.LABELS, "hi", source="shop")
-        assert summary["auc"]["value"] == pytest.approx(everything, abs=1e-12)
-        assert summary["by_mesh"]["m"]["auc"]["value"] == pytest.approx(mesh)
-        assert summary["by_source"]["shop"]["auc"]["value"] == pytest.approx(shop, abs=1e-12)
-
-    def test_count_an_image_once_for_each_class(self, summary):
-        false_positives = 0
-        for item in FRUIT:
-            best = item.ranking[0]
-            false_positives += best in self.LABELS and not item.is_of(best)
-        assert counts(summary["recall"]) == counts(wilson(2, 8))
-        assert counts(summary["false_positive_rate"]) == counts(wilson(false_positives, 12))
-        assert summary["n"]["photographs"] == 10
-        assert summary["n"]["positives"] == 8
-        assert summary["n"]["negatives"] == 12
-        # Hits at the thresholds of the classes add up, too.
-        for name in AT_THRESHOLD:
-            hits = [part[name]["hits"] for part in summary["by_label"].values()]
-            assert summary[name]["hits"] == sum(hits)
+    # An image counts once for each class.
+    best = [(item, item.ranking[0]) for item in FRUIT]
+    false_positives = sum(name in labels and not item.is_of(name) for item, name in best)
+    assert counts(summary["recall"]) == counts(wilson(2, 8))
+    assert counts(summary["false_positive_rate"]) == counts(wilson(false_positives, 12))
+    expected = {"photographs": 10, "positives": 8, "negatives": 12}
+    assert summary["n"].items() >= expected.items()
+    # Hits at the thresholds of the classes add up, too.
+    for name in AT_THRESHOLD:
+        hits = [part[name]["hits"] for part in summary["by_label"].values()]
+        assert summary[name]["hits"] == sum(hits)
 
 
 def test_the_score_is_the_log_odds_also_if_the_probability_rounds_to_0_or_1(known_model, tmp_path):

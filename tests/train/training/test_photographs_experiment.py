@@ -1,6 +1,5 @@
 """experiment=photographs learns from unlabeled photographs in the light of a projector."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from train.__main__ import main as train_command
 from train.checkpoints import load
 from train.commands.experiment import train
 from train.results.page import PAGE
-from train.run_folder import BEST, LAST, PREVIOUS, read_metrics
+from train.run_folder import BEST, LAST, read_metrics
 from train.settings import PHOTOGRAPHS_FIRST
 from train.train_settings import TrainSettings
 from train.training import run
@@ -78,22 +77,6 @@ def test_the_weights_lie_on_the_line_between_original_and_trained_ones(finished,
             expected = start + factor * (trained - start)
             value = best["model"][f"network.{name}"]
             torch.testing.assert_close(value, expected, atol=1e-6, rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_a_run_that_was_stopped_ends_as_one_that_was_not(finished, settings_of, tmp_path):
-    folder, scores = finished
-    stopped = tmp_path / "run"
-    shutil.copytree(folder, stopped)
-    # This is the checkpoint after the first of two epochs.
-    (stopped / PREVIOUS).replace(stopped / LAST)
-    again = completed_run(settings_of(stopped, "train.resume=true"), stopped)
-    assert again["test/accuracy"] == scores["test/accuracy"]
-    resumed = load(stopped / BEST)
-    whole = load(folder / BEST)
-    assert resumed[INTERPOLATION] == whole[INTERPOLATION]
-    for name, value in whole["model"].items():
-        assert torch.equal(value, resumed["model"][name])
 
 
 @pytest.fixture(scope="module")
