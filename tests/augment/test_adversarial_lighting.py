@@ -75,14 +75,20 @@ def test_light_hides_boxes_from_a_detector(images):
     assert torch.cat(scores[1]).mean() < torch.cat(scores[0]).mean()
 
 
-def test_gradients_need_not_be_enabled_and_bits_of_a_pixel_do_not_matter(images):
-    lighting = nb.AdversarialLighting(Mean(), steps=2, lights="linear")
+def test_neither_the_mode_of_gradients_nor_the_bits_of_a_pixel_matter(images):
+    lighting = nb.AdversarialLighting(Mean(), steps=2, lights="point")
     found = []
-    for given in (images / 255, (images.int() * 257).to(torch.uint16)):
+    of_16_bits = (images.int() * 257).to(torch.uint16)
+    for mode, given in (
+        (torch.enable_grad, images / 255),
+        (torch.no_grad, of_16_bits),
+        (torch.inference_mode, of_16_bits),
+    ):
         torch.manual_seed(0)
-        with torch.no_grad():
+        with mode():
             found.append(lighting(given, torch.zeros(8, dtype=torch.int64)))
     torch.testing.assert_close(found[1].float() / 65535, found[0], rtol=0, atol=1e-4)
+    assert torch.equal(found[1], found[2])
 
 
 @pytest.mark.parametrize("given", [list, np.array, lambda labels: torch.tensor(labels).int()])
@@ -135,13 +141,3 @@ def test_pixels_without_a_class_count_as_background(images, label):
 def test_label_maps_of_other_classes_are_refused(images, label):
     with pytest.raises(InputError, match="classes"):
         segment(images, torch.full((8, 16, 16), label))
-
-
-def test_under_inference_mode_the_light_is_the_same(images):
-    found = []
-    lighting = nb.AdversarialLighting(Mean(), lights="point")
-    for mode in (False, True):
-        torch.manual_seed(0)
-        with torch.inference_mode(mode):
-            found.append(lighting(images / 255, torch.zeros(8, dtype=torch.int64)))
-    assert torch.equal(*found)

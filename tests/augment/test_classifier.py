@@ -126,12 +126,14 @@ def test_a_network_gets_images_in_its_own_units(network, images, options, expect
     assert classifier.classes == ("0", "1", "2")
 
 
-def test_a_plain_network_is_attacked_like_its_classifier(network):
-    classifier = augment.Classifier(network, SIZE, CLASSES)
-    expected = augment.attack(classifier, scene("orange"), settings=light(), force=True)
+def test_a_plain_network_is_attacked_like_its_classifier_and_stays_as_it_is(network):
+    network[1].bias.requires_grad_(False)
     options = {"settings": light(), "force": True}
     by_name = augment.attack(network, scene("orange"), classes=CLASSES, **options)
     by_index = augment.attack(network, scene(0), **options)
+    assert [parameter.requires_grad for parameter in network.parameters()] == [True, False]
+    classifier = augment.Classifier(network, SIZE, CLASSES)
+    expected = augment.attack(classifier, scene("orange"), settings=light(), force=True)
     for result in (by_name, by_index):
         assert torch.equal(result.images, expected.images)
         assert torch.equal(result.logits, expected.logits)
@@ -150,15 +152,13 @@ def test_a_number_is_an_index_even_if_a_class_has_this_number_as_its_name(networ
     assert of_a_mesh.criterion.source.item() == 1
 
 
-def test_the_parameters_of_the_network_require_gradients_as_before(network):
-    network[1].bias.requires_grad_(False)
-    augment.attack(network, scene(0), settings=light(), force=True)
-    assert [parameter.requires_grad for parameter in network.parameters()] == [True, False]
-
-
 def without_eval(network: nn.Sequential) -> nn.Module:
     network[2].train()
     return network
+
+
+def with_normalize(network: nn.Module) -> nn.Module:
+    return nn.Sequential(Normalize(MEAN, STD), network).eval()
 
 
 def with_pixel_mean(network: nn.Module) -> nn.Module:
@@ -171,20 +171,12 @@ def with_pixel_mean(network: nn.Module) -> nn.Module:
     [
         (without_eval, {}, "training mode"),
         (lambda _: lambda images: {"scores": images.mean((2, 3))}, {}, "dict"),
-        (
-            lambda network: nn.Sequential(Normalize(MEAN, STD), network).eval(),
-            {"normalization": "imagenet"},
-            "Normalize",
-        ),
+        (with_normalize, {"normalization": "imagenet"}, "Normalize"),
         (with_pixel_mean, {"normalization": "imagenet"}, "pixel_mean"),
         (lambda network: network, {"classes": CLASSES[:2]}, "classes has 2 names"),
         (lambda network: network, {"normalization": BYTES}, "value_range"),
         (lambda _: nn.Flatten, {}, "Flatten"),
-        (
-            lambda network: augment.Classifier(network, SIZE, CLASSES),
-            {"classes": CLASSES},
-            "plain network",
-        ),
+        (partial(Classifier, size=SIZE, classes=CLASSES), {"classes": CLASSES}, "plain network"),
     ],
 )
 def test_a_mistake_is_refused(network, change, options, message):
@@ -245,16 +237,11 @@ def warned(caplog):
     return lambda: re.findall(r"size=\d+(?= is assumed: give size=)", caplog.text)
 
 
-@pytest.fixture(scope="module")
-def small_weights(tmp_path_factory):
-    path = tmp_path_factory.mktemp("weights") / "my64.pth"
+def test_what_the_user_leaves_out_is_said_once_to_be_assumed(tmp_path, said, warned):
+    path = tmp_path / "my64.pth"
     torch.save(get_model(SMALL, num_classes=3).state_dict(), path)
-    return path
-
-
-def test_what_the_user_leaves_out_is_said_once_to_be_assumed(small_weights, said, warned):
     for options in ({}, {}, {"size": 64, "normalization": (SHIFT, SCALE)}):
-        nb.load_classifier(f"torchvision:{SMALL}", small_weights, **options)
+        nb.load_classifier(f"torchvision:{SMALL}", path, **options)
     first, second = said()
     assert f"224 × 224 pixels, assumed; {IMAGENET}, assumed; values from 0 to 1, assumed" in first
     stated = "std (0.2, 0.5, 3), stated by you; values from 0 to 1, stated by you"

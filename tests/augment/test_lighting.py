@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scipy import integrate, stats
+from scipy import integrate, spatial, stats
 from torch.utils.data import DataLoader
 from torchvision import tv_tensors
 
@@ -231,14 +231,6 @@ def test_a_batch_keeps_channels_last(dtype):
     assert relit.is_contiguous(memory_format=torch.channels_last)
 
 
-def test_torch_draws_the_light():
-    image = picture(3, 8, 8)
-    torch.manual_seed(5)
-    first = nb.RandomLighting()(image)
-    torch.manual_seed(5)
-    assert torch.equal(first, nb.RandomLighting()(image))
-
-
 def test_bytes_are_exactly_rounded():
     # All bytes in 300 lights, against the curve in double precision.
     light = torch.rand(300, generator=torch.Generator().manual_seed(0)) * 3
@@ -293,6 +285,20 @@ def test_noisy_bytes_equal_what_the_camera_measures():
     relit = nb.RandomLighting().apply(image, {"lights": [light]})
     exact = nb.RandomLighting().apply(image / 255, {"lights": [light]})
     assert (relit / 255 - exact).abs().max() < 0.51 / 255
+
+
+def test_a_pixel_of_a_slide_belongs_to_the_cell_whose_center_is_nearest():
+    [shown] = patterns.draw_cells(1, (30, 50), torch.Generator().manual_seed(3))
+    draws = torch.Generator().manual_seed(3)
+    count = int(torch.randint(patterns.MIN_CELLS, patterns.MAX_CELLS + 1, (1,), generator=draws))
+    centers = 2 * torch.rand(patterns.MAX_CELLS, 2, generator=draws)[:count] - 1
+    centers[:, 1] *= 30 / 50
+    points = patterns.pixel_centers((30, 50)).flatten(1).T
+    _, nearest = spatial.cKDTree(centers.numpy()).query(points.numpy())
+    colors = shown.flatten(1).T.numpy()
+    for cell in range(count):
+        assert len(np.unique(colors[nearest == cell], axis=0)) <= 1
+    assert len(np.unique(colors, axis=0)) == len(np.unique(nearest))
 
 
 @pytest.mark.parametrize("distance", [-1.5, -1.0, -0.6, -0.1, 0.0, 0.3, 0.99, 1.0, 2.0])

@@ -73,16 +73,11 @@ def test_an_attack_on_light_takes_half_to_all_of_the_memory_that_it_must_find_fr
     assert required[-1] / 2 < peak <= required[-1]
 
 
-def test_renders_need_their_memory_before_any_is_made(monkeypatch):
-    monkeypatch.setattr(errors, "free_memory", lambda device: 2**26)
-    grays = (0, 0.25, 0.5, 0.75, 1)
-    with pytest.raises(InputError, match=r"^1000 renders of 64 × 64 pixels .* 0\.4 GB"):
-        build_scene(ORANGE, 64, 200, backgrounds=grays, rasterizer="numpy")
-
-
-def test_views_need_their_memory_before_any_is_made(monkeypatch):
+def test_renders_and_views_need_their_memory_before_any_is_made(monkeypatch):
     shown = build_scene(ORANGE, 64, 100, rasterizer="numpy", samples=1)
     monkeypatch.setattr(errors, "free_memory", lambda device: 10**6)
+    with pytest.raises(InputError, match=r"^1000 renders of 64 × 64 pixels .* 0\.4 GB"):
+        build_scene(ORANGE, 64, 200, backgrounds=(0, 0.25, 0.5, 0.75, 1), rasterizer="numpy")
     with pytest.raises(InputError, match=r"^100 views of 64 × 64 pixels"):
         first = torch.arange(1)
         shown.render(shown.conditions(first), first)

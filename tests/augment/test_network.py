@@ -25,9 +25,7 @@ OUT_OF_MEMORY = [
 class Limited(nn.Module):
     def __init__(self, most: int = 99, error: Exception = OUT_OF_MEMORY[0]):
         super().__init__()
-        self.most = most
-        self.error = error
-        self.batch_sizes = []
+        self.most, self.error, self.batch_sizes = most, error, []
 
     def forward(self, images):
         self.batch_sizes.append(len(images))
@@ -102,8 +100,7 @@ def network():
     return network
 
 
-@pytest.mark.parametrize("shape", [(7,), (7, 2), (0,)])
-@pytest.mark.parametrize("batch_size", [1, 3, 99])
+@pytest.mark.parametrize(("shape", "batch_size"), [((7,), 3), ((7, 2), 99), ((0,), 1)])
 def test_outputs_of_many_images_are_those_of_a_copy_in_eval_mode(network, shape, batch_size):
     images = torch.rand(*shape, 3, 8, 8)
     state = {name: value.clone() for name, value in network.state_dict().items()}

@@ -5,15 +5,15 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
-from scipy.spatial import cKDTree
 from torch import nn
 
 import norm_balls as nb
 from augment.attack_settings import RelightingSettings
+from augment.classifier import as_network
 from augment.lighting import relight_photographs
 from augment.photographs import ADVERSARIAL, LIGHTS, RANDOM, attack_photographs
 from augment.random_streams import generator
-from augment.scene.patterns import ProjectedLight, draw_cells, draw_projected_light
+from augment.scene.patterns import ProjectedLight, draw_projected_light
 from renderer.errors import InputError
 from renderer.image import LUMINANCE, encode, to_unit
 
@@ -44,17 +44,13 @@ def result(photographs):
     return attack_photographs(HueNetwork().eval(), photographs, SETTINGS, seed=1)
 
 
-def test_the_class_to_keep_is_that_of_the_unchanged_photograph(result, photographs):
+def test_a_result_has_the_predictions_of_its_images_and_gains_within_the_norm_ball(
+    result, photographs
+):
     means = to_unit(photographs)[:, :, : SIZE // 2].mean((2, 3))
     assert torch.equal(result.source, means.argmax(1))
-
-
-def test_factors_stay_in_the_norm_ball(result):
     for log_gain in result.log_gain.values():
         assert log_gain.abs().max() <= math.log(2) + 1e-6
-
-
-def test_images_of_a_result_have_its_predictions(result):
     network = HueNetwork()
     for light in LIGHTS:
         for index in range(len(result.photographs)):
@@ -120,12 +116,12 @@ def test_a_function_without_gradients_is_attacked_by_random_search(photographs):
         result.kept(ADVERSARIAL)
 
 
-def test_photographs_of_another_size_are_an_error(photographs):
-    from augment.classifier import as_network
-
+def test_photographs_of_another_size_or_without_detections_are_an_error(photographs):
     classifier = as_network(HueNetwork().eval(), SIZE, None)
     with pytest.raises(InputError, match="use the size of its images, 16"):
         attack_photographs(classifier, photographs[:, :, :8, :8])
+    with pytest.raises(InputError, match="no detections in"):
+        attack_photographs(find_bright, 0 * photographs, SETTINGS, classes=["a", "b"])
 
 
 def plain_light(count=1):
@@ -174,20 +170,6 @@ def test_the_gradient_of_the_gain_agrees_with_finite_differences():
     assert torch.autograd.gradcheck(lambda value: light.expose(albedo, value), log_gain)
 
 
-def test_each_pixel_of_a_slide_of_cells_has_the_color_of_the_nearest_point():
-    slide = draw_cells(1, 16, generator(4))[0]
-    draws = generator(4)
-    count = int(torch.randint(3, 25, (1,), generator=draws))
-    points = (2 * torch.rand(1, 24, 2, generator=draws) - 1)[0, :count].numpy()
-    centers = (np.arange(16) + 0.5) / 8 - 1
-    grid = np.stack(np.meshgrid(centers, centers), axis=-1).reshape(-1, 2)
-    nearest = cKDTree(points).query(grid)[1]
-    colors = slide.flatten(1).T.numpy()
-    for cell in np.unique(nearest):
-        assert np.ptp(colors[nearest == cell], axis=0).max() == 0
-    assert len(np.unique(colors, axis=0)) == len(np.unique(nearest))
-
-
 def test_relit_photographs_repeat_with_their_seed(photographs):
     first = relight_photographs(photographs, seed=1, slides=photographs)
     again = relight_photographs(photographs, seed=1, slides=photographs)
@@ -224,11 +206,6 @@ def test_what_a_detector_finds_in_unchanged_photographs_is_attacked_one_by_one(p
     assert result.kept("adversarial").sum() < result.kept("slide").sum()
     few = attack_photographs(find_bright, photographs, settings, limit=2, **options)
     assert few.index.tolist() == [int(index[0]), int(index[-1])]
-
-
-def test_what_is_found_nowhere_cannot_be_attacked(photographs):
-    with pytest.raises(InputError, match="no detections in"):
-        attack_photographs(find_bright, 0 * photographs, SETTINGS, classes=["a", "b"])
 
 
 def test_each_segment_of_a_photograph_is_attacked_by_itself(photographs):

@@ -2,7 +2,6 @@
 
 import csv
 import math
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from benchmarks import (
     renderer,
     scene,
     steps,
-    training,
     whole_steps,
 )
 from renderer.operators import shadows as precomputed
@@ -110,20 +108,6 @@ def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
     for row in costs:
         assert all(float(row[name]) > 0 for name in ("step_ms", "build_s", "megabytes"))
         assert all(0 < float(row[name]) < 0.4 for name in ("image_error", "gradient_error"))
-
-
-def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, monkeypatch):
-    # A process would take seconds to import torch.
-    monkeypatch.setattr(
-        training, "ProcessPoolExecutor", lambda workers, context: ThreadPoolExecutor(workers)
-    )
-    path = tmp_path / "renders.csv"
-    rows = training.main(["renders", "--numbers", "10", "--meshes", "1", "2", "--csv", str(path)])
-    loads = [(row["renders"], row["meshes"], row["views"]) for row in rows]
-    assert loads == [(10, 1, 2), (20, 2, 4)]
-    assert all(row["attack_seconds"] > 0 for row in rows)
-    assert all(row["ms_per_render_and_pass"] > 0 for row in rows)
-    assert len(read(path)) == 2
 
 
 @pytest.mark.slow

@@ -179,34 +179,6 @@ def test_the_bootstrap_resamples_cameras_and_not_renders():
     assert (high - low) / 2 == pytest.approx(1.96 * standard_error, rel=0.15)
 
 
-@pytest.mark.parametrize(
-    ("network", "state", "outcomes"),
-    [
-        # The third image does not count, because the target was wrong before. The
-        # fourth does not count, because the attack did not deceive the source.
-        ("target", "first", [True, False]),
-        ("target", "first_random", [False, True]),
-        ("source", "first", [True, True, True, False]),
-        ("source", "first_random", [False] * 4),
-    ],
-)
-def test_only_what_deceives_the_attacked_network_and_was_clean_correct_counts(
-    network, state, outcomes
-):
-    source = {
-        "before": ["orange", "orange", "orange", "orange"],
-        "first": ["coal", "coal", "coal", "orange"],
-        "first_random": ["orange", "orange", "orange", "orange"],
-    }
-    target = {
-        "before": ["orange", "orange", "coal", "orange"],
-        "first": ["coal", "orange", "coal", "coal"],
-        "first_random": ["orange", "coal", "coal", "coal"],
-    }
-    records = [{"label": "orange", "predictions": {"source": source, "target": target}}]
-    assert list(table.transfer_outcomes(records, network, state)) == outcomes
-
-
 # The cells are those of docs/results.md.
 @pytest.mark.parametrize(
     ("name", "cells"),

@@ -98,18 +98,6 @@ def test_seeds_are_averaged_and_drawn():
     assert mean[0, 1:].var() == pytest.approx(1 / 8, abs=0.01)
 
 
-def test_photographs_are_written_in_each_light(folder, monkeypatch, tmp_path_factory):
-    out = tmp_path_factory.mktemp("simulated")
-    brighten = lambda images, seed, lights: images + 50  # noqa: E731
-    monkeypatch.setattr(real_light.nb, "relight_photographs", brighten)
-    words = ["--lights", "highlights", "--classes", "orange"]
-    real_light.main(["simulate", str(folder), str(out), *words])
-    assert {path.parent.name for path in out.rglob("*.png")} == {"orange"}
-    for light, level in (("plain", 40), ("highlights", 90)):
-        image = np.asarray(Image.open(out / f"orange/{light}__plain__p0_1.png"))
-        assert image.shape == (160, 160, 3) and (image == level).all()
-
-
 def test_networks_that_two_lights_rank_alike_have_a_rank_correlation_of_one(tmp_path):
     values = {"a": 0.2, "b": 0.3, "c": 0.7, "d": 0.9, "e": 0.95}
     for title, power in (("real", 1), ("alike", 3), ("other", -1)):

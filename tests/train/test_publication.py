@@ -5,7 +5,6 @@ from shutil import copytree
 import pytest
 import torch
 from safetensors import safe_open
-from torch import Tensor
 
 import norm_balls as nb
 from renderer.errors import InputError
@@ -17,78 +16,50 @@ from train.results.store import summarize
 from train.run_folder import PUBLISHED
 
 
-@pytest.fixture(scope="module")
-def published(finished, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("published") / "tiny"
-    nb.publish(finished, folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def metadata(published) -> dict:
+def test_a_published_network_is_one_file_with_its_settings_without_paths_and_its_scores(
+    finished, tmp_path
+):
+    published = tmp_path / "tiny"
+    nb.publish(finished, published)
+    assert [path.name for path in published.iterdir()] == [PUBLISHED]
+    network = load_run(published)
+    assert network.classes == ("apple", "orange", "pear")
+    assert network.network.head.in_features == 64
     with safe_open(published / PUBLISHED, "pt") as file:
-        return {name: json.loads(text) for name, text in file.metadata().items()}
+        metadata = {name: json.loads(text) for name, text in file.metadata().items()}
+    assert metadata["settings"]["data.path"] == "tiny.npz"
+    assert metadata["settings"]["train.epochs"] == 3
+    assert str(finished.parent) not in str(metadata)
+    assert str(published.parent) not in str(metadata)
+    summary = json.loads((finished / "photographs" / "summary.json").read_text())
+    assert metadata["scores"]["photographs"]["auc"] == summary["auc"]
+    found, expected = summarize(published), summarize(finished)
+    assert found.accuracy == expected.accuracy
+    assert found.photographs == expected.photographs
 
 
-class TestAPublishedNetwork:
-    def test_is_one_file_that_loads(self, published):
-        assert [path.name for path in published.iterdir()] == [PUBLISHED]
-        network = load_run(published)
-        assert network.classes == ("apple", "orange", "pear")
-        assert network.network.head.in_features == 64
+def test_an_operating_point_is_the_second_lowest_log_odds_of_four_negatives_and_stays(
+    finished, photos, tmp_path
+):
+    """With a rate of 1/2, 2 of the negatives may exceed the threshold."""
+    calibrated = tmp_path / "first"
+    nb.publish(finished, calibrated, calibrate=photos, false_positive_rate=0.5)
+    network = load_run(calibrated)
+    paths = sorted(photos.rglob("*.png"))
+    negatives = [read_image(path, 16) for path in paths if path.parent.name != "orange"]
+    probabilities = network(torch.stack(negatives)).double().softmax(1)[:, 1]
+    log_odds = torch.logit(probabilities).sort().values
+    (point,) = network.operating_points
+    assert point.threshold == pytest.approx(float(log_odds[1]), rel=1e-5)
+    assert network.detect(torch.stack(negatives)).sum() == 2
 
-    def test_has_the_settings_without_paths(self, published, metadata, finished):
-        assert metadata["settings"]["data.path"] == "tiny.npz"
-        assert metadata["settings"]["train.epochs"] == 3
-        assert str(finished.parent) not in str(metadata)
-        assert str(published.parent) not in str(metadata)
-
-    def test_has_the_scores_of_its_run(self, published, metadata, finished):
-        summary = json.loads((finished / "photographs" / "summary.json").read_text())
-        assert metadata["scores"]["photographs"]["auc"] == summary["auc"]
-        found = summarize(published)
-        expected = summarize(finished)
-        assert found.accuracy == expected.accuracy
-        assert found.photographs == expected.photographs
-
-
-def read_images(paths: list[Path]) -> Tensor:
-    return torch.stack([read_image(path, 16) for path in paths])
-
-
-@pytest.fixture(scope="module")
-def calibrated(finished, photos, tmp_path_factory) -> Path:
-    """Publish a network with the threshold of a false positive rate of 1/2."""
-    folder = tmp_path_factory.mktemp("calibrated") / "first"
-    nb.publish(finished, folder, calibrate=photos, false_positive_rate=0.5)
-    return folder
-
-
-class TestAnOperatingPoint:
-    def test_is_the_second_lowest_of_the_log_odds_of_four_negatives(self, calibrated, photos):
-        """Compare with the log-odds of the negatives, of which 2 may exceed the threshold."""
-        network = load_run(calibrated)
-        paths = sorted(photos.rglob("*.png"))
-        negatives = read_images([path for path in paths if path.parent.name != "orange"])
-        probabilities = network(negatives).double().softmax(1)[:, 1]
-        log_odds = torch.logit(probabilities).sort().values
-        (point,) = network.operating_points
-        assert point.threshold == pytest.approx(float(log_odds[1]), rel=1e-5)
-        assert network.detect(negatives).sum() == 2
-
-    def test_and_the_network_stay_the_same_if_it_is_published_again(self, calibrated, tmp_path):
-        nb.publish(calibrated, tmp_path / "second")
-        hashes = []
-        for folder in (calibrated, tmp_path / "second"):
-            _, state = load_selected(folder)
-            hashes.append(content_hash(sorted(state.items())))
-        assert hashes[0] == hashes[1]
-
-    def test_is_used_by_evaluation(self, calibrated, photos, tmp_path):
-        (point,) = load_run(calibrated).operating_points
-        nb.evaluate(load_run(calibrated), photos, "orange", out=tmp_path)
-        summary = json.loads((tmp_path / "summary.json").read_text())
-        assert summary["operating_point"] == vars(point) | {"in_sample": True}
+    nb.publish(calibrated, tmp_path / "second")
+    states = [load_selected(folder)[1] for folder in (calibrated, tmp_path / "second")]
+    first, second = (content_hash(sorted(state.items())) for state in states)
+    assert first == second
+    nb.evaluate(network, photos, "orange", out=tmp_path / "scores")
+    summary = json.loads((tmp_path / "scores" / "summary.json").read_text())
+    assert summary["operating_point"] == vars(point) | {"in_sample": True}
 
 
 LABELS = ("orange", "apple")

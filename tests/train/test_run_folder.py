@@ -71,6 +71,7 @@ def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
     [
         *("meshes=[[solid:orange, {{mesh: {}, at: [1, 1]}}]]", "scene.backgrounds=[0.5,{}]"),
         *("augment.vary.environments=[{}]", "network={0.parent}", "data.path={0.parent}"),
+        *("scene.light={}", "augment.folder={0.parent}"),
     ],
 )
 def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
@@ -125,6 +126,7 @@ AUDIT = {"network": "c", "meshes": ["solid:orange"], "out": "audit"}
         (AUDIT | {"network": "python:network:build"}, "network.py"),
         (AUDIT | {"hardened": "run:photographs"}, "photographs/orange/a.png"),
         (AUDIT | {"environments": ["wall.png"]}, "wall.png"),
+        (AUDIT | {"weights": "wall.png"}, "wall.png"),
         (AUDIT | {"classes": "classes.txt"}, "classes.txt"),
     ],
 )
@@ -142,18 +144,6 @@ def test_an_input_whose_content_alone_changed_is_refused(tmp_path, monkeypatch, 
     replace_content(tmp_path / changed)
     with pytest.raises(InputError, match="has changed since"):
         run_config.require_same(tmp_path / "audit", settings, "out=", lambda *_: False)
-
-
-def test_a_folder_too_large_to_read_is_told_by_the_times_of_its_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(run_config, "MAX_FOLDER_BYTES", 1)
-    (tmp_path / "photographs").mkdir()
-    file = tmp_path / "photographs" / "a.png"
-    file.write_text("ab")
-    settings = AuditSettings(**AUDIT | {"photos": str(file.parent)})
-    before = run_config.fingerprints(settings)
-    assert run_config.fingerprints(settings) == before
-    os.utime(file, ns=(0, 0))
-    assert run_config.fingerprints(settings) != before
 
 
 def test_a_last_line_that_was_cut_short_is_skipped(tmp_path):

@@ -175,28 +175,6 @@ def test_a_file_of_onnx_with_decode_has_the_gradients_of_its_network(tmp_path, b
     assert cost_falls(loaded, task)
 
 
-@pytest.mark.ecosystem
-@pytest.mark.filterwarnings("ignore")
-def test_a_file_of_onnx_that_cannot_be_converted_is_attacked_by_search(
-    tmp_path, monkeypatch, caplog
-):
-    onnx2torch = pytest.importorskip("onnx2torch")
-
-    def refuse(path: str) -> nn.Module:
-        raise NotImplementedError("no converter")
-
-    monkeypatch.setattr(onnx2torch, "convert", refuse)
-    path = tmp_path / "network.onnx"
-    torch.onnx.export(Raw().eval(), (torch.rand(1, 3, SIZE, SIZE),), path, dynamo=False)
-    task = nb.Detection(decode=decode)
-    loaded = nb.load_classifier(str(path), classes=CLASSES, task=task)
-    assert "has no gradients, since onnx2torch fails (no converter)" in caplog.text
-    scene = nb.build_scene([("solid:ball", "ball")], **SCENE)
-    settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.3), max_queries=8)
-    result = nb.attack(loaded, scene, settings=settings, force=True)
-    assert result.settings.optimizer == "random_search"
-
-
 LABELS = {"id2label": dict(enumerate(CLASSES)), "label2id": {"ball": 1, "cup": 2}}
 QUERIES = {"num_queries": 20, "d_model": 32, "encoder_layers": 1, "decoder_layers": 1}
 HEADS = {"encoder_attention_heads": 2, "decoder_attention_heads": 2}

@@ -85,18 +85,12 @@ def mean_values_of(views: lights.Views) -> torch.Tensor:
 
 def test_views_are_attacked_at_an_exposure_at_which_they_are_recognized(views):
     limit = float(mean_values_of(views).min()) - 1e-3
-    network = darker_than(limit)
-
-    plain = lights.find_plain_views(network, views)
-
+    plain = lights.find_plain_views(darker_than(limit), views)
     assert plain.recognized_as_given == 0
     assert plain.recognized >= 3
     found = replace(views, light=plain.light, exposure=plain.exposure, size=plain.size)
-    is_dark = mean_values_of(found) < limit
-    assert plain.recognized == int(is_dark.sum())
+    assert plain.recognized == int((mean_values_of(found) < limit).sum())
 
-
-def test_views_that_are_recognized_as_they_are_stay_so(views):
     plain = lights.find_plain_views(darker_than(1.0), views)
     assert plain.recognized == plain.recognized_as_given == views.count
     assert (plain.light, plain.exposure, plain.size) == (views.light, views.exposure, views.size)

@@ -29,20 +29,15 @@ def photographs(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def settings(photographs, tmp_path_factory) -> AuditSettings:
-    out = tmp_path_factory.mktemp("audit") / "out"
-    return AuditSettings(network="first", unlabeled=str(photographs), out=str(out))
+@pytest.fixture
+def settings(photographs, tmp_path) -> AuditSettings:
+    return AuditSettings(network="first", unlabeled=str(photographs), out=str(tmp_path / "out"))
 
 
-@pytest.fixture(scope="module")
-def page(settings) -> str:
-    return run_audit(settings, NETWORKS).path.read_text()
-
-
-def test_the_page_counts_the_photographs_that_keep_their_class(page, settings):
-    first = read_relit(Path(settings.out) / "classifier" / RELIT_FOLDER)
-    second = read_relit(Path(settings.out) / "hardened" / RELIT_FOLDER)
+def test_the_page_counts_the_photographs_that_keep_their_class(settings, tmp_path):
+    page = run_audit(settings, NETWORKS).path.read_text()
+    first = read_relit(tmp_path / "out" / "classifier" / RELIT_FOLDER)
+    second = read_relit(tmp_path / "out" / "hardened" / RELIT_FOLDER)
     # The second network answers all images alike.
     assert [second.kept(light).hits for light in second.lights] == [10, 10, 10]
     for light in first.lights:
@@ -51,9 +46,9 @@ def test_the_page_counts_the_photographs_that_keep_their_class(page, settings):
     assert first.kept("adversarial").hits < 10
 
 
-def test_a_part_that_exists_is_not_measured_again(settings, photographs, tmp_path):
+def test_a_part_that_exists_is_not_measured_again(settings, tmp_path):
     name = "python:tests.train.commands.test_attack_photographs:load_bright_or_dark"
-    named = replace(settings, network=name, out=str(tmp_path / "out"), budget=0.02)
+    named = replace(settings, network=name, budget=0.02)
     run_audit(named)
     path = tmp_path / "out" / "classifier" / RELIT_FOLDER / RELIT
     marked = path.read_text().replace('"predicted": "', '"predicted": "marked ')
@@ -63,10 +58,9 @@ def test_a_part_that_exists_is_not_measured_again(settings, photographs, tmp_pat
         run_audit(replace(named, budget=0.05))
 
 
-def test_the_budget_limits_the_photographs(photographs, tmp_path):
-    out = tmp_path / "out"
-    few = AuditSettings(network="first", unlabeled=str(photographs), out=str(out), budget=0.03)
+def test_the_budget_limits_the_photographs(settings, tmp_path):
+    few = replace(settings, budget=0.03)
     text = run_audit(few, {"classifier": NETWORKS["classifier"]}).path.read_text()
-    scores = read_relit(out / "classifier" / RELIT_FOLDER)
+    scores = read_relit(tmp_path / "out" / "classifier" / RELIT_FOLDER)
     assert [item.path for item in scores.photographs] == ["0.png", "4.png", "9.png"]
     assert "holds 10 photographs" in text

@@ -42,7 +42,7 @@ def out(photographs, tmp_path_factory):
     return folder
 
 
-def test_every_photograph_has_predictions_and_counts(out, photographs):
+def test_every_photograph_has_predictions_which_the_tables_count(out, photographs):
     scores = read_relit(out)
     paths = {path.relative_to(photographs).as_posix() for path in photographs.rglob("*.png")}
     assert {item.path for item in scores.photographs} == paths
@@ -52,9 +52,6 @@ def test_every_photograph_has_predictions_and_counts(out, photographs):
             assert is_kept <= item.kept[light] <= scores.slides
         assert item.kept["adversarial"] <= item.kept["slide"]
 
-
-def test_the_tables_count_the_photographs_that_keep_their_class_under_all_slides(out):
-    scores = read_relit(out)
     content = json.loads((out / RELIT).read_text())
     rows = {row[0]: row for row in scores.tables()[1].rows}
     for place, light in enumerate(scores.lights):
@@ -78,12 +75,7 @@ def test_pictures_show_the_photograph_and_its_lights(out, photographs):
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        ["attack=relighting"],
-        ["unlabeled=folder"],
-        ["attack=relighting+lighting", "unlabeled=folder"],
-    ],
+    "words", [["attack=relighting"], ["attack=relighting+lighting", "unlabeled=folder"]]
 )
 def test_relighting_needs_photographs_alone(words):
     with pytest.raises(InputError, match="relighting"):

@@ -46,8 +46,9 @@ def photographs(tmp_path):
 
 
 @pytest.mark.parametrize("fit", ["letterbox", "stretch"])
-def test_recall_and_false_detections_are_the_counted_ones(photographs, fit):
-    scores = nb.evaluate(_find_white, photographs, classes=CLASSES, size=120, fit=fit)
+def test_recall_and_false_detections_are_the_counted_ones_and_written(photographs, tmp_path, fit):
+    out = tmp_path / "out"
+    scores = nb.evaluate(_find_white, photographs, classes=CLASSES, size=120, fit=fit, out=out)
     assert scores.photograph_count == 3
     assert scores.by_label["dog"].n == 3
     assert scores.by_label["dog"].recall.value == pytest.approx(2 / 3)
@@ -57,20 +58,12 @@ def test_recall_and_false_detections_are_the_counted_ones(photographs, fit):
     assert scores.overall.recall == scores.by_label["dog"].recall
     recalls = {name: metrics["dog"].recall.value for name, metrics in scores.by_source.items()}
     assert recalls == {"dark": 0, "light": 1}
-
-
-def test_scores_and_detections_are_written_in_pixels_of_the_photographs(photographs, tmp_path):
-    out = tmp_path / "out"
-    nb.evaluate(_find_white, photographs, classes=CLASSES, size=120, out=out)
     summary = json.loads((out / "summary.json").read_text())
     assert summary["by_label"]["dog"]["recall"]["value"] == pytest.approx(2 / 3)
     found = json.loads((out / "detections.json").read_text())
-    (box,) = (
-        item["bbox"]
-        for item in found
-        if item["file_name"] == "light/a.png" and item["category"] == "dog"
-    )
-    assert box == pytest.approx([20, 10, 30, 20], abs=1)
+    dogs = {item["file_name"]: item["bbox"] for item in found if item["category"] == "dog"}
+    # The box is in pixels of the photograph.
+    assert dogs["light/a.png"] == pytest.approx([20, 10, 30, 20], abs=1)
     assert (out / "contact_sheet.png").is_file()
 
 

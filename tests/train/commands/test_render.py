@@ -262,7 +262,7 @@ def test_ultralytics_reads_boxes_and_classes(groups, tmp_path, splits):
         assert np.allclose(np.stack(corners, 1) * [32, 20, 32, 20], expected, atol=1e-3)
 
 
-@pytest.mark.parametrize("size", [[40, 40], [24, 40], [40, 24]])
+@pytest.mark.parametrize("size", [[24, 40], [40, 24]])
 def test_all_objects_of_an_entry_are_in_the_image(meshes, size):
     box, ball = ((item["mesh"], item["label"]) for item in meshes)
     entries = [[box, ball], [ball, box, box], ball]

@@ -1,4 +1,3 @@
-import csv
 import json
 import shutil
 from html.parser import HTMLParser
@@ -7,9 +6,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from train.results.compare import format_comparison
 from train.results.page import report_of, write_report
-from train.results.store import summarize
 from train.run_config import write_config
 from train.run_folder import locked
 
@@ -146,19 +143,3 @@ def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_tr
     first, *_, last = report_of([finished], tmp_path).strip().splitlines()
     assert first.startswith("no report: Traceback")
     assert last.startswith("ZeroDivisionError")
-
-
-def test_each_predictions_csv_is_parsed_once_for_tables_and_the_report(
-    finished, tmp_path, monkeypatch
-):
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)
-    parsed = []
-    reader = csv.DictReader
-    monkeypatch.setattr(csv, "DictReader", lambda file: parsed.append(file.name) or reader(file))
-    folder = shutil.copytree(finished, tmp_path / "run")
-    for _ in range(2):
-        format_comparison([summarize(folder)])
-        report_of([folder], tmp_path)
-    tables = sorted(str(path) for path in folder.rglob("predictions.csv"))
-    assert tables
-    assert sorted(name for name in parsed if name.endswith("predictions.csv")) == tables

@@ -15,7 +15,7 @@ from renderer import errors
 from renderer.errors import InputError
 from train import checkpoints, run_folder
 from train.data.sets import Split
-from train.device import Interrupted, MixedPrecision
+from train.device import MixedPrecision
 from train.networks import WideResNet
 from train.run_folder import read_metrics
 from train.train_settings import TrainSettings
@@ -215,23 +215,6 @@ def test_each_epoch_of_a_soup_begins_without_the_momentum_of_the_last(tmp_path):
         fit(trainer, images, single_colors(3))
         ends.append(trainer.model.state_dict())
     torch.testing.assert_close(ends[1], ends[0], rtol=0, atol=0)
-
-
-def test_several_processes_that_resume_count_a_loss_once_between_them(tmp_path, monkeypatch):
-    trainer = make_trainer(tmp_path, epochs=1, batch_size=8)
-    signal_after_step(trainer, 3)
-    with pytest.raises(Interrupted):
-        fit_noise(trainer)
-    saved = load(tmp_path)["under_way"]
-    assert saved["step"] == 3
-    assert saved["sums"][0] > 0
-    parts = []
-    for rank in range(2):
-        monkeypatch.setattr(loop.distributed, "rank", lambda rank=rank: rank)
-        resumed = make_trainer(tmp_path, epochs=1, batch_size=8)
-        resumed.resume()
-        parts.append(resumed.state_dict()["under_way"]["sums"])
-    torch.testing.assert_close(sum(parts), saved["sums"], rtol=0, atol=0)
 
 
 def test_a_run_in_float16_is_resumed_with_its_scale(tmp_path):
