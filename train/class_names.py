@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from augment.classifier import TaskNetwork, class_index, nearest
+from augment.classifier import class_index, nearest
 from augment.scene.objects import MESHES_IN_MEMORY, name_mesh
 from augment.settings import ObjectSettings
 from renderer.errors import InputError, as_list, describe
@@ -32,13 +32,17 @@ def class_name(classes: Sequence[str], label: str | int, key: str) -> str:
 def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
     """Return the settings of a mesh, in which its class is given by name instead of by index.
 
-    An item without a label, or with one that no network has, such as "other_lemon", stays as it is.
-    Only a mapping can have a label.
+    The same holds for the objects beside it. A mapping without a label, or with one that no network
+    has, such as "other_lemon", keeps it. Only a mapping can have a label.
     """
-    label: Any = item.get("label") if isinstance(item, dict) else None
-    if is_of_no_class(label):
+    if not isinstance(item, dict):
         return item
-    return {**item, "label": class_name(classes, label, f"{key}.label")}
+    named = dict(item)
+    if not is_of_no_class(item.get("label")):
+        named["label"] = class_name(classes, item["label"], f"{key}.label")
+    if item.get("others"):
+        named["others"] = [with_class_name(other, classes, key) for other in item["others"]]
+    return named
 
 
 def class_of_name(name: str, classes: Sequence[str]) -> str | None:
@@ -148,10 +152,10 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
     return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
 
 
-def as_mappings(name: str, items: Sequence[MeshItem], network: TaskNetwork) -> list[dict[str, Any]]:
+def as_mappings(name: str, items: Sequence[MeshItem]) -> list[dict[str, Any]]:
     """Convert the meshes of a caller to mappings with the fields of `ObjectSettings`.
 
-    A mapping has a "label" if the class is given.
+    A mapping has a "label" if the class is given, by name or index.
     """
     kinds = MeshSource | tuple | list | ObjectSettings
     mappings = []
@@ -159,7 +163,7 @@ def as_mappings(name: str, items: Sequence[MeshItem], network: TaskNetwork) -> l
         key = f"{name}[{index}]"
         # A list of objects is one mesh with others around it, which are in the same render.
         if isinstance(item, list) and any(isinstance(of, tuple | ObjectSettings) for of in item):
-            mapping, *others = as_mappings(key, item, network)
+            mapping, *others = as_mappings(key, item)
             mappings.append(mapping | {"others": [*mapping.get("others", ()), *others]})
             continue
         if isinstance(item, ObjectSettings):
@@ -171,7 +175,5 @@ def as_mappings(name: str, items: Sequence[MeshItem], network: TaskNetwork) -> l
                 raise InputError(f"{key} is {describe(item)}: give {EXPECTED}")
             mesh = name_mesh(source) if isinstance(source, Mesh) else str(source)
             mapping = {"mesh": mesh, **({"label": label[0]} if label else {})}
-        if mapping.get("label", "") != "":
-            mapping["label"] = network.classes[network.label(mapping["label"])]
         mappings.append(mapping)
     return mappings

@@ -24,32 +24,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.scene import loops
+from augment.scene import loops, patterns, surfaces
 from augment.scene.black_body import planckian_rgb
-from augment.scene.patterns import (
-    AMBIENT,
-    DARKEST,
-    STOPS,
-    by_kind,
-    draw_slides,
-    fraction,
-    luminance,
-    random_colors,
-    require_photographs,
-)
-from augment.scene.surfaces import (
-    MAX_POLAR,
-    MAX_STEEPNESS,
-    SURFACE_NODES,
-    Surface,
-    axes,
-    circle_segment,
-    direction,
-    lambert,
-    smooth,
-    spline,
-    surface_of_depth,
-)
 from renderer import errors
 from renderer.errors import InputError
 from renderer.settings import Size, height_and_width
@@ -92,10 +68,10 @@ def _ranges(
 
 # Ranges of the numbers that several models have.
 TURN = Range(0, 2 * math.pi)
-WEAK = Range(*AMBIENT)
-METER = Range(*STOPS)
-STEEPNESS = Range(0, MAX_STEEPNESS)
-SURFACE = (STEEPNESS, TURN, Range(0, math.radians(MAX_POLAR)))
+WEAK = Range(*patterns.AMBIENT)
+METER = Range(*patterns.STOPS)
+STEEPNESS = Range(0, surfaces.MAX_STEEPNESS)
+SURFACE = (STEEPNESS, TURN, Range(0, math.radians(surfaces.MAX_POLAR)))
 # Position of a small lamp, in half widths.
 LAMP = (Range(-1.5, 1.5), Range(-1.5, 1.5), Range(0.4, 2.0, True))
 
@@ -113,14 +89,16 @@ class Drawn(NamedTuple):
     depth: Tensor | None
     seeds: Sequence[int]
 
-    def surface(self, steepness: Tensor, start: int = 0) -> Surface:
+    def surface(self, steepness: Tensor, start: int = 0) -> surfaces.Surface:
         """Return the surface of the depth of the images, or a random smooth one."""
         if self.depth is not None:
-            return surface_of_depth(self.depth)
-        heights = normal_numbers(self.constants[:, start : start + SURFACE_NODES**2])
-        nodes = steepness * heights.view(-1, 1, SURFACE_NODES, SURFACE_NODES)
-        down, right = (smooth(nodes, self.size, slope) for slope in "yx")
-        return Surface(down, right, (*axes(self.size, nodes), smooth(nodes, self.size)))
+            return surfaces.surface_of_depth(self.depth)
+        heights = normal_numbers(self.constants[:, start : start + surfaces.SURFACE_NODES**2])
+        nodes = steepness * heights.view(-1, 1, surfaces.SURFACE_NODES, surfaces.SURFACE_NODES)
+        down, right = (surfaces.smooth(nodes, self.size, slope) for slope in "yx")
+        return surfaces.Surface(
+            down, right, (*surfaces.axes(self.size, nodes), surfaces.smooth(nodes, self.size))
+        )
 
 
 class Illumination(NamedTuple):
@@ -182,9 +160,11 @@ class LightModel:
         if not self.has_meter:
             return light
         mean = light._replace(field=light.field.mean((2, 3), keepdim=True)).total()
-        gray = luminance(mean) if mean.shape[1] == 3 else mean
+        gray = patterns.luminance(mean) if mean.shape[1] == 3 else mean
         # The last number is the exposure in stops. After it, the mean luminance is 2^stops.
-        return light.scaled(torch.exp2(strength * drawn.numbers[-1]) / gray.clamp(min=DARKEST))
+        return light.scaled(
+            torch.exp2(strength * drawn.numbers[-1]) / gray.clamp(min=patterns.DARKEST)
+        )
 
     def camera(
         self, radiance: Float[Tensor, "B C H W"], drawn: Drawn, strength: float, white: Tensor
@@ -205,20 +185,22 @@ class ProjectedSlide(LightModel):
     slides: Tensor | None = None
     cells: ClassVar[int] = 3
     ranges = (*SURFACE, WEAK, *[Range(-math.log(2), math.log(2))] * 3 * cells**2, METER)
-    constants = SURFACE_NODES**2
+    constants = surfaces.SURFACE_NODES**2
     has_meter = True
 
     def __post_init__(self) -> None:
         if self.slides is not None:
-            require_photographs("slides", self.slides)
+            patterns.require_photographs("slides", self.slides)
 
     def light(self, drawn: Drawn) -> Illumination:
         """Project a picture of its own on each image."""
         draws = [torch.Generator().manual_seed(seed) for seed in drawn.seeds]
-        pictures = torch.cat([draw_slides(1, drawn.size, draw, self.slides) for draw in draws])
+        pictures = torch.cat(
+            [patterns.draw_slides(1, drawn.size, draw, self.slides) for draw in draws]
+        )
         # Logarithms of the gains of the channels in a grid of cells, shape (B, 3, cells, cells).
         log_gain = drawn.numbers[4:-1, :, 0, 0, 0].T.reshape(-1, 3, self.cells, self.cells)
-        light = smooth(log_gain, drawn.size, mode="bilinear").exp_()
+        light = surfaces.smooth(log_gain, drawn.size, mode="bilinear").exp_()
         # Autograd needs the factors, so they are multiplied in place only without gradients.
         for factor in (pictures.to(light), shading(drawn)):
             light = light * factor if light.requires_grad else light.mul_(factor)
@@ -229,14 +211,14 @@ def shading(drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
     """Compute the shading of a surface from its steepness and the direction of the light."""
     steepness, azimuth, polar, *_ = drawn.numbers
     surface = drawn.surface(steepness)
-    slopes, towards = (surface.slope_down, surface.slope_right), direction(azimuth, polar)
+    slopes, towards = (surface.slope_down, surface.slope_right), surfaces.direction(azimuth, polar)
     # The compiled loop is faster. It does not exist without numba, on a GPU or with gradients.
     if loop := loops.cosines(drawn.numbers, *slopes):
         cosine = drawn.numbers.new_empty(slopes[0].shape)
         flat = (slope.flatten(1) for slope in slopes)
         loop(*flat, torch.cat(towards, 1)[..., 0, 0], cosine.flatten(1))
         return cosine
-    return lambert(*slopes, *towards)
+    return surfaces.lambert(*slopes, *towards)
 
 
 @dataclass(frozen=True)
@@ -247,7 +229,7 @@ class DirectionalLight(LightModel):
     """
 
     ranges = (*SURFACE, WEAK, METER)
-    constants = SURFACE_NODES**2
+    constants = surfaces.SURFACE_NODES**2
     has_meter = True
 
     def light(self, drawn: Drawn) -> Illumination:
@@ -256,7 +238,7 @@ class DirectionalLight(LightModel):
 
 
 def lamp_light(
-    surface: Surface, places: Float[Tensor, "B L 3"], colors: Float[Tensor, "B L C"]
+    surface: surfaces.Surface, places: Float[Tensor, "B L 3"], colors: Float[Tensor, "B L C"]
 ) -> Float[Tensor, "B C H W"]:
     """Add up the irradiance of small lamps, cos / distance², in units of that right below each."""
     x, y, height = surface.position
@@ -271,7 +253,7 @@ def lamp_light(
     # No surface is nearer to the lamp than a tenth of its distance.
     offsets = right - x, down - y, torch.maximum(above - height, 0.1 * above)
     squares = torch.addcmul(offsets[0] ** 2 + offsets[1] ** 2, offsets[2], offsets[2])
-    cosine = lambert(surface.slope_down, surface.slope_right, *offsets)
+    cosine = surfaces.lambert(surface.slope_down, surface.slope_right, *offsets)
     fields = cosine * (squares * squares.sqrt()).reciprocal() * above**2
     return (colors.mT @ fields.flatten(2)).unflatten(2, fields.shape[2:])
 
@@ -285,7 +267,7 @@ class PointLight(LightModel):
     """
 
     ranges = (STEEPNESS, *LAMP, WEAK, METER)
-    constants = SURFACE_NODES**2
+    constants = surfaces.SURFACE_NODES**2
     has_meter = True
 
     def light(self, drawn: Drawn) -> Illumination:
@@ -304,7 +286,7 @@ class ColoredLamps(LightModel):
     """
 
     ranges = (STEEPNESS, *[*LAMP, Range(0, 1), Range(0, 1)] * 3, WEAK, METER)
-    constants = 1 + SURFACE_NODES**2
+    constants = 1 + surfaces.SURFACE_NODES**2
     has_meter = True
 
     def light(self, drawn: Drawn) -> Illumination:
@@ -315,7 +297,7 @@ class ColoredLamps(LightModel):
         count = int(last.max()) + 1
         # Numbers of each lamp, shape (B, count, 5).
         lamps = drawn.numbers[1 : 1 + 5 * count, :, 0, 0, 0].T.unflatten(1, (count, 5))
-        colors = random_colors(lamps[..., 3:].flatten(0, 1)).view(-1, count, 3)
+        colors = patterns.random_colors(lamps[..., 3:].flatten(0, 1)).view(-1, count, 3)
         is_on = torch.arange(count, device=last.device) <= last
         light = lamp_light(surface, lamps[..., :3], colors * is_on[..., None])
         return Illumination(light, offset=drawn.numbers[-2])
@@ -336,7 +318,7 @@ class LinearLight(LightModel):
         """Compute a ramp with the mean 1 and the minimum 1 − contrast."""
         turn, contrast, _ = drawn.numbers
         height, width = height_and_width(drawn.size)
-        x, y = axes(drawn.size, turn)
+        x, y = surfaces.axes(drawn.size, turn)
         right, down = turn.cos(), turn.sin()
         # The largest value of right · x + down · y is in a corner. There, the ramp is 1 ± contrast.
         gain = contrast / (right.abs() + height / width * down.abs())
@@ -362,7 +344,7 @@ class FractalLight(LightModel):
         blended = blend(drawn.constants, angle)[..., 0, 0]
         nodes = blended @ _sum_of_octaves(self.octaves, angle.device, angle.dtype)
         nodes = contrast * nodes.view(-1, 1, self.octaves[-1], self.octaves[-1])
-        return Illumination(smooth(nodes, drawn.size).exp())
+        return Illumination(surfaces.smooth(nodes, drawn.size).exp())
 
 
 @lru_cache(maxsize=8)
@@ -372,7 +354,9 @@ def _sum_of_octaves(
 ) -> Float[Tensor, "E nodes"]:
     """Return the matrix that adds the nodes of all octaves at the nodes of the last one."""
     # Each octave is interpolated at the nodes of the last one, along rows and along columns.
-    parts = [spline(count, octaves[-1], 0.0, "bicubic", device, dtype) for count in octaves]
+    parts = [
+        surfaces.spline(count, octaves[-1], 0.0, "bicubic", device, dtype) for count in octaves
+    ]
     return torch.cat([0.5**i * torch.kron(part, part).T for i, part in enumerate(parts)])
 
 
@@ -421,7 +405,7 @@ class CastShadow(LightModel):
         # Light of the sky in the shadow, relative to that of sun and sky.
         sky = ambient - ambient * blue * blue.new_tensor([0.5, 0.2, 0.0])[:, None, None]
         # sky + (1 − sky) · v, where v = 1/2 + segment / π is the visible fraction of the sun.
-        return Illumination(by_kind(kinds, segment), (1 - sky) / math.pi, (1 + sky) / 2)
+        return Illumination(patterns.by_kind(kinds, segment), (1 - sky) / math.pi, (1 + sky) / 2)
 
     def _segment(self, kind: str, drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
         """Compute the segment of the sun, which depends on the distance to the edge of a shadow.
@@ -432,12 +416,12 @@ class CastShadow(LightModel):
         if kind == "leaves":
             nodes = blend(drawn.constants, angle).view(-1, 1, self.nodes, self.nodes)
             # The heights are 0 at the edges between leaves and gaps.
-            height = smooth(nodes, drawn.size) - right
-            slopes = [smooth(nodes, drawn.size, slope) for slope in "xy"]
+            height = surfaces.smooth(nodes, drawn.size) - right
+            slopes = [surfaces.smooth(nodes, drawn.size, slope) for slope in "xy"]
             # Distance to the edge, to first order.
             squares = torch.addcmul(slopes[0] * slopes[0], slopes[1], slopes[1])
-            return circle_segment(height * (squares + 1e-6).rsqrt() / softness)
-        x, y = axes(drawn.size, right)
+            return surfaces.circle_segment(height * (squares + 1e-6).rsqrt() / softness)
+        x, y = surfaces.axes(drawn.size, right)
         x, y, scale = (x - right) / softness, (y - down) / softness, scale / softness
         constants = drawn.constants[..., None, None]
         # `back` is the distance of the edges of a polygon from its center. `limits` are the half
@@ -462,18 +446,20 @@ class CastShadow(LightModel):
             distance = columns.new_empty(len(columns), *height_and_width(drawn.size))
             of_kind = ("polygon", "blinds", "window").index(kind)
             loop(of_kind, columns[:, :, 0], rows[..., 0], torch.cat(limits, 1)[..., 0, 0], distance)
-            return circle_segment(distance[:, None])
+            return surfaces.circle_segment(distance[:, None])
         edges = columns + rows
         if kind == "polygon":
             # Outside a convex polygon. The distance is exact except near corners.
-            return circle_segment(edges.amax(1, keepdim=True))
+            return surfaces.circle_segment(edges.amax(1, keepdim=True))
         if kind == "blinds":
             # Inside the gaps between parallel slats, with a period of 0.4 in units of the scale.
-            return circle_segment((limits[0] - (fraction(edges) - 0.5).abs()) * period)
+            return surfaces.circle_segment(
+                (limits[0] - (patterns.fraction(edges) - 0.5).abs()) * period
+            )
         # Inside the panes of a window with a cross bar.
         p, q = edges.abs().split(1, 1)
         inside = torch.minimum(limits[0] - p, limits[1] - q)
-        return circle_segment(torch.minimum(inside, torch.minimum(p, q) - limits[2]))
+        return surfaces.circle_segment(torch.minimum(inside, torch.minimum(p, q) - limits[2]))
 
 
 @dataclass(frozen=True)
@@ -495,7 +481,7 @@ class ColorTemperature(LightModel):
         # The camera assumes a color between that of D65 (6504 K) and that of the lamp.
         assumed = 1 / 6504 + balance * (lamp - 1 / 6504)
         color = planckian_rgb(1 / lamp, tint) / planckian_rgb(1 / assumed)
-        return Illumination(torch.ones_like(lamp), color / luminance(color))
+        return Illumination(torch.ones_like(lamp), color / patterns.luminance(color))
 
 
 @dataclass(frozen=True)

@@ -206,12 +206,13 @@ def _box_filter(
         # Irradiance of each seen face from a light with a single coefficient of 1: one row for
         # each face, one column for each coefficient.
         face_values = basis.irradiance(surface.face_planes)
-        entry_to_pixel, entry_to_face, sample_count, _ = fragments.groups
+        entry_to_pixel = fragments.groups.group_to_pixel
+        entry_to_face = fragments.groups.group_to_seen_face
         if albedo.shape[1] == 1:
-            weights = sample_count.double()[:, None] / fragments.samples**2
+            weights = fragments.groups.sample_count.double()[:, None] / fragments.samples**2
         else:
             # Sum of the albedo of the samples of an entry, divided by the samples of a pixel.
-            weights = fragments.merge(albedo)[2]
+            weights = fragments.merge(albedo)
     else:
         entry_to_pixel = fragments.sample_to_pixel
         weights = albedo / fragments.samples**2

@@ -75,9 +75,11 @@ def radiance(
         # All samples of a face in a pixel have the same irradiance. They are merged: the
         # weight of a pair of face and pixel is their mean albedo times their share of the
         # samples of the pixel.
-        pixel, seen_face, weights = fragments.merge(albedo)
+        weights = fragments.merge(albedo)
+        pixel = fragments.groups.group_to_pixel
         face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
-        incoming = irradiance(face_normals, light, wide).index_select(1, seen_face)
+        incoming = irradiance(face_normals, light, wide)
+        incoming = incoming.index_select(1, fragments.groups.group_to_seen_face)
     else:
         pixel = fragments.sample_to_pixel
         weights = albedo / fragments.samples**2

@@ -241,19 +241,15 @@ class Fragments:
         # The axes corner, value, seen face become seen face, corner, value.
         return corner_rows.unflatten(0, (3, -1)).permute(2, 0, 1)
 
-    def merge(self, albedo: Float[Tensor, "S C"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Add up the albedo of the samples of a pixel that show the same face.
+    def merge(self, albedo: Float[Tensor, "S C"]) -> Float[Tensor, "R C"]:
+        """Add up the albedo of each of the R `groups`, divided by the samples of a pixel.
 
-        With flat normals, the samples of such a group have the same normal, so they
-        can be shaded together. The results are, for each of R groups, the index into
-        `pixels`, the index into `faces`, and the sum of the albedo divided by the number of
-        samples of a pixel, which is differentiable.
+        With flat normals, the samples of a group have the same normal, so they can be shaded
+        together. The result is differentiable.
         """
-        groups = self.groups
-        zeros = albedo.new_zeros(albedo.shape[1], len(groups.sample_count))
+        zeros = albedo.new_zeros(albedo.shape[1], len(self.groups.sample_count))
         scaled_albedo = albedo.T / self.samples**2
-        albedo_of_groups = zeros.index_add(1, groups.sample_to_group, scaled_albedo)
-        return groups.group_to_pixel, groups.group_to_seen_face, albedo_of_groups.T
+        return zeros.index_add(1, self.groups.sample_to_group, scaled_albedo).T
 
     @cached_property
     def groups(self) -> PixelGroups:

@@ -123,8 +123,8 @@ def audit(
         classifier = networks[CLASSIFIER]
         with folder_or_temporary(out) as folder:
             # `run_audit` takes settings, as the command does, so the arguments become settings.
-            items = as_mappings("meshes", meshes, classifier)
-            negatives = as_mappings("hard_negatives", hard_negatives, classifier)
+            items = as_mappings("meshes", meshes)
+            negatives = as_mappings("hard_negatives", hard_negatives)
             folders = {"photos": photos, "laboratory": laboratory, "out": folder}
             given: dict[str, Any] = {key: path and str(path) for key, path in folders.items()}
             given |= {"label": label, "meshes": items, "hard_negatives": negatives, "seed": seed}

@@ -158,21 +158,20 @@ def harden(
             raise InputError("network has no parameters: give a network that can be trained")
         # Text vectors of a zero-shot network become buffers, so that they are copied and saved.
         keep_text_vectors(classifier.network, len(classifier.classes))
-        items = class_names.as_mappings("meshes", meshes, classifier)
+        items = class_names.as_mappings("meshes", meshes)
         # Settings by which this call differs from the experiment.
         changes: dict[str, Any] = {"seed": seed, "overwrite": overwrite, "meshes": items}
         changes |= {"network": classifier.name, "unlabeled": str(as_path("unlabeled", unlabeled))}
         changes |= {"data": {"name": "unlabeled"}, "train": {"device": str(device)}}
         changes["out"] = str(folder.absolute())
         if label is not None:
-            changes["label"] = classifier.classes[classifier.label(label)]
+            changes["label"] = label
         if is_detector:
             require_losses(classifier, bool(meshes))
             if not meshes:
                 changes["augment"] = {"mode": "none"}
         if hard_negatives is not None:
-            negatives = class_names.as_mappings("hard_negatives", hard_negatives, classifier)
-            changes["hard_negatives"] = negatives
+            changes["hard_negatives"] = class_names.as_mappings("hard_negatives", hard_negatives)
         if out is None:
             # Nothing is written outside of the temporary folder.
             changes["train"]["cache"] = None
@@ -180,7 +179,7 @@ def harden(
         sections: dict[str, Any] = {"train": train, "augment": augment, "scene": scene}
         sections |= {"renderer": renderer, "data": data}
         settings = _read_settings(experiment, changes, sections)
-        if settings.label is None and meshes:
+        if meshes or label is not None:
             settings = class_names.with_class_names(settings, classifier.classes)
         with sole_writer("out", folder), _restores_torch():
             initial = initial_of(classifier, settings.size)

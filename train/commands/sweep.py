@@ -144,7 +144,7 @@ def _run(config: DictConfig, folder: Path) -> None:
         try:
             settings = with_label(read_settings(ExperimentSettings, config))
             settings.train.resume = checkpoints.exists(folder)
-            command = format_command([_unescaped(override) for override in job.overrides.task])
+            command = format_command(job.overrides.task)
             data, initial = load_inputs(settings)
             run = Run(settings, data, folder, initial, command)
             run.begin()
@@ -158,17 +158,6 @@ def _run(config: DictConfig, folder: Path) -> None:
             # If the disk is full, the file cannot be written.
             with suppress(OSError):
                 atomic_write(folder / FAILURE, f"{reason}\n")
-
-
-def _unescaped(override: str) -> str:
-    r"""Write the value of a setting in quotes, if Hydra wrote it with backslashes.
-
-    For example, path=a\ b becomes path='a b'.
-    """
-    value = OverridesParser.create().parse_override(override).value()
-    if "\\" in override and isinstance(value, str):
-        return f"{override.partition('=')[0]}={quoted(value)}"
-    return override
 
 
 def format_sweep(folders: Sequence[Path]) -> str:

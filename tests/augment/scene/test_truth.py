@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 import norm_balls as nb
 from augment.scene.truth import NO_OBJECT
 from renderer.mesh import select_faces
-from train.class_names import as_mappings
+from train.class_names import as_mappings, with_class_name
 from train.settings import read_objects
 
 
@@ -95,9 +96,9 @@ def test_objects_without_a_position_do_not_touch_and_stand_on_one_ground():
 
 
 def test_a_list_of_objects_in_settings_and_arguments_is_one_entry():
-    classifier = nb.Classifier(lambda x: x.mean((2, 3)), 8, ["pear", "cup", "lemon"])
     cup = nb.ObjectSettings("solid:cup", "cup", at=[1.0, 2.0])
-    mappings = as_mappings("meshes", [[("solid:pear", 0), cup], "solid:pear"], classifier)
+    arguments = as_mappings("meshes", [[("solid:pear", 0), replace(cup, label=1)], "solid:pear"])
+    mappings = [with_class_name(item, ["pear", "cup", "lemon"], "meshes") for item in arguments]
     written = ["solid:pear", {"mesh": "solid:cup", "label": "cup", "at": [1.0, 2.0]}]
     for given in (mappings, [written, "solid:pear"]):
         read = read_objects(given, "pear", "meshes")
