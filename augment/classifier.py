@@ -430,15 +430,10 @@ def as_network(
     if size is not None:
         size = as_size("size", size, MAX_SIZE)
     if isinstance(network, TaskNetwork):
-        if task not in (None, network.task):
-            reason = f"task is {task}, but {network.title} has the task {network.task}"
-            raise InputError(f"{reason}: leave the task out")
         if classes is not None or normalization is not None or value_range != UNIT_RANGE:
             given = "classes, normalization and value_range"
             raise InputError(f"{given} are for a plain network: leave them out")
-        if size not in (None, network.size):
-            advice = f"use the size of its images, {network.size}"
-            raise InputError(f"size={size} does not fit {network.title}: {advice}")
+        _require_own(network, size, task)
         if says:
             wrappers.say_inputs(network.name, network.network, network.size, network.inputs)
         return network.normalizing_light(normalize_light)
@@ -455,12 +450,7 @@ def as_network(
     device = wrappers.device_of(network) if device is None else errors.as_device(device)
     function = _preprocessed(network, normalization, value_range).to(device)
     name = name or type(network).__name__
-    # Who states the normalization and the size, for the line that is logged. None: assumed.
-    stated_by_network = wrappers.NETWORK if wrappers.normalization_of(network) else None
-    normalizer = stated_by_network if normalization is None else wrappers.YOU
-    # A mean is in the units of the value range. The default range is an object of its own.
-    is_stated = normalization is not None or value_range is not UNIT_RANGE
-    limits = (0.0, 1.0) if normalization == IMAGENET else (value_range[0], value_range[1])
+    # Who states the size, for the line that is logged. None: assumed.
     sizer: str | None = size_from
     if size is None:
         known_size = wrappers.own_size(network)
@@ -468,7 +458,7 @@ def as_network(
         # timm records the size of the published weights, which need not be those of the network.
         published = getattr(network, "pretrained_cfg", {}).get("input_size", [USUAL_SIZE])
         size = known_size or published[-1]
-    inputs = wrappers.Inputs(sizer, normalizer, wrappers.YOU if is_stated else None, limits)
+    inputs = _describe_inputs(network, sizer, normalization, value_range)
     if says:
         wrappers.say_inputs(name, function, size, inputs)
     # Gray images of different shades, to find errors before an attack begins.
@@ -493,6 +483,31 @@ def as_network(
         made = TaskNetwork(function, size, known, name, normalize_light, task)
     made.inputs = inputs
     return made
+
+
+def _require_own(network: TaskNetwork, size: Size | None, task: Task | None) -> None:
+    """Check that a size and a task, if they are given, are those of a network."""
+    if task not in (None, network.task):
+        reason = f"task is {task}, but {network.title} has the task {network.task}"
+        raise InputError(f"{reason}: leave the task out")
+    if size not in (None, network.size):
+        advice = f"use the size of its images, {network.size}"
+        raise InputError(f"size={size} does not fit {network.title}: {advice}")
+
+
+def _describe_inputs(
+    network: ImageFunction,
+    sizer: str | None,
+    normalization: Normalization,
+    value_range: tuple[float, float],
+) -> wrappers.Inputs:
+    """Describe what images a network gets, and who states it. `sizer` states their size."""
+    stated_by_network = wrappers.NETWORK if wrappers.normalization_of(network) else None
+    normalizer = stated_by_network if normalization is None else wrappers.YOU
+    # A mean is in the units of the value range. The default range is an object of its own.
+    is_stated = normalization is not None or value_range is not UNIT_RANGE
+    limits = (0.0, 1.0) if normalization == IMAGENET else (value_range[0], value_range[1])
+    return wrappers.Inputs(sizer, normalizer, wrappers.YOU if is_stated else None, limits)
 
 
 def require_evaluation_mode(network: object, argument: str) -> None:

@@ -9,7 +9,6 @@ input files have changed.
 import hashlib
 import os
 import platform
-import re
 import shlex
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -19,7 +18,6 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -37,14 +35,6 @@ CONFIG = "config.yaml"
 NOT_RECORDED = ("out=", "train.resume=")
 # The files of a folder with more bytes are not read. Their sizes and times count instead.
 MAX_FOLDER_BYTES = 2**32
-# What a line of a .obj, .mtl or .ply file says before the path of another file, and such a path in
-# a .gltf file.
-REFERENCE = re.compile(
-    rb"^[ \t]*(?:mtllib|map_\w+|bump|norm|disp|refl|comment TextureFile)[ \t]+(.+?)[ \t\r]*$"
-    rb'|"uri"\s*:\s*"([^"]{1,1000})"',
-    re.MULTILINE | re.IGNORECASE,
-)
-REFERRING = (".obj", ".mtl", ".ply", ".gltf")
 # Settings that can name input files. Their hashes are recorded with a run.
 INPUTS = (
     *("data.path", "weights", "classes", "scene.backgrounds", "scene.light", "augment.folder"),
@@ -254,13 +244,15 @@ def _path_of(text: str) -> Path:
 def _fingerprint(path: Path) -> str:
     """Compute the fingerprint of a file, of a training run or of another folder that exists."""
     # Results of runs are read without torch, which these imports need.
+    from renderer.io.meshes import files_beside
     from train.checkpoints import selected_file
     from train.data.photographs import visible_files
 
     path = selected_file(path) or path
     if path.is_file():
-        companions = [(str(name), _hash_file(name)) for name in sorted(_companions(path))]
-        return _hash([_hash_file(path), *companions]) if companions else _hash_file(path)
+        # The materials, textures and buffers of a mesh.
+        beside = [_hash_file(file) for file in files_beside(path)]
+        return _hash([_hash_file(path), *beside]) if beside else _hash_file(path)
     names = sorted(map(str, visible_files(path)))
     files = {name: path / name for name in names if (path / name).is_file()}
     statuses = [file.stat() for file in files.values()]
@@ -269,23 +261,6 @@ def _fingerprint(path: Path) -> str:
         times = [(status.st_size, status.st_mtime_ns) for status in statuses]
         return _hash([*zip(names, times, strict=False)])
     return _hash([(name, _hash_file(file)) for name, file in files.items()])
-
-
-def _companions(mesh: Path) -> set[Path]:
-    """Find the materials, textures and buffers that a mesh file or its materials name."""
-    if mesh.suffix.lower() not in REFERRING:
-        return set()
-    found = set()
-    for line, uri in REFERENCE.findall(mesh.read_bytes()):
-        words = unquote((line or uri).decode(errors="replace")).replace("\\", "/").split(" ")
-        # A line may have options before the path.
-        for name in (" ".join(words[start:]).strip('"') for start in range(len(words))):
-            # The path is relative to the mesh, or its last part is a file beside the mesh.
-            for file in (mesh.parent / name, mesh.parent / Path(name).name):
-                with suppress(OSError, ValueError):  # The name is too long or has a NUL.
-                    if file.is_file() and file != mesh:
-                        found.add(file)
-    return found.union(*(_companions(file) for file in found if file.suffix.lower() == ".mtl"))
 
 
 def _hash(value: object) -> str:

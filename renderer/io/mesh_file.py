@@ -75,6 +75,8 @@ class MeshFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.content = path.read_bytes()
+        # Files that were read beside the mesh.
+        self.beside: set[Path] = set()
         # Dictionaries without values, because sets have no order.
         self._ignored: dict[str, None] = {}
         self._assumptions: dict[str, None] = {}
@@ -92,9 +94,12 @@ class MeshFile:
         for path in (written, unquote(written), re.split(r"\s+#", written)[0]):
             for candidate in (f"{folder}{path}", path, path.rpartition("/")[2]):
                 try:
-                    return file_below(self.path.parent, candidate).read_bytes()
+                    found = file_below(self.path.parent, candidate)
                 except ValueError as error:
                     errors.append(error)
+                    continue
+                self.beside.add(found)
+                return found.read_bytes()
         raise errors[0]
 
     def texture(self, name: str, folder: str = "") -> np.ndarray:

@@ -4,7 +4,8 @@ import io
 import json
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -111,15 +112,14 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
 def read_parts(path: Path, gloss: bool = False) -> list[Part]:
     """Read the parts of a mesh file, and warn once of what is ignored or assumed."""
     errors.require_file(path, "give the path of a mesh file")
-    suffix = path.suffix.lower().lstrip(".")
-    readers = READERS | dict.fromkeys(GLTF, partial(read_gltf, gloss=gloss))
-    if suffix not in readers:
-        known = ", ".join(sorted(readers))
+    read = _reader(path, gloss)
+    if read is None:
+        known = ", ".join(sorted([*READERS, *GLTF]))
         raise InputError(f"{path} is not of a mesh format that is read: convert it to {known}")
     # NumPy and Pillow can raise almost any exception for a damaged file.
     try:
         file = MeshFile(path)
-        parts = readers[suffix](file)
+        parts = read(file)
     except Exception as error:
         message = errors.single_line(error)
         # The message of a missing key is only this key.
@@ -128,6 +128,24 @@ def read_parts(path: Path, gloss: bool = False) -> list[Part]:
         raise InputError(f"{path} cannot be read as a mesh: {message}") from error
     file.warn(stacklevel=3)
     return parts
+
+
+def _reader(path: Path, gloss: bool) -> Callable[[MeshFile], list[Part]] | None:
+    """Return the function that reads mesh files of a suffix. None for other files."""
+    suffix = path.suffix.lower().lstrip(".")
+    return partial(read_gltf, gloss=gloss) if suffix in GLTF else READERS.get(suffix)
+
+
+def files_beside(path: Path) -> list[Path]:
+    """List the materials, textures and buffers that a mesh file names, and that exist."""
+    read = _reader(path, gloss=True)
+    if read is None:
+        return []
+    file = MeshFile(path)
+    # `load_mesh` raises the error of a mesh that cannot be read.
+    with suppress(Exception):
+        read(file)
+    return sorted(file.beside)
 
 
 # Types of the numbers and kinds of the rows of arrays in glTF (3.6.2.2).

@@ -1,10 +1,13 @@
 import itertools
+import json
 import os
 import time
 from pathlib import Path
 
 import pytest
 import torch
+from gltf_files import Gltf
+from oracles import png_of
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from renderer.errors import InputError
@@ -96,17 +99,21 @@ def replace_content(file: Path) -> None:
     run_config._hash_version.cache_clear()  # As in another process.
 
 
+VERTICES = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n"
+OBJ = f"# comment\n  mtllib my mesh.mtl\n{VERTICES}usemtl red\nf 1/1 2/1 3/1\n"
 MATERIAL = "newmtl red\nmap_Kd -s 1 1 1 my skin.png\n"
-GLTF = '{"images": [{"uri": "textures/my%20skin.png"}], "buffers": [{"uri": "mesh.bin"}]}'
+TEXTURED = Gltf().square(pbrMetallicRoughness={"baseColorTexture": {"index": 0}})
+TEXTURED.tree |= {"images": [{"uri": "textures/my%20skin.png"}], "textures": [{"source": 0}]}
+BUFFER = {"uri": "mesh.bin", "byteLength": len(TEXTURED.buffer)}
 INPUT_FILES = {
     "photographs/orange/a.png": "ab",
     "linked/b.png": "ab",
-    "mesh.obj": "# comment\n  mtllib my mesh.mtl\n",
+    "mesh.obj": OBJ,
     "my mesh.mtl": MATERIAL,
     "my skin.png": "ab",
-    "mesh.gltf": GLTF,
-    "mesh.bin": "ab",
-    "textures/my skin.png": "ab",
+    "mesh.gltf": json.dumps(TEXTURED.tree | {"buffers": [BUFFER]}),
+    "mesh.bin": TEXTURED.buffer,
+    "textures/my skin.png": png_of(255, 0, 0),
     "network.py": "# ab\n",
     "wall.png": "ab",
     "classes.txt": "ab",
@@ -133,7 +140,7 @@ AUDIT = {"network": "c", "meshes": ["solid:orange"], "out": "audit"}
 def test_an_input_whose_content_alone_changed_is_refused(tmp_path, monkeypatch, given, changed):
     for name, content in INPUT_FILES.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(content)
+        (tmp_path / name).write_bytes(content.encode() if isinstance(content, str) else content)
     (tmp_path / "photographs" / "apple").symlink_to(tmp_path / "linked")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from warnings import catch_warnings, filterwarnings
 
 import torch
@@ -82,39 +82,53 @@ def run(settings: AttackExperimentSettings) -> None:
         if settings.attack.checks is not False:
             # The checks say this for each mesh.
             filterwarnings("ignore", ZERO_GRADIENT)
-        headings: list[str] = []
-        # Name, examples, examples that were correct before, and successes for each mesh.
-        rows: list[tuple[str, int, int, int]] = []
-        details = []
+        attacked = []
         sweeps: dict[str, attack_tables.Sweep] = {}
         # Attacks on one mesh after the other, each with its scene and its result.
         found = attacks(settings, classifier, device, adversary)
         for index, (name, scene, result) in enumerate(found):
             # The name of a solid has colons, which Windows does not allow in file names.
             folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
-            heading, lines = _write_attack(name, scene, result, folder, settings, targets)
+            mesh = _write_attack(name, scene, result, folder, settings, targets)
             if settings.attack.radius_scales:
                 sweeps[folder.name] = success_by_radius(result, settings.attack.radius_scales)
             if is_verbose():
-                print("\n".join([heading, *lines, ""]))
-            # Only examples that were classified correctly before the attack count.
-            correct = result.clean_correct
-            hits = int(result.success[correct].sum())
-            rows.append((name, len(correct), int(correct.sum()), hits))
-            headings.append(heading)
-            details += lines
-        if len(rows) > 1:
-            correct_count, hits = sum(row[2] for row in rows), sum(row[3] for row in rows)
-            total = f"success on {hits} of {correct_count} examples that were correct before"
-            table = Table("", ["mesh", "examples", "correct before", "success"], rows)
-            headings = [f"{len(rows)} meshes: {total}", *str(table).splitlines()]
+                print("\n".join([mesh.heading, *mesh.details, ""]))
+            attacked.append(mesh)
         if not is_verbose():
-            print("\n".join(shortened([*headings, *details])))
+            details = [line for mesh in attacked for line in mesh.details]
+            print("\n".join(shortened([*_headings(attacked), *details])))
         if sweeps:
             norms = {name: steps.norm for name, steps in settings.attack.parameters.items()}
             attack_tables.write_sweeps(sweeps, norms, out)
             print(f"success against radius: {out / SWEEP_TABLE} and {out / SWEEP_FIGURE}")
     print(f"images, adversaries and numbers: {out}")
+
+
+class _AttackedMesh(NamedTuple):
+    """Numbers of examples of an attacked mesh, and lines about it for the console.
+
+    Only examples that were classified correctly before the attack count as successes.
+    """
+
+    name: str
+    examples: int
+    correct_before: int
+    successes: int
+    heading: str
+    details: list[str]
+
+
+def _headings(attacked: Sequence[_AttackedMesh]) -> list[str]:
+    """Return the heading of a mesh, or the sum and a table of several."""
+    if len(attacked) < 2:
+        return [mesh.heading for mesh in attacked]
+    hits = sum(mesh.successes for mesh in attacked)
+    correct_count = sum(mesh.correct_before for mesh in attacked)
+    total = f"success on {hits} of {correct_count} examples that were correct before"
+    rows = [(mesh.name, mesh.examples, mesh.correct_before, mesh.successes) for mesh in attacked]
+    table = Table("", ["mesh", "examples", "correct before", "success"], rows)
+    return [f"{len(rows)} meshes: {total}", *str(table).splitlines()]
 
 
 @contextmanager
@@ -142,8 +156,8 @@ def _write_attack(
     folder: Path,
     settings: AttackExperimentSettings,
     targets: Mapping[str, Any],
-) -> tuple[str, list[str]]:
-    """Check and write the attack on one mesh, and return its success and further lines."""
+) -> _AttackedMesh:
+    """Check and write the attack on one mesh."""
     details = []
     # The search chose another scene than the given one, in which the network was wrong already.
     if scene != settings.scene:
@@ -166,7 +180,9 @@ def _write_attack(
     if any(targets.values()):
         table = attack_tables.write_transfers(transfer(result, **targets), folder / TRANSFERS)
         details += table.splitlines()
-    return heading, details
+    correct = result.clean_correct
+    hits = int(result.success[correct].sum())
+    return _AttackedMesh(name, len(correct), int(correct.sum()), hits, heading, details)
 
 
 def attacks(

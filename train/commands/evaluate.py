@@ -188,13 +188,13 @@ def evaluate(
         with sole_writer("out", target) if target else nullcontext():
             if not isinstance(made, Classifier):
                 found: AnnotatedScores
-                # Arguments that the functions for detectors and segmenters share.
-                how = fit, skip_unreadable, device
                 if isinstance(made.task, Detection):
                     chosen = None if label is None else label_names(label)
-                    found = evaluate_detector(made, annotations, chosen, *how)
+                    found = evaluate_detector(
+                        made, annotations, chosen, fit, skip_unreadable, device
+                    )
                 else:
-                    found = evaluate_segmenter(made, folder, *how)
+                    found = evaluate_segmenter(made, folder, fit, skip_unreadable, device)
                 if target:
                     annotated_scores.write(found, target)
                 return found
@@ -207,8 +207,9 @@ def evaluate(
                 negatives = published_folder(Path(calibrate))
                 # The caller knows this folder as the argument `calibrate`.
                 with keyed(folder="calibrate"):
-                    options = labels, false_positive_rate, skip_unreadable
-                    points = scoring.choose_operating_points(predictor, negatives, *options)
+                    points = scoring.choose_operating_points(
+                        predictor, negatives, labels, false_positive_rate, skip_unreadable
+                    )
             scores = scoring.score(predictor.predict(folder, labels, skip_unreadable), by, points)
             if target:
                 scoring.write(scores, target)
