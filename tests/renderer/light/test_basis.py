@@ -5,12 +5,22 @@ import xml.etree.ElementTree as xml
 import torch
 
 from renderer.camera import OrthographicCamera
+from renderer.light.basis import Harmonics, SumBasis, split_light
 from renderer.light.environment import read_map
-from renderer.light.lamps import Projector
+from renderer.light.lamps import Lamps, Projector
 from renderer.mesh import Mesh
 from renderer.mitsuba_scene import SCENE, write_mitsuba_scene
 from renderer.settings import ImageSettings
 from renderer.solids import sphere
+
+
+def test_a_light_is_split_into_environment_light_and_local_lights_in_any_order():
+    lamps, projector = Lamps(((2.0, 0.0, 1.0), (0.0, 2.0, 1.0))), Projector(3)
+    coefficients = torch.arange(20.0)[:, None].expand(-1, 3)
+    split = split_light(SumBasis((lamps, Harmonics(2), projector)), coefficients)
+    assert split.environment[:, 0].tolist() == list(range(2, 11))
+    first = [(basis, values[0, 0].item()) for basis, values in split.local_lights]
+    assert first == [(lamps, 0), (projector, 11)]
 
 
 def test_each_projector_has_its_own_pattern_in_a_scene_of_mitsuba(tmp_path):

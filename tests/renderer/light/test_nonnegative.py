@@ -98,17 +98,19 @@ def assert_nowhere_negative(lights: Tensor) -> None:
 
 
 @pytest.mark.parametrize(
-    ("amplitude", "norm", "radius"), [(3.0, "linf", 0.1), (0.02, "l2", 0.01), (3.0, "l2", 100.0)]
+    ("amplitude", "norm", "radius"), [(3.0, "linf", 0.1), (0.1, "l2", 0.3), (3.0, "l2", 100.0)]
 )
 def test_the_nearest_light_in_a_ball_is_there_and_nowhere_negative(amplitude, norm, radius):
     assert_nowhere_negative(nearest_nonnegative(random_lights(2, amplitude)))
-    target = random_lights(1, amplitude)
+    target = random_lights(2, amplitude)
     center = nearest_nonnegative(GRACE).expand_as(target)
     nearest = nearest_nonnegative(target, Ball(center, radius, norm))
     assert_nowhere_negative(nearest)
     order = {"linf": torch.inf, "l2": 2}[norm]
     distance = (nearest - center).flatten(1).norm(order, dim=1)
     assert (distance <= radius * (1 + 1e-12)).all()
+    if radius < 1:  # The target is outside, so that the nearest point is on the surface.
+        assert (distance >= radius * (1 - 1e-6)).all()
 
 
 both_projections = pytest.mark.parametrize("projection", [nearest_nonnegative, project_nonnegative])
