@@ -92,6 +92,8 @@ def test_all_starts_together_show_at_most_the_given_number_of_images(
     result = attacked(steps, max_queries=max_queries, **options)
     assert not result.success.any()
     assert (result.queries <= max_queries).all()
+    expected = result.queries if optimizer == "gradient" else 0 * result.queries
+    assert torch.equal(result.backward_passes, expected)
     if optimizer != "cma_es" and max_queries > 1:
         # The share is used up. The first start shows the initial image without a step.
         share = max_queries // 3

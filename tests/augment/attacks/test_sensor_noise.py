@@ -11,6 +11,7 @@ import augment
 from augment.attacks.loop import minimize
 from augment.attacks.objective import NOISE_DRAWS, Objective, add_sensor_noise
 from augment.attacks.result import AttackResult
+from augment.augmentation_settings import TrainingAttackSettings
 from augment.tasks.classification import ClassCriterion
 from augment.tasks.task import NO_CLASS
 
@@ -217,3 +218,20 @@ def test_checks_files_transfers_and_sweeps_count_as_the_attack_does(attacked, tm
     (row,) = augment.success_by_radius(result, [100.0])
     for method in ("adversarial", "random"):
         assert (row[method] <= row[f"{method}_without_noise"]).all()
+
+
+def test_training_attacks_count_without_noise_unless_told_otherwise():
+    options = {"views": 2, "samples": 1, "backgrounds": [0.3, 0.6], "rasterizer": "numpy"}
+    renders = []
+    for settings in ({}, {"sensor_noise": 1.0}):
+        attack = TrainingAttackSettings(max_steps=4, **settings)
+        chosen = augment.AugmentationSettings(attack=attack)
+        meshes = [("solid:orange:0", 0)]
+        service = augment.AugmentationService.from_meshes(meshes, SIZE, chosen, **options)
+        renders.append(service.regenerate(nervous(0.2).train(), 0))
+    without, noisy = renders
+    assert torch.equal(without.images, noisy.images)
+    assert "attack_success_without_noise" not in without.diagnostics
+    success_without_noise = noisy.diagnostics["attack_success_without_noise"]
+    assert success_without_noise == without.diagnostics["attack_success"]
+    assert success_without_noise >= noisy.diagnostics["attack_success"]

@@ -258,6 +258,12 @@ def test_the_transparent_gray_of_a_png_file_is_transparent(tmp_path, depth, pixe
     np.testing.assert_array_equal(read(tmp_path / "a.png")[..., 1], [expected, expected])
 
 
+def test_the_transparent_color_of_16_bits_is_transparent(tmp_path):
+    row = struct.pack(">6H", 0x1000, 0x2000, 0x3000, 0x1100, 0x2000, 0x3000)
+    (tmp_path / "a.png").write_bytes(png((2, 2), 16, 2, 2 * row, tRNS=row[:6]))
+    assert read(tmp_path / "a.png")[0].tolist() == [[255] * 3, [0x11, 0x20, 0x30]]
+
+
 def test_16_bit_tiff_files_are_turned_and_scaled(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 8

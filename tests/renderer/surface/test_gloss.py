@@ -387,7 +387,7 @@ def positive_light(degree: int) -> Tensor:
 
 
 def mitsuba_radiance(mesh, light, surface, sample_count) -> Tensor:
-    """Render a mesh with interpolated normals in environment light, shape (3, 16, 16)."""
+    """Render a mesh with interpolated normals in an environment or by an emitter, (3, 16, 16)."""
     pytest.importorskip("mitsuba")
     with mitsuba() as module:
         sampler = {"type": "multijitter", "sample_count": sample_count}
@@ -396,9 +396,12 @@ def mitsuba_radiance(mesh, light, surface, sample_count) -> Tensor:
         triangles = np.arange(len(corners)).reshape(-1, 3)
         normals = mesh.corner_normals.reshape(-1, 3)
         mitsuba_mesh = shape(module, surface, corners, triangles, normals)
-        sky = environment({"bitmap": module.Bitmap(mitsuba_map(light, 256).float().numpy())})
-        parts = {"sensor": sensor, "mesh": mitsuba_mesh, "sky": sky}
-        scene = load(module, {"type": "scene", "integrator": integrator(0, 0), **parts})
+        emitter_samples = int(isinstance(light, dict))
+        if isinstance(light, Tensor):
+            light = environment({"bitmap": module.Bitmap(mitsuba_map(light, 256).float().numpy())})
+        parts = {"sensor": sensor, "mesh": mitsuba_mesh, "light": light}
+        parts |= {"type": "scene", "integrator": integrator(0, emitter_samples)}
+        scene = load(module, parts)
         image = np.array(module.render(scene, spp=sample_count, seed=1))
     return math.pi * torch.from_numpy(image[..., :3]).double().permute(2, 0, 1)
 
@@ -421,14 +424,27 @@ def rough_mirror(roughness: float) -> dict[str, Any]:
 
 
 BALL = Mesh.plain(*sphere(4))
+EGG = normalize(replace(BALL, vertices=BALL.vertices * [1.0, 0.7, 0.8]))
 
 
 def test_metals_look_as_mitsubas_in_light_of_degree_6():
     """The error is that of the lobes, with Mitsuba's noise."""
     light = positive_light(6)
-    egg = normalize(replace(BALL, vertices=BALL.vertices * [1.0, 0.7, 0.8]))
-    found = our_radiance(egg, light, Gloss(0.3, metallic=1.0))
-    assert relative_error(found, mitsuba_radiance(egg, light, rough_mirror(0.3), 144)) < 0.016
+    found = our_radiance(EGG, light, Gloss(0.3, metallic=1.0))
+    assert relative_error(found, mitsuba_radiance(EGG, light, rough_mirror(0.3), 144)) < 0.016
+
+
+def test_the_highlight_of_a_lamp_is_mitsubas():
+    """A point light has no noise except at the edges of pixels. The ball has few faces."""
+    coarse_ball = Mesh.plain(*sphere(2))
+    lamp = Lamps(((2.0, 1.0, 2.5),), power=1.0)
+    settings = ImageSettings(16, 4, normals="smooth")
+    [operator] = operators_of(coarse_ball, [CAMERA], settings, lamp, Gloss(0.4, metallic=1.0))
+    found = image_of(operator, UP.new_ones(1, 3))[:3]
+    intensity = {"type": "rgb", "value": [1.0] * 3}
+    emitter = {"type": "point", "position": list(lamp.positions[0]), "intensity": intensity}
+    expected = mitsuba_radiance(coarse_ball, emitter, rough_mirror(0.4), 64)
+    assert relative_error(found, expected) < 0.02
 
 
 @pytest.mark.parametrize("roughness", [0.4, pytest.param(0.2, marks=pytest.mark.slow)])
