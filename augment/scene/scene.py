@@ -140,13 +140,8 @@ class Scene:
         # Two axes of size 1 let the exposures multiply lights of shape (E, coefficients, 3).
         self._exposure = exposures.to(lights)[:, None, None]
 
-        pixels_per_example = self.views * settings.pixel_count
-        self.group_size = max(1, AT_ONCE // pixels_per_example)
-        per_rendered_pixel = NUMBERS_WITH_CAMERA if camera_effects else NUMBERS_PER_RENDERED_PIXEL
-        numbers = NUMBERS_PER_PIXEL * len(self) * pixels_per_example
-        numbers += per_rendered_pixel * min(len(self), self.group_size) * pixels_per_example
-        numbers += NUMBERS_PER_LIGHT_VALUE * self.lights.numel()
-        self.attack_bytes = lights.element_size() * numbers
+        self.group_size = max(1, AT_ONCE // (self.views * settings.pixel_count))
+        self.attack_bytes = self._count_attack_bytes()
         height, width = settings.shape
         count = f"{len(self) * self.views} renders of {height} × {width} pixels"
         errors.require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
@@ -165,6 +160,17 @@ class Scene:
         self._direct_renderer = DirectRenderer(
             self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light
         )
+
+    def _count_attack_bytes(self) -> int:
+        """Estimate the memory of an attack on all examples."""
+        per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL
+        if self.camera_effects:
+            per_rendered_pixel = NUMBERS_WITH_CAMERA
+        pixels_per_example = self.views * self.settings.pixel_count
+        numbers = NUMBERS_PER_PIXEL * len(self) * pixels_per_example
+        numbers += per_rendered_pixel * min(len(self), self.group_size) * pixels_per_example
+        numbers += NUMBERS_PER_LIGHT_VALUE * self.lights.numel()
+        return self.lights.element_size() * numbers
 
     def _require_fit(self, examples: list[Example], lights: Tensor, backgrounds: Tensor) -> None:
         """Check that examples, lights and backgrounds fit the objects, the basis and the size."""

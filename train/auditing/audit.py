@@ -88,13 +88,9 @@ def run_audit(
     of `networks` are CLASSIFIER and HARDENED. None loads those that the settings name.
     """
     is_named = networks is None
-    if networks is None:
-        networks = {CLASSIFIER: load_chosen(settings)}
-        if settings.hardened:
-            with keyed(name="hardened"):
-                networks[HARDENED] = load_network(settings.hardened, trust_code=settings.trust)
     device = choose_device(settings.device)
-    networks = {key: network.to(device) for key, network in networks.items()}
+    loaded = networks or _load_networks(settings)
+    networks = {key: network.to(device) for key, network in loaded.items()}
     # Without meshes, only photographs are attacked, and there is no plan.
     plan, given = None, settings
     if settings.meshes:
@@ -138,13 +134,7 @@ def run_audit(
                 _write_folder(renders, partial(_write_renders, settings, plan, size))
             plan.measure(networks, out)
         if settings.unlabeled:
-            attack = RelightingSettings(passes=relit.PASSES)
-            count = settings.scale(relit.PHOTOGRAPH_COUNT)
-            options: dict[str, Any] = {"seed": settings.seed, "limit": count}
-            for key, network in networks.items():
-                # The folder is written in one step, so a folder that exists is complete.
-                write = partial(relit.attack_folder, network, photographs, attack, **options)
-                _write_folder(out / key / relit.RELIT_FOLDER, write)
+            _attack_photographs(settings, networks, photographs, out)
         names = {key: network.name for key, network in networks.items()}
         # Both networks can have the same name.
         if len({*names.values()}) < len(names):
@@ -153,6 +143,28 @@ def run_audit(
             return page.write_audit_page("", names, {}, {}, out, caveats)
         found_in = name_remedies(networks), plan.image_folders
         return page.write_audit_page(settings.label, names, *found_in, out, caveats)
+
+
+def _load_networks(settings: AuditSettings) -> dict[str, Classifier]:
+    """Load the network that the settings name, and the hardened one, if they name one."""
+    networks = {CLASSIFIER: load_chosen(settings)}
+    if settings.hardened:
+        with keyed(name="hardened"):
+            networks[HARDENED] = load_network(settings.hardened, trust_code=settings.trust)
+    return networks
+
+
+def _attack_photographs(
+    settings: AuditSettings, networks: Mapping[str, Classifier], photographs: Path, out: Path
+) -> None:
+    """Attack the light of photographs without labels, and write the results for each network."""
+    attack = RelightingSettings(passes=relit.PASSES)
+    count = settings.scale(relit.PHOTOGRAPH_COUNT)
+    options: dict[str, Any] = {"seed": settings.seed, "limit": count}
+    for key, network in networks.items():
+        # The folder is written in one step, so a folder that exists is complete.
+        write = partial(relit.attack_folder, network, photographs, attack, **options)
+        _write_folder(out / key / relit.RELIT_FOLDER, write)
 
 
 def _caveats(

@@ -14,6 +14,7 @@ from PIL import Image
 from renderer.io.images import read_center
 from train.data.photo import DESCRIPTION
 from train.results import compare
+from train.results.metrics import Pool
 from train.results.pictures import Picture, encode_picture
 from train.results.predictions import Predictions
 from train.results.store import RunSummary
@@ -194,17 +195,7 @@ def compare_networks(
     known = {text: gains[metric] for metric, text in reasons.items()}
     sentences += [gain_sentence(text, gain) for text, gain in known.items() if gain is not None]
 
-    shown = pool.negatives.photograph
-    # Object of each image without a positive class. A photograph has one prediction for each label.
-    others = {item.path: item.mesh or item.path for item in shown if item.label not in labels}
-    scored = pool.metrics.auc
-    images = (
-        f"Scored on {scored.positives:,} images of {label} ({scored.positive_objects:,} objects) "
-        f"and {len(others):,} of other objects ({len({*others.values()}):,} objects)."
-    )
-    if len(labels) > 1:
-        images += " For each class, the images of the other classes count as other objects, too."
-    images += f" The gains have {describe_intervals([auc])}."
+    images = f"{_describe_images(pool, labels)} The gains have {describe_intervals([auc])}."
     trained = _classes_with_trained_objects(after[0].run, labels, folder)
     if trained:
         trained_labels = join_words(trained, "and")
@@ -220,6 +211,22 @@ def compare_networks(
         rows = choose_disagreements(one, other, folder, labels, subjects)
     answer = _answer(change, recall, mistaken, auc)
     return FirstScreen(answer, sentences, numbers, names, images, rows, note)
+
+
+def _describe_images(pool: Pool, labels: Sequence[str]) -> str:
+    """Tell on how many images and objects of the positive classes and of others scores are."""
+    shown = pool.negatives.photograph
+    # Object of each image without a positive class. A photograph has one prediction for each label.
+    others = {item.path: item.mesh or item.path for item in shown if item.label not in labels}
+    scored = pool.metrics.auc
+    label = join_words([in_words(item) for item in labels], "or")
+    text = (
+        f"Scored on {scored.positives:,} images of {label} ({scored.positive_objects:,} objects) "
+        f"and {len(others):,} of other objects ({len({*others.values()}):,} objects)."
+    )
+    if len(labels) > 1:
+        text += " For each class, the images of the other classes count as other objects, too."
+    return text
 
 
 def _classes_with_trained_objects(

@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from jaxtyping import Int
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
+from torch import Tensor, nn
 
 from augment import distributed
 from augment import network as wrappers
@@ -117,15 +117,8 @@ class Run:
             images = data.train.sample(SAMPLED)
         mean, std = channel_statistics(images)
         torch.manual_seed(stream_seed(settings.seed, "weights"))
-        # A network in memory is copied, since the caller's must not change.
-        if initial and initial.network is not None:
-            network = deepcopy(initial.network).requires_grad_(True)
-        else:
-            # The shape of a classifier has the normalization of the classifier.
-            arguments: dict[str, Any] = {"mean": mean, "std": std, **shape}
-            arguments["trust_code"] = settings.trust
-            with keyed(**keys_of("model", settings.model)):
-                network = build_network(data.classes, data.size, **arguments)
+        # The shape of a classifier has the normalization of the classifier.
+        network = self._build_network({"mean": mean, "std": std} | shape)
         encoding = settings.renderer.encoding
         facts = {"classes": list(data.classes), "size": data.size, "encoding": encoding, **shape}
         light = settings.normalize_light
@@ -160,6 +153,15 @@ class Run:
         service = inputs.build_service(settings, data, device, task)
         options = description, service, self.folder, data.labeled, initial is not None
         return Trainer(recipe, model, *options)
+
+    def _build_network(self, shape: dict[str, Any]) -> nn.Module:
+        """Build the network without its trained weights, or copy the one that the caller gave."""
+        if self.initial and self.initial.network is not None:
+            # The caller's network must not change.
+            return deepcopy(self.initial.network).requires_grad_(True)
+        classes, size = self.data.classes, self.data.size
+        with keyed(**keys_of("model", self.settings.model)):
+            return build_network(classes, size, trust_code=self.settings.trust, **shape)
 
     def begin(self) -> None:
         """Remove what an earlier run left in the folder, unless it is resumed; write config.yaml.
