@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int32, UInt8
 from PIL import Image
 from torch import Tensor
 from torch.utils._pytree import tree_flatten_with_path, tree_unflatten
@@ -29,7 +29,7 @@ from torchvision.transforms import v2
 from augment.random_streams import generator, stream_seed
 from augment.scene import loops
 from augment.scene.lights import MODELS, Drawn, Illumination, LightModel, LowLight, normal_noise
-from augment.scene.loops import BINS
+from augment.scene.loops import BIN_BITS, BINS
 from augment.scene.patterns import draw_projected_light, luminance, require_photographs
 from renderer import errors
 from renderer.errors import InputError
@@ -423,11 +423,11 @@ def _relight(
         light = Illumination(cast(Tensor, field), gain, offset)
     is_integer = not images.is_floating_point()
     largest = torch.iinfo(images.dtype).max if is_integer else 1
-    if images.dtype == torch.uint8 and not values.requires_grad:
-        if isinstance(model, LowLight):
-            relit = _noisy_bytes(colors, model, drawn, strength)
-        else:
-            relit = relit_bytes(colors, light)
+    is_byte = images.dtype == torch.uint8 and not values.requires_grad
+    if is_byte and isinstance(model, LowLight) and (loop := loops.noisy_bytes(colors, values)):
+        relit = _noisy_bytes(colors, model, drawn, strength, loop)
+    elif is_byte and not isinstance(model, LowLight):
+        relit = relit_bytes(colors, light)
     else:
         unit = colors.to(dtype) / largest
         # The largest value of an image above 1 is its white, at which a sensor is full.
@@ -446,71 +446,56 @@ def _relight(
     return relit if colored == images.shape[1] else torch.cat([relit, images[:, colored:]], 1)
 
 
-class Tables(NamedTuple):
-    """Tables of sRGB of 8 bits.
-
-    `decoded` has the linear value of each byte. A linear value in a bin of width 1 / BINS has the
-    byte `lowest`, and one more from the value `limit` on.
-    """
-
-    decoded: Float[Tensor, " 256"]
-    lowest: UInt8[Tensor, " bins"]
-    limit: Float[Tensor, " bins"]
-
-
 @cache
-def _tables(device: torch.device) -> Tables:
-    """Compute the tables in double precision. A value that is half way is rounded up."""
-    decoded = decode(torch.arange(256, dtype=torch.float64) / 255, "srgb")
+def _tables(device: torch.device) -> tuple[Float[Tensor, " 256"], Int32[Tensor, " bins"]]:
+    """Return tables of sRGB of 8 bits, from double precision. A value half way is rounded up.
+
+    The first has the linear value of each byte, in units of 1 / (BINS << BIN_BITS). If v is a whole
+    number of these units, the nearest byte is (v + carry[v >> BIN_BITS]) >> BIN_BITS, where `carry`
+    is the second: the sum has a carry in each bin of width 1 / BINS from the value on at which the
+    byte changes.
+    """
+    unit = BINS << BIN_BITS
+    decoded = decode(torch.arange(256, dtype=torch.float64) / 255, "srgb") * unit
     # Linear values at which the nearest byte changes.
-    halves = decode((torch.arange(255, dtype=torch.float64) + 0.5) / 255, "srgb").float()
-    starts = torch.arange(BINS + 1) / BINS
-    lowest = torch.searchsorted(halves, starts, right=True)
-    limit = torch.cat([halves, halves.new_tensor([2.0])])[lowest]
-    return Tables(*(table.to(device) for table in (decoded.float(), lowest.byte(), limit)))
+    halves = decode((torch.arange(255, dtype=torch.float64) + 0.5) / 255, "srgb") * unit
+    starts = torch.arange(BINS + 1) << BIN_BITS
+    # Each bin has the byte `lowest` at its start, and the next one from its position `limit` on.
+    lowest = torch.searchsorted(halves, starts.double(), right=True)
+    limit = torch.cat([halves.ceil().long(), starts[-1:] * 2])[lowest] - starts
+    carry = ((lowest + 1) << BIN_BITS) - limit.clamp(max=1 << BIN_BITS) - starts
+    return decoded.float().to(device), carry.int().to(device)
 
 
 def _noisy_bytes(
-    colors: UInt8[Tensor, "N C H W"], model: LowLight, drawn: Drawn, strength: float
+    colors: UInt8[Tensor, "N C H W"], model: LowLight, drawn: Drawn, strength: float, loop: Any
 ) -> UInt8[Tensor, "N C H W"]:
-    """Return the nearest bytes of what a camera measures, from a table of its response to each."""
+    """Return the bytes of what a camera measures, by a loop and its response to each byte."""
     # Response a + b z + c z² of each image to each of the 256 bytes, shape (N, 1, 1, 256).
-    tables = _tables(colors.device)
-    decoded = tables.decoded.expand(len(colors), 1, 1, -1)
+    decoded = (_tables(colors.device)[0] / (BINS << BIN_BITS)).expand(len(colors), 1, 1, -1)
     response = model.response(decoded, drawn, strength, decoded.new_ones(()))
-    z = normal_noise(tables.decoded.new_empty(colors.shape), drawn.seeds)
+    z = normal_noise(decoded.new_empty(colors.shape), drawn.seeds)
     # Byte of each level of the camera's converter.
     levels = torch.arange(model.levels + 1, device=colors.device).view(1, 1, 1, -1) / model.levels
     encoded = relit_bytes(torch.full_like(levels, 255, dtype=torch.uint8), Illumination(levels))
-    if loop := loops.noisy_bytes(z):
-        parts = [part.flatten(1) for part in (colors, z, *response)]
-        loop(*parts, encoded.flatten(), (noisy := torch.empty_like(parts[0])))
-        return noisy.view(colors.shape)
-    # Without a compiled loop: look up the coefficients at 256 · image + byte.
-    first = 256 * torch.arange(len(colors), device=colors.device, dtype=torch.int32)
-    index = (colors.int() + first[:, None, None, None]).flatten()
-    middle, slope, curve = (
-        part.flatten().index_select(0, index).view(colors.shape) for part in response
-    )
-    signal = curve.mul_(z).add_(slope).mul_(z).add_(middle).clamp_(0, model.levels).round_()
-    return encoded.flatten().index_select(0, signal.int().flatten()).view(colors.shape)
+    parts = [part.flatten(1) for part in (colors, z, *response)]
+    loop(*parts, encoded.flatten(), (noisy := torch.empty_like(parts[0])))
+    return noisy.view(colors.shape)
 
 
 def relit_bytes(colors: UInt8[Tensor, "N C H W"], light: Illumination) -> UInt8[Tensor, "N C H W"]:
     """Multiply the linear colors of bytes by light, and return the nearest bytes."""
-    tables = _tables(colors.device)
+    decoded, carry = _tables(colors.device)
     loop = loops.relit_bytes(colors, light.field)
     # The light is gain · field + offset. The loop takes these parts instead of their sum.
     if loop is None:
-        decoded = tables.decoded.index_select(0, colors.flatten().int()).view(colors.shape)
-        linear = (decoded * light.total()).clamp_(max=1)
-        bins = (linear * BINS).int()
-        return tables.lowest[bins] + (linear >= tables.limit[bins])
+        albedo = decoded.index_select(0, colors.flatten().int()).view(colors.shape)
+        linear = (albedo * light.total()).clamp_(max=BINS << BIN_BITS).int()
+        return ((linear + carry[linear >> BIN_BITS]) >> BIN_BITS).byte()
     parts = [part.numpy()[..., 0, 0] if isinstance(part, Tensor) else part for part in light[1:]]
     gain, offset = (np.full(colors.shape[:2], part, np.float32) for part in parts)
     relit = colors.new_empty(colors.shape)
-    field = light.field.float().flatten(2)
-    loop(colors.flatten(2), field, gain, offset, *tables, relit.flatten(2))
+    loop(colors, light.field, gain, offset, decoded, carry, relit)
     return relit
 
 

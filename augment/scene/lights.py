@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -29,22 +30,6 @@ from augment.scene.black_body import planckian_rgb
 from renderer import errors
 from renderer.errors import InputError
 from renderer.settings import Size, height_and_width
-
-
-def between(numbers: Tensor, low: float, high: float) -> Tensor:
-    """Map numbers in [0, 1] to an interval."""
-    return low + (high - low) * numbers
-
-
-def normal_numbers(uniform: Float[Tensor, " *S"]) -> Float[Tensor, " *S"]:
-    """Convert uniform numbers to standard normal ones."""
-    return 2**0.5 * torch.erfinv(2 * uniform.clamp(1e-6, 1 - 1e-6) - 1)
-
-
-def blend(uniform: Float[Tensor, "B E"], angle: Float[Tensor, "B 1 1 1"]) -> Tensor:
-    """Blend both halves of uniform numbers to normal ones, of equal variance at any angle."""
-    first, second = normal_numbers(uniform)[..., None, None].chunk(2, 1)
-    return angle.cos() * first + angle.sin() * second
 
 
 class Range(NamedTuple):
@@ -79,22 +64,35 @@ LAMP = (Range(-1.5, 1.5), Range(-1.5, 1.5), Range(0.4, 2.0, True))
 class Drawn(NamedTuple):
     """Numbers of the lights of B images, and what the lights depend on.
 
-    `numbers` are what light depends on smoothly, in their ranges. The `constants` are uniform in
-    [0, 1]. `seeds` are for the noise and for slides.
+    `rows` has the numbers that light depends on smoothly, in their ranges. The `constants` are
+    uniform in [0, 1]. `seeds` are for the noise and for slides.
     """
 
-    numbers: Float[Tensor, "D B 1 1 1"]
+    rows: Float[Tensor, "B D"]
     constants: Float[Tensor, "B E"]
     size: Size
     depth: Tensor | None
     seeds: Sequence[int]
 
-    def surface(self, steepness: Tensor, start: int = 0) -> surfaces.Surface:
+    @property
+    def numbers(self) -> Float[Tensor, "D B 1 1 1"]:
+        """Numbers of all images, each of which can be multiplied by fields."""
+        return self.rows.T[..., None, None, None]
+
+    def field(self, channels: int = 1) -> Float[Tensor, "B _ H W"]:
+        """Return an empty field for a loop."""
+        return self.rows.new_empty(len(self.rows), channels, *height_and_width(self.size))
+
+    def heights(self) -> Float[Tensor, "B nodes"]:
+        """Return heights of the nodes of a random surface, whose steepness is the first number."""
+        last = self.constants[:, -(surfaces.SURFACE_NODES**2) :]
+        return self.rows[:, :1] * surfaces.normal_numbers(last)
+
+    def surface(self) -> surfaces.Surface:
         """Return the surface of the depth of the images, or a random smooth one."""
         if self.depth is not None:
             return surfaces.surface_of_depth(self.depth)
-        heights = normal_numbers(self.constants[:, start : start + surfaces.SURFACE_NODES**2])
-        nodes = steepness * heights.view(-1, 1, surfaces.SURFACE_NODES, surfaces.SURFACE_NODES)
+        nodes = self.heights().view(-1, 1, surfaces.SURFACE_NODES, surfaces.SURFACE_NODES)
         down, right = (surfaces.smooth(nodes, self.size, slope) for slope in "yx")
         return surfaces.Surface(
             down, right, (*surfaces.axes(self.size, nodes), surfaces.smooth(nodes, self.size))
@@ -148,9 +146,7 @@ class LightModel:
         low, span, is_geometric = _ranges(self.ranges, values.device, values.dtype)
         numbers = torch.addcmul(low, span, values[:, : self.dimensions])
         numbers = torch.where(is_geometric, numbers.exp(), numbers)
-        return Drawn(
-            numbers.T[..., None, None, None], values[:, self.dimensions :], size, depth, seeds
-        )
+        return Drawn(numbers, values[:, self.dimensions :], size, depth, seeds)
 
     def illumination(self, drawn: Drawn, strength: float = 1.0) -> Illumination:
         """Mix the light with the unchanged light, and expose it."""
@@ -195,30 +191,23 @@ class ProjectedSlide(LightModel):
     def light(self, drawn: Drawn) -> Illumination:
         """Project a picture of its own on each image."""
         draws = [torch.Generator().manual_seed(seed) for seed in drawn.seeds]
-        pictures = torch.cat(
-            [patterns.draw_slides(1, drawn.size, draw, self.slides) for draw in draws]
-        )
+        shown = [patterns.draw_slides(1, drawn.size, draw, self.slides) for draw in draws]
+        slides = torch.cat(shown) if len(shown) > 1 else shown[0]
         # Logarithms of the gains of the channels in a grid of cells, shape (B, 3, cells, cells).
         log_gain = drawn.numbers[4:-1, :, 0, 0, 0].T.reshape(-1, 3, self.cells, self.cells)
-        light = surfaces.smooth(log_gain, drawn.size, mode="bilinear").exp_()
-        # Autograd needs the factors, so they are multiplied in place only without gradients.
-        for factor in (pictures.to(light), shading(drawn)):
-            light = light * factor if light.requires_grad else light.mul_(factor)
-        return Illumination(light, offset=drawn.numbers[3])
+        if loop := loops.multiply_slides(log_gain):
+            weights = surfaces.grid(self.cells, drawn.size, "bilinear")
+            loop(log_gain, weights, shading(drawn), slides)
+            return Illumination(slides, offset=drawn.numbers[3])
+        light = surfaces.smooth(log_gain, drawn.size, mode="bilinear").exp()
+        return Illumination(light * slides.to(light) * shading(drawn), offset=drawn.numbers[3])
 
 
 def shading(drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
-    """Compute the shading of a surface from its steepness and the direction of the light."""
-    steepness, azimuth, polar, *_ = drawn.numbers
-    surface = drawn.surface(steepness)
-    slopes, towards = (surface.slope_down, surface.slope_right), surfaces.direction(azimuth, polar)
-    # The compiled loop is faster. It does not exist without numba, on a GPU or with gradients.
-    if loop := loops.cosines(drawn.numbers, *slopes):
-        cosine = drawn.numbers.new_empty(slopes[0].shape)
-        flat = (slope.flatten(1) for slope in slopes)
-        loop(*flat, torch.cat(towards, 1)[..., 0, 0], cosine.flatten(1))
-        return cosine
-    return surfaces.lambert(*slopes, *towards)
+    """Compute the shading of a surface in the light of a direction."""
+    _, azimuth, polar, *_ = drawn.numbers
+    towards = torch.cat(surfaces.direction(azimuth, polar), 1)[:, None, :, 0, 0]
+    return lamp_light(drawn, towards, torch.ones_like(towards[..., :1]), near=0.0)
 
 
 @dataclass(frozen=True)
@@ -238,23 +227,26 @@ class DirectionalLight(LightModel):
 
 
 def lamp_light(
-    surface: surfaces.Surface, places: Float[Tensor, "B L 3"], colors: Float[Tensor, "B L C"]
+    drawn: Drawn, places: Float[Tensor, "B L 3"], colors: Float[Tensor, "B L C"], near: float = 1.0
 ) -> Float[Tensor, "B C H W"]:
-    """Add up the irradiance of small lamps, cos / distance², in units of that right below each."""
-    x, y, height = surface.position
-    # With a depth, x and y differ from pixel to pixel.
-    if len(x.flatten()) == x.shape[3] and (loop := loops.lamps(places, height)):
-        slopes = surface.slope_down[:, 0], surface.slope_right[:, 0]
-        light = height.new_empty(len(places), colors.shape[2], *height.shape[2:])
-        loop(*slopes, height[:, 0], x.flatten(), y.flatten(), places, colors, light)
-        return light
+    """Add up the irradiance of small lamps, cos / distance², in units of that right below each.
+
+    If `near` is 0, the lamps are far away, in the directions of the unit vectors `places`.
+    """
+    if drawn.depth is None and (loop := loops.lamps(places)):
+        field = drawn.field(colors.shape[2])
+        weights = surfaces.grid(surfaces.SURFACE_NODES, drawn.size)
+        loop(drawn.heights(), weights, near, places, colors, field)
+        return field
+    surface = drawn.surface()
+    x, y, height = (near * part for part in surface.position)
     # Position of each lamp, shape (B, L, 1, 1) each, so that fields have the shape (B, L, H, W).
     right, down, above = places[..., None, None].unbind(2)
     # No surface is nearer to the lamp than a tenth of its distance.
     offsets = right - x, down - y, torch.maximum(above - height, 0.1 * above)
     squares = torch.addcmul(offsets[0] ** 2 + offsets[1] ** 2, offsets[2], offsets[2])
     cosine = surfaces.lambert(surface.slope_down, surface.slope_right, *offsets)
-    fields = cosine * (squares * squares.sqrt()).reciprocal() * above**2
+    fields = cosine * (squares * squares.sqrt()).reciprocal() * above ** (2 * near)
     return (colors.mT @ fields.flatten(2)).unflatten(2, fields.shape[2:])
 
 
@@ -273,8 +265,8 @@ class PointLight(LightModel):
     def light(self, drawn: Drawn) -> Illumination:
         """Add weak ambient light to the light of the lamp."""
         # Position of the one lamp of each image, shape (B, 1, 3).
-        place = drawn.numbers[1:4, :, :, 0, 0].permute(1, 2, 0)
-        light = lamp_light(drawn.surface(drawn.numbers[0]), place, torch.ones_like(place[..., :1]))
+        place = drawn.rows[:, None, 1:4]
+        light = lamp_light(drawn, place, torch.ones_like(place[..., :1]))
         return Illumination(light, offset=drawn.numbers[4])
 
 
@@ -291,15 +283,14 @@ class ColoredLamps(LightModel):
 
     def light(self, drawn: Drawn) -> Illumination:
         """Add the light of the lamps, of which some are off, to weak ambient light."""
-        surface = drawn.surface(drawn.numbers[0], start=1)
         # Index of the last lamp of each image that is on.
         last = (3 * drawn.constants[:, :1]).floor().clamp(max=2)
         count = int(last.max()) + 1
         # Numbers of each lamp, shape (B, count, 5).
-        lamps = drawn.numbers[1 : 1 + 5 * count, :, 0, 0, 0].T.unflatten(1, (count, 5))
+        lamps = drawn.rows[:, 1 : 1 + 5 * count].unflatten(1, (count, 5))
         colors = patterns.random_colors(lamps[..., 3:].flatten(0, 1)).view(-1, count, 3)
         is_on = torch.arange(count, device=last.device) <= last
-        light = lamp_light(surface, lamps[..., :3], colors * is_on[..., None])
+        light = lamp_light(drawn, lamps[..., :3], colors * is_on[..., None])
         return Illumination(light, offset=drawn.numbers[-2])
 
 
@@ -313,6 +304,14 @@ class LinearLight(LightModel):
 
     ranges = (TURN, Range(0, 0.95), METER)
     has_meter = True
+
+    def illumination(self, drawn: Drawn, strength: float = 1.0) -> Illumination:
+        """Expose the light, whose mean is 1, by a loop that needs no meter."""
+        if loop := loops.ramps(drawn.rows):
+            field, parts = drawn.field(), torch.empty(2, len(drawn.rows), 1)
+            loop(drawn.rows, surfaces.grid(1, drawn.size), strength, field, parts)
+            return Illumination(field, *parts[..., None, None])
+        return super().illumination(drawn, strength)
 
     def light(self, drawn: Drawn) -> Illumination:
         """Compute a ramp with the mean 1 and the minimum 1 − contrast."""
@@ -341,23 +340,14 @@ class FractalLight(LightModel):
         """Blend two random fields of the same variance, and take the exponential."""
         contrast, angle, _ = drawn.numbers
         # Normal numbers at the nodes of all octaves, shape (B, all nodes).
-        blended = blend(drawn.constants, angle)[..., 0, 0]
-        nodes = blended @ _sum_of_octaves(self.octaves, angle.device, angle.dtype)
+        blended = surfaces.blend(drawn.constants, angle)[..., 0, 0]
+        nodes = blended @ surfaces.sum_of_octaves(self.octaves, angle.device, angle.dtype)
         nodes = contrast * nodes.view(-1, 1, self.octaves[-1], self.octaves[-1])
         return Illumination(surfaces.smooth(nodes, drawn.size).exp())
 
 
-@lru_cache(maxsize=8)
-@torch.inference_mode(False)
-def _sum_of_octaves(
-    octaves: Sequence[int], device: torch.device, dtype: torch.dtype
-) -> Float[Tensor, "E nodes"]:
-    """Return the matrix that adds the nodes of all octaves at the nodes of the last one."""
-    # Each octave is interpolated at the nodes of the last one, along rows and along columns.
-    parts = [
-        surfaces.spline(count, octaves[-1], 0.0, "bicubic", device, dtype) for count in octaves
-    ]
-    return torch.cat([0.5**i * torch.kron(part, part).T for i, part in enumerate(parts)])
+# Kinds of cast shadows, in the order of the numbers in `loops.shadows`.
+SHADOWS = ("polygon", "leaves", "blinds", "window")
 
 
 @dataclass(frozen=True)
@@ -369,7 +359,7 @@ class CastShadow(LightModel):
     "polygon", "leaves", "blinds" and "window".
     """
 
-    kinds: tuple[str, ...] = ("polygon", "leaves", "blinds", "window")
+    kinds: tuple[str, ...] = SHADOWS
     corners: ClassVar[int] = 4
     nodes: ClassVar[int] = 9
     # Position, turn and scale of the shape, radius of the penumbra, and amount and blueness of the
@@ -386,7 +376,7 @@ class CastShadow(LightModel):
 
     def __post_init__(self) -> None:
         for kind in errors.as_list("kinds", self.kinds, str, "a list of names"):
-            errors.require_choice("kinds", kind, ("polygon", "leaves", "blinds", "window"))
+            errors.require_choice("kinds", kind, SHADOWS)
         if not self.kinds:
             raise InputError("kinds is empty: name at least one kind of shadow")
 
@@ -395,15 +385,24 @@ class CastShadow(LightModel):
         # Uniform numbers are less than 1, but their product with the count is rounded.
         last = len(self.kinds) - 1
         kinds = [min(int(each * (last + 1)), last) for each in drawn.constants[:, 0].tolist()]
+        if loop := loops.shadows(drawn.rows):
+            indices = np.array([SHADOWS.index(self.kinds[kind]) for kind in kinds])
+            field, parts = drawn.field(), torch.empty(2, len(kinds), 3)
+            # Only leaves have heights.
+            heights = drawn.constants
+            if 1 in indices:
+                heights = surfaces.blend(heights[:, 1:], drawn.numbers[2])[..., 0, 0]
+            weights = surfaces.grid(self.nodes, drawn.size)
+            loop(indices, drawn.rows, drawn.constants, heights, weights, field, parts)
+            return Illumination(field, *parts[..., None, None])
 
         def segment(kind: int, rows: list[int] | slice) -> Tensor:
-            numbers, constants = drawn.numbers[:, rows], drawn.constants[rows, 1:]
-            part = drawn._replace(numbers=numbers, constants=constants)
+            part = drawn._replace(rows=drawn.rows[rows], constants=drawn.constants[rows, 1:])
             return self._segment(self.kinds[kind], part)
 
         *_, ambient, blue = drawn.numbers
         # Light of the sky in the shadow, relative to that of sun and sky.
-        sky = ambient - ambient * blue * blue.new_tensor([0.5, 0.2, 0.0])[:, None, None]
+        sky = ambient - ambient * blue * blue.new_tensor(loops.SKY)[:, None, None]
         # sky + (1 − sky) · v, where v = 1/2 + segment / π is the visible fraction of the sun.
         return Illumination(patterns.by_kind(kinds, segment), (1 - sky) / math.pi, (1 + sky) / 2)
 
@@ -414,7 +413,7 @@ class CastShadow(LightModel):
         """
         right, down, angle, scale, softness, *_ = drawn.numbers
         if kind == "leaves":
-            nodes = blend(drawn.constants, angle).view(-1, 1, self.nodes, self.nodes)
+            nodes = surfaces.blend(drawn.constants, angle).view(-1, 1, self.nodes, self.nodes)
             # The heights are 0 at the edges between leaves and gaps.
             height = surfaces.smooth(nodes, drawn.size) - right
             slopes = [surfaces.smooth(nodes, drawn.size, slope) for slope in "xy"]
@@ -424,42 +423,35 @@ class CastShadow(LightModel):
         x, y = surfaces.axes(drawn.size, right)
         x, y, scale = (x - right) / softness, (y - down) / softness, scale / softness
         constants = drawn.constants[..., None, None]
-        # `back` is the distance of the edges of a polygon from its center. `limits` are the half
-        # widths of gaps, panes and bars, and the period of blinds.
-        period, back, limits = 1.0, 0.0, [scale] * 3
+        # `back` is the distance of the edges of a polygon from its center. `gap`, `scale`, `high`
+        # and `bar` are half widths, and `period` is that of blinds.
+        period, back = 1.0, 0.0
         index = torch.arange(self.corners, device=scale.device)[:, None, None]
         if kind == "polygon":
             # Each edge has a random direction near that of a regular polygon, and a distance.
             turns, far = constants[:, : 2 * self.corners].chunk(2, 1)
             normal = angle + 2 * math.pi / self.corners * (index + 0.8 * turns)
-            back = scale * between(far, 0.4, 1.0)
+            back = scale * surfaces.between(far, *loops.FAR)
         elif kind == "blinds":
             normal, period = angle + math.pi / 2, scale / 2.5
-            limits[:2] = between(constants[:, :1], 0.15, 0.35), period
+            gap = surfaces.between(constants[:, :1], *loops.GAP)
         else:
             normal = angle + math.pi / 2 * index[:2]
-            high, bar = between(constants[:, :1], 0.6, 1.6), between(constants[:, 1:2], 0.03, 0.12)
-            limits = [scale, scale * high, scale * bar]
+            high = scale * surfaces.between(constants[:, :1], *loops.HIGH)
+            bar = scale * surfaces.between(constants[:, 1:2], *loops.BAR)
         # Distances of each column, and of each row, along the normals of the shape.
         columns, rows = normal.cos() * x / period, (normal.sin() * y - back) / period
-        if loop := loops.edges(columns):
-            distance = columns.new_empty(len(columns), *height_and_width(drawn.size))
-            of_kind = ("polygon", "blinds", "window").index(kind)
-            loop(of_kind, columns[:, :, 0], rows[..., 0], torch.cat(limits, 1)[..., 0, 0], distance)
-            return surfaces.circle_segment(distance[:, None])
         edges = columns + rows
         if kind == "polygon":
             # Outside a convex polygon. The distance is exact except near corners.
             return surfaces.circle_segment(edges.amax(1, keepdim=True))
         if kind == "blinds":
             # Inside the gaps between parallel slats, with a period of 0.4 in units of the scale.
-            return surfaces.circle_segment(
-                (limits[0] - (patterns.fraction(edges) - 0.5).abs()) * period
-            )
+            return surfaces.circle_segment((gap - (patterns.fraction(edges) - 0.5).abs()) * period)
         # Inside the panes of a window with a cross bar.
         p, q = edges.abs().split(1, 1)
-        inside = torch.minimum(limits[0] - p, limits[1] - q)
-        return surfaces.circle_segment(torch.minimum(inside, torch.minimum(p, q) - limits[2]))
+        inside = torch.minimum(scale - p, high - q)
+        return surfaces.circle_segment(torch.minimum(inside, torch.minimum(p, q) - bar))
 
 
 @dataclass(frozen=True)
@@ -480,7 +472,9 @@ class ColorTemperature(LightModel):
         lamp, balance, tint = drawn.numbers
         # The camera assumes a color between that of D65 (6504 K) and that of the lamp.
         assumed = 1 / 6504 + balance * (lamp - 1 / 6504)
-        color = planckian_rgb(1 / lamp, tint) / planckian_rgb(1 / assumed)
+        kelvin = 1 / torch.stack([lamp, assumed])
+        light, white = planckian_rgb(kelvin, torch.stack([tint, 0 * tint]))
+        color = light / white
         return Illumination(torch.ones_like(lamp), color / patterns.luminance(color))
 
 

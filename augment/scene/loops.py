@@ -17,6 +17,15 @@ from torch import Tensor
 
 # Linear values are looked up in so many bins. Each has at most one limit between two bytes.
 BINS = 4096
+# Bits of the position of a linear value in its bin.
+BIN_BITS = 16
+# Power of 2 above the number of cells of a slide. Distances to the centers of cells are multiples
+# of it, to which the index of the cell is added.
+CELL_CODE = 32
+# Types of arrays: a field (B, C, H, W), numbers of each image, and what `grid` returns.
+FIELD = "float32[:,:,:,::1]"
+ROWS = "float32[:,::1]"
+GRID = f"Tuple((float32[::1], float32[::1], {', '.join(4 * [ROWS])}))"
 
 
 def _loop(
@@ -39,6 +48,8 @@ def _loop(
             vectorize = settings.LOOP_VECTORIZE
             # Vector instructions that look up a table are slower than single ones.
             settings.LOOP_VECTORIZE = int(vectorize and not uses_tables)
+            for helper in (_between, _segment, _interpolate):
+                numba.extending.register_jitable(fastmath=True)(helper)
             # Bytes are equal to those of torch, and light is to rounding.
             njit: Any = partial(
                 numba.njit,
@@ -70,40 +81,33 @@ def _loop(
 
 def _as_array(value: Any) -> Any:
     """Return a tensor as an array, and anything else as it is."""
-    return value.contiguous().numpy() if isinstance(value, Tensor) else value
+    return np.ascontiguousarray(value.numpy()) if isinstance(value, Tensor) else value
 
 
 @_loop(
-    "uint8[:,:,::1], float32[:,:,::1], float32[:,::1], float32[:,::1], float32[::1], uint8[::1],"
-    "float32[::1], uint8[:,:,::1]",
+    f"uint8[:,:,:,::1], {FIELD}, {ROWS}, {ROWS}, float32[::1], int32[::1], uint8[:,:,:,::1]",
     uses_tables=True,
 )
 def relit_bytes(
-    colors: Any, field: Any, gain: Any, offset: Any, decoded: Any, lowest: Any, limit: Any, out: Any
+    colors: Any, field: Any, gain: Any, offset: Any, decoded: Any, carry: Any, out: Any
 ) -> None:
     """Multiply the linear values of bytes by light, and look up the nearest bytes."""
-    one, bins = np.float32(1), np.float32(BINS)
-    pixels = colors.shape[2]
+    most = np.float32(BINS << BIN_BITS)
     for image in range(len(colors)):
         for channel in range(colors.shape[1]):
-            given, shown = colors[image, channel], out[image, channel]
+            given, shown = colors[image, channel].ravel(), out[image, channel].ravel()
             # A field of one value or of one channel stands for all.
-            row = field[image, min(channel, field.shape[1] - 1)]
+            row = field[image, min(channel, field.shape[1] - 1)].ravel()
             factor, added = gain[image, channel], offset[image, channel]
-            step = 1 if len(row) == pixels else 0
-            for pixel in range(pixels):
+            step = 1 if len(row) == len(given) else 0
+            for pixel in range(len(given)):
                 light = factor * row[pixel * step] + added
-                value = min(decoded[given[pixel]] * light, one)
                 # Unsigned indices need no check for negative ones.
-                index = np.uint32(np.int32(value * bins))
-                shown[pixel] = lowest[index] + (value >= limit[index])
+                value = np.uint32(np.int32(min(decoded[given[pixel]] * light, most)))
+                shown[pixel] = (np.int32(value) + carry[value >> BIN_BITS]) >> BIN_BITS
 
 
-@_loop(
-    "uint8[:,::1], float32[:,::1], float32[:,::1], float32[:,::1], float32[:,::1], uint8[::1],"
-    "uint8[:,::1]",
-    uses_tables=True,
-)
+@_loop(f"uint8[:,::1], {ROWS}, {ROWS}, {ROWS}, {ROWS}, uint8[::1], uint8[:,::1]", uses_tables=True)
 def noisy_bytes(
     colors: Any, z: Any, middle: Any, slope: Any, curve: Any, encoded: Any, out: Any
 ) -> None:
@@ -118,103 +122,166 @@ def noisy_bytes(
             out[image, pixel] = encoded[np.uint32(np.int32(np.rint(signal)))]
 
 
-@_loop("int64, float32[:,:,::1], float32[:,:,::1], float32[:,::1], float32[:,:,::1]")
-def edges(kind: int, columns: Any, rows: Any, limits: Any, out: Any) -> None:
-    """Compute the distance of each pixel to the nearest edge of a shadow."""
-    # Kind 0 is a polygon, 1 are blinds, and 2 is a window (see `CastShadow`).
-    half = np.float32(0.5)
-    for image, row in np.ndindex(out.shape[:2]):
-        across, down, distance = columns[image, 0], rows[image, 0, row], out[image, row]
-        first, second, third = limits[image]
-        if kind == 0:
-            distance[:] = np.float32(-1)
-            for edge in range(columns.shape[1]):
-                across, down = columns[image, edge], rows[image, edge, row]
-                for column in range(len(across)):
-                    distance[column] = max(distance[column], across[column] + down)
-        elif kind == 1:
-            for column in range(len(across)):
-                t = across[column] + down
-                distance[column] = (first - abs(t - np.floor(t) - half)) * second
-        else:
-            other, lower = columns[image, 1], rows[image, 1, row]
-            for column in range(len(across)):
-                p, q = abs(across[column] + down), abs(other[column] + lower)
-                distance[column] = min(min(first - p, second - q), min(p, q) - third)
-
-
+# Numbers of 32 bits, with which loops compute.
+ZERO, HALF, ONE, PI = map(np.float32, (0, 0.5, 1, math.pi))
 # With u = 1 - |t|, π/2 - |t √(1 − t²) + asin t| is u √u times this polynomial, within 3e-6.
 SEGMENT = np.array([1.8856159, -0.28273824, -0.02603879, -0.00292429, -0.00311553], np.float32)
+# Coefficients of the exponential of numbers in [-0.7, 0.7], within 2e-6.
+EXPONENTIAL = np.array([1 / math.factorial(power) for power in range(8)], np.float32)
+# Smallest and largest fraction of a gap between blinds, height of a window, width of its bar, and
+# distance of the edge of a polygon.
+GAP, HIGH, BAR, FAR = (0.15, 0.35), (0.6, 1.6), (0.03, 0.12), (0.4, 1.0)
+# Fractions of the light of the sky that its blueness takes from the channels.
+SKY = (0.5, 0.2, 0.0)
 
 
-@_loop("float32[::1], float32[::1]")
-def segment(distance: Any, out: Any) -> None:
-    """Compute t √(1 − t²) + asin t for distances, which are clamped to [-1, 1]."""
-    zero, one, most = np.float32(0), np.float32(1), np.float32(math.pi / 2)
+def _between(number: Any, ends: Any) -> Any:
+    """Map a number in [0, 1] to an interval."""
+    return np.float32(ends[0]) + np.float32(ends[1] - ends[0]) * number
+
+
+def _segment(t: Any) -> Any:
+    """Return t √(1 − t²) + asin t for a distance, which is clamped to [-1, 1]."""
     a, b, c, d, e = SEGMENT
-    for pixel in range(len(out)):
-        t = distance[pixel]
-        u = max(one - abs(t), zero)
-        part = most - u * np.sqrt(u) * (a + u * (b + u * (c + u * (d + u * e))))
-        out[pixel] = part if t > zero else -part
+    u = max(ONE - abs(t), ZERO)
+    part = HALF * PI - u * np.sqrt(u) * (a + u * (b + u * (c + u * (d + u * e))))
+    return part if t > ZERO else -part
 
 
-@_loop(
-    "float32[:,:,::1], float32[:,:,::1], float32[:,:,::1], float32[::1], float32[::1],"
-    "float32[:,:,::1], float32[:,:,::1], float32[:,:,:,::1]"
-)
-def lamps(
-    slope_down: Any,
-    slope_right: Any,
-    heights: Any,
-    x: Any,
-    y: Any,
-    places: Any,
-    colors: Any,
-    out: Any,
+def _interpolate(nodes: Any, weights: Any, columns: Any, out: Any) -> None:
+    """Interpolate nodes along a row of pixels, by weights of the rows and columns of nodes."""
+    out[:] = ZERO
+    for column in range(len(columns)):
+        node = ZERO
+        for row in range(len(weights)):
+            node += weights[row] * nodes[row, column]
+        for pixel in range(len(out)):
+            out[pixel] += node * columns[column, pixel]
+
+
+@_loop(f"{ROWS}, {GRID}, float32, {FIELD}, float32[:,:,::1]")
+def ramps(numbers: Any, grid: Any, strength: Any, field: Any, parts: Any) -> None:
+    """Compute ramps, and their gains and offsets (see `LinearLight`)."""
+    x, y = grid[:2]
+    for image in range(len(field)):
+        turn, contrast, stops = numbers[image]
+        right, down, exposure = math.cos(turn), math.sin(turn), np.exp2(strength * stops)
+        corner = abs(right) + np.float32(len(y) / len(x)) * abs(down)
+        parts[0, image], parts[1, image] = strength * exposure * contrast / corner, exposure
+        for row in range(len(y)):
+            for column in range(len(x)):
+                field[image, 0, row, column] = right * x[column] + down * y[row]
+
+
+@_loop(f"int64[::1], {ROWS}, {ROWS}, {ROWS}, {GRID}, {FIELD}, float32[:,:,::1]")
+def shadows(
+    kinds: Any, numbers: Any, constants: Any, heights: Any, grid: Any, field: Any, parts: Any
 ) -> None:
-    """Add up the irradiance of small lamps, cos / distance², times their squared heights."""
-    zero, one = np.float32(0), np.float32(1)
-    field = np.empty(len(x), np.float32)
+    """Compute cast shadows of polygons (kind 0), leaves (1), blinds (2) and windows (3)."""
+    x, y, rows, row_slopes, columns, column_slopes = grid
+    across, along, edges = np.empty_like(x), np.empty_like(x), np.empty((4, 3), np.float32)
+    for image in range(len(field)):
+        kind, chosen = kinds[image], constants[image, 1:]
+        left, top, angle, scale, radius, ambient, blue = numbers[image]
+        scale /= radius
+        for channel in range(3):
+            sky = ambient - ambient * blue * np.float32(SKY[channel])
+            parts[0, image, channel], parts[1, image, channel] = (ONE - sky) / PI, HALF + HALF * sky
+        # Normal of each edge, in units of the radius, and its distance from the center.
+        for edge in range(4):
+            shift = np.float32(0.8) * chosen[edge] if kind == 0 else np.float32(kind == 2)
+            turn = angle + HALF * PI * (np.float32(edge) + shift)
+            edges[edge, 0], edges[edge, 1] = math.cos(turn) / radius, math.sin(turn) / radius
+            edges[edge, 2] = scale * _between(chosen[4 + edge], FAR)
+        period, gap = scale / np.float32(2.5), _between(chosen[0], GAP)
+        high, bar = scale * _between(chosen[0], HIGH), scale * _between(chosen[1], BAR)
+        for row in range(len(y)):
+            distance, below = field[image, 0, row], y[row] - top
+            if kind == 0:
+                distance[:] = -ONE
+                for edge in range(4):
+                    right, down, far = edges[edge]
+                    for pixel in range(len(x)):
+                        height = right * (x[pixel] - left) + (down * below - far)
+                        distance[pixel] = max(distance[pixel], height)
+            elif kind == 1:
+                nodes = heights[image].reshape(len(columns), len(columns))
+                _interpolate(nodes, rows[row], columns, distance)
+                _interpolate(nodes, rows[row], column_slopes, across)
+                _interpolate(nodes, row_slopes[row], columns, along)
+                for pixel in range(len(x)):
+                    squares = across[pixel] * across[pixel] + along[pixel] * along[pixel]
+                    length = radius * np.sqrt(squares + np.float32(1e-6))
+                    distance[pixel] = (distance[pixel] - left) / length
+            else:
+                for pixel in range(len(x)):
+                    p = edges[0, 0] * (x[pixel] - left) + edges[0, 1] * below
+                    q = edges[1, 0] * (x[pixel] - left) + edges[1, 1] * below
+                    if kind == 2:
+                        t = p / period
+                        distance[pixel] = (gap - abs(t - np.floor(t) - HALF)) * period
+                    else:
+                        p, q = abs(p), abs(q)
+                        distance[pixel] = min(min(scale - p, high - q), min(p, q) - bar)
+            for pixel in range(len(x)):
+                distance[pixel] = _segment(distance[pixel])
+
+
+@_loop(f"{ROWS}, {GRID}, float32, float32[:,:,::1], float32[:,:,::1], {FIELD}")
+def lamps(heights: Any, grid: Any, near: Any, places: Any, colors: Any, out: Any) -> None:
+    """Add up cos / distance² of small lamps, times their squared heights. Far lamps are at 0."""
+    x, y, rows, row_slopes, columns, column_slopes = grid
+    # Parts of one array would keep the compiler from vector instructions, as they might overlap.
+    height, field, across, along = [np.empty_like(x) for _ in range(4)]
     for image, row in np.ndindex(len(out), len(y)):
-        # The slope to the right comes first, as x does.
-        slopes, height = (slope_right[image, row], slope_down[image, row]), heights[image, row]
-        out[image, :, row] = zero
+        nodes = heights[image].reshape(len(columns), len(columns))
+        _interpolate(nodes, rows[row], columns, height)
+        _interpolate(nodes, rows[row], column_slopes, across)
+        _interpolate(nodes, row_slopes[row], columns, along)
+        out[image, :, row] = ZERO
         for lamp in range(places.shape[1]):
             right, down, above = places[image, lamp]
-            dy = down - y[row]
-            for column in range(len(x)):
-                dx, dz = right - x[column], max(above - height[column], np.float32(0.1) * above)
-                across, along = slopes[0][column], slopes[1][column]
+            dy, power = down - near * y[row], above * above if near else ONE
+            for pixel in range(len(x)):
+                dx = right - near * x[pixel]
+                # No surface is nearer to the lamp than a tenth of its distance.
+                dz = max(above - near * height[pixel], np.float32(0.1) * above)
                 squares = dx * dx + dy * dy + dz * dz
                 # Vector to the lamp times the normal (−across, −along, 1), before normalization.
-                dot = max(dz - dx * across - dy * along, zero) * (above * above)
-                length = one + across * across + along * along
-                field[column] = dot / (squares * np.sqrt(squares * length))
+                dot = max(dz - dx * across[pixel] - dy * along[pixel], ZERO) * power
+                length = ONE + across[pixel] * across[pixel] + along[pixel] * along[pixel]
+                field[pixel] = dot / (squares * np.sqrt(squares * length))
             for channel in range(out.shape[1]):
                 shown, color = out[image, channel, row], colors[image, lamp, channel]
-                for column in range(len(field)):
-                    shown[column] += color * field[column]
+                for pixel in range(len(x)):
+                    shown[pixel] += color * field[pixel]
 
 
-@_loop("float32[:,::1], float32[:,::1], float32[:,::1], float32[:,::1]")
-def cosines(slope_down: Any, slope_right: Any, towards: Any, out: Any) -> None:
-    """Compute the cosine between the normal of each pixel and a direction, at least 0."""
-    zero, one = np.float32(0), np.float32(1)
-    for image in range(len(out)):
-        right, down, up = towards[image]
-        along, across, field = slope_down[image], slope_right[image], out[image]
-        for pixel in range(len(field)):
-            length = one + across[pixel] * across[pixel] + along[pixel] * along[pixel]
-            dot = up - right * across[pixel] - down * along[pixel]
-            field[pixel] = max(dot, zero) / np.sqrt(length)
+@_loop(f"{FIELD}, {GRID}, {FIELD}, {FIELD}")
+def multiply_slides(log_gain: Any, grid: Any, shading: Any, slides: Any) -> None:
+    """Multiply slides by their shading and by the exponential of interpolated logarithms."""
+    x, _, rows, _, columns, _ = grid
+    gain = np.empty_like(x)
+    for image, channel, row in np.ndindex(slides.shape[:3]):
+        _interpolate(log_gain[image, channel], rows[row], columns, gain)
+        shown, shade = slides[image, channel, row], shading[image, 0, row]
+        for pixel in range(len(shown)):
+            factor = EXPONENTIAL[7]
+            for power in range(6, -1, -1):
+                factor = factor * gain[pixel] + EXPONENTIAL[power]
+            shown[pixel] *= factor * shade[pixel]
 
 
-@_loop("int32[:,::1], int32[:,::1], int32[:,::1]")
-def lowest_sums(columns: Any, rows: Any, out: Any) -> None:
-    """Compute the lowest sum of the numbers of a column and of a row."""
-    for row in range(len(out)):
-        out[row] = 2**31 - 1
+@_loop("int32[:,::1], int32[:,::1], float32[:,::1], float32[:,:,::1]")
+def draw_cells(columns: Any, rows: Any, colors: Any, out: Any) -> None:
+    """Draw the colors of cells, by the lowest sum of the numbers of a column and of a row."""
+    lowest = np.empty(out.shape[2], np.int32)
+    for row in range(out.shape[1]):
+        lowest[:] = 2**31 - 1
         for cell in range(len(columns)):
-            for column in range(out.shape[1]):
-                out[row, column] = min(out[row, column], columns[cell, column] + rows[cell, row])
+            for column in range(len(lowest)):
+                lowest[column] = min(lowest[column], columns[cell, column] + rows[cell, row])
+        for column in range(len(lowest)):
+            cell = lowest[column] & (CELL_CODE - 1)
+            for channel in range(3):
+                out[channel, row, column] = colors[channel, cell]

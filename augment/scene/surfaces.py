@@ -6,15 +6,16 @@ The image is 2 units wide: x points to the right, y down, and heights towards th
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from augment.scene import loops
 from renderer.settings import Size, height_and_width
 
 # A random smooth surface interpolates random heights at a grid of this number of points per side.
@@ -26,6 +27,22 @@ MAX_STEEPNESS = 0.3
 MAX_POLAR = 60.0
 # Horizontal field of view in degrees of the camera that a depth map is from.
 FIELD_OF_VIEW = 60.0
+
+
+def between(numbers: Tensor, low: float, high: float) -> Tensor:
+    """Map numbers in [0, 1] to an interval."""
+    return low + (high - low) * numbers
+
+
+def normal_numbers(uniform: Float[Tensor, " *S"]) -> Float[Tensor, " *S"]:
+    """Convert uniform numbers to standard normal ones."""
+    return 2**0.5 * torch.erfinv(2 * uniform.clamp(1e-6, 1 - 1e-6) - 1)
+
+
+def blend(uniform: Float[Tensor, "B E"], angle: Float[Tensor, "B 1 1 1"]) -> Tensor:
+    """Blend both halves of uniform numbers to normal ones, of equal variance at any angle."""
+    first, second = normal_numbers(uniform)[..., None, None].chunk(2, 1)
+    return angle.cos() * first + angle.sin() * second
 
 
 @lru_cache(maxsize=64)
@@ -65,6 +82,21 @@ def spline(
     return matrix.to(device, dtype).contiguous()
 
 
+@lru_cache(maxsize=64)
+def grid(nodes: int, size: Size, mode: str = "bicubic") -> tuple[np.ndarray, ...]:
+    """Return x, y, weights of nodes (H, n) and (n, W), and those of slopes, in this order."""
+    height, width = height_and_width(size)
+    kind = torch.device("cpu"), torch.float32
+    x, y = (axis.flatten().numpy() for axis in _axes(height, width, *kind))
+    rows, row_slopes, columns, column_slopes = (
+        spline(nodes, pixels, spacing, mode, *kind).numpy()
+        for pixels in (height, width)
+        for spacing in (0.0, 2 / width)
+    )
+    columns, column_slopes = (np.ascontiguousarray(part.T) for part in (columns, column_slopes))
+    return x, y, rows, row_slopes, columns, column_slopes
+
+
 def smooth(
     nodes: Float[Tensor, "B C n n"], size: Size, slope: str = "", mode: str = "bicubic"
 ) -> Float[Tensor, "B C H W"]:
@@ -81,6 +113,17 @@ def smooth(
     to_rows = spline(count, height, 2 / width if slope == "y" else 0.0, *kind)
     to_columns = spline(count, width, 2 / width if slope == "x" else 0.0, *kind)
     return to_rows @ nodes @ to_columns.T
+
+
+@lru_cache(maxsize=8)
+@torch.inference_mode(False)
+def sum_of_octaves(
+    octaves: Sequence[int], device: torch.device, dtype: torch.dtype
+) -> Float[Tensor, "E nodes"]:
+    """Return the matrix that adds the nodes of all octaves at the nodes of the last one."""
+    # Each octave is interpolated at the nodes of the last one, along rows and along columns.
+    parts = [spline(count, octaves[-1], 0.0, "bicubic", device, dtype) for count in octaves]
+    return torch.cat([0.5**i * torch.kron(part, part).T for i, part in enumerate(parts)])
 
 
 class Surface(NamedTuple):
@@ -155,9 +198,5 @@ def circle_segment(distance: Tensor) -> Tensor:
     A straight edge at a distance, in units of the radius, leaves the fraction 1/2 + segment / π of
     a uniform disc visible. The distance is positive if the center is visible.
     """
-    if loop := loops.segment(distance):
-        segment = distance.new_empty(distance.shape)
-        loop(distance.flatten(), segment.flatten())
-        return segment
     t = distance.clamp(-1 + 1e-6, 1 - 1e-6)
     return torch.addcmul(torch.asin(t), t, torch.addcmul(t.new_ones(()), t, t, value=-1).sqrt())

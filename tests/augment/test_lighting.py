@@ -253,20 +253,33 @@ def test_the_loop_of_numba_equals_the_operations_of_torch(monkeypatch):
     assert torch.equal(lighting.relit_bytes(colors, light), expected)
 
 
-LOOPS = ("relit_bytes", "noisy_bytes", "edges", "segment", "lamps", "cosines", "lowest_sums")
+LOOPS = ("relit_bytes", "noisy_bytes", "ramps", "shadows", "lamps", "multiply_slides")
+LOOPS += ("draw_cells",)
 
 
-@pytest.mark.parametrize(
-    "name", [*lights.CastShadow().kinds, "point", "lamps", "directional", "projected_slide"]
-)
+@pytest.mark.parametrize("name", [*lights.CastShadow().kinds, *MODELS])
 def test_the_light_of_the_loops_equals_that_of_torch(name, monkeypatch):
     pytest.importorskip("numba")
     model = MODELS[name]() if name in MODELS else lights.CastShadow((name,))
     drawn = model.draw(draw_values(model, 3), (33, 65), seeds=[0, 1, 2])
-    light = model.illumination(drawn).total()
+    lit, mixed = model.illumination(drawn).total(), model.illumination(drawn, 0.3).total()
     for loop in LOOPS:
         monkeypatch.setattr(loops, loop, lambda *_: None)
-    torch.testing.assert_close(light, model.illumination(drawn).total(), atol=1e-4, rtol=1e-4)
+    for strength, light in ((1.0, lit), (0.3, mixed)):
+        expected = model.illumination(drawn, strength).total()
+        torch.testing.assert_close(light, expected.expand_as(light), atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_images_that_loops_relight_are_those_of_torch(name, monkeypatch):
+    pytest.importorskip("numba")
+    images = picture(20, 3, 33, 65)
+    params = (transform := nb.RandomLighting(name)).make_params([images])
+    relit = transform.apply(images, params).int()
+    for loop in LOOPS:
+        monkeypatch.setattr(loops, loop, lambda *_: None)
+    difference = (relit - transform.apply(images, params)).abs()
+    assert difference.max() <= 1 and (difference == 0).float().mean() > 0.999
 
 
 def test_noisy_bytes_of_the_loop_equal_those_of_torch(monkeypatch):
