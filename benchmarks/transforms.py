@@ -5,7 +5,7 @@
 
 Images have 256 × 256 pixels of 8 bits. Each gets a light of its own. Kornia gets the same images as
 32-bit numbers in [0, 1], as its transforms need. The transforms take turns, and the table has
-medians over the rounds. Seconds are those in which the thread runs.
+medians and quartiles over the rounds. Seconds are those in which the thread runs.
 """
 
 import argparse
@@ -38,6 +38,12 @@ def measure(call: Callable[[], object], repeats: int) -> float:
     return repeats / (time.thread_time() - start)
 
 
+def quartiles(values: list[float], decimals: int) -> str:
+    """Return the median and the quartiles of values as text."""
+    first, median, third = (f"{value:.{decimals}f}" for value in statistics.quantiles(values, n=4))
+    return f"{median} [{first}, {third}]"
+
+
 def transforms(size: int) -> dict[str, Callable[[], object]]:
     """Return a call of each transform for one image, by its name."""
     image = torch.randint(0, 256, (3, size, size), dtype=torch.uint8)
@@ -67,7 +73,7 @@ def transforms(size: int) -> dict[str, Callable[[], object]]:
 
 
 def main() -> None:
-    """Print the medians, and the ratio to the faster counterpart."""
+    """Print medians and quartiles of the rates, and of the ratio to the faster counterpart."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -88,7 +94,8 @@ def main() -> None:
         for name, call in calls.items():
             rates[name].append(measure(call, options.repeats))
     print(
-        f"version {nb.__version__}, torch {torch.__version__}\n\n| transform | images/s | ratio |"
+        f"version {nb.__version__}, torch {torch.__version__}, load average "
+        f"{os.getloadavg()[0]:.1f}\n\n| transform | images/s | ratio |"
     )
     print("|-|-|-|")
     for name, values in rates.items():
@@ -102,8 +109,8 @@ def main() -> None:
         if rivals:
             # Rounds are compared one by one, because other programs share the machine.
             pairs = zip(values, max(rivals, key=statistics.median), strict=True)
-            ratio = f"{statistics.median(ours / theirs for ours, theirs in pairs):.2f}"
-        print(f"| {name} | {statistics.median(values):.0f} | {ratio} |")
+            ratio = quartiles([ours / theirs for ours, theirs in pairs], 2)
+        print(f"| {name} | {quartiles(values, 0)} | {ratio} |")
 
 
 if __name__ == "__main__":
