@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import pytest
@@ -14,21 +13,19 @@ import renderer
 from augment.progress import Phases
 from renderer import harmonics, skylight
 from renderer.camera import Camera
-from tests.helpers import bright_or_dark
-from tests.tetrahedron import CAMERA, IMAGES, LAMP, LIGHT, MESH, SIZE, render
+from tests.tetrahedron import (
+    CLASSIFIER,
+    IMAGES,
+    LAMP,
+    LIGHT,
+    MESH,
+    SIZE,
+    operator,
+    render,
+    small_scene,
+)
 
 LABELS = torch.tensor([1, 0])
-CLASSIFIER = augment.Classifier(bright_or_dark, SIZE, ["orange", "other"])
-
-
-@cache
-def operator() -> renderer.TransferOperator:
-    return renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)
-
-
-@cache
-def small_scene() -> augment.Scene:
-    return augment.build_scene([(MESH, "orange")], SIZE, views=2, light="uniform", samples=1)
 
 
 def render_scene(scene: augment.Scene) -> Tensor:

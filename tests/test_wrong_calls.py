@@ -27,7 +27,18 @@ from renderer.errors import describe
 from renderer.light.lamps import Lamps, Projector
 from tests.detectors import BrightBox
 from tests.helpers import bright_or_dark
-from tests.tetrahedron import CAMERA, IMAGES, LAMP, LIGHT, MESH, SIZE, render
+from tests.tetrahedron import (
+    CAMERA,
+    CLASSIFIER,
+    IMAGES,
+    LAMP,
+    LIGHT,
+    MESH,
+    SIZE,
+    operator,
+    render,
+    small_scene,
+)
 from train import load_run
 from train.commands.evaluate import evaluate
 
@@ -42,24 +53,13 @@ def probabilities(images: Tensor) -> Tensor:
     return bright_or_dark(images).softmax(1)
 
 
-CLASSIFIER = augment.Classifier(bright_or_dark, SIZE, CLASSES)
 LINEAR = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 2)).eval()
-
-
-@cache
-def small_scene() -> augment.Scene:
-    return augment.build_scene([(MESH, "orange")], SIZE, views=2, light="uniform", samples=1)
 
 
 @cache
 def small_result() -> AttackResult:
     settings = augment.AttackSettings(lighting=augment.StepSettings("l2", 1.0), max_steps=1)
     return augment.attack(CLASSIFIER, small_scene(), settings=settings, force=True)
-
-
-@cache
-def operator() -> renderer.TransferOperator:
-    return renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)
 
 
 def small_service(label: Any = 0, **options: Any) -> augment.AugmentationService:

@@ -12,8 +12,6 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 import norm_balls as nb
-from renderer.io.meshes import load_mesh
-from renderer.light.files import load_light
 from renderer.visibility import choose
 from tests.helpers import find_red
 from train.commands.attack import format_reloaded
@@ -70,23 +68,6 @@ def test_an_attack_prints_what_it_attacked_writes_its_files_and_records_its_sett
     assert written == {"attack.jsonl", "example_000.png", "example_000"}
     paths = (folder / "example_000").rglob("*.*")
     assert {str(path.relative_to(folder / "example_000")) for path in paths} == ADVERSARY_FILES
-
-
-@pytest.mark.slow
-def test_files_of_an_attack_are_meshes_and_lights_of_another(run, tmp_path):
-    assert run("attack=lighting+geometry", *WITHOUT_CHECKS) == 0
-    example = tmp_path / "out" / FOLDER_OF_ORANGE / "example_000"
-    light = example / "light.json"
-    shape = example / "mesh.glb"
-    assert load_light(str(light)).shape == (49, 3)
-    assert len(load_mesh(shape).faces) > 0
-    meshes = f"meshes=[{shape},{{mesh: 'solid:orange:0', label: apple}}]"
-    shown = meshes, f"scene.light={light}"
-    assert run("attack=pixels", "out=again", "label=orange", *shown, *WITHOUT_CHECKS) == 0
-    folders = {path.name for path in (tmp_path / "again").iterdir() if path.is_dir()}
-    assert folders == {"0_mesh", "1_solid_orange_0"}
-    (line,) = read_lines(tmp_path / "again" / "1_solid_orange_0" / "attack.jsonl")
-    assert line["label"] == ["apple"]
 
 
 @pytest.mark.slow

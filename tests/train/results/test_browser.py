@@ -14,6 +14,40 @@ from train.command_settings import AuditSettings
 
 pytestmark = pytest.mark.slow
 CLASSES = ("orange", "other")
+# Least contrast of text by WCAG 2.1, level AA, section 1.4.3; and of large text.
+CONTRAST = 4.5
+CONTRAST_OF_LARGE_TEXT = 3.0
+# The lowest contrast of visible text to the page, divided by what its size needs.
+LOWEST_CONTRAST = """([needed, neededIfLarge]) => {
+  const channels = (text) => text.match(/[\\d.]+/g).map(Number);
+  const luminance = (color) => {
+    const linear = color.slice(0, 3).map((value) => {
+      const c = value / 255;
+      return c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4;
+    });
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2];
+  };
+  const background = (element) => {
+    for (let e = element; e; e = e.parentElement) {
+      const color = channels(getComputedStyle(e).backgroundColor);
+      if (color.length === 3 || color[3] > 0) return color;
+    }
+    return [255, 255, 255];
+  };
+  let lowest = Infinity;
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (walker.nextNode()) {
+    const element = walker.currentNode.parentElement;
+    if (!walker.currentNode.data.trim() || !element.checkVisibility()) continue;
+    const style = getComputedStyle(element);
+    const [a, b] = [luminance(channels(style.color)), luminance(background(element))];
+    const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+    const size = parseFloat(style.fontSize);
+    const isLarge = size >= 24 || (size >= 18.66 && style.fontWeight >= 700);
+    lowest = Math.min(lowest, ratio / (isLarge ? neededIfLarge : needed));
+  }
+  return lowest;
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +117,12 @@ def test_details_open_and_the_page_never_scrolls_sideways(view):
         assert item.get_attribute("open") is not None
     assert view.evaluate("document.documentElement.scrollWidth") <= width
     assert view.evaluate("[...document.images].every(image => image.naturalWidth && image.alt)")
+
+
+def test_text_has_the_contrast_of_wcag_aa(view):
+    view.evaluate("document.querySelectorAll('details').forEach(item => { item.open = true })")
+    limits = [CONTRAST, CONTRAST_OF_LARGE_TEXT]
+    assert view.evaluate(LOWEST_CONTRAST, limits) >= 1
 
 
 def test_a_page_with_a_slider_has_at_most_a_megabyte(page):
