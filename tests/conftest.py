@@ -131,6 +131,8 @@ def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
     The command runs within this process, in the temporary folder of the test.
     """
     handlers = logging.root.handlers[:]
+    # Hydra composes the settings a first time to read its mode, which no file sets.
+    monkeypatch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)
 
     def command(name: str, *arguments: str) -> int:
         monkeypatch.chdir(tmp_path)

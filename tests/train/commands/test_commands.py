@@ -68,6 +68,7 @@ class TestEvaluationWithoutALabel:
         self, call, here, capsys, monkeypatch, recorded
     ):
         save_noise(here / "2024" / "fig" / "a.png", np.random.default_rng(0), (64, 64))
+        monkeypatch.setattr("train.results.scoring.write_roc", lambda *_: None)
         if recorded:
             monkeypatch.setattr("train.commands.evaluate.trained_labels", lambda run: ["orange"])
         assert call(*EVALUATE, "out=scores") == 0

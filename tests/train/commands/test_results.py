@@ -90,7 +90,8 @@ def test_every_command_refuses_the_folder_of_another_command_and_leaves_it_as_it
     assert contents(here) == before
 
 
-def test_older_scores_are_replaced_by_overwrite(call, here):
+def test_older_scores_are_replaced_by_overwrite(call, here, monkeypatch):
+    monkeypatch.setattr("train.results.scoring.write_roc", lambda *_: None)
     write_results(here / "out", "evaluate")
     assert call("evaluate", *COMMANDS["evaluate"], "label=fig", "out=out", "overwrite=true") == 0
     assert json.loads((here / "out" / "summary.json").read_text())["label"] == "fig"

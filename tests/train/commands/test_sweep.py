@@ -47,6 +47,7 @@ def run_sweep(tiny_npz) -> Callable[..., int | None]:
         arguments = [*SMALL, f"data.path={tiny_npz}", f"sweep={folder}", *overrides]
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", ["train", "--multirun", *arguments])
+            patch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)
             try:
                 command.main()
             except SystemExit as stop:

@@ -38,6 +38,11 @@ from train.training.run_log import RunLog
 WITHOUT_RENDERS = ("augment=none", "train.epochs=1")
 
 
+@pytest.fixture(autouse=True)
+def no_figure(monkeypatch) -> None:
+    monkeypatch.setattr("train.results.scoring.write_roc", lambda *_: None)
+
+
 def weight_hashes(folder: Path) -> list[str]:
     names = (run_folder.LAST, run_folder.BEST)
     return [content_hash(checkpoints.load(folder / name)["model"]) for name in names]
