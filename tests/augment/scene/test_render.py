@@ -12,14 +12,11 @@ from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.image import decode, encode
 from renderer.mesh import Mesh
-from renderer.operators.build import build_operators
 from renderer.settings import ENCODINGS
 from renderer.solids import solid
-from renderer.visibility import choose
 
 EPS = torch.finfo(torch.float64).eps
 EPS32 = torch.finfo(torch.float32).eps
-RASTERIZER = choose("numpy")
 EVERY = torch.arange(3)
 # Sums of 31 products below 1 are in another order, and the sRGB curve has a slope of 12.92.
 ROUNDING = 13 * 8 * EPS
@@ -29,44 +26,6 @@ def own_lights(scene: Scene) -> Tensor:
     draws = torch.Generator().manual_seed(0)
     offsets = torch.randn(len(scene), 49, 3, generator=draws)
     return scene.lights + 0.01 * offsets.to(scene.lights)
-
-
-def images_of_operators(scene: Scene, lights: Tensor) -> Tensor:
-    item = scene.objects[0]
-    images = []
-    for row, cameras in enumerate(scene.cameras):
-        options = {"albedo_scale": item.albedo_scale, "dtype": lights.dtype}
-        operators = build_operators(item.mesh, cameras, scene.settings, RASTERIZER, **options)
-        background = scene.backgrounds[row]
-        images.append(torch.stack([each.image(lights[row], background) for each in operators]))
-    return torch.stack(images)
-
-
-@pytest.mark.parametrize(
-    ("unchanged", "encoding", "dtype"),
-    [
-        ("light alone", "linear", torch.float32),
-        ("light alone", "srgb", torch.float64),
-        ("vertices", "srgb", torch.float64),
-        ("albedo", "linear", torch.float32),
-    ],
-)
-def test_images_equal_the_operators_of_each_view(make_scene, dtype, encoding, unchanged):
-    """Given vertices and albedo are shaded by other code, even if they are unchanged."""
-    scene = make_scene(dtype=dtype, encoding=encoding, albedo_scale=1.2)
-    lights = own_lights(scene)
-    changes = {
-        "light alone": {},
-        "vertices": {"vertices": scene.vertices.expand(3, -1, -1)},
-        "albedo": {"albedo": torch.zeros(3, 20, 3, dtype=dtype)},
-    }
-    images = scene.render(Conditions(lights, **changes[unchanged]), EVERY)
-    assert images.shape == (3, 2, 3, 6, 6)
-    assert images.dtype == dtype
-    assert 0 < images.min() <= images.max() < 1
-    expected = images_of_operators(scene, lights)
-    rounding = ROUNDING / EPS * torch.finfo(dtype).eps
-    torch.testing.assert_close(images, expected, rtol=0, atol=rounding)
 
 
 SHAPES = {"vertices": (12, 3), "albedo": (20, 3), "pixels": (2, 3, 6, 6)}

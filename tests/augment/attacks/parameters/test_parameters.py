@@ -23,22 +23,16 @@ from augment.tasks.classification import ClassCriterion
 from renderer.camera import orbit_cameras
 from renderer.light.environment import to_map
 from renderer.light.files import directional, mean_luminance
-from renderer.light.harmonics import irradiance_error, nonzero_coefficients
+from renderer.light.harmonics import irradiance_error
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.skylight import ZENITH, coefficients
-from renderer.operators.build import build_operators
 from renderer.settings import TURBIDITY
 
 EPS = torch.finfo(torch.float64).eps
 SKY = (51.6, 22.9, 3.0)  # zenith and azimuth in degrees, turbidity
 EVERY = torch.arange(3)
 FRONT, SIDE, BACK = orbit_cameras(3, 2.2)
-ONE_VIEW = [[FRONT], [SIDE], [BACK]]
 TWO_VIEWS = [[FRONT, SIDE], [SIDE, BACK], [FRONT, BACK]]
-
-# Mask of the coefficients (49,) that do not reach diffuse surfaces.
-IS_WITHOUT_EFFECT = torch.ones(49, dtype=torch.bool)
-IS_WITHOUT_EFFECT[nonzero_coefficients(6)] = False
 
 
 def sky_at(start: tuple[float, float, float], **steps: Any) -> SkylightSettings:
@@ -284,75 +278,6 @@ def test_a_sky_stays_in_its_domain_and_its_ball(
         if radius is not None:
             rounding = 20 * 64 * torch.finfo(dtype).eps
             assert (norms(candidate - center, norm) <= radius + rounding).all()
-
-
-def light_slope(scene: Scene, weight: Tensor) -> Tensor:
-    """Derive weight · images, summed over views, by the light (E, 49, 3) from operators alone."""
-    slope = torch.zeros(len(scene), 49, 3, dtype=weight.dtype)
-    coefficients = nonzero_coefficients(6)
-    for row, cameras in enumerate(scene.cameras):
-        mesh = scene.mesh(row)
-        operators = build_operators(
-            mesh, cameras, scene.settings, scene.rasterizer, dtype=weight.dtype
-        )
-        for operator in operators:
-            transfer = operator.transfer * operator.albedo[:, None]  # (3, K, P)
-            pixel_weights = weight.view(3, -1)[:, operator.pixels]  # (3, P)
-            slope[row, coefficients] += torch.einsum("ckp,cp->kc", transfer, pixel_weights)
-    return slope
-
-
-# Cameras, number of classes, logit of the first class that no pixel changes, target, and dtype.
-LINEAR_CASES = {
-    "one view, untargeted": (ONE_VIEW, 2, 4.0, None, torch.float64),
-    "one view": (ONE_VIEW, 5, 50.0, 1, torch.float32),
-    "two views": (TWO_VIEWS, 5, 50.0, 1, torch.float64),
-}
-BALL_RADIUS = 0.01
-
-
-@pytest.mark.parametrize(
-    ("norm", "step", "step_size", "steps", "case"),
-    [
-        ("linf", "sign", 0.004, 3, "one view, untargeted"),
-        # This step is so long that the smallest derivative reaches its face of the cube too.
-        ("linf", "unit", 1e5, 1, "two views"),
-        ("l2", "unit", 0.004, 3, "one view"),
-        ("l2", "raw", 1e5, 1, "two views"),
-    ],
-)
-def test_the_light_of_the_lowest_cost_of_a_linear_classifier_is_reached(
-    make_scene, make_linear, norm, step, step_size, steps, case
-):
-    """The lowest point of the ball about U₀ is its corner U₀ - r sign(s), or U₀ - r s / |s|."""
-    cameras, class_count, bias, target, dtype = LINEAR_CASES[case]
-    scene = make_scene(cameras=cameras, dtype=dtype)
-    model = make_linear(class_count, bias, dtype=dtype)
-    problem = problem_of(scene, lighting=StepSettings(norm, BALL_RADIUS, step, step_size))
-    result = attack(model, problem, towards(problem, target), steps)
-    assert not result.success.any()
-    assert result.steps.eq(steps).all()
-    assert 0 < result.images.min() <= result.images.max() < 1
-
-    eps = torch.finfo(dtype).eps
-    weight = model[1].weight.detach()
-    slope = light_slope(scene, (weight[0] - weight[1]).double())
-    has_effect = slope.abs() > 100 * eps  # Rounding of the sum of 108 products is smaller.
-    assert torch.equal(has_effect, ~IS_WITHOUT_EFFECT[:, None].expand(3, 49, 3))
-    lights = result.values.unflatten(1, (49, 3))
-    start = scene.lights
-    assert torch.equal(lights[:, IS_WITHOUT_EFFECT], start[:, IS_WITHOUT_EFFECT])
-    if norm == "linf":
-        corner = torch.where(slope > 0, start - BALL_RADIUS, start + BALL_RADIUS)
-        assert torch.equal(lights[has_effect], corner[has_effect])
-        dual_norm = slope.abs().sum((1, 2))
-    else:
-        dual_norm = slope.flatten(1).norm(dim=1)
-        lowest_light = start - BALL_RADIUS * slope / dual_norm[:, None, None]
-        torch.testing.assert_close(lights.double(), lowest_light, rtol=0, atol=16 * eps)
-    if target is not None:  # The cost is the margin itself.
-        lowest_cost = result.cost_before.double() - BALL_RADIUS * dual_norm
-        torch.testing.assert_close(result.cost.double(), lowest_cost, rtol=0, atol=200 * eps)
 
 
 TARGETS_OF_VIEWS = torch.tensor([[1, 2], [2, 1], [1, 1]])
