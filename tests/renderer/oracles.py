@@ -86,6 +86,12 @@ def patchwork(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> Mesh:
     )
 
 
+def textured(mesh: Mesh, uvs: ArrayLike, texture: np.ndarray, texture_ids=0) -> Mesh:
+    """Return a mesh with texture coordinates (F, 3, 2) and a texture, by default on all faces."""
+    ids = np.broadcast_to(np.int32(texture_ids), len(mesh.faces)).copy()
+    return replace(mesh, corner_uvs=np.float32(uvs), texture_ids=ids, textures=(texture,))
+
+
 def mesh_of(shape: trimesh.Trimesh, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
     return Mesh.plain(shape.vertices, shape.faces, color)
 

@@ -103,12 +103,9 @@ class Setup:
         samples = self.settings.samples
         points = self.camera.project(mesh.vertices)
         is_cut_open = bool((points[:, 2] < -1).any())
-        [ids] = self.rasterizer.rasterize(
-            points[None],
-            mesh.faces,
-            self.settings.size * samples,
-            closed=mesh.closed and not is_cut_open,
-        )
+        resolution = self.settings.size * samples
+        closed = mesh.closed and not is_cut_open
+        [ids] = self.rasterizer.rasterize(points[None], mesh.faces, resolution, closed)
         return wide.view(
             ids=ids,
             samples=samples,
@@ -311,14 +308,8 @@ def all_errors(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
 
 def operator_errors(setup, dtype=torch.float32, lost=None) -> Errors:
     """Measure the errors of an operator's image and light gradient, without `lost` radiance."""
-    [operator] = build_operators(
-        setup.mesh,
-        [setup.camera],
-        setup.settings,
-        setup.rasterizer,
-        basis=Harmonics(setup.degree),
-        dtype=dtype,
-    )
+    scene = (setup.mesh, [setup.camera], setup.settings, setup.rasterizer)
+    [operator] = build_operators(*scene, basis=Harmonics(setup.degree), dtype=dtype)
     view = setup.view()
     light = setup.light.to(dtype)
     upstream = random_upstream(len(view.pixels))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import image_of, mesh_of
+from oracles import image_of, mesh_of, textured
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.light.environment import write_map
@@ -67,15 +67,9 @@ def textured_hull() -> Mesh:
     points = rng.normal(size=(12, 3))
     on_sphere = points / np.linalg.norm(points, axis=1, keepdims=True)
     hull = trimesh.convex.convex_hull(on_sphere * [1.0, 0.8, 0.9])
-    face_count = len(hull.faces)
-    uvs = rng.uniform(-0.5, 1.5, (face_count, 3, 2))
+    uvs = rng.uniform(-0.5, 1.5, (len(hull.faces), 3, 2))
     texture = rng.integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    return replace(
-        Mesh.plain(hull.vertices, hull.faces),
-        corner_uvs=uvs.astype(np.float32),
-        texture_ids=np.zeros(face_count, dtype=np.int32),
-        textures=(texture,),
-    )
+    return textured(Mesh.plain(hull.vertices, hull.faces), uvs, texture)
 
 
 def bowl(subdivisions: int = 3) -> Mesh:
@@ -201,7 +195,8 @@ def test_shadows_and_bounces_are_those_of_mitsuba_within_its_noise(
     close where light bounces. If a normal turns away from the camera, Mitsuba takes its other side.
     """
     monkeypatch.setattr(rays, "DIRECTIONS", 2**12)
-    size = 20 if make_mesh is coarse_bowl else 32  # Fewer pixels take less time.
+    # Fewer pixels and rays take less time.
+    size, ray_count = (20, 64) if make_mesh is coarse_bowl else (32, 128)
     plain = ImageSettings(size, 8, normals=normals)
     theirs_settings = replace(plain, bounces=bounces)
     with_shadows = replace(plain, shadows=True)
@@ -209,7 +204,7 @@ def test_shadows_and_bounces_are_those_of_mitsuba_within_its_noise(
         (theirs_settings, with_shadows) if bounces else (with_shadows, plain)
     )
     mesh = make_mesh()
-    theirs = mitsuba_image(tmp_path, mesh, VIEWS[view], theirs_settings, ray_count=128)
+    theirs = mitsuba_image(tmp_path, mesh, VIEWS[view], theirs_settings, ray_count)
     ours = our_image(mesh, VIEWS[view], settings)
     less = our_image(mesh, VIEWS[view], settings_of_less)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import image_of, mesh_of
+from oracles import image_of, mesh_of, textured
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera
@@ -23,20 +23,12 @@ from renderer.visibility import choose
 
 pytest.importorskip("mitsuba")
 drjit = pytest.importorskip("drjit")
+ASIDE = {"roll": 34.0, "center_x": 0.3, "principal_right": 0.3, "principal_up": -0.2}
 CAMERAS = [
     OrthographicCamera(57.3, 126.1, 2.3),
     OrthographicCamera(131.8, 292.2, 2.7, right=0.2, up=-0.1),
     PerspectiveCamera(80.2, 17.2, 2.7, right=0.2, up=-0.1, distance=2.2),
-    PinholeCamera(
-        polar=80.2,
-        azimuth=17.2,
-        width=2.9,
-        distance=3.2,
-        roll=34.0,
-        center_x=0.3,
-        principal_right=0.3,
-        principal_up=-0.2,
-    ),
+    PinholeCamera(80.2, 17.2, 2.9, distance=3.2, **ASIDE),
 ]
 
 
@@ -47,13 +39,9 @@ def ball() -> Mesh:
     is_above = sphere.vertices[sphere.faces].mean(axis=1)[:, 2] > 0
     colors = np.where(is_above[:, None, None], [0.9, 0.8, 0.6], mesh.corner_colors)
     uvs = (sphere.vertices[:, :2] / 2 + 0.5)[sphere.faces]
-    return replace(
-        mesh,
-        corner_uvs=uvs.astype(np.float32),
-        corner_colors=colors.astype(np.float32),
-        texture_ids=np.where(is_above, 0, -1).astype(np.int32),
-        textures=(draws.integers(0, 256, (9, 6, 3), dtype=np.uint8),),
-    )
+    texture = draws.integers(0, 256, (9, 6, 3), dtype=np.uint8)
+    colored = replace(mesh, corner_colors=np.float32(colors))
+    return textured(colored, uvs, texture, np.where(is_above, 0, -1))
 
 
 def can() -> Mesh:
@@ -87,19 +75,19 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, enc
 
 def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
     """Dielectrics agree within 10%, because `principled` has another diffuse part."""
-    textured = normalize(ball())
+    with_texture = normalize(ball())
     light = load_light("st_peters")
     settings = ImageSettings(24, 8)
     gloss_texture = np.random.default_rng(0).integers(100, 255, (9, 6, 2), dtype=np.uint8)
-    metal = replace(Gloss(0.6, metallic=1.0).on(textured), gloss_textures=(gloss_texture,))
-    varnished = Gloss(0.4).on(textured)
+    metal = replace(Gloss(0.6, metallic=1.0).on(with_texture), gloss_textures=(gloss_texture,))
+    varnished = Gloss(0.4).on(with_texture)
     write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
 
     def render(mesh: Mesh) -> Tensor:
         [operator] = build_operators(mesh, CAMERAS[:1], settings, choose("numpy"))
         return image_of(operator, light)[:3]
 
-    matte_image = render(textured)
+    matte_image = render(with_texture)
     for name, mesh, largest_error in (("metal", metal, 0.05), ("varnish", varnished, 0.1)):
         write_mitsuba_scene(tmp_path / name, mesh, 1.0, CAMERAS[:1], settings, "../light.exr")
         [rendered] = render_mitsuba_scene(tmp_path / name / SCENE, 1, (24, 24)).double()

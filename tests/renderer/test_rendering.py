@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw, draw_uniform
+from oracles import draw, draw_uniform, textured
 from torch import Tensor
 
 import renderer
@@ -113,13 +113,9 @@ def test_a_given_albedo_replaces_that_of_the_mesh_and_light_bounces_off_it(
     rng = np.random.default_rng(3)
     if kind == "a texture":
         texture = rng.integers(0, 256, (4, 5, 3)).astype(np.uint8)
-        textured = replace(
-            renderer.Mesh.plain(mesh.vertices, mesh.faces),
-            corner_uvs=rng.random((len(mesh.faces), 3, 2)).astype(np.float32),
-            texture_ids=np.zeros(len(mesh.faces), dtype=np.int32),
-            textures=(texture,),
-        )
-        painted, other = textured, replace(textured, textures=(np.zeros_like(texture),))
+        white = renderer.Mesh.plain(mesh.vertices, mesh.faces)
+        painted = textured(white, rng.random((len(mesh.faces), 3, 2)), texture)
+        other = replace(painted, textures=(np.zeros_like(texture),))
         encoded = torch.from_numpy(texture).double() / 255
     else:
         colors = np.float32(rng.integers(0, 256, (len(mesh.faces), 3)) / 255)
@@ -181,16 +177,9 @@ def test_lamps_and_projectors_are_rendered_as_by_operators(sky, samples):
     lamps = Lamps(((2.0, 1.0, 2.0),), radius=0.3)
     projector = Projector(8, 28.6, 91.7)
     pattern = draw_uniform(64, 3).float()
-    images = renderer.render(
-        cup,
-        CAMERAS,
-        sky,
-        lights=[lamps, (projector, pattern)],
-        samples=samples,
-        normals="flat",
-        shadows=True,
-        **SMALL,
-    )
+    options = SMALL | {"samples": samples, "normals": "flat", "shadows": True}
+    lights = [lamps, (projector, pattern)]
+    images = renderer.render(cup, CAMERAS, sky, lights=lights, **options)
     full_power = torch.full((1, 3), lamps.power)
     sky_coefficients = torch.zeros(49, 3) if sky is None else sky
     local_lights = [(lamps, full_power), (projector, pattern)]

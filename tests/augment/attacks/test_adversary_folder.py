@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from oracles import textured
 
 import augment
 from augment.attack_settings import PARAMETER_NAMES
@@ -62,13 +63,10 @@ def textured_pear() -> Mesh:
     is_textured = np.arange(len(mesh.faces)) % 2 == 1
     colors = mesh.corner_colors.copy()
     colors[is_textured] = 1
-    return replace(
-        mesh,
-        texture_ids=np.where(is_textured, 0, -1).astype(np.int32),
-        corner_uvs=draws.random((len(mesh.faces), 3, 2), dtype=np.float32),
-        corner_colors=colors.astype(np.float32),
-        textures=(draws.integers(0, 256, (16, 8, 3), dtype=np.uint8),),
-    )
+    uvs = draws.random((len(mesh.faces), 3, 2), dtype=np.float32)
+    texture = draws.integers(0, 256, (16, 8, 3), dtype=np.uint8)
+    colored = replace(mesh, corner_colors=np.float32(colors))
+    return textured(colored, uvs, texture, np.where(is_textured, 0, -1))
 
 
 def scene_with(item: SceneObject) -> Scene:
@@ -212,10 +210,7 @@ CAMERA = {"polar": 0, "azimuth": 0}
         ({"cameras": [CAMERA | {"width": 0}]}, "width=0"),
         ({"own_faces": 0}, "own_faces=0"),
         ({"background": [1]}, r"adversary\.json: background=\[1\]"),
-        (
-            {"cameras": [CAMERA | {"width": 2, "distance": 0.5}]},
-            r"adversary\.json: the mesh reaches",
-        ),
+        ({"cameras": [CAMERA | {"width": 2, "distance": 0.5}]}, r"json: the mesh reaches"),
     ],
     ids=["another size", "a flat camera", "no own faces", "a list", "a camera in the mesh"],
 )

@@ -168,16 +168,11 @@ def test_a_network_may_return_logits_in_half_precision(tmp_path, dtype, optimize
         mean = images.mean((1, 2, 3))
         return torch.stack([mean, 0.3 + 0 * mean], dim=1).to(dtype)
 
-    settings = augment.AttackSettings(
-        lighting=augment.StepSettings(step_size=0.5),
-        optimizer=optimizer,
-        max_queries=40,
-        allow_negative=True,
-        eot=augment.EOTSettings(draws=1),
-    )
-    result = augment.attack(
-        half_logits, augment.build_scene([("solid:orange", 0)], 8), settings=settings
-    )
+    options = {"max_queries": 40, "allow_negative": True, "eot": augment.EOTSettings(draws=1)}
+    lighting = augment.StepSettings(step_size=0.5)
+    settings = augment.AttackSettings(lighting=lighting, optimizer=optimizer, **options)
+    scene = augment.build_scene([("solid:orange", 0)], 8)
+    result = augment.attack(half_logits, scene, settings=settings)
     assert result.logits.dtype == torch.float32
     brightness = to_unit(to_bytes(result.images)).mean((1, 2, 3))
     torch.testing.assert_close(

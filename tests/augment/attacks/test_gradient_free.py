@@ -63,15 +63,9 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
 
     scene = augment.build_scene([("solid:orange", 0)], 8, views=2, rasterizer="numpy")
     lighting = augment.StepSettings("linf", 0.2)
-    settings = augment.AttackSettings(
-        lighting=lighting,
-        optimizer=optimizer,
-        max_queries=40,
-        allow_negative=True,
-        quantized=False,
-        sensor_noise=noise,
-        noise_margin=1.0,
-    )
+    options = {"max_queries": 40, "allow_negative": True, "quantized": False, "noise_margin": 1.0}
+    options |= {"optimizer": optimizer, "sensor_noise": noise}
+    settings = augment.AttackSettings(lighting=lighting, **options)
     gray = 2  # images with which the network is checked
     result = augment.attack(function, scene, settings=settings, force=True)
     probes = 1
@@ -107,26 +101,18 @@ def test_a_numpy_function_and_a_file_of_onnx_give_the_adversary_of_the_torch_net
     pytest.importorskip("onnx")
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        layers = [nn.Conv2d(3, 4, 3), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten()]
-        network = nn.Sequential(*layers, nn.Linear(4, 3)).eval()
+        layers = [nn.Flatten(), nn.Linear(192, 8), nn.ReLU(), nn.Linear(8, 3)]
+        network = nn.Sequential(*layers).eval()
     weights = [parameter.detach().numpy() for parameter in network.parameters()]
 
     def numpy_network(images: np.ndarray) -> np.ndarray:
-        windows = np.lib.stride_tricks.sliding_window_view(images, (3, 3), axis=(2, 3))
-        features = np.einsum("ncijxy,kcxy->nkij", windows, weights[0])
-        features = np.maximum(features + weights[1][:, None, None], 0).mean((2, 3))
+        features = np.maximum(images.reshape(-1, 192) @ weights[0].T + weights[1], 0)
         return features @ weights[2].T + weights[3]
 
     path = tmp_path / "network.onnx"
-    torch.onnx.export(
-        network,
-        (torch.rand(1, 3, 16, 16),),
-        path,
-        dynamo=False,
-        input_names=["images"],
-        dynamic_axes={"images": {0: "N"}},
-    )
-    scene = augment.build_scene([("solid:orange", 0)], 16, rasterizer="numpy")
+    options = {"input_names": ["images"], "dynamic_axes": {"images": {0: "N"}}}
+    torch.onnx.export(network, (torch.rand(1, 3, 8, 8),), path, dynamo=False, **options)
+    scene = augment.build_scene([("solid:orange", 0)], 8, rasterizer="numpy")
     lighting = augment.StepSettings("linf", 0.2)
     search = {"optimizer": "random_search", "max_queries": 40, "allow_negative": True}
     settings = augment.AttackSettings(lighting=lighting, **search)

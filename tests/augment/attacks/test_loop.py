@@ -224,12 +224,8 @@ def test_a_step_that_does_not_lower_the_cost_is_taken_back_and_tried_at_half_its
     start = torch.tensor([[1.0], [0.125], [0.75]], dtype=torch.float64)
     zeros = torch.zeros(3, 1, dtype=torch.int64)
     criterion = ClassCriterion(zeros, zeros + 1)
-    result = descend(
-        two_classes(lambda value: 1 + value**2),
-        Axis(start),
-        criterion,
-        settings_of(steps, backtracking=True),
-    )
+    hill = two_classes(lambda value: 1 + value**2)
+    result = descend(hill, Axis(start), criterion, settings_of(steps, backtracking=True))
     values = result.values.flatten()
     assert values.tolist() == [FROM_1[steps], FROM_EIGHTH[steps], FROM_THREE_QUARTERS[steps]]
     assert torch.equal(result.images.flatten(), values)
@@ -293,14 +289,8 @@ def test_a_zero_gradient_leaves_the_values_and_is_reported(step):
 def small_network() -> nn.Sequential:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return nn.Sequential(
-            nn.Conv2d(3, 8, 3, padding=1),
-            nn.BatchNorm2d(8),
-            nn.SiLU(),
-            nn.Dropout(0.5),
-            nn.Flatten(),
-            nn.Linear(32, 4),
-        ).double()
+        layers = [nn.Conv2d(3, 8, 3, padding=1), nn.BatchNorm2d(8), nn.SiLU(), nn.Dropout(0.5)]
+        return nn.Sequential(*layers, nn.Flatten(), nn.Linear(32, 4)).double()
 
 
 NINE_STARTS = 3 * random(9, VALUE_COUNT, seed=3)

@@ -102,16 +102,11 @@ def test_patterns_and_powers_stay_in_range_and_in_their_norm_ball(norm, paramete
 def joint_attack(request, tmp_path_factory) -> tuple[augment.AttackResult, Adversary, Path]:
     """Attack all lights, the shape and the albedo at once, and write the first example."""
     light = StepSettings("linf", None, "unit", 0.5)
-    settings = augment.AttackSettings(
-        lighting=light,
-        projector=light,
-        lamps=light,
-        positions=StepSettings("l2", 1.0, "unit", 0.3),
-        geometry=StepSettings("linf", 0.02, "sign", 0.01),
-        albedo=StepSettings("linf", 0.1, "sign", 0.05),
-        max_steps=3,
-        backtracking=True,
-    )
+    steps = dict.fromkeys(("lighting", "projector", "lamps"), light)
+    steps["positions"] = StepSettings("l2", 1.0, "unit", 0.3)
+    steps["geometry"] = StepSettings("linf", 0.02, "sign", 0.01)
+    steps["albedo"] = StepSettings("linf", 0.1, "sign", 0.05)
+    settings = augment.AttackSettings(**steps, max_steps=3, backtracking=True)
     shown = scene(exposure=0.3, lamps=replace(LAMPS, radius=request.param))
     done = augment.attack(by_mean_color(), shown, settings=settings, force=True)
     before = done.images_in_views_before[0]

@@ -20,19 +20,11 @@ from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.visibility import choose
 
+ASIDE = {"roll": 34.0, "principal_right": 0.3, "principal_up": -0.2, "pixel_aspect": 1.1}
 CAMERAS = {
     "parallel": OrthographicCamera(63.0, 22.9, 2.4, 0.1, -0.2),
     "perspective": PerspectiveCamera(63.0, 22.9, 2.4, 0.1, -0.2, distance=5.0),
-    "pinhole": PinholeCamera(
-        polar=80.2,
-        azimuth=17.2,
-        width=2.4,
-        distance=3.2,
-        roll=34.0,
-        principal_right=0.3,
-        principal_up=-0.2,
-        pixel_aspect=1.1,
-    ),
+    "pinhole": PinholeCamera(80.2, 17.2, 2.4, distance=3.2, **ASIDE),
 }
 SHAPES = [(12, 20), (20, 12)]
 each_shape = pytest.mark.parametrize("shape", SHAPES, ids=["wide", "tall"])

@@ -105,13 +105,9 @@ def test_table_and_wall_are_lit_by_a_far_lamp_as_meshes_are(surface, camera):
     direction = torch.nn.functional.normalize(torch.tensor([0.5, 0.1, 0.8]).double(), dim=0)
     position = tuple((FAR * direction).tolist())
     power = torch.full((1, 3), 0.1 * FAR**2).double()
-    compared = compare(
-        surface,
-        camera,
-        lamps=[(Lamps((position,), 1e5), power)],
-        light=(torch.zeros(49, 3).double(), direction),
-        scale=0.1,
-    )
+    lamps = [(Lamps((position,), 1e5), power)]
+    light = (torch.zeros(49, 3).double(), direction)
+    compared = compare(surface, camera, lamps=lamps, light=light, scale=0.1)
     compared.require_close(mean=0.01, typical=0.02)
 
 

@@ -46,13 +46,8 @@ def test_boxes_and_fractions_of_two_balls_are_those_of_overlapping_discs():
 
 def test_a_mask_is_that_of_the_object_alone_without_what_others_hide():
     cup = nb.ObjectSettings("solid:cup", "cup", at=[-1.2, 0.3], scale=0.9, azimuth=40.0)
-    scene = nb.build_scene(
-        [[("solid:pear", "pear"), cup, ("solid:lemon", "")]],
-        (64, 96),
-        width=6.0,
-        fov=30.0,
-        samples=1,
-    )
+    meshes = [[("solid:pear", "pear"), cup, ("solid:lemon", "")]]
+    scene = nb.build_scene(meshes, (64, 96), width=6.0, fov=30.0, samples=1)
     truth = scene.truth(["pear", "cup"].index)
     assert truth.labels.tolist() == [[[0, 1]]]  # The lemon has no class.
     item = scene.objects[0]

@@ -217,12 +217,8 @@ def degree_6_and_9() -> list[Scene]:
 
 def test_light_of_probes_varies_alike_in_every_degree(degree_6_and_9):
     """The probes' coefficients beyond degree 2 are zero."""
-    settings = {
-        "environments": ["eucalyptus", "uniform"],
-        "lit_background": True,
-        "exposure": [0.5, 2.0],
-        "background_saturation": 1.0,
-    }
+    settings = {"environments": ["eucalyptus", "uniform"], "lit_background": True}
+    settings |= {"exposure": [0.5, 2.0], "background_saturation": 1.0}
     low, high = (drawn(scene, **settings) for scene in degree_6_and_9)
     assert high.basis.degree == 9
     torch.testing.assert_close(images_of(high), images_of(low), rtol=0, atol=1e-5)
@@ -271,25 +267,17 @@ def test_tables_are_refused_in_scenes_where_they_would_be_wrong(options):
         drawn(built("solid:plate", **options), tables=0.5)
 
 
-LOCAL_LIGHTS = {
-    "lamps": LampsSettings(
-        positions=[[0.6, 1.5, 2.0], [0.0, -2.0, 1.5]], radius=0.3, start=[[2, 1, 0.5], [0.5, 1, 2]]
-    ),
-    "projector": ProjectorSettings(polar=20.0, pattern=0.8),
-}
+PLACES = [[0.6, 1.5, 2.0], [0.0, -2.0, 1.5]]
+LAMPS = LampsSettings(positions=PLACES, radius=0.3, start=[[2, 1, 0.5], [0.5, 1, 2]])
+LOCAL_LIGHTS = {"lamps": LAMPS, "projector": ProjectorSettings(polar=20.0, pattern=0.8)}
 
 
 def test_local_lights_light_a_drawn_table_as_they_do_a_ground_of_triangles():
     """The object and its prop throw their shadows on both."""
     prop = ObjectSettings(mesh="solid:ball", at=[0.7, -0.4], scale=0.3)
     meshes = [ObjectSettings("solid:pear:1", "pear", others=[prop])]
-    options = {
-        "rasterizer": "numpy",
-        "light": torch.zeros(49, 3),
-        "polar": 30.0,
-        "width": 2.4,
-        **LOCAL_LIGHTS,
-    }
+    options = {"rasterizer": "numpy", "light": torch.zeros(49, 3), "polar": 30.0, "width": 2.4}
+    options |= LOCAL_LIGHTS
     white = [1.0, 1.0, 1.0]
     with_ground = augment.build_scene(meshes, SIZE, ground=white, backgrounds=[0.0], **options)
     without = augment.build_scene(meshes, SIZE, backgrounds=[1.0], **options)
@@ -309,12 +297,8 @@ def test_local_lights_light_a_drawn_table_as_they_do_a_ground_of_triangles():
 
 
 def test_light_is_drawn_as_without_local_lights_and_these_stay():
-    settings = {
-        "environments": ["grace", "eucalyptus"],
-        "directional_fraction": 0.5,
-        "tables": 0.5,
-        "lit_background": True,
-    }
+    settings = {"environments": ["grace", "eucalyptus"], "directional_fraction": 0.5}
+    settings |= {"tables": 0.5, "lit_background": True}
     without = built("solid:plate", views=6)
     beside = built("solid:plate", views=6, **LOCAL_LIGHTS)
     lights = drawn(beside, **settings).lights

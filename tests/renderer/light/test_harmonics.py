@@ -25,14 +25,8 @@ EPS = np.finfo(np.float64).eps
 every_degree = pytest.mark.parametrize("degree", [0, 1, 2, 6, MAX_DEGREE])
 # Directions with both signs of zero, for which polar angles are special.
 POLES = [[0.0, 0.0, 1.0], [-0.0, 0.0, 1.0], [0.0, -0.0, -1.0], [-0.0, -0.0, -1.0]]
-EQUATOR = [
-    [1.0, 0.0, 0.0],
-    [-1.0, 0.0, -0.0],
-    [-0.0, 1.0, 0.0],
-    [0.0, -1.0, -0.0],
-    [-0.6, 0.8, 0.0],
-    [-1.0, -0.0, 0.0],
-]
+EQUATOR = [[1.0, 0.0, 0.0], [-1.0, 0.0, -0.0], [-0.0, 1.0, 0.0], [0.0, -1.0, -0.0]]
+EQUATOR += [[-0.6, 0.8, 0.0], [-1.0, -0.0, 0.0]]
 
 
 @every_degree
@@ -77,8 +71,8 @@ def test_constants_that_are_first_computed_in_inference_mode_serve_training_late
 
 def test_the_projection_of_an_exponential_has_its_closed_form():
     """exp(z) = Σ (2l + 1) i_l(1) P_l(z), with the modified spherical Bessel functions i_l."""
-    projected = project(lambda directions: directions[:, 2:].exp(), MAX_DEGREE)[:, 0].numpy()
-    l = np.arange(MAX_DEGREE + 1)
+    projected = project(lambda directions: directions[:, 2:].exp(), 20)[:, 0].numpy()
+    l = np.arange(21)
     expected = np.zeros_like(projected)
     expected[l * l + l] = np.sqrt(4 * np.pi * (2 * l + 1)) * spherical_in(l, 1.0)
     np.testing.assert_allclose(projected, expected, rtol=0, atol=1000 * EPS)

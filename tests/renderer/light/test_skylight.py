@@ -60,16 +60,10 @@ def weighted_sky(angles: np.ndarray, sky: tuple[float, float, float]) -> np.ndar
 def test_quadrature_agrees_with_adaptive_cubature_of_the_published_formula(sky):
     zenith, azimuth, _ = sky
     # The radiance has a cusp at the sun.
-    is_sun_inside = 0 < zenith < HORIZON
-    result = cubature(
-        partial(weighted_sky, sky=sky),
-        [0, azimuth - math.pi],
-        [HORIZON, azimuth + math.pi],
-        rule="gk21",
-        rtol=1e-6,
-        atol=1e-6,
-        points=[(zenith, azimuth)] if is_sun_inside else [],
-    )
+    points = [(zenith, azimuth)] if 0 < zenith < HORIZON else []
+    ends = [0, azimuth - math.pi], [HORIZON, azimuth + math.pi]
+    options = {"rule": "gk21", "rtol": 1e-6, "atol": 1e-6, "points": points}
+    result = cubature(partial(weighted_sky, sky=sky), *ends, **options)
     assert relative_error(by_quadrature(*sky), result.estimate.reshape(49, 3)) < 2e-8
 
 

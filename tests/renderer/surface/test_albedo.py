@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw_uniform, linear_of, patchwork
+from oracles import draw_uniform, linear_of, patchwork, textured
 from scipy.ndimage import map_coordinates
 
 from renderer.camera import OrthographicCamera
@@ -36,12 +36,8 @@ def random_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
 
 
 def poster(texture: np.ndarray, uvs=UNIT_UVS, color=(1.0, 1.0, 1.0)) -> Mesh:
-    return replace(
-        Mesh.plain(SQUARE, SQUARE_FACES, color),
-        corner_uvs=np.asarray(uvs, dtype=np.float32)[SQUARE_FACES],
-        texture_ids=np.zeros(2, dtype=np.int32),
-        textures=(texture,),
-    )
+    square = Mesh.plain(SQUARE, SQUARE_FACES, color)
+    return textured(square, np.asarray(uvs)[SQUARE_FACES], texture)
 
 
 def patchwork_sphere() -> Mesh:

@@ -212,13 +212,8 @@ def test_a_highlight_under_its_window_is_nowhere_negative(roughness):
 
 def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_it():
     """This is a white furnace for all roughness, metallic and specular_factor, from all sides."""
-    grid = torch.meshgrid(
-        torch.linspace(0, 1, 21, dtype=DOUBLE),
-        torch.linspace(MIN_ROUGHNESS, 1, 9, dtype=DOUBLE),
-        torch.linspace(0, 1, 3, dtype=DOUBLE),
-        torch.linspace(0, 1, 2, dtype=DOUBLE),
-        indexing="ij",
-    )
+    ranges = [(0, 1, 21), (MIN_ROUGHNESS, 1, 9), (0, 1, 3), (0, 1, 2)]
+    grid = torch.meshgrid(*(torch.linspace(*ends, dtype=DOUBLE) for ends in ranges), indexing="ij")
     cosine, roughness, metallic, specular_factor = (values.flatten() for values in grid)
     gloss = SampleGloss(roughness, metallic, specular_factor)
     views = torch.stack([-((1 - cosine**2).sqrt()), 0 * cosine, cosine], dim=1)
@@ -490,13 +485,8 @@ class GlossyView:
     def start(self) -> dict[str, Tensor]:
         face_count = len(self.mesh.faces)
         sample_count = len(self.view.sample_to_seen_face)
-        shapes = {
-            "lamp": (1, 3),
-            "albedo": (sample_count, 3),
-            "roughness": (face_count,),
-            "metallic": (face_count,),
-            "specular_factor": (face_count,),
-        }
+        shapes = {"lamp": (1, 3), "albedo": (sample_count, 3)}
+        shapes |= dict.fromkeys(("roughness", "metallic", "specular_factor"), (face_count,))
         uniform = {}
         for seed, (name, size) in enumerate(shapes.items()):
             uniform[name] = 0.3 + 0.5 * draw_uniform(*size, seed=seed)
@@ -505,19 +495,10 @@ class GlossyView:
 
     def total(self, values: dict[str, Tensor]) -> Tensor:
         gloss = Gloss(values["roughness"], values["metallic"], values["specular_factor"])
-        vertices = values["vertices"]
-        view = ShadedView(
-            self.mesh,
-            self.view,
-            self.settings,
-            vertices,
-            values["albedo"],
-            SplitLight(values["environment"], [(self.LAMP, values["lamp"])]),
-            LocalLightView(
-                self.rays, Surface(self.mesh, self.view, self.settings, vertices, gloss)
-            ),
-            gloss=gloss,
-        )
+        seen = (self.mesh, self.view, self.settings, values["vertices"])
+        light = SplitLight(values["environment"], [(self.LAMP, values["lamp"])])
+        lamp_view = LocalLightView(self.rays, Surface(*seen, gloss))
+        view = ShadedView(*seen, values["albedo"], light, lamp_view, gloss=gloss)
         return (view.radiance() * self.upstream).sum()
 
 

@@ -25,14 +25,8 @@ from renderer.visibility.fragments import Fragments, build_fragments
 
 EPS = torch.finfo(torch.float64).eps
 # Poles and directions on the equator, with both signs of zero.
-SPECIAL = [
-    [0.0, 0.0, 1.0],
-    [-0.0, 0.0, -1.0],
-    [1.0, 0.0, 0.0],
-    [-1.0, -0.0, 0.0],
-    [0.0, -1.0, -0.0],
-    [1e-9, 0.0, 1.0],
-]
+SPECIAL = [[0.0, 0.0, 1.0], [-0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [-1.0, -0.0, 0.0]]
+SPECIAL += [[0.0, -1.0, -0.0], [1e-9, 0.0, 1.0]]
 
 
 def irradiance(normals: Tensor, light: Tensor) -> Tensor:

@@ -22,17 +22,8 @@ from renderer.solids import SOLIDS
 
 FAR = OrthographicCamera(63.0, 22.9, 2.8)
 NEAR = PerspectiveCamera(63.0, 22.9, 2.8, 0.1, -0.05, distance=4.0)
-TURNED = PinholeCamera(
-    polar=63.0,
-    azimuth=22.9,
-    width=2.8,
-    distance=4.0,
-    roll=30.0,
-    center_x=0.1,
-    principal_right=0.2,
-    principal_up=-0.1,
-    pixel_aspect=1.1,
-)
+ASIDE = {"roll": 30.0, "center_x": 0.1, "principal_right": 0.2, "principal_up": -0.1}
+TURNED = PinholeCamera(63.0, 22.9, 2.8, distance=4.0, pixel_aspect=1.1, **ASIDE)
 FROM_ABOVE = OrthographicCamera(0.0, 17.2, 2.0)
 LIGHT = 0.4 * load_light("grace").double()
 
@@ -171,12 +162,7 @@ def test_gradients_by_the_camera_include_the_movement_of_highlights():
 
 
 def square(half: float, height: float) -> renderer.Mesh:
-    corners = [
-        [-half, -half, height],
-        [half, -half, height],
-        [half, half, height],
-        [-half, half, height],
-    ]
+    corners = [[half * x, half * y, height] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     return renderer.Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from oracles import textured
 
 import augment
 from augment.attacks.adversary import Adversary, final_images, reload, write_adversary
@@ -39,16 +40,10 @@ def egg(gloss: Gloss | None) -> Mesh:
 def textured_egg(gloss: Gloss) -> Mesh:
     draws = np.random.default_rng(0)
     plain = egg(None)
-    face_count = len(plain.faces)
-    uvs = draws.random((face_count, 3, 2), dtype=np.float32)
+    uvs = draws.random((len(plain.faces), 3, 2), dtype=np.float32)
     colors = draws.integers(60, 200, (8, 8, 3), dtype=np.uint8)
     gloss_texels = draws.integers(150, 255, (1, 1, 2), dtype=np.uint8)
-    mesh = replace(
-        Mesh.plain(plain.vertices, plain.faces),
-        corner_uvs=uvs,
-        texture_ids=np.zeros(face_count, dtype=np.int32),
-        textures=(colors,),
-    )
+    mesh = textured(Mesh.plain(plain.vertices, plain.faces), uvs, colors)
     return replace(gloss.on(mesh), gloss_textures=(gloss_texels,))
 
 
