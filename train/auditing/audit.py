@@ -13,7 +13,7 @@ the subfolders are CLASSIFIER and HARDENED.
 import json
 import math
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -35,7 +35,7 @@ from renderer.mitsuba_scene import mitsuba
 from renderer.settings import Size, height_and_width
 from train import class_names, console
 from train.auditing import found, lights, page, relit
-from train.auditing.network import CLASSIFIER, HARDENED, name_remedies, normalizing
+from train.auditing.network import CLASSIFIER, HARDENED, IN_WORDS, name_remedies, normalizing
 from train.checkpoints import load_chosen, load_network
 from train.command_settings import AuditSettings, LabSettings
 from train.data.annotations import read_annotations
@@ -126,23 +126,21 @@ def run_audit(
         _prepare_folder(settings, out, renders)
         for key in networks:
             (out / key).mkdir(exist_ok=True)
-        if plan is not None:
-            if plan.image_folders.get(LABORATORY) == renders:
-                # The test images are rendered for the network with the largest images.
-                sizes = [network.size for network in networks.values()]
-                size = max(sizes, key=lambda size: math.prod(height_and_width(size)))
-                _write_folder(renders, partial(_write_renders, settings, plan, size))
-            plan.measure(networks, out)
-        if settings.unlabeled:
-            _attack_photographs(settings, networks, photographs, out)
         names = {key: network.name for key, network in networks.items()}
         # Both networks can have the same name.
         if len({*names.values()}) < len(names):
             names[HARDENED] += " (hardened)"
+        write_page = partial(page.write_audit_page, settings.label, names, name_remedies(networks))
+        for missing, folders in [] if plan is None else plan.measure(networks, out, settings):
+            path = write_page(folders, out, caveats, missing).path
+            # A caller from Python gets the complete page.
+            if is_named:
+                console.warning(f"first results: {path}")
+        if settings.unlabeled:
+            _attack_photographs(settings, networks, photographs, out)
         if plan is None:
             return page.write_audit_page("", names, {}, {}, out, caveats)
-        found_in = name_remedies(networks), plan.image_folders
-        return page.write_audit_page(settings.label, names, *found_in, out, caveats)
+        return write_page(plan.image_folders, out, caveats)
 
 
 def _load_networks(settings: AuditSettings) -> dict[str, Classifier]:
@@ -266,11 +264,18 @@ class _Plan:
             for count in (VIEW_COUNT, ATTACKED_COUNT)
         )
 
-    def measure(self, networks: Mapping[str, Classifier], out: Path) -> None:
+    def measured_folders(self) -> dict[str, Path]:
+        """Return the folders of test images on which `measure` has scored the networks by now."""
+        return {name: folder for name, folder in self.image_folders.items() if folder.exists()}
+
+    def measure(
+        self, networks: Mapping[str, Classifier], out: Path, settings: AuditSettings
+    ) -> Iterator[tuple[str, dict[str, Path]]]:
         """Test and attack the networks, except for results that exist already.
 
-        The views of all networks have the ordinary light and the size at which the audited network
-        recognizes most views.
+        What takes long comes last. Before it, yield what is still to come, in words, and the
+        folders of test images that are scored. The views of all networks have the ordinary light
+        and the size at which the audited network recognizes most views.
         """
         path = out / CLASSIFIER / lights.PLAIN
         searched = (networks[CLASSIFIER], self.attacked_views)
@@ -282,13 +287,29 @@ class _Plan:
         )
         # Arguments of the functions that show views in all lights of the audit.
         environments = (views, self.environments, self.random_light_count)
+        # Attacks within the largest radius, which go on with smaller radii, by the path of both.
+        attacks: dict[Path, Iterator[dict[str, Any]]] = {}
         for key, network in networks.items():
             results = out / key
             recognize = lights.recognize_in_environments
             _write_json(results / lights.RECOGNIZED, recognize, network, *environments)
             for kind in lights.KINDS:
-                arguments = (network, attacked_views, kind, results)
-                _write_json(results / f"{kind}.json", lights.success_by_light, *arguments)
+                path = results / f"{kind}.json"
+                if not path.exists():
+                    arguments = (network, attacked_views, kind, results)
+                    attacks[path] = lights.success_by_light(*arguments)
+                    _write_json(results / (kind + lights.FIRST), next, attacks[path])
+        self._score(networks, out)
+        to_render = self.image_folders.keys() - self.measured_folders().keys()
+        later = [IN_WORDS[name] for name in to_render]
+        if attacks:
+            missing = " and ".join(["attacks within smaller radii", *later])
+            yield missing, self.measured_folders()
+        for path, counts in attacks.items():
+            _write_json(path, lambda counts=counts: [*counts][-1])
+            path.with_name(path.stem + lights.FIRST).unlink()
+        for key, network in networks.items():
+            results = out / key
             # Light that fools one network is shown to the other network.
             for other in networks.values():
                 if other is not network:
@@ -298,9 +319,19 @@ class _Plan:
                 negatives = replace(views, objects=self.negatives)
                 lit = (network, views, attacked_views, negatives, *environments[1:], results)
                 _write_json(results / found.DETECTED, found.find_in_lights, *lit)
-        # Test images are also scored with the remedy "normalized light".
+        if later:
+            yield later[0], self.measured_folders()
+            # The test images are rendered for the network with the largest images.
+            sizes = [network.size for network in networks.values()]
+            size = max(sizes, key=lambda size: math.prod(height_and_width(size)))
+            renders = self.image_folders[LABORATORY]
+            _write_folder(renders, partial(_write_renders, settings, self, size))
+            self._score(networks, out)
+
+    def _score(self, networks: Mapping[str, Classifier], out: Path) -> None:
+        """Score the networks on test images, also with the remedy "normalized light"."""
         for key, network in {**networks, **normalizing(networks)}.items():
-            for name, images in self.image_folders.items():
+            for name, images in self.measured_folders().items():
                 predictor = Predictor(network, network.classes, network.size, self.views.device)
                 # Unreadable photographs are left out.
                 evaluate = partial(evaluate_photographs, predictor, images, self.label)

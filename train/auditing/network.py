@@ -205,8 +205,12 @@ class AuditedNetwork:
 
     @cached_property
     def counts(self) -> dict[str, dict[str, Any]]:
-        """Result of `success_by_light` for each kind of lighting."""
-        return {kind: read_json(self.folder / f"{kind}.json") for kind in KINDS}
+        """Result of `success_by_light` for each kind of lighting, or the first one until then."""
+        paths = {kind: self.folder / f"{kind}.json" for kind in KINDS}
+        first = {kind: self.folder / (kind + lights.FIRST) for kind in KINDS}
+        return {
+            kind: read_json(path if path.exists() else first[kind]) for kind, path in paths.items()
+        }
 
     @cached_property
     def transfers(self) -> dict[str, Any]:
@@ -292,7 +296,7 @@ class AuditedNetwork:
         faults = []
         for kind, counts in self.counts.items():
             light = KINDS[kind]
-            for radius, fooled_count in zip(light.radii, counts["adversarial"], strict=True):
+            for radius, fooled_count in self.lost(kind, "adversarial").items():
                 # At least half of the views that were correct before are lost.
                 if 0 < counts["correct"] <= 2 * fooled_count:
                     attack = f"an attack with {light.title} of radius {radius:g}"
@@ -319,7 +323,12 @@ class AuditedNetwork:
         The first is for the radius 0. `method` is "adversarial" or "random".
         """
         correct = self.counts[kind]["correct"]
-        return [fraction(correct - count, correct) for count in (0, *self.counts[kind][method])]
+        return [fraction(correct - count, correct) for count in self.lost(kind, method).values()]
+
+    def lost(self, kind: str, method: str) -> dict[float, int]:
+        """Return how many views are lost by radius: none at 0, and the radii that are measured."""
+        radii, counts = KINDS[kind].radii, self.counts[kind][method]
+        return {0: 0} | dict(zip(radii[len(radii) - len(counts) :], counts, strict=True))
 
     def report(self) -> NetworkReport:
         """Collect the results as `nb.audit` returns them."""

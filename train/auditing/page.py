@@ -88,11 +88,12 @@ def write_audit_page(
     folders: Mapping[str, Path],
     out: Path,
     caveats: Sequence[str],
+    missing: str = "",
 ) -> Audited:
     """Write report.html from the results in the folder of an audit.
 
     Keys of `names` and values of `remedies` are subfolders of `out` with results. Without meshes,
-    `label` is empty.
+    `label` is empty. `missing` names what is not measured yet; `folders` are then without it.
     """
     # The folder with the results of each network, by its name.
     results = {name: out / key for key, name in names.items()}
@@ -128,7 +129,8 @@ def write_audit_page(
         advice = [recommendation.advice if is_shown else recommendation.sentence]
     elif screen.answer in (VERDICTS["No"], VERDICTS["Perhaps not"]):
         advice = [NEXT_HARDENING]
-    screen = replace(screen, sentences=[*screen.sentences, *advice])
+    note = [f"These are first results. Not measured yet: {missing}."] if missing else []
+    screen = replace(screen, sentences=[*note, *screen.sentences, *advice])
     slider = _slider(networks)
     unreadable = []
     for name in folders:
@@ -289,14 +291,14 @@ def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:
     """Plot the fraction of recognized views against the radius of attacks.
 
     Each network has a line for the attack and one for random draws, unless it recognizes no view
-    before the attack.
+    before the attack, or not all radii are measured.
     """
     pictures = []
     for kind, light in KINDS.items():
         lines = {
             network.name + end: network.remaining(kind, method)
             for network in networks
-            if network.counts[kind]["correct"]
+            if network.counts[kind]["correct"] and network.counts[kind]["random"]
             for end, method in (("", "adversarial"), (", random", "random"))
         }
         if lines:

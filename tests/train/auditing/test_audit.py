@@ -68,8 +68,11 @@ def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp
         expected.append(int((is_correct & is_wrong).sum()))
     assert 0 < expected[0] < expected[1]
 
-    counts = lights.success_by_light(darker_than(limit), views, "lamps", tmp_path)
+    steps = lights.success_by_light(darker_than(limit), views, "lamps", tmp_path)
 
+    # The first counts are of the largest radius alone.
+    assert next(steps)["adversarial"] == expected[-1:]
+    counts = next(steps)
     assert counts["correct"] == int(is_correct.sum())
     assert counts["adversarial"] == expected
     for random, hits in zip(counts["random"], expected, strict=True):
@@ -177,6 +180,7 @@ def stop(*arguments) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:classifier guessing scores black and white")
 class TestAWholeAudit:
     @pytest.fixture
     def folder(self, given, tmp_path) -> Path:
@@ -189,17 +193,27 @@ class TestAWholeAudit:
         assert summary["auc"]["value"] == 0.5
         assert summary["n"]["positives"] == summary["n"]["negatives"] == 2
 
+    @pytest.mark.parametrize(
+        ("module", "stopped"),
+        [(lights, "success_by_light"), (lights, "success_by_radius"), (audit, "_write_renders")],
+    )
     def test_continues_if_it_was_stopped_and_writes_the_same(
-        self, folder, given, monkeypatch, tmp_path
+        self, folder, given, monkeypatch, tmp_path, module, stopped
     ):
         expected = results_of(folder)
         assert len(expected) > 15
         folder.rename(tmp_path / "uninterrupted")
         with monkeypatch.context() as patch:
-            patch.setattr(lights, "success_by_light", stop)
+            patch.setattr(module, stopped, stop)
             with pytest.raises(KeyboardInterrupt):
                 run_audit(AuditSettings(**given))
-        times = modification_times(folder)
+        # A page with first results is there before what takes longest.
+        if stopped != "success_by_light":
+            assert "still recognizes" in (folder / "report.html").read_text()
+        first = [*folder.glob("*/*_first.json")]
+        times = {
+            path: time for path, time in modification_times(folder).items() if path not in first
+        }
         assert folder / "classifier" / RECOGNIZED in times
 
         run_audit(AuditSettings(**given, hardened="guessing"))  # A hardened network may be added.
@@ -238,7 +252,7 @@ def test_an_audit_without_mitsuba_leaves_the_laboratory_out_and_says_so(
     recognized = {"uniform": [True], "random 1": [True]}
     monkeypatch.setattr(audit, "mitsuba", Mock(side_effect=InputError("Mitsuba is missing")))
     monkeypatch.setattr(lights, "recognize_in_environments", lambda *_: recognized)
-    monkeypatch.setattr(lights, "success_by_light", lambda *_: counts)
+    monkeypatch.setattr(lights, "success_by_light", lambda *_: iter([counts, counts]))
     report = run_audit(AuditSettings(**given)).path
     assert "The laboratory is left out, and hard_negatives with it" in report.read_text()
     assert not (tmp_path / "audit/renders").exists()
