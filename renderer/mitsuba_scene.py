@@ -361,7 +361,7 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_sca
     def bitmap(name: str, image: UInt8[np.ndarray, "..."], raw: bool) -> Scene:
         """Write a texture of the part, and return its entry."""
         file = f"{name}_{number}.png"
-        write_image(folder / file, image)
+        write_image(folder / file, image, compress_level=1)
         return {"type": "bitmap", "filename": file, "raw": raw}
 
     albedo: Scene = {"type": "mesh_attribute", "name": "vertex_color"}
