@@ -70,33 +70,6 @@ class InputError(ValueError):
         super().__init__(message)
         self.argument = argument
 
-    def within(self, key: str, names: Collection[str]) -> InputError:
-        """Return a copy of the error whose sentence begins with the key of some settings.
-
-        Args:
-            key: Key of the settings, such as "scene". If it is empty, the error
-                itself is returned.
-            names: Names of the fields of the settings. If the argument of the error
-                is one of them, the key is put before the argument, with a period.
-                Otherwise it is put before the sentence, with a colon.
-
-        Returns:
-            Error whose sentence begins with the key.
-
-        >>> import norm_balls as nb
-        >>> error = nb.InputError("views=0 must be at least 1", "views")
-        >>> error.within("scene", ["views", "light"])
-        InputError('scene.views=0 must be at least 1')
-        """
-        if not key:
-            return self
-        # An argument such as "light.turbidity" or
-        # "light[0]" belongs to the field "light".
-        field = re.split(r"[.[]", self.argument)[0]
-        if field and field in names:
-            return InputError(f"{key}.{self}", f"{key}.{self.argument}")
-        return InputError(f"{key}: {self}", key)
-
 
 @contextmanager
 def keyed(group: str = "", /, **keys: str) -> Iterator[None]:

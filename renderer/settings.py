@@ -28,6 +28,7 @@ from renderer.errors import (
     is_flag,
     is_number,
     is_whole,
+    keyed,
     require_choice,
     require_range,
 )
@@ -222,10 +223,8 @@ def settings_from(kind: type[Kind], values: object, argument: str) -> Kind:
         if item.name not in values and item.default is item.default_factory is MISSING:
             missing = f"{argument}.{item.name}"
             raise InputError(f"{missing} is not set: give a value", missing)
-    try:
+    with keyed(argument, **{name: f"{argument}.{name}" for name in names}):
         return kind(**values)
-    except InputError as error:
-        raise error.within(argument, names) from None
 
 
 @cache

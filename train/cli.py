@@ -41,7 +41,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 import conf
-from renderer.errors import InputError
+from renderer.errors import InputError, keyed
 from renderer.settings import Settings, facts_of, field_types
 from train import system
 
@@ -322,11 +322,9 @@ def _read_node(node: DictConfig, key: str) -> Any:
         elif OmegaConf.is_config(value):
             value = OmegaConf.to_container(value, resolve=True)
         values[name] = value
-    try:
-        return kind(**values)
     # The class knows only its own names, so the message gets the key of the group.
-    except InputError as error:
-        raise error.within(key, values) from None
+    with keyed(key, **{name: f"{key}.{name}" if key else name for name in values}):
+        return kind(**values)
 
 
 def as_override(argument: str, keys: Mapping[str, Any]) -> str:
