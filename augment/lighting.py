@@ -423,11 +423,11 @@ def _relight(
         light = Illumination(cast(Tensor, field), gain, offset)
     is_integer = not images.is_floating_point()
     largest = torch.iinfo(images.dtype).max if is_integer else 1
-    is_byte = images.dtype == torch.uint8 and not values.requires_grad
-    if is_byte and isinstance(model, LowLight) and (loop := loops.noisy_bytes(colors, values)):
-        relit = _noisy_bytes(colors, model, drawn, strength, loop)
-    elif is_byte and not isinstance(model, LowLight):
-        relit = relit_bytes(colors, light)
+    if images.dtype == torch.uint8 and not values.requires_grad:
+        if isinstance(model, LowLight):
+            relit = _noisy_bytes(colors, model, drawn, strength)
+        else:
+            relit = relit_bytes(colors, light)
     else:
         unit = colors.to(dtype) / largest
         # The largest value of an image above 1 is its white, at which a sensor is full.
@@ -468,9 +468,9 @@ def _tables(device: torch.device) -> tuple[Float[Tensor, " 256"], Int32[Tensor, 
 
 
 def _noisy_bytes(
-    colors: UInt8[Tensor, "N C H W"], model: LowLight, drawn: Drawn, strength: float, loop: Any
+    colors: UInt8[Tensor, "N C H W"], model: LowLight, drawn: Drawn, strength: float
 ) -> UInt8[Tensor, "N C H W"]:
-    """Return the bytes of what a camera measures, by a loop and its response to each byte."""
+    """Return the nearest bytes of what a camera measures, from a table of its response to each."""
     # Response a + b z + c z² of each image to each of the 256 bytes, shape (N, 1, 1, 256).
     decoded = (_tables(colors.device)[0] / (BINS << BIN_BITS)).expand(len(colors), 1, 1, -1)
     response = model.response(decoded, drawn, strength, decoded.new_ones(()))
@@ -478,9 +478,18 @@ def _noisy_bytes(
     # Byte of each level of the camera's converter.
     levels = torch.arange(model.levels + 1, device=colors.device).view(1, 1, 1, -1) / model.levels
     encoded = relit_bytes(torch.full_like(levels, 255, dtype=torch.uint8), Illumination(levels))
-    parts = [part.flatten(1) for part in (colors, z, *response)]
-    loop(*parts, encoded.flatten(), (noisy := torch.empty_like(parts[0])))
-    return noisy.view(colors.shape)
+    if loop := loops.noisy_bytes(z):
+        parts = [part.flatten(1) for part in (colors, z, *response)]
+        loop(*parts, encoded.flatten(), (noisy := torch.empty_like(parts[0])))
+        return noisy.view(colors.shape)
+    # Without a compiled loop: look up the coefficients at 256 · image + byte.
+    first = 256 * torch.arange(len(colors), device=colors.device, dtype=torch.int32)
+    index = (colors.int() + first[:, None, None, None]).flatten()
+    middle, slope, curve = (
+        part.flatten().index_select(0, index).view(colors.shape) for part in response
+    )
+    signal = curve.mul_(z).add_(slope).mul_(z).add_(middle).clamp_(0, model.levels).round_()
+    return encoded.flatten().index_select(0, signal.int().flatten()).view(colors.shape)
 
 
 def relit_bytes(colors: UInt8[Tensor, "N C H W"], light: Illumination) -> UInt8[Tensor, "N C H W"]:

@@ -88,6 +88,18 @@ class Drawn(NamedTuple):
         last = self.constants[:, -(surfaces.SURFACE_NODES**2) :]
         return self.rows[:, :1] * surfaces.normal_numbers(last)
 
+    def lit(self, places: Tensor, colors: Tensor, near: float = 1.0) -> Tensor | None:
+        """Return the light of lamps on a random surface by a loop, or None if it is not compiled.
+
+        If `near` is 0, the lamps are far away, in the directions of the unit vectors `places`.
+        """
+        if self.depth is not None or not (loop := loops.lamps(places)):
+            return None
+        field = self.field(colors.shape[2])
+        weights = surfaces.grid(surfaces.SURFACE_NODES, self.size)
+        loop(self.heights(), weights, near, places, colors, field)
+        return field
+
     def surface(self) -> surfaces.Surface:
         """Return the surface of the depth of the images, or a random smooth one."""
         if self.depth is not None:
@@ -206,8 +218,12 @@ class ProjectedSlide(LightModel):
 def shading(drawn: Drawn) -> Float[Tensor, "B 1 H W"]:
     """Compute the shading of a surface in the light of a direction."""
     _, azimuth, polar, *_ = drawn.numbers
-    towards = torch.cat(surfaces.direction(azimuth, polar), 1)[:, None, :, 0, 0]
-    return lamp_light(drawn, towards, torch.ones_like(towards[..., :1]), near=0.0)
+    towards = surfaces.direction(azimuth, polar)
+    place = torch.cat(towards, 1)[:, None, :, 0, 0]
+    if (field := drawn.lit(place, torch.ones_like(place[..., :1]), near=0.0)) is not None:
+        return field
+    surface = drawn.surface()
+    return surfaces.lambert(surface.slope_down, surface.slope_right, *towards)
 
 
 @dataclass(frozen=True)
@@ -227,26 +243,20 @@ class DirectionalLight(LightModel):
 
 
 def lamp_light(
-    drawn: Drawn, places: Float[Tensor, "B L 3"], colors: Float[Tensor, "B L C"], near: float = 1.0
+    drawn: Drawn, places: Float[Tensor, "B L 3"], colors: Float[Tensor, "B L C"]
 ) -> Float[Tensor, "B C H W"]:
-    """Add up the irradiance of small lamps, cos / distance², in units of that right below each.
-
-    If `near` is 0, the lamps are far away, in the directions of the unit vectors `places`.
-    """
-    if drawn.depth is None and (loop := loops.lamps(places)):
-        field = drawn.field(colors.shape[2])
-        weights = surfaces.grid(surfaces.SURFACE_NODES, drawn.size)
-        loop(drawn.heights(), weights, near, places, colors, field)
+    """Add up the irradiance of small lamps, cos / distance², in units of that right below each."""
+    if (field := drawn.lit(places, colors)) is not None:
         return field
     surface = drawn.surface()
-    x, y, height = (near * part for part in surface.position)
+    x, y, height = surface.position
     # Position of each lamp, shape (B, L, 1, 1) each, so that fields have the shape (B, L, H, W).
     right, down, above = places[..., None, None].unbind(2)
     # No surface is nearer to the lamp than a tenth of its distance.
     offsets = right - x, down - y, torch.maximum(above - height, 0.1 * above)
     squares = torch.addcmul(offsets[0] ** 2 + offsets[1] ** 2, offsets[2], offsets[2])
     cosine = surfaces.lambert(surface.slope_down, surface.slope_right, *offsets)
-    fields = cosine * (squares * squares.sqrt()).reciprocal() * above ** (2 * near)
+    fields = cosine * (squares * squares.sqrt()).reciprocal() * above**2
     return (colors.mT @ fields.flatten(2)).unflatten(2, fields.shape[2:])
 
 
@@ -388,10 +398,7 @@ class CastShadow(LightModel):
         if loop := loops.shadows(drawn.rows):
             indices = np.array([SHADOWS.index(self.kinds[kind]) for kind in kinds])
             field, parts = drawn.field(), torch.empty(2, len(kinds), 3)
-            # Only leaves have heights.
-            heights = drawn.constants
-            if 1 in indices:
-                heights = surfaces.blend(heights[:, 1:], drawn.numbers[2])[..., 0, 0]
+            heights = surfaces.blend(drawn.constants[:, 1:], drawn.numbers[2])[..., 0, 0]
             weights = surfaces.grid(self.nodes, drawn.size)
             loop(indices, drawn.rows, drawn.constants, heights, weights, field, parts)
             return Illumination(field, *parts[..., None, None])
@@ -473,8 +480,7 @@ class ColorTemperature(LightModel):
         # The camera assumes a color between that of D65 (6504 K) and that of the lamp.
         assumed = 1 / 6504 + balance * (lamp - 1 / 6504)
         kelvin = 1 / torch.stack([lamp, assumed])
-        light, white = planckian_rgb(kelvin, torch.stack([tint, 0 * tint]))
-        color = light / white
+        color = torch.div(*planckian_rgb(kelvin, torch.stack([tint, 0 * tint])))
         return Illumination(torch.ones_like(lamp), color / patterns.luminance(color))
 
 

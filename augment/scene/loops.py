@@ -19,9 +19,6 @@ from torch import Tensor
 BINS = 4096
 # Bits of the position of a linear value in its bin.
 BIN_BITS = 16
-# Power of 2 above the number of cells of a slide. Distances to the centers of cells are multiples
-# of it, to which the index of the cell is added.
-CELL_CODE = 32
 # Types of arrays: a field (B, C, H, W), numbers of each image, and what `grid` returns.
 FIELD = "float32[:,:,:,::1]"
 ROWS = "float32[:,::1]"
@@ -272,16 +269,11 @@ def multiply_slides(log_gain: Any, grid: Any, shading: Any, slides: Any) -> None
             shown[pixel] *= factor * shade[pixel]
 
 
-@_loop("int32[:,::1], int32[:,::1], float32[:,::1], float32[:,:,::1]")
-def draw_cells(columns: Any, rows: Any, colors: Any, out: Any) -> None:
-    """Draw the colors of cells, by the lowest sum of the numbers of a column and of a row."""
-    lowest = np.empty(out.shape[2], np.int32)
-    for row in range(out.shape[1]):
-        lowest[:] = 2**31 - 1
+@_loop("int32[:,::1], int32[:,::1], int32[:,::1]")
+def lowest_sums(columns: Any, rows: Any, out: Any) -> None:
+    """Compute the lowest sum of the numbers of a column and of a row."""
+    for row in range(len(out)):
+        out[row] = 2**31 - 1
         for cell in range(len(columns)):
-            for column in range(len(lowest)):
-                lowest[column] = min(lowest[column], columns[cell, column] + rows[cell, row])
-        for column in range(len(lowest)):
-            cell = lowest[column] & (CELL_CODE - 1)
-            for channel in range(3):
-                out[channel, row, column] = colors[channel, cell]
+            for column in range(out.shape[1]):
+                out[row, column] = min(out[row, column], columns[cell, column] + rows[cell, row])

@@ -227,6 +227,9 @@ MAX_NODES = 6
 FIELD_CONTRAST = 2.0
 # Probabilities of a slide with a two-color pattern, Voronoi cells, a smooth field or a photograph.
 PROBABILITIES = (0.4, 0.15, 0.15, 0.3)
+# Power of 2 above `MAX_CELLS`. A distance to the center of a cell is a multiple of it, to which the
+# index of the cell is added.
+CELL_CODE = 32
 
 
 def draw_slides(
@@ -267,20 +270,20 @@ def draw_cells(count: int, size: Size, draws: Generator) -> Pictures:
     unit = 4 * (1 + (height / width) ** 2) / 2**25
     pictures = []
     for used, places, palette in zip(cell_counts.tolist(), centers, colors, strict=True):
-        # Squared distances along x and along y from each cell, as multiples of CELL_CODE. Their
+        # Squared distances along x and along y from each cell, as multiples of `CELL_CODE`. Their
         # sum is the squared distance, and its lowest bits are the index of the cell.
         columns, rows = (
-            ((axis - place) ** 2 / unit).round().int() * loops.CELL_CODE
+            ((axis - place) ** 2 / unit).round().int() * CELL_CODE
             for axis, place in zip((x, y), places[:used].T[..., None, None], strict=True)
         )
         columns += torch.arange(used, dtype=torch.int32)[:, None, None]
-        if loop := loops.draw_cells(rows):
-            shown = torch.empty(3, height, width)
-            loop(columns[:, 0], rows[..., 0], palette, shown)
+        if loop := loops.lowest_sums(rows):
+            nearest = torch.empty(height, width, dtype=torch.int32)
+            loop(columns[:, 0], rows[..., 0], nearest)
         else:
-            nearest = (columns + rows).amin(0) & (loops.CELL_CODE - 1)
-            shown = palette.index_select(1, nearest.flatten()).unflatten(1, (height, width))
-        pictures.append(shown)
+            nearest = (columns + rows).amin(0)
+        shown = palette.index_select(1, (nearest & (CELL_CODE - 1)).flatten())
+        pictures.append(shown.unflatten(1, (height, width)))
     return torch.stack(pictures)
 
 

@@ -254,7 +254,7 @@ def test_the_loop_of_numba_equals_the_operations_of_torch(monkeypatch):
 
 
 LOOPS = ("relit_bytes", "noisy_bytes", "ramps", "shadows", "lamps", "multiply_slides")
-LOOPS += ("draw_cells",)
+LOOPS += ("lowest_sums",)
 
 
 @pytest.mark.parametrize("name", [*lights.CastShadow().kinds, *MODELS])
