@@ -52,6 +52,7 @@ def transforms(size: int) -> dict[str, Callable[[], object]]:
     calls: dict[str, Callable[[], object]] = {}
     for name in MODELS:
         calls[name] = partial(RandomLighting(name).__call__, image)
+    calls["any model"] = partial(RandomLighting().__call__, image)
     if find_spec("albumentations"):
         os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"
         import albumentations
