@@ -1,15 +1,11 @@
 """Accuracy of the renderer under numerically hard conditions, against wider numbers.
 
-An error is the largest difference anywhere in an image or gradient, divided by
-the largest magnitude in it. It is counted in units of ε, the spacing of the
-number type at 1. Gradients are those of Σ upstream × image, with random upstream
-gradients of either sign.
+An error is the largest difference anywhere in an image or gradient, divided by the largest
+magnitude in it, in units of ε, the spacing of the number type at 1.
 
-    python tests/renderer/test_accuracy.py
-    python tests/renderer/test_accuracy.py --quick
+    python tests/renderer/test_accuracy.py [--quick]
 
-The first command prints the tables as Markdown, in some minutes. The second one
-uses the sizes of the test.
+The command prints the tables as Markdown, in some minutes. --quick uses the sizes of the test.
 """
 
 import math

@@ -16,7 +16,7 @@ import augment
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 from augment.random_streams import generator
 from augment.scene.objects import Conditions
-from augment.scene.patterns import draw_patterns, draw_photograph_patterns, pixel_centers
+from augment.scene.patterns import draw_patterns
 from augment.scene.scene import Scene
 from augment.scene.vary import draw_camera_effects, vary
 from augment.settings import LampsSettings, ObjectSettings, ProjectorSettings
@@ -498,20 +498,3 @@ def test_half_of_the_patterns_show_photographs_of_a_folder(tmp_path):
     gray = decode(torch.tensor(150 / 255, dtype=torch.float64), "srgb")
     shows_photograph = ((ratio - gray).abs() < 1e-4).all(1)
     assert 0.3 < shows_photograph.double().mean() < 0.7
-
-
-def test_a_photograph_is_turned_scaled_and_mirrored_beyond_its_border():
-    count, size = 50, 64
-    # The value is linear in x from the left border to the right one.
-    x = pixel_centers(size)[0, 0]
-    photographs = (0.5 + 0.4 * x).expand(count, 3, size, size)
-    patterns = draw_photograph_patterns(photographs, pixel_centers(size), generator(0))
-    turn, zoom, _ = torch.rand(3, count, 1, 1, generator=generator(0))
-    column, row = pixel_centers(size)[:, 0]
-    angle = 2 * math.pi * turn
-    shown = 2 ** (2 * zoom - 1) * (angle.cos() * column - angle.sin() * row)
-    # A triangle wave with period 4.
-    mirrored = 1 - ((shown + 1) % 4 - 2).abs()
-    expected = (0.5 + 0.4 * mirrored)[:, None].expand_as(patterns)
-    # Half a pixel at each border has the value of the outermost pixel.
-    torch.testing.assert_close(patterns, expected, rtol=0, atol=0.4 / size + 1e-5)

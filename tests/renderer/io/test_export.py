@@ -169,19 +169,6 @@ def gltf_projection(lens: dict) -> np.ndarray:
     return matrix
 
 
-def test_faces_are_ordered_by_texture_and_textures_of_no_face_left_out(tmp_path):
-    # Faces have the textures 0 and 2 in turn.
-    mesh = replace(painted(box(), 3), texture_ids=np.arange(12, dtype=np.int32) % 2 * 2)
-    export_mesh(mesh, tmp_path / "mesh.glb")
-    loaded = load_mesh(tmp_path / "mesh.glb")
-    order = [0, 2, 4, 6, 8, 10, 1, 3, 5, 7, 9, 11]
-    assert_array_equal(corners_of(loaded), corners_of(mesh)[order])
-    assert_array_equal(loaded.texture_ids, [0] * 6 + [1] * 6)
-    first, second = loaded.textures
-    assert_array_equal(first, mesh.textures[0])
-    assert_array_equal(second, mesh.textures[2])
-
-
 def glossy(mesh: Mesh) -> Mesh:
     rng = np.random.default_rng(3)
     kinds = rng.random((3, 3), dtype=np.float32)
