@@ -75,7 +75,7 @@ def test_a_point_light_on_heights_is_that_of_mitsuba(tmp_path):
 
 @pytest.mark.parametrize("kind", lights.CastShadow().kinds)
 def test_a_penumbra_is_the_sharp_shadow_averaged_over_the_disc_of_the_sun(kind):
-    size = (200, 200)
+    size = (160, 160)
     model = lights.CastShadow((kind,))
     # The second radius is 1e-6.
     soft, sharp = (drawn_of(model, {3: 0.8, 4: radius}, size) for radius in (0.6, -2.5))
@@ -84,7 +84,7 @@ def test_a_penumbra_is_the_sharp_shadow_averaged_over_the_disc_of_the_sun(kind):
     disc = (x * x + y * y <= radius * radius).astype(float)
     seen = [model.light(drawn).field[0, 0].double().numpy() / math.pi for drawn in (soft, sharp)]
     averaged = ndimage.convolve(seen[1], disc / disc.sum())
-    inner = np.s_[20:-20, 20:-20]
+    inner = np.s_[16:-16, 16:-16]
     error = np.abs(seen[0] - averaged)[inner]
     assert error.mean() < 0.01 and np.ptp(averaged) > 0.9
 
