@@ -72,18 +72,15 @@ class Predictions(ShortRepr):
 
     @classmethod
     def of_labels(
-        cls, columns: Sequence[Any], by_label: Mapping[str, Sequence[Any]]
+        cls, shared: Mapping[str, Any], by_label: Mapping[str, Mapping[str, Any]]
     ) -> "Predictions":
-        """Repeat the columns that do not depend on the positive class for each of them.
-
-        `columns` are `photograph`, and `predicted` to `true_rank`. `by_label` has the last three
-        columns of each positive class.
-        """
-        photograph, *others = (np.tile(as_column(column), len(by_label)) for column in columns)
-        label = as_column([*by_label]).repeat(len(columns[0]))
+        """Join the columns of each positive class, for which the `shared` columns are repeated."""
+        columns = {name: np.tile(as_column(shared[name]), len(by_label)) for name in shared}
+        columns["label"] = as_column([*by_label]).repeat(len(shared["photograph"]))
         # Rows of the first class come first, and then those of the next classes.
-        last = [np.concatenate(parts) for parts in zip(*by_label.values(), strict=True)]
-        return cls(photograph, label, *others, *last)
+        for name in ("label_probability", "label_rank", "log_odds"):
+            columns[name] = np.concatenate([of_label[name] for of_label in by_label.values()])
+        return cls(**columns)
 
     def __len__(self) -> int:
         return len(self.label)
@@ -186,14 +183,22 @@ def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
         def numbers(name: str, unknown: str = "") -> list[float]:
             return [float(row[name] or unknown) for row in rows]
 
-        known = ([row["predicted"] for row in rows], numbers("probability"))
-        of_true = (numbers(TRUE_PROBABILITY, "nan"), numbers(TRUE_RANK, "inf"))
-        columns = (photographs, *known, *of_true)
-        by_label = {}
-        for name in label_names(label):
-            ranks = [int(row[f"{name}_rank"]) for row in rows]
-            by_label[name] = (numbers(f"{name}_probability"), ranks, numbers(f"{name}_log_odds"))
-        return Predictions.of_labels(columns, by_label)
+        shared = {
+            "photograph": photographs,
+            "predicted": [row["predicted"] for row in rows],
+            "probability": numbers("probability"),
+            "true_probability": numbers(TRUE_PROBABILITY, "nan"),
+            "true_rank": numbers(TRUE_RANK, "inf"),
+        }
+        by_label = {
+            name: {
+                "label_probability": numbers(f"{name}_probability"),
+                "label_rank": [int(row[f"{name}_rank"]) for row in rows],
+                "log_odds": numbers(f"{name}_log_odds"),
+            }
+            for name in label_names(label)
+        }
+        return Predictions.of_labels(shared, by_label)
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
         raise InputError(
             f"{path} is not a table of predictions for label={label} ({single_line(error)}): "

@@ -177,19 +177,22 @@ def rank_classes(
     rows = np.arange(len(photographs))
     index_of_class = {name: index for index, name in enumerate(classes)}
     shown = np.array([index_of_class.get(item.label, -1) for item in photographs])
-    columns = (
-        photographs,
-        [classes[index] for index in predicted],
-        probabilities[rows, predicted],
-        np.where(shown < 0, np.nan, probabilities[rows, shown]),
-        np.where(shown < 0, np.inf, ranks[rows, shown]),
-    )
+    shared = {
+        "photograph": photographs,
+        "predicted": [classes[index] for index in predicted],
+        "probability": probabilities[rows, predicted],
+        "true_probability": np.where(shown < 0, np.nan, probabilities[rows, shown]),
+        "true_rank": np.where(shown < 0, np.inf, ranks[rows, shown]),
+    }
     by_label = {}
     for label in labels:
         index = index_of_class[label]
-        odds = log_odds(logits, index).numpy()
-        by_label[label] = (probabilities[:, index], ranks[:, index], odds)
-    return Predictions.of_labels(columns, by_label)
+        by_label[label] = {
+            "label_probability": probabilities[:, index],
+            "label_rank": ranks[:, index],
+            "log_odds": log_odds(logits, index).numpy(),
+        }
+    return Predictions.of_labels(shared, by_label)
 
 
 @dataclass(frozen=True)
