@@ -14,6 +14,7 @@ Blender and Mitsuba.
 """
 
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -259,8 +260,16 @@ def _in_rec709(radiance: Float[np.ndarray, "H W 3"], chromaticities: Sequence[fl
     # Infinite radiance gives NaN, which `read_map` refuses.
     with np.errstate(invalid="ignore", over="ignore"):
         converted: np.ndarray = radiance @ matrix.T.astype(np.float32)
-    # Colors beyond Rec. 709 have a negative channel after the conversion, which becomes 0.
+    # True for negative channels of texels that had no negative channel before the conversion.
     is_beyond = (converted < 0) & (radiance >= 0).all(axis=-1, keepdims=True)
+    # Fraction of all radiance that setting these channels to 0 changes.
+    lost = -converted[is_beyond].sum() / max(np.abs(converted).sum(), np.finfo(np.float32).tiny)
+    if lost > NEGATIVE:
+        warnings.warn(
+            f"{lost:.2%} of the radiance of the environment map is of colors beyond Rec. 709: "
+            "their negative channels are set to 0",
+            stacklevel=2,
+        )
     return np.where(is_beyond, 0, converted)
 
 

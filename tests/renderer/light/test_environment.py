@@ -175,10 +175,11 @@ def test_a_map_of_acescg_becomes_rec_709(tmp_path, suffix):
     )
 
 
-def test_colors_beyond_rec_709_have_no_negative_radiance(tmp_path):
+def test_colors_beyond_rec_709_have_no_negative_radiance_and_a_warning(tmp_path):
     green = np.broadcast_to([0.0, 1.0, 0.0], (2, 3, 3))
     write_exr(tmp_path / "map.exr", green, ("R", "G", "B"), chromaticities=ACESCG)
-    radiance = read_map(tmp_path / "map.exr")
+    with pytest.warns(UserWarning, match=r"beyond Rec\. 709"):
+        radiance = read_map(tmp_path / "map.exr")
     expected = torch.from_numpy(ACESCG_TO_REC_709[:, 1]).float().clamp(min=0)
     torch.testing.assert_close(radiance, expected.expand(2, 3, 3), rtol=0, atol=1e-3)
 
