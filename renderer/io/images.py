@@ -4,9 +4,9 @@ A sheet is a picture with a grid of tiles. A tile is an image with its caption
 below.
 
 The first of these that a file has says how its colors become sRGB (PNG, third edition,
-section 4.3): an ICC profile, the chunk sRGB of a PNG file, its chunks gAMA and cHRM, or the
-mark of Adobe RGB in the EXIF data of a camera (DCF 2.0). Without any of them, pixels are
-sRGB.
+section 4.3): the chunk cICP of a PNG file, an ICC profile, the chunk sRGB, the chunks gAMA
+and cHRM, or the mark of Adobe RGB in the EXIF data of a camera (DCF 2.0). Without any of
+them, pixels are sRGB.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from functools import lru_cache, partial
 from itertools import accumulate, repeat, zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -100,8 +100,23 @@ def open_image(path: str | Path) -> Iterator[Image.Image]:
     """Open a regular image file of one of `FORMATS`, without decoding its pixels."""
     require_file(path, "give an image file")
     # From a path, Pillow would map a TIFF file to memory, and scramble it if it is rotated.
-    with Path(path).open("rb") as file, Image.open(file, formats=FORMATS) as image:
+    with Path(path).open("rb") as file, identify(file) as image:
         yield image
+
+
+def identify(file: BinaryIO) -> Image.Image:
+    """Return the image in a stream of bytes, without decoding its pixels."""
+    image = Image.open(file, formats=FORMATS)
+    key = image.info.get("transparency")
+    if image.format == "PNG" and key is not None:
+        # Pillow expands gray pixels of 2 and 4 bits, and keeps the upper 8 of 16 bits
+        # of colors, but does not do the same with the transparent color.
+        layout = image.tile[0][3]
+        if layout in ("L;2", "L;4"):
+            image.info["transparency"] = key * {"L;2": 85, "L;4": 17}[layout]
+        elif layout == "RGB;16B":
+            image.info["transparency"] = tuple(value >> 8 for value in key)
+    return image
 
 
 def read_rgb(path: str | Path, min_side: int) -> Image.Image:
@@ -114,7 +129,7 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
     with open_image(path) as image:
         # `draft` makes Pillow decode a JPEG file at a reduced size.
         image.draft(None, (min_side, min_side))
-        convert = conversion_to_srgb(image)
+        convert = conversion_to_srgb(image, path)
         has_more_bits = re.search(";1[26]", str(getattr(image, "tile", "")))
         color, alpha = color_and_alpha(image)
     if convert is not None:
@@ -324,6 +339,14 @@ ADOBE_GAMMA = 2 + 51 / 256
 ADOBE_PRIMARIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.329)
 # Gammas in this range stand for the curve of sRGB (PNG, section 11.3.2.2).
 SRGB_GAMMAS = (2.1, 2.3)
+# Primaries and gammas by their codes in the chunk cICP (ITU-T H.273). A gamma of None is
+# the curve of sRGB. Files of high dynamic range have other codes.
+CODED_PRIMARIES = {
+    1: REC_709,
+    9: (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.329),
+    12: (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329),
+}
+CODED_GAMMAS = {4: 2.2, 8: 1.0, 13: None}
 # Color spaces of ICC profiles by the modes of Pillow for the same channels.
 SPACE_OF_MODE = {"L": "GRAY", "RGB": "RGB", "CMYK": "CMYK"}
 # A profile is that of sRGB if it changes no 8-bit value by more than this. Different
@@ -333,8 +356,14 @@ SRGB_TOLERANCE = 2
 Conversion = Callable[[Image.Image], Image.Image]
 
 
-def conversion_to_srgb(image: Image.Image) -> Conversion | None:
+def conversion_to_srgb(image: Image.Image, path: str | Path) -> Conversion | None:
     """Find how colors (L, RGB or CMYK) of an image file become sRGB. None if they already are."""
+    codes = _coded_colors(Path(path)) if image.format == "PNG" else None
+    if codes is not None:
+        primaries_code, curve_code = codes
+        if primaries_code not in CODED_PRIMARIES or curve_code not in CODED_GAMMAS:
+            raise ValueError(f"its chunk cICP has the codes {codes}, such as HDR: save it in sRGB")
+        return _conversion(CODED_GAMMAS[curve_code], CODED_PRIMARIES[primaries_code])
     if profile := image.info.get("icc_profile"):
         return partial(_apply_profile, profile)
     if "srgb" in image.info:
@@ -351,6 +380,22 @@ def conversion_to_srgb(image: Image.Image) -> Conversion | None:
         # "R03" is the mark of Adobe RGB.
         if image.getexif().get_ifd(ExifTags.IFD.Interop).get(1) == "R03":
             return _conversion(ADOBE_GAMMA, ADOBE_PRIMARIES)
+    return None
+
+
+def _coded_colors(path: Path) -> tuple[int, int] | None:
+    """Read the codes of the primaries and of the curve from the chunk cICP of a PNG file."""
+    with path.open("rb") as file:
+        # The signature of PNG has 8 bytes. Each chunk begins with its length and its name, 4 bytes
+        # each.
+        file.seek(8)
+        while len(header := file.read(8)) == 8 and header[4:] != b"IDAT":
+            length = int.from_bytes(header[:4], "big")
+            if header[4:] == b"cICP":
+                codes = file.read(2)
+                return codes[0], codes[1]
+            # A checksum of 4 bytes follows the data of the chunk.
+            file.seek(length + 4, io.SEEK_CUR)
     return None
 
 

@@ -19,7 +19,7 @@ from PIL import Image
 from renderer.errors import MAX_MAGNITUDE, require_memory
 from renderer.image import decode, encode
 from renderer.io.files import file_below
-from renderer.io.images import FORMATS, eight_bits
+from renderer.io.images import eight_bits, identify
 from renderer.mesh import NO_TEXTURE, Mesh, transformed
 
 # Largest difference from the range [0, 1] that counts as rounding of a color.
@@ -133,7 +133,7 @@ class MeshFile:
 
 def decode_image(content: bytes | memoryview) -> Image.Image:
     """Decode an image file with 8 bits per channel, if it fits into memory as a texture."""
-    image = Image.open(io.BytesIO(content), formats=FORMATS)
+    image = identify(io.BytesIO(content))
     require_memory("textures", TEXEL_BYTES * image.width * image.height, CPU)
     return eight_bits(image)
 
@@ -214,7 +214,9 @@ def triangles_of(
         file.ignore("faces with fewer than 3 corners")
     # Places in `indices` of the corners of polygons with at least 3 corners.
     places = np.flatnonzero(is_face.repeat(sizes))
-    corners, polygons = triangulate(vertices[indices[places]], sizes[is_face])
+    corners, polygons, crossing_count = triangulate(vertices[indices[places]], sizes[is_face])
+    if crossing_count:
+        file.assume(f"{crossing_count} faces intersect themselves, so their shape is unclear")
     return places[corners], np.flatnonzero(is_face)[polygons]
 
 
@@ -281,16 +283,19 @@ def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 # Axes that remain if a polygon is projected along the axis x, y or z. A
 # polygon that is counter-clockwise seen from the positive axis stays so.
 _REMAINING_AXES = np.array([[1, 2], [2, 0], [0, 1]])
+# Largest relative difference of areas that counts as rounding.
+_AREA_TOLERANCE = 1e-6
 
 
 def triangulate(
     corners: Num[np.ndarray, "C 3"], sizes: Int[np.ndarray, " P"]
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Divide polygons into triangles that cover the same area, also if the polygons are concave.
 
     All corners of a polygon are corners of its triangles, also corners on a
     straight edge. Neighboring faces therefore still share their vertices. The results are
-    the corners of the triangles, and the ascending polygon of each triangle.
+    the corners of the triangles, the ascending polygon of each triangle, and the number of
+    polygons that intersect themselves, whose area is unclear.
     """
     # First corner of each polygon. A polygon with n corners has n - 2 triangles.
     starts = np.cumsum(sizes) - sizes
@@ -302,7 +307,7 @@ def triangulate(
     # Each fan of triangles is around the first corner of the polygon.
     triangles = starts[polygons, None] + np.stack([0 * steps, steps + 1, steps + 2], axis=1)
     if (sizes == 3).all():
-        return triangles, polygons
+        return triangles, polygons, 0
     # Corners in the plane of their polygon, in which it is counter-clockwise, shape (C, 2).
     points = _projected(corners, starts, sizes)
     # A fan of counter-clockwise triangles covers the polygon.
@@ -310,14 +315,17 @@ def triangulate(
     is_fan |= sizes == 3
     parts = [triangles[is_fan[polygons]]]
     owners = [polygons[is_fan[polygons]]]
+    crossing_count = 0
     for polygon in np.flatnonzero(~is_fan):
-        clipped = _clip_ears(points[starts[polygon] : starts[polygon] + sizes[polygon]])
+        polygon_points = points[starts[polygon] : starts[polygon] + sizes[polygon]]
+        clipped, is_crossing = _clip_ears(polygon_points)
+        crossing_count += is_crossing
         parts.append(starts[polygon] + clipped)
         owners.append(np.full(len(clipped), polygon))
     polygons = np.concatenate(owners)
     # Triangles of fans come before clipped ones. Sort them by polygon.
     order = np.argsort(polygons, kind="stable")
-    return np.concatenate(parts)[order], polygons[order]
+    return np.concatenate(parts)[order], polygons[order], crossing_count
 
 
 def _projected(corners: np.ndarray, starts: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -345,8 +353,8 @@ def _doubled_areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
 
 
-def _clip_ears(points: Num[np.ndarray, "N 2"]) -> Int[np.ndarray, "T 3"]:
-    """Divide a counter-clockwise polygon into triangles."""
+def _clip_ears(points: Num[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], bool]:
+    """Divide a counter-clockwise polygon into triangles, and tell whether it intersects itself."""
     count = len(points)
     ends = np.array([count], dtype=np.uint32)
     # Earcut cuts triangles (ears) off the polygon until nothing is left.
@@ -354,7 +362,7 @@ def _clip_ears(points: Num[np.ndarray, "N 2"]) -> Int[np.ndarray, "T 3"]:
     triangles = indices.reshape(-1, 3)
     if not len(triangles):  # The polygon has no area.
         fan = np.arange(1, count - 1)
-        return np.stack([0 * fan, fan, fan + 1], axis=1)
+        return np.stack([0 * fan, fan, fan + 1], axis=1), False
     if _doubled_areas(points, triangles).sum() < 0:
         triangles = triangles[:, ::-1]
     # The ears leave out some corners on straight edges. Each triangle
@@ -373,4 +381,9 @@ def _clip_ears(points: Num[np.ndarray, "N 2"]) -> Int[np.ndarray, "T 3"]:
         opposite = np.full(len(chain) - 1, triangles[row, column - 1])
         fan = np.stack([chain[:-1], chain[1:], opposite], axis=1)
         triangles = np.concatenate([np.delete(triangles, row, axis=0), fan])
-    return triangles
+    # Twice the area of the polygon (shoelace formula). Triangles of a polygon that intersects
+    # itself cover another area.
+    following = np.roll(points, -1, axis=0)
+    area = (points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum()
+    covered = np.abs(_doubled_areas(points, triangles)).sum()
+    return triangles, bool(abs(covered - area) > _AREA_TOLERANCE * np.ptp(points, axis=0).prod())

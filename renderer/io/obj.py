@@ -17,6 +17,9 @@ _IGNORED = {"l", "p", "s", "vp", "lod", "mg", "bevel", "c_interp", "d_interp", "
 _REFUSED_PROPERTIES = {"map_d", "map_tr", "disp", "decal"}
 # Keyword at the beginning of a line, and the text after it.
 _LINE = re.compile(rb"^[ \t]*(\S+)[ \t]*(.*)", re.MULTILINE)
+# Comment of ZBrush with the colors of vertices. Each is a
+# mask, red, green and blue in two hexadecimal digits each.
+_POLYPAINT = re.compile(rb"^#MRGB[ \t]+((?:[0-9a-fA-F]{8})+)", re.MULTILINE)
 # Options of a texture that leave it as it is: a scale of 1 and a shift of 0.
 _NEUTRAL_OPTIONS = re.compile(r"(-(s(\s+1(\.0*)?)+|[ot](\s+0(\.0*)?)+)\s+)*", re.IGNORECASE)
 # End of the text of a corner that leaves out an index.
@@ -129,7 +132,12 @@ def _vertices(lines: _Lines, file: MeshFile) -> tuple[np.ndarray, np.ndarray | N
         colors = np.ones((len(table), 3))
         colors[is_colored] = mesh_file.unit_colors(table[is_colored, 3:], file)
         return table[:, :3], colors
-    return table[:, :3], None
+    painted = bytes.fromhex(b"".join(_POLYPAINT.findall(file.content)).decode())
+    if not painted:
+        return table[:, :3], None
+    if len(painted) != 4 * len(table):
+        raise ValueError("the colors in comments #MRGB are not one for each vertex")
+    return table[:, :3], np.frombuffer(painted, np.uint8).reshape(-1, 4)[:, 1:] / 255
 
 
 def _polygons(lines: dict[str, _Lines]) -> tuple[np.ndarray, np.ndarray]:

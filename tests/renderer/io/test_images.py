@@ -23,6 +23,7 @@ SRGB = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, *D65)
 DISPLAY_P3 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, *D65)
 ADOBE = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *D65)
 PRO_PHOTO = (0.734699, 0.265301, 0.159597, 0.840403, 0.036598, 0.000105, 0.34567, 0.3585)
+REC_2020 = (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, *D65)
 # White of the connection space of ICC profiles, and Bradford's matrix.
 D50 = np.array([0.9642, 1, 0.8249])
 BRADFORD = np.array(
@@ -194,6 +195,9 @@ def png_numbers(*numbers: float) -> bytes:
         (ADOBE, None, {"gAMA": png_numbers(0.45455), "cHRM": png_numbers(*D65, *ADOBE[:6])}),
         (SRGB, None, {"gAMA": png_numbers(0.45455), "cHRM": png_numbers(*D65, *SRGB[:6])}),
         (SRGB, None, {"sRGB": b"\0", "gAMA": png_numbers(1)}),
+        (DISPLAY_P3, None, {"cICP": bytes([12, 13, 0, 1])}),
+        (REC_2020, 1.0, {"cICP": bytes([9, 8, 0, 1]), "gAMA": png_numbers(0.45455)}),
+        (SRGB, None, {"cICP": bytes([1, 13, 0, 1])}),
     ],
 )
 def test_the_color_chunks_of_a_png_file_count(tmp_path, primaries, gamma, chunks):
@@ -201,6 +205,13 @@ def test_the_color_chunks_of_a_png_file_count(tmp_path, primaries, gamma, chunks
     (tmp_path / "a.png").write_bytes(png((2, 2), 8, 2, rows, **chunks))
     tolerance = 0 if primaries == SRGB and gamma is None else 2
     assert np.abs(read(tmp_path / "a.png") - COLOR).max() <= tolerance
+
+
+def test_a_png_file_of_high_dynamic_range_is_refused(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_bytes(png((2, 2), 8, 2, bytes(12), cICP=bytes([9, 16, 0, 1])))
+    with pytest.raises(InputError, match="cICP"):
+        read_image(path, 2)
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif"])
@@ -234,6 +245,8 @@ def test_the_mark_of_adobe_rgb_in_exif_data_counts(tmp_path):
     ("depth", "pixels", "key", "expected"),
     [
         (1, "10101010", 1, [255, 0] * 4),
+        (2, "00011011", 2, [0, 85, 255, 255]),
+        (4, "00110100", 4, [51, 255]),
         (8, f"{100:08b}{7:08b}", 100, [255, 7]),
         (16, f"{0x6440:016b}{0x6441:016b}", 0x6440, [255, 0x64]),
     ],
@@ -243,6 +256,12 @@ def test_the_transparent_gray_of_a_png_file_is_transparent(tmp_path, depth, pixe
     content = png((len(expected), 2), depth, 0, 2 * row, tRNS=struct.pack(">H", key))
     (tmp_path / "a.png").write_bytes(content)
     np.testing.assert_array_equal(read(tmp_path / "a.png")[..., 1], [expected, expected])
+
+
+def test_the_transparent_color_of_16_bits_is_transparent(tmp_path):
+    row = struct.pack(">6H", 0x1000, 0x2000, 0x3000, 0x1100, 0x2000, 0x3000)
+    (tmp_path / "a.png").write_bytes(png((2, 2), 16, 2, 2 * row, tRNS=row[:6]))
+    assert read(tmp_path / "a.png")[0].tolist() == [[255] * 3, [0x11, 0x20, 0x30]]
 
 
 def test_16_bit_tiff_files_are_turned_and_scaled(tmp_path):

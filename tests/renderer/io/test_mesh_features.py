@@ -113,6 +113,8 @@ ROWS = [
     ("vn", obj(face="f 1//1 2//1 3//1"), WHITE),
     ("vt for some corners", obj(face="f 1/1 2 3//1"), WHITE),
     ("vertex colors", obj(vertex="1 0 0"), RED),
+    ("polypaint", obj("#MRGB ffff0000ffff0000\n#MRGB 00ff0000"), RED),
+    ("polypaint of two vertices", obj("#MRGB ffff0000ffff0000"), REFUSED),
     ("weight", obj(vertex="2"), REFUSED),
     ("color above 1", obj(vertex="1.5 0 0"), REFUSED),
     ("line", obj("l 1 2"), IGNORED),

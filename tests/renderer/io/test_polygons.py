@@ -45,11 +45,12 @@ def test_triangles_cover_the_area_of_the_shoelace_formula_and_keep_all_edges(mak
     for _ in range(100):
         points = make(rng)
         corners = in_space(points, rng)
-        triangles, _ = triangulate(corners, np.array([len(points)]))
+        triangles, _, crossing_count = triangulate(corners, np.array([len(points)]))
         vectors = areas_of(corners[triangles])
         # Triangles that leave the polygon would have a larger sum of areas.
         assert np.linalg.norm(vectors, axis=1).sum() == pytest.approx(shoelace(points))
         assert np.linalg.norm(vectors.sum(axis=0)) == pytest.approx(shoelace(points))
+        assert crossing_count == 0
         sides = {tuple(side) for side in triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)}
         boundary = {(a, b) for a, b in sides if (b, a) not in sides}
         indices = np.arange(len(points))
@@ -62,7 +63,7 @@ def test_polygons_of_all_sizes_are_triangulated_together():
     order = rng.permutation(len(polygons))
     corners = np.concatenate([in_space(polygons[index], rng) for index in order])
     sizes = np.array([len(polygons[index]) for index in order])
-    triangles, owners = triangulate(corners, sizes)
+    triangles, owners, _ = triangulate(corners, sizes)
     found = np.bincount(owners, np.linalg.norm(areas_of(corners[triangles]), axis=1))
     expected = [abs(shoelace(polygons[index])) for index in order]
     assert found == pytest.approx(np.array(expected))
@@ -74,11 +75,16 @@ def test_a_polygon_with_a_bridge_to_its_hole_leaves_the_hole_open():
     hole = [[1, 1], [1, 3], [3, 3], [3, 1]]
     points = np.array([*outer, outer[0], hole[0], *hole[1:], hole[0]], dtype=float)
     corners = np.column_stack([points, np.zeros(len(points))])
-    triangles, _ = triangulate(corners, np.array([len(points)]))
+    triangles, _, _ = triangulate(corners, np.array([len(points)]))
     assert np.linalg.norm(areas_of(corners[triangles]), axis=1).sum() == pytest.approx(12)
+
+
+def test_a_polygon_that_intersects_itself_is_counted():
+    crossed = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [1, 1, 0]], dtype=float)
+    assert triangulate(crossed, np.array([4]))[2] == 1
 
 
 def test_a_polygon_without_area_gives_triangles_without_area():
     line = np.arange(5)[:, None] * np.ones(3)
-    triangles, _ = triangulate(line, np.array([5]))
+    triangles, _, _ = triangulate(line, np.array([5]))
     assert not areas_of(line[triangles]).any()
