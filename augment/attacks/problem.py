@@ -132,7 +132,6 @@ def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
     """
     if not settings.allow_negative:
         physical = scene.basis.project_nonnegative(scene.lights)
-        # A copy of the scene would be rasterized again.
         if not torch.equal(physical, scene.lights):
             scene = scene.changed(lights=physical)
     of_light = {"nonnegative": not settings.allow_negative}

@@ -233,7 +233,13 @@ class Scene:
         """
         # Each argument is also an attribute of this name.
         present = {name: getattr(self, name) for name in signature(Scene).parameters}
-        return Scene(**present | arguments)
+        copy = Scene(**present | arguments)
+        kinds = [(lights.dtype, lights.device) for lights in (copy.lights, self.lights)]
+        if arguments.keys() == {"lights"} and kinds[0] == kinds[1]:
+            # Operators, with their shadows, are the same in any light, so they are built once.
+            copy._operator_renderer = self._operator_renderer
+            copy._direct_renderer = self._direct_renderer
+        return copy
 
     def with_count(self, count: int) -> Scene:
         """Return a copy with `count` examples, as many of each object as possible.

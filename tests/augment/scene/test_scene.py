@@ -176,6 +176,17 @@ def test_each_mesh_is_rasterized_once_in_all_views_when_it_is_needed(rasterized)
     assert rasterized == [4, 4]
 
 
+def test_a_copy_in_other_light_is_not_rasterized_again_and_shows_that_light(rasterized):
+    scene, fresh = (built("plate", "cup", views=4) for _ in range(2))
+    every = torch.arange(len(scene))
+    scene.render(scene.conditions(every), every)
+    copy = scene.changed(lights=scene.lights.flip(-1) / 2)
+    found = copy.render(copy.conditions(every), every)
+    assert rasterized == [4, 4]
+    expected = fresh.render(copy.conditions(every), every)
+    torch.testing.assert_close(found, expected)
+
+
 STACKS = {"one stack": (render.PIXELS_PER_STACK, "linear"), "a stack per view": (1, "srgb")}
 
 
