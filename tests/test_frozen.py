@@ -392,8 +392,10 @@ def fingerprint() -> str:
         for found in distributions(name=name):
             versions[name] = found.version
     instructions = torch.backends.cpu.get_cpu_capability()
-    # OPENBLAS_CORETYPE changes the instructions that NumPy and SciPy use.
-    kernels = {info.get("architecture", "") for info in threadpool_info()} - {""}
+    # OPENBLAS_CORETYPE changes the instructions that NumPy and SciPy use. Other libraries, such as
+    # OpenCV, have an OpenBLAS of their own, which other tests may have loaded.
+    libraries = [info for info in threadpool_info() if "opencv" not in info["filepath"]]
+    kernels = {info.get("architecture", "") for info in libraries} - {""}
     versions["OpenBLAS"] = " ".join(sorted(kernels))
     return ", ".join([processor, instructions, *map(" ".join, versions.items())])
 
