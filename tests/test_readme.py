@@ -76,6 +76,12 @@ def test_random_light_block_relights_a_batch_and_a_clip():
     assert len(names["frames"]) == 8
 
 
+def linear_network() -> tuple[nn.Sequential, torch.Tensor]:
+    """Return a network, and a copy of its weights."""
+    network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
+    return network, network[1].weight.detach().clone()
+
+
 @pytest.fixture
 def relit(monkeypatch) -> list[object]:
     """The types of the images that random light has changed."""
@@ -142,20 +148,17 @@ def test_ultralytics_block_trains_on_relit_images(folder, monkeypatch):
 @pytest.mark.filterwarnings("default")
 def test_lightning_module_block_trains_on_relit_images(relit):
     pytest.importorskip("lightning")
-    network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
-    before = network[1].weight.detach().clone()
+    network, before = linear_network()
     run("In a Lightning module", network=network, data=Photographs())
     assert relit == [torch.Tensor]
     assert not torch.equal(network[1].weight, before)
 
 
 def test_plain_loop_block_trains_on_relit_and_worst_images(relit):
-    network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
-    before = network[1].weight.detach().clone()
-    options = {"optimizer": torch.optim.SGD(network.parameters(), lr=0.01)}
-    run(
-        "In a plain loop", network=network, data=[(torch.full((3, 32, 32), 0.5), 1)] * 40, **options
-    )
+    network, before = linear_network()
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.01)
+    data = [(torch.full((3, 32, 32), 0.5), 1)] * 40
+    run("In a plain loop", network=network, data=data, optimizer=optimizer)
     # The second batch is seen in two lights, and shown in the worse one.
     assert len(relit) == 4
     assert not torch.equal(network[1].weight, before)
@@ -198,12 +201,8 @@ def test_cameras_block_renders_and_builds_a_scene_of_the_camera_in_the_files(fol
 
 
 def test_load_block_recognizes_an_orange(folder):
-    image = renderer.render(
-        renderer.solid("orange", 0),
-        renderer.orbit_cameras(1, width=2.4),
-        renderer.load_light("grace"),
-        96,
-    )
+    shown = renderer.solid("orange", 0), renderer.orbit_cameras(1, width=2.4)
+    image = renderer.render(*shown, renderer.load_light("grace"), 96)
     Image.fromarray(to_bytes(image[0]).permute(1, 2, 0).numpy()).save(folder / "orange.jpg")
     assert run("Load")["predicted"] == "orange"
 
@@ -250,16 +249,10 @@ class Photographs(Dataset):
 
 def test_training_loop_block_trains_on_data_and_renders():
     torch.manual_seed(0)
-    network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
-    before = network[1].weight.detach().clone()
+    network, before = linear_network()
     optimizer = torch.optim.SGD(network.parameters(), lr=0.01)
-    names = run(
-        "Your own training loop",
-        torch=torch,
-        network=network,
-        data=Photographs(),
-        optimizer=optimizer,
-    )
+    given = {"torch": torch, "network": network, "data": Photographs(), "optimizer": optimizer}
+    names = run("Your own training loop", **given)
     assert len(names["renders"]) == 10
     assert names["renders"].labels.eq(53).all()
     assert names["renders"].images.shape == (10, 3, 32, 32)

@@ -68,6 +68,10 @@ def small_service(label: Any = 0, **options: Any) -> augment.AugmentationService
     return augment.AugmentationService.from_meshes([(MESH, label)], SIZE, **given)
 
 
+def small_service_with(settings: Any) -> augment.AugmentationService:
+    return augment.AugmentationService.from_meshes([(MESH, 0)], SIZE, settings)
+
+
 def shown_examples(examples: Any) -> Tensor:
     return small_scene().render(small_scene().conditions(torch.arange(2)), examples)
 
@@ -385,6 +389,7 @@ SERVICES = [
     *calls_of("amplitude", RandomLightSettings, 0),
     *by_name(service_of, scene=[3, MESH], labels=["orange", [0]], positive_classes=["orange"]),
     *by_name(service_of, seed=[None, 0.5]),
+    *calls_of("examples", small_service_with, augment.AugmentationSettings(examples=0)),
     *calls_of("meshes", lambda x: of_meshes(x, SIZE), [(MESH,)], [MESH], 3),
     *calls_of("label", small_service, "orange", 1.5, None),
     *calls_of("size", lambda x: of_meshes([(MESH, 0)], x), 16.5, 0),

@@ -19,7 +19,6 @@ from augment.scene.scene import Scene
 from augment.service import AugmentationService
 from augment.settings import SceneSettings
 from augment.tasks.classification import complementary_label
-from renderer.errors import InputError
 from renderer.light.files import probe
 from renderer.solids import solid
 
@@ -266,11 +265,6 @@ def test_both_arms_change_shape_and_albedo_within_their_norm_balls(model, mode):
     assert diagnostics["light_change"] == 0
     if mode == "adversarial":
         assert diagnostics["loss"] > diagnostics["loss_before"]
-
-
-def test_a_service_from_meshes_without_renders_is_refused():
-    with pytest.raises(InputError, match="examples is 0"):
-        AugmentationService.from_meshes([("solid:cup", 0)], 8, AugmentationSettings(examples=0))
 
 
 def test_the_settings_of_a_scene_keep_their_backgrounds_in_a_service():

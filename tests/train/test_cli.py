@@ -80,6 +80,7 @@ def test_a_training_of_two_methods_ends_with_their_table_and_records_its_command
         (["data=npz", "data.path=none.npz"], "data.path=none.npz does not exist"),
         (["out=file/run"], "out=PATH/file/run cannot be written to"),
         (["out=odd"], "PATH/odd/train.log cannot be read or written"),
+        (["network=none"], "network=none"),
         (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs the command sbatch"),
         (["--multirun", "seed=0,0"], "the sweep has two runs with the same settings"),
         (["--multirun", "out=a", "seed=0,1"], "out="),

@@ -64,6 +64,7 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["attack@augment.attack=[lightning]"], "attack=lightning is not a choice"),
         (["~seed"], "~seed: a setting cannot be removed"),
         (["out="], "out is empty"),
+        (["scene.ground=[a]"], "scene.ground[0]"),
         (["augment.attack.geometry.radius=1"], "augment.attack.geometry is null"),
         (
             ["attack@augment.attack=[geometry]", "augment.attack.geometry.radius=-1"],

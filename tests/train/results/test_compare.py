@@ -204,19 +204,7 @@ class TestAHardenedNetwork:
         ((_, recall, *_), *_) = found["adversarial minus scores/base (1 and 1 seeds, paired)"]
         assert recall.startswith("+0.750")
 
-    def test_has_an_initial_network_of_its_own_if_it_began_with_other_weights(self, hardened):
-        config = hardened[1] / "config.yaml"
-        text = config.read_text()
-        assert "\nweights: null" in text
-        config.write_text(text.replace("\nweights: null", "\nweights: other.pth", 1))
-        tables = compare(hardened)
-        _, *rows = tables[""]
-        assert [row[0].startswith("the initial network") for row in rows].count(True) == 2
-        pairs = [pair for pair in differences(hardened) if "minus the initial" in pair]
-        assert len(pairs) == 2
-        assert all("weights=other.pth" in pair for pair in pairs if pair.startswith("adversarial"))
-
-    def test_began_with_one_network_also_if_the_runs_were_scored_on_other_folders(self, hardened):
+    def test_began_with_one_network_on_any_folders_unless_the_weights_differ(self, hardened):
         for folder in (hardened[1], hardened[1] / "before"):
             summary = copytree(folder / "photographs", folder / "more") / "summary.json"
             text = summary.read_text()
@@ -224,6 +212,12 @@ class TestAHardenedNetwork:
         assert [row[0] for row in compare(hardened)[""]].count("the initial network") == 1
         more = differences(hardened, "more")
         assert "adversarial minus the initial network (1 and 1 seeds, paired)" in more
+        config = hardened[1] / "config.yaml"
+        text = config.read_text()
+        assert "\nweights: null" in text
+        config.write_text(text.replace("\nweights: null", "\nweights: other.pth", 1))
+        names = [row[0] for row in compare(hardened)[""] if row[0].startswith("the initial")]
+        assert len(names) == 2 and "weights=other.pth" in "".join(names)
 
 
 def test_a_difference_of_three_seeds_is_that_of_their_means_and_paired(scored_run):
