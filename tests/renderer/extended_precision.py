@@ -80,17 +80,8 @@ def view(ids, samples, placed, vertices, faces, albedo, towards, lift) -> View:
     placed_normals = cross(*_edges(lift(placed), corners))
     cosines = (placed_normals * lift(towards)[:, None]).sum(axis=0)
     first, second = _edges(lift(vertices), corners)
-    return View(
-        first=first,
-        second=second,
-        side=np.where(cosines < 0, -1, 1),
-        albedo=albedo[seen],
-        corners=corners,
-        pixel=pixel,
-        face=face,
-        pixels=pixels,
-        samples=samples**2,
-    )
+    side = np.where(cosines < 0, -1, 1)
+    return View(first, second, side, albedo[seen], corners, pixel, face, pixels, samples**2)
 
 
 def image(view: View, light: np.ndarray) -> np.ndarray:

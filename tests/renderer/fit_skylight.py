@@ -19,22 +19,13 @@ from renderer.light.harmonics import basis
 from renderer.light.skylight import coefficients
 from renderer.settings import TURBIDITY
 
-# Preetham et al., appendix A.2: the parameters A to E of Perez's formula. The rows are the
-# luminance Y, x and y. The first table is the slope in turbidity, the second the offset.
-PEREZ = np.array(
-    [
-        [
-            [0.1787, -0.3554, -0.0227, 0.1206, -0.0670],
-            [-0.0193, -0.0665, -0.0004, -0.0641, -0.0033],
-            [-0.0167, -0.0950, -0.0079, -0.0441, -0.0109],
-        ],
-        [
-            [-1.4630, 0.4275, 5.3251, -2.5771, 0.3703],
-            [-0.2592, 0.0008, 0.2125, -0.8989, 0.0452],
-            [-0.2608, 0.0092, 0.2102, -1.6537, 0.0529],
-        ],
-    ]
-)
+# Preetham et al., appendix A.2: the parameters A to E of Perez's formula for the luminance Y, x and
+# y, by turbidity T and 1.
+PEREZ = [
+    [[0.1787, -0.3554, -0.0227, 0.1206, -0.0670], [-1.4630, 0.4275, 5.3251, -2.5771, 0.3703]],
+    [[-0.0193, -0.0665, -0.0004, -0.0641, -0.0033], [-0.2592, 0.0008, 0.2125, -0.8989, 0.0452]],
+    [[-0.0167, -0.0950, -0.0079, -0.0441, -0.0109], [-0.2608, 0.0092, 0.2102, -1.6537, 0.0529]],
+]
 # Chromaticities x and y overhead: rows T², T and 1 of the turbidity, and columns θ³, θ², θ and 1 of
 # the sun's zenith angle.
 ZENITH_X = [
@@ -142,17 +133,13 @@ def radiance(cosine: np.ndarray, angle: np.ndarray, zenith: float, turbidity: fl
     """
     chi = (4 / 9 - turbidity / 120) * (math.pi - 2 * zenith)
     luminance_overhead = (4.0453 * turbidity - 4.9710) * math.tan(chi) - 0.2155 * turbidity + 2.4192
-    overhead = np.array(
-        [
-            luminance_overhead,
-            _chromaticity_overhead(ZENITH_X, zenith, turbidity),
-            _chromaticity_overhead(ZENITH_Y, zenith, turbidity),
-        ]
-    )
+    powers = zenith ** np.arange(3, -1, -1)
+    chromaticities = np.array([turbidity**2, turbidity, 1]) @ [ZENITH_X, ZENITH_Y] @ powers
+    overhead = np.append(luminance_overhead, chromaticities)
     # The last direction is straight up.
     cosine = np.append(cosine.clip(MIN_COSINE), 1)
     angle = np.append(angle, zenith)
-    a, b, c, d, e = (turbidity * PEREZ[0] + PEREZ[1]).T[:, :, None]
+    a, b, c, d, e = (np.array([turbidity, 1]) @ PEREZ).T[:, :, None]
     gradation = 1 + a * np.exp(b / cosine)
     indicatrix = 1 + c * np.exp(d * angle) + e * np.cos(angle) ** 2
     perez = gradation * indicatrix
@@ -160,11 +147,6 @@ def radiance(cosine: np.ndarray, angle: np.ndarray, zenith: float, turbidity: fl
     chromaticities = np.stack([x, y, 1 - x - y], axis=1)
     xyz = chromaticities * (luminance / y)[:, None]
     return xyz @ np.linalg.inv(RGB_TO_XYZ).T
-
-
-def _chromaticity_overhead(rows: list[list[float]], zenith: float, turbidity: float) -> float:
-    by_turbidity = [np.polyval(row, zenith) for row in rows]
-    return np.polyval(by_turbidity, turbidity)
 
 
 if __name__ == "__main__":

@@ -102,16 +102,10 @@ class Setup:
         resolution = self.settings.size * samples
         closed = mesh.closed and not is_cut_open
         [ids] = self.rasterizer.rasterize(points[None], mesh.faces, resolution, closed)
-        return wide.view(
-            ids=ids,
-            samples=samples,
-            placed=mesh.vertices,
-            vertices=self.shaded_vertices().double().numpy(),
-            faces=mesh.faces,
-            albedo=mesh.corner_colors[:, 0].astype(np.float64),
-            towards=self.camera.axes()[2],
-            lift=self.lift,
-        )
+        shaded = (self.shaded_vertices().double().numpy(), mesh.faces)
+        albedo = mesh.corner_colors[:, 0].astype(np.float64)
+        towards = self.camera.axes()[2]
+        return wide.view(ids, samples, mesh.vertices, *shaded, albedo, towards, self.lift)
 
     def fragments(self) -> Fragments:
         mesh = self.mesh
@@ -350,13 +344,10 @@ def shadow_errors(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
     setup = replace(setup, settings=settings)
     surface = Surface(mesh, setup.fragments(), settings)
     offsets = rays.Rays(mesh).offset * surface.planes
-    lost = wide.shadow(
-        view=setup.view(),
-        points=extended((surface.points + offsets).numpy()),
-        corners=extended(mesh.vertices[mesh.faces]),
-        directions=extended(rays.sphere(rays.DIRECTIONS).numpy()),
-        degree=setup.degree,
-    )
+    points = extended((surface.points + offsets).numpy())
+    corners = extended(mesh.vertices[mesh.faces])
+    directions = extended(rays.sphere(rays.DIRECTIONS).numpy())
+    lost = wide.shadow(setup.view(), points, corners, directions, setup.degree)
     return operator_errors(setup, dtype, lost)
 
 

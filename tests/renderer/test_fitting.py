@@ -12,7 +12,7 @@ from torch import Tensor
 import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
-from renderer.fit import FittedScene, _fit_channels, fit_scene
+from renderer.fit import FittedScene, fit_scene
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import load_light
 from renderer.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
@@ -34,25 +34,6 @@ def coverage_of(mesh: renderer.Mesh, camera: Camera, size: int) -> Tensor:
     black = torch.zeros(49, 3, dtype=torch.float64)
     background = renderer.render(mesh, camera, black, size, 1.0, samples=8)
     return 1 - background[0]
-
-
-@pytest.mark.slow
-def test_the_brightest_channel_is_fitted_alone_and_the_others_are_pulled_toward_its_light():
-    """The light is nearly uniform, so that no radiance is negative, and the minimum is closed."""
-    gain = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
-    matrix = gain[:, None, None] * torch.eye(49, dtype=torch.float64)
-    penalty = torch.linspace(0.1, 0.5, 49, dtype=torch.float64)
-    right = torch.zeros(3, 49, dtype=torch.float64)
-    right[:, 0] = torch.tensor([6.0, 3.0, 2.0])
-    right[:, 1] = torch.tensor([0.1, 0.2, 0.3])
-    light, expected = _fit_channels(matrix, right, penalty, grid=8)
-    alone = right[0] / (gain[0] + penalty)
-    torch.testing.assert_close(light[:, 0], alone)
-    assert not expected[:, 0].any()
-    for channel in (1, 2):
-        factor = (right[channel] @ alone) / (gain[channel] * (alone @ alone))
-        pulled = (right[channel] + penalty * factor * alone) / (gain[channel] + penalty)
-        torch.testing.assert_close(light[:, channel], pulled)
 
 
 def require_same_camera(found: Camera, expected: Camera) -> None:

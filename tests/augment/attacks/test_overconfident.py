@@ -36,14 +36,10 @@ def attack(network, scene, factor, optimizer) -> nb.AttackResult:
     return nb.attack(classifier, scene, settings=settings)
 
 
-@pytest.mark.parametrize(
-    "optimizer",
-    [
-        "gradient",
-        pytest.param("random_search", marks=pytest.mark.slow),
-        pytest.param("cma_es", marks=pytest.mark.slow),
-    ],
-)
+SEARCHES = [pytest.param(each, marks=pytest.mark.slow) for each in ("random_search", "cma_es")]
+
+
+@pytest.mark.parametrize("optimizer", ["gradient", *SEARCHES])
 def test_an_attack_succeeds_in_the_same_views_if_the_logits_are_multiplied(
     network, scene, optimizer
 ):

@@ -12,7 +12,7 @@ from augment.augmentation_settings import CameraEffectSettings, VariationSetting
 from augment.random_streams import generator
 from augment.scene import patterns
 from augment.scene.surfaces import draw_shading
-from augment.scene.vary import _blur, vary
+from augment.scene.vary import vary
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.light.environment import write_map
 from renderer.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
@@ -153,15 +153,6 @@ def test_a_photograph_in_a_pattern_keeps_its_proportions():
     shown = patterns.draw_photograph_patterns(disk.expand(1, 3, -1, -1), points, draws)[0, 1]
     rows, columns = torch.nonzero(shown[10:50, 40:80] > 0.5).T.double()
     assert rows.std().item() == pytest.approx(columns.std().item(), rel=0.05)
-
-
-@each_shape
-def test_a_blur_is_that_of_the_square_away_from_the_border(shape):
-    images = torch.rand(1, 1, 3, 40, 40, generator=torch.Generator().manual_seed(2))
-    larger = (shape[0] + 18, shape[1] + 18)
-    deviations = torch.tensor([1.5])
-    blurred = center(_blur(center(images, larger), deviations), shape)
-    torch.testing.assert_close(blurred, center(_blur(images, deviations), shape))
 
 
 @each_shape

@@ -350,14 +350,9 @@ def test_morph_targets_are_added_to_each_attribute(tmp_path):
     sparse = gltf.array(np.float32([[0, 0, 0]] * 3))
     del gltf.tree["accessors"][sparse]["bufferView"]
     gltf.sparse(sparse, np.uint8([1]), np.float32([4, 0, 0]))
-    primitive["targets"] = [
-        {
-            "POSITION": gltf.array(np.float32([[0, 0, 1]] * 3)),
-            "COLOR_0": gltf.array(np.float32([[0.4, 0, 2]] * 3)),
-            "NORMAL": gltf.array(np.float32([[2, 0, 0]] * 3)),
-        },
-        {"POSITION": sparse},
-    ]
+    changes = {"POSITION": [0, 0, 1], "COLOR_0": [0.4, 0, 2], "NORMAL": [2, 0, 0]}
+    arrays = {name: gltf.array(np.float32([row] * 3)) for name, row in changes.items()}
+    primitive["targets"] = [arrays, {"POSITION": sparse}]
     gltf.tree["meshes"][0]["weights"] = [0.5, 0.25]
     mesh = gltf.load(tmp_path)
     expected = POINTS[:3] + [0, 0, 0.5] + 0.25 * np.float32([[0] * 3, [4, 0, 0], [0] * 3])

@@ -29,15 +29,11 @@ FAR = 2**24 - 1
 NO_FACE = -1
 
 
-@pytest.fixture(
-    scope="module",
-    params=[
-        "numpy",
-        "torch",
-        pytest.param("numba", marks=needs_numba),
-        pytest.param("opengl", marks=needs_egl),
-    ],
-)
+NUMBA = pytest.param("numba", marks=needs_numba)
+OPENGL = pytest.param("opengl", marks=needs_egl)
+
+
+@pytest.fixture(scope="module", params=["numpy", "torch", NUMBA, OPENGL])
 def rasterizer(request) -> Rasterizer:
     return choose(request.param)
 
