@@ -124,6 +124,13 @@ def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive
     np.testing.assert_allclose(all_rows(operator)[0].T, expected, atol=4e-3)
 
 
+def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monkeypatch):
+    monkeypatch.setattr(rays, "MAX_COMPARISONS", 0)
+    convex = operator_of(CONVEX["a ball"])
+    assert torch.equal(convex.nonzero, nonzero_coefficients(6))
+    assert len(operator_of(dented()).nonzero) == 49
+
+
 @pytest.mark.parametrize("bounces", [0, 1])
 def test_a_face_without_area_leaves_the_transfer_finite(bounces, monkeypatch):
     monkeypatch.setattr(precomputed, "PATCHES", 2**7)
