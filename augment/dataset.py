@@ -45,8 +45,8 @@ class LabeledRender:
         index: Index of the render in its data set.
         image: Image of 8 bits, uint8, shape (3, H, W).
         labels: Class of each of n visible objects, as `meshes` gives it.
-        boxes: Left, top, right and bottom of their visible parts in pixels,
-            float32, shape (n, 4).
+        boxes: Left, top, right and bottom of their masks in pixels, float32,
+            shape (n, 4). 0 for an object that covers half of no pixel.
         masks: Pixels of which each covers half or more, bool, shape (n, H, W).
         visible: Fraction of each object that nothing hides, shape (n,).
         depth: Distance from the camera along the viewing direction in world

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from bisect import bisect
 from collections import UserDict
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from copy import copy
 from functools import cache
 from itertools import accumulate
@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Float, Int32, UInt8
 from PIL import Image
 from torch import Tensor
-from torch.utils._pytree import tree_flatten_with_path, tree_unflatten
+from torch.utils._pytree import SequenceKey, tree_flatten_with_path, tree_unflatten
 from torchvision import tv_tensors
 from torchvision.transforms import v2
 
@@ -58,7 +58,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
     and changes the images only. An image is a PIL image, or a tensor of any
     dtype and of shape (..., C, H, W), with 1 to 4 channels. A second or fourth
     channel is alpha and stays. Of plain tensors in a sample, only the first is an
-    image, or that of a key "image", "images", "img" or "pixel_values". Each image
+    image, or those of a key "image", "images", "img" or "pixel_values". Each image
     of a batch has its own light, and all frames of a `tv_tensors.Video` have the
     same. Values above 1 (HDR) are not clipped. The random numbers are from torch's
     global generator on the CPU.
@@ -143,13 +143,14 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         count = max([math.prod(_batch_shape(image)) for image in flat_inputs], default=1)
         models, weights = [*self.lights], [*self.lights.values()]
         lights: list[Light | None] = []
-        seeds = torch.randint(2**62, (count,)).tolist()
-        for seed, (chance, choice) in zip(seeds, torch.rand(count, 2).tolist(), strict=True):
-            # Draw a model with a probability in proportion to its weight.
-            model = models[bisect(list(accumulate(weights)), choice * sum(weights))]
-            values = torch.rand(model.dimensions + model.constants)
-            is_changed = chance < self.p and self.strength > 0
-            lights.append(Light(model, values, seed, self.strength) if is_changed else None)
+        with _usual_defaults("cpu"):
+            seeds = torch.randint(2**62, (count,)).tolist()
+            for seed, (chance, choice) in zip(seeds, torch.rand(count, 2).tolist(), strict=True):
+                # Draw a model with a probability in proportion to its weight.
+                model = models[bisect(list(accumulate(weights)), choice * sum(weights))]
+                values = torch.rand(model.dimensions + model.constants)
+                is_changed = chance < self.p and self.strength > 0
+                lights.append(Light(model, values, seed, self.strength) if is_changed else None)
         return {"lights": lights}
 
     def apply(self, image: Any, params: dict[str, Any], depth: Any = None) -> Any:
@@ -206,7 +207,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
             return self.transform(sample, self.make_params([sample]))
         paths, spec = tree_flatten_with_path(sample)
         leaves = [leaf for _, leaf in paths]
-        keys = [getattr(path[-1], "key", None) if path else None for path, _ in paths]
+        keys = [_key_of(path) for path, _ in paths]
         # Keys of leaves that are no images: all but `IMAGES`, if the sample has one of those.
         hidden = {"depth"} if {*IMAGES}.isdisjoint(keys) else {*keys} - {*IMAGES}
         # Torchvision tells which of the others are images: the first of plain tensors.
@@ -214,15 +215,21 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
             None if key in hidden and (key == "depth" or v2._utils.is_pure_tensor(leaf)) else leaf
             for key, leaf in zip(keys, leaves, strict=True)
         ]
-        is_image = self._needs_transform_list(others)
-        if not any(is_image):
+        found = zip(leaves, keys, self._needs_transform_list(others), strict=True)
+        places = [
+            place
+            for place, (leaf, key, is_image) in enumerate(found)
+            if is_image or (key in IMAGES and v2._utils.is_pure_tensor(leaf))
+        ]
+        if not places:
             raise InputError("the sample has no image: give a PIL image or a tensor (C, H, W)")
-        pairs = [*zip(leaves, is_image, strict=True)]
-        params = self.make_params([leaf for leaf, is_it in pairs if is_it])
-        params["depth"] = leaves[keys.index("depth")] if "depth" in keys else None
-        return tree_unflatten(
-            [self.transform(leaf, params) if is_it else leaf for leaf, is_it in pairs], spec
-        )
+        depths = [leaf for leaf, key in zip(leaves, keys, strict=True) if key == "depth"] or [None]
+        if len(depths) not in (1, len(places)):
+            raise InputError(f"depth has {len(depths)} maps for {len(places)} images: give each")
+        params = self.make_params([leaves[place] for place in places])
+        for place, depth in zip(places, depths * (len(places) // len(depths)), strict=True):
+            leaves[place] = self.transform(leaves[place], params | {"depth": depth})
+        return tree_unflatten(leaves, spec)
 
     def albumentations(self) -> Any:
         """Return this transform as one of Albumentations, for arrays (H, W, C).
@@ -285,8 +292,29 @@ def relight_photographs(
         require_photographs("slides", slides)
     count, _, *shape = photographs.shape
     # Photographs stand for the albedo, and the light of the projector multiplies it.
-    light = draw_projected_light(count, shape, generator(seed, "relight"), slides)
-    return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
+    with _usual_defaults(photographs.device.type):
+        light = draw_projected_light(count, shape, generator(seed, "relight"), slides)
+        return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
+
+
+@contextmanager
+def _usual_defaults(kind: str) -> Iterator[None]:
+    """Create tensors on the CPU in 32 bits, and compute without autocast, in a `with` block."""
+    with ExitStack() as stack:
+        if torch.is_autocast_enabled(kind):
+            stack.enter_context(torch.autocast(kind, enabled=False))
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        if (dtype := torch.get_default_dtype()) != torch.float32:
+            stack.callback(torch.set_default_dtype, dtype)
+            torch.set_default_dtype(torch.float32)
+        yield
+
+
+def _key_of(path: Sequence[Any]) -> Any:
+    """Return the key at which a dictionary has a leaf, or a list with it."""
+    named = [part for part in path if not isinstance(part, SequenceKey)]
+    return getattr(named[-1], "key", None) if named else None
 
 
 def _as_model(light: str | LightModel) -> LightModel:
@@ -361,7 +389,6 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         limit = f"{errors.MAX_MAGNITUDE:g}"
         raise InputError(f"the image has values that are NaN or beyond ±{limit}: replace them")
     depths = None if depth is None else _as_depth(depth, frames, count)
-    is_mixed = torch.is_autocast_enabled(plain.device.type)
     # Rows of the frames that have the same model and the same strength. Unchanged frames have None.
     groups: dict[Any, list[int]] = {}
     for row, light in enumerate(lights):
@@ -371,7 +398,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         chosen = [light for light in (lights[row] for row in rows) if light is not None]
         part = frames if len(rows) == len(frames) else frames[rows]
         depth_of_rows = None if depths is None else depths[rows]
-        with torch.autocast(plain.device.type, enabled=False) if is_mixed else nullcontext():
+        with _usual_defaults(plain.device.type):
             parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
     relit = parts[0]
     if len(parts) > 1:

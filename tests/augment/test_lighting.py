@@ -112,6 +112,28 @@ def test_plain_tensors_before_a_named_image_stay(kind, key):
     assert not torch.equal(relit[key], picture(3, 6, 6))
 
 
+@pytest.mark.parametrize("kind", [list, tuple])
+def test_all_images_of_a_list_change_and_its_boxes_stay(kind):
+    images = kind(picture(3, 6, 6 + extra) for extra in range(3))
+    boxes = kind(torch.rand(2, 4) for _ in images)
+    relit = nb.RandomLighting("linear")({"boxes": boxes, "images": images})
+    pairs = [*zip(relit["images"], images, strict=True)]
+    assert all(new.shape == old.shape and not torch.equal(new, old) for new, old in pairs)
+    assert all(new is old for new, old in zip(relit["boxes"], boxes, strict=True))
+
+
+def test_each_image_of_a_list_of_samples_has_its_own_depth():
+    transform = nb.RandomLighting("point")
+    samples = [{"depth": torch.rand(6, 6) + 1, "image": picture(3, 6, 6)} for _ in range(2)]
+    torch.manual_seed(0)
+    relit = transform(samples)
+    torch.manual_seed(0)
+    light = transform.make_params()
+    for new, old in zip(relit, samples, strict=True):
+        assert new["depth"] is old["depth"]
+        assert torch.equal(new["image"], transform.apply(old["image"], light, old["depth"]))
+
+
 def test_a_plain_tensor_is_the_image_even_behind_its_depth():
     depth, image = torch.rand(6, 6) + 1, picture(3, 6, 6)
     relit = nb.RandomLighting("directional")({"depth": depth, "image": image})
@@ -156,6 +178,27 @@ def test_autocast_changes_nothing(name):
     expected = transform.apply(images, light)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(transform.apply(images, light), expected)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_default_types_and_devices_change_nothing(name):
+    # The device "meta" stands for a GPU: random numbers and tables have to be on the CPU.
+    images, transform = picture(2, 3, 6, 6), nb.RandomLighting(name)
+
+    def relit():
+        torch.manual_seed(0)
+        return transform(images), nb.relight_photographs(images)
+
+    expected = relit()
+    for dtype in (torch.float64, torch.bfloat16):
+        try:
+            torch.set_default_dtype(dtype)
+            with torch.device("meta"):
+                found = relit()
+            assert torch.get_default_dtype() == dtype
+        finally:
+            torch.set_default_dtype(torch.float32)
+        assert all(map(torch.equal, found, expected))
 
 
 @pytest.mark.parametrize("name", MODELS)

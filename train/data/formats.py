@@ -145,7 +145,8 @@ class Coco(DataSet):
                 image_id, name = render["index"] + 1, Path(render["image"]).name
                 height, width = render["size"]
                 images.append({"id": image_id, "file_name": name, "height": height, "width": width})
-                for item in render["objects"]:
+                # Trainers refuse the empty box of an object that covers half of no pixel.
+                for item in (one for one in render["objects"] if one["area"]):
                     left, top, right, bottom = item["box"]
                     annotation = {
                         "id": next(numbers),
@@ -176,6 +177,9 @@ class Yolo(DataSet):
         text = ""
         for label, box in zip(render.labels, render.boxes.tolist(), strict=True):
             left, top, right, bottom = box
+            # An object that covers half of no pixel has an empty box.
+            if left == right:
+                continue
             x, y = (left + right) / 2 / width, (top + bottom) / 2 / height
             numbers = (x, y, (right - left) / width, (bottom - top) / height)
             words = [f"{number:.6f}" for number in numbers]

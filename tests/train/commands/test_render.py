@@ -112,6 +112,18 @@ def test_lines_of_yolo_are_centers_and_sizes_as_fractions(meshes, tmp_path):
         assert found == pytest.approx([left, top, right - left, bottom - top], abs=1e-4)
 
 
+def test_an_object_too_thin_for_a_box_has_an_image_and_no_annotation(tmp_path):
+    trimesh.creation.box((2, 0.02, 0.02)).export(tmp_path / "wire.ply")
+    wires = [{"mesh": str(tmp_path / "wire.ply"), "label": "wire"}]
+    options = {"count": 2, "splits": {"train": 1}, "maps": []}
+    coco = write(wires, tmp_path / "coco", format="coco", **options)
+    found = json.loads((coco / "annotations/instances_train.json").read_text())
+    assert len(found["images"]) == 2 and not found["annotations"]
+    yolo = write(wires, tmp_path / "yolo", format="yolo", **options)
+    lines = [path.read_text() for path in (yolo / "labels/train").iterdir()]
+    assert lines == ["", ""]
+
+
 def test_without_maps_the_pictures_are_the_same(meshes, written, tmp_path):
     folder = write(meshes, tmp_path / "out", maps=[])
     assert pictures(written).items() >= pictures(folder).items()
