@@ -57,7 +57,7 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
     seen = []
 
     def function(images: np.ndarray) -> np.ndarray:
-        scores = logits_of_means(images) + [0, 7.5]
+        scores = logits_of_means(images) + np.array([0, 7.5])
         seen.extend(image.tobytes() for image in images)
         return scores
 
