@@ -84,7 +84,7 @@ def audit(
             which Mitsuba is needed.
         environments: Names of environment lightings, or files of maps.
         budget: Factor of the number of views, lightings and renders. With 1, a
-            network of 224 pixels takes about 20 minutes on one core.
+            network of 224 pixels takes about 7 minutes on one core.
         task: Task of the networks, such as `nb.Detection(threshold=0.3)`. None if
             the outputs tell.
         seed: Seed of all random draws.
