@@ -313,7 +313,9 @@ def find_scene(
         return settings, scene
     highest, best_settings = 0.0, settings
     for candidate in progress(_candidates(settings, cameras, draws), "search for a scene"):
-        confidence, lit = _best_light(build(candidate), candidate, attack_settings, classifier)
+        # The first candidate is the given scene, whose shadows are computed already.
+        tried = scene if candidate is settings else build(candidate)
+        confidence, lit = _best_light(tried, candidate, attack_settings, classifier)
         if confidence > highest:
             highest, best_settings = confidence, lit
         if highest >= CONFIDENCE_TO_STOP:

@@ -238,6 +238,9 @@ class Scene:
         if arguments.keys() == {"lights"} and kinds[0] == kinds[1]:
             # Operators, with their shadows, are the same in any light, so they are built once.
             copy._operator_renderer = self._operator_renderer
+        # Views that are rendered directly have no number, so the same ones may be in any order.
+        has_same_views = {*map(_view_of, copy.examples)} <= {*map(_view_of, self.examples)}
+        if arguments.keys() <= {"lights", "examples"} and kinds[0] == kinds[1] and has_same_views:
             copy._direct_renderer = self._direct_renderer
         return copy
 
@@ -541,3 +544,8 @@ class Scene:
             # Pixels at the border of the object show a part of the background.
             term = background_term(coverage[None], background_pixels, self.settings.encoding)
             yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])
+
+
+def _view_of(example: Example) -> tuple[int, tuple[Camera, ...]]:
+    """Return what an example shows, in front of any background and at any exposure."""
+    return example.object, example.cameras

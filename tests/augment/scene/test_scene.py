@@ -187,6 +187,23 @@ def test_a_copy_in_other_light_is_not_rasterized_again_and_shows_that_light(rast
     torch.testing.assert_close(found, expected)
 
 
+def test_the_same_views_in_another_order_are_not_rasterized_again(rasterized):
+    scene, fresh = (built("cup", "ball", shadows=True) for _ in range(2))
+
+    def unpainted(scene: Scene) -> torch.Tensor:
+        """Render with unchanged colors that could change, for which no operator is used."""
+        every = torch.arange(len(scene))
+        colors = torch.zeros(len(scene), max(len(item.mesh.faces) for item in scene.objects), 3)
+        return scene.render(replace(scene.conditions(every), albedo=colors), every)
+
+    expected = unpainted(fresh.changed(examples=fresh.examples[::-1]))
+    unpainted(scene)
+    rasterized.clear()
+    found = unpainted(scene.changed(examples=scene.examples[::-1]))
+    assert rasterized == []
+    torch.testing.assert_close(found, expected)
+
+
 STACKS = {"one stack": (render.PIXELS_PER_STACK, "linear"), "a stack per view": (1, "srgb")}
 
 
