@@ -303,10 +303,11 @@ def _usual_defaults(kind: str) -> Iterator[None]:
     with ExitStack() as stack:
         if torch.is_autocast_enabled(kind):
             stack.enter_context(torch.autocast(kind, enabled=False))
-        if torch.get_default_device().type != "cpu":
+        made = torch.empty(0)  # Ten times as fast as `torch.get_default_device`.
+        if made.device.type != "cpu":
             stack.enter_context(torch.device("cpu"))
-        if (dtype := torch.get_default_dtype()) != torch.float32:
-            stack.callback(torch.set_default_dtype, dtype)
+        if made.dtype != torch.float32:
+            stack.callback(torch.set_default_dtype, made.dtype)
             torch.set_default_dtype(torch.float32)
         yield
 

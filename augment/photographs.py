@@ -195,6 +195,7 @@ class PhotographAttackResult(errors.ShortRepr):
         return to_bytes(projected.expose(decode(to_unit(chosen[None]), "srgb"), log_gain))[0]
 
 
+@torch.inference_mode(False)  # Attacks need autograd.
 def attack_photographs(
     network: TaskNetwork | Callable[[Tensor], Any],
     photographs: Tensor,

@@ -220,6 +220,7 @@ class AugmentationService:
         examples = self.settings.examples
         return len(self.labels) if examples is None else examples
 
+    @torch.inference_mode(False)  # Attacks need autograd.
     def regenerate(self, model: nn.Module, number: int) -> Renders:
         """Make the renders for the current weights of a network.
 

@@ -62,6 +62,7 @@ Target = str | int | Sequence[str | int] | None
 Settings = TypeVar("Settings", bound=SceneSettings)
 
 
+@torch.inference_mode(False)  # Attacks need autograd.
 def attack(
     classifier: Classifier | Callable[[Tensor], Any],
     scene: Scene,

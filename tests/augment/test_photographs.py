@@ -74,6 +74,14 @@ def test_a_gain_of_one_changes_nothing_more_than_the_slide(photographs):
     assert torch.equal(result.changed[ADVERSARIAL], result.changed["slide"])
 
 
+def test_photographs_are_attacked_alike_in_inference_mode(result, photographs):
+    network = HueNetwork().eval()
+    with torch.inference_mode():
+        again = attack_photographs(network, photographs.clone(), SETTINGS, seed=1)
+    for light, changed in result.changed.items():
+        assert torch.equal(again.changed[light], changed)
+
+
 def test_photographs_are_attacked_alike_in_any_batch(result, photographs):
     again = attack_photographs(HueNetwork().eval(), photographs, SETTINGS, batch_size=5, seed=1)
     for light in LIGHTS:

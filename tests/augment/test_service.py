@@ -110,6 +110,14 @@ def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
     assert not torch.equal(serve(seed=2, **settings).regenerate(model, 3).images, images)
 
 
+def test_renders_that_are_made_in_inference_mode_can_be_trained_on(serve, model):
+    settings = {"mode": "adversarial", "init": "random"}
+    expected = serve(**settings).regenerate(model, 0).images
+    with torch.inference_mode():
+        images = serve(**settings).regenerate(model, 0).images
+    assert torch.equal(images, expected) and not images.is_inference()
+
+
 class Always(nn.Module):
     def __init__(self, label: int):
         super().__init__()

@@ -44,6 +44,13 @@ def test_logits_costs_and_success_are_those_of_the_images(result, by_color):
     assert torch.equal(result.success, result.logits.argmax(1) != 0)
 
 
+def test_inference_mode_changes_no_attack(attacked):
+    expected = attacked("lighting", {}, max_steps=3)
+    with torch.inference_mode():
+        found = attacked("lighting", {}, max_steps=3)
+    assert torch.equal(found.minimum.values, expected.minimum.values)
+
+
 def test_the_images_are_those_of_the_values(result):
     images = result.problem.render(result.minimum.values, torch.arange(2))
     torch.testing.assert_close(images.detach(), result.images_in_views, rtol=0, atol=1e-6)
