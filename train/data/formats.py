@@ -136,7 +136,10 @@ class Coco(DataSet):
     def finish(self) -> None:
         """Write annotations/instances_PART.json for each part."""
         renders = [json.loads(self.last_file(index).read_text()) for index in range(self.count)]
-        categories = [{"id": number, "name": name} for number, name in enumerate(self.classes, 1)]
+        categories = [
+            {"id": number, "name": name, "supercategory": name}
+            for number, name in enumerate(self.classes, 1)
+        ]
         numbers = itertools.count(1)
         for part in self.splits:
             images, annotations = [], []

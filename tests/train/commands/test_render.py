@@ -239,6 +239,7 @@ def test_pycocotools_and_torchvision_read_boxes_and_masks(groups, tmp_path):
     wrapped = wrap_dataset_for_transforms_v2(found, target_keys="all")
     assert len(found) == 7
     found.coco.info()
+    assert found.coco.getCatIds(supNms=["box"]) == [1]
     for (image, annotations), (_, target) in zip(found, wrapped, strict=True):
         index = annotations[0]["image_id"] - 1
         assert image.size == (32, 20)
