@@ -257,12 +257,14 @@ def lamps(heights: Any, grid: Any, near: Any, places: Any, colors: Any, out: Any
 @_loop(f"{FIELD}, {GRID}, {FIELD}, {FIELD}")
 def multiply_slides(log_gain: Any, grid: Any, shading: Any, slides: Any) -> None:
     """Multiply slides by their shading and by the exponential of interpolated logarithms."""
+    # Weights of the nodes of the grid at each row and each column of the image.
     x, _, rows, _, columns, _ = grid
     gain = np.empty_like(x)
     for image, channel, row in np.ndindex(slides.shape[:3]):
         _interpolate(log_gain[image, channel], rows[row], columns, gain)
         shown, shade = slides[image, channel, row], shading[image, 0, row]
         for pixel in range(len(shown)):
+            # Horner's scheme: EXPONENTIAL has the coefficients of a polynomial near exp.
             factor = EXPONENTIAL[7]
             for power in range(6, -1, -1):
                 factor = factor * gain[pixel] + EXPONENTIAL[power]

@@ -142,7 +142,8 @@ def files_beside(path: Path) -> list[Path]:
     if read is None:
         return []
     file = MeshFile(path)
-    # `load_mesh` raises the error of a mesh that cannot be read.
+    # A reader notes each file that it opens in `beside`. `load_mesh` raises the error of a mesh
+    # that cannot be read.
     with suppress(Exception):
         read(file)
     return sorted(file.beside)

@@ -310,6 +310,7 @@ class AuditedNetwork:
 
         None if no view is recognized before the attacks.
         """
+        # The last count of misclassified views is that of the largest radius.
         lost = {
             kind: counts["adversarial"][-1] / counts["correct"]
             for kind, counts in self.counts.items()

@@ -137,6 +137,7 @@ def read_file(path: str) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image file in sRGB at its full size, rotated as its EXIF orientation says."""
     require_file(path, "give an image file")
     try:
+        # Images whose shorter side has more pixels than this may be reduced.
         return np.asarray(read_rgb(Path(path), 10**6))
     # Pillow raises errors of almost any type for a damaged file.
     except Exception as error:

@@ -341,7 +341,11 @@ def _draw_images(before: Predictions, after: Predictions, images: Path) -> list[
 
 
 def describe_prediction(predictions: Predictions, row: int) -> ShownPrediction:
-    """Describe the class that a network predicts for the image in a row."""
+    """Describe the class that a network predicts for the image in a row.
+
+    It is right if the image shows it, also if the network has no such class, and wrong if it
+    misses the positive class or names it falsely. Otherwise, the verdict is empty.
+    """
     predicted = predictions.predicted[row]
     verdict = ""
     if predicted == predictions.shown[row]:
