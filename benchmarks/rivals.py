@@ -17,7 +17,8 @@ our attack with a margin that no example reaches, so that it takes all steps.
 """
 
 import argparse
-from collections.abc import Callable
+import statistics
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,37 @@ def gradient(evaluate: Callable[[Tensor], Tensor], points: Tensor, weights: Tens
     return result
 
 
+def compare(
+    part: str,
+    setting: str,
+    calls: Mapping[str, Callable[[], object]],
+    rounds: int,
+    results: Mapping[str, Row],
+) -> list[Row]:
+    """Time the calls of all libraries in turn, relative to the first one.
+
+    Args:
+        part: What is compared.
+        setting: Setting of the comparison.
+        calls: Call of each library. The first library is the one to compare with.
+        rounds: Number of rounds.
+        results: Columns "error" and "changed" of each library.
+
+    Returns:
+        A row for each library.
+    """
+    times = times_in_turn(calls, rounds)
+    rows: list[Row] = []
+    for name, of_call in times.items():
+        low, middle, high = quartiles_of_ratio(of_call, times[next(iter(calls))])
+        row = {"part": part, "setting": setting, "library": name}
+        row |= {"time_ms": statistics.median(of_call), "ratio": middle}
+        row |= {"ratio_low": low, "ratio_high": high} | results[name]
+        print(row, flush=True)
+        rows.append(row)
+    return rows
+
+
 def harmonics(rounds: int) -> list[Row]:
     """Compare the harmonics of both libraries, for each degree and type of numbers."""
     from sphericart.torch import SphericalHarmonics
@@ -63,38 +95,23 @@ def harmonics(rounds: int) -> list[Row]:
         exact = torch.empty(POINTS, (degree + 1) ** 2, dtype=torch.float64)
         for index, values in reference.harmonics(exact_points, degree):
             exact[:, index] = values
+        contenders: dict[str, Callable[[Tensor], Tensor]] = {
+            "sphericart": SphericalHarmonics(degree),
+            "norm_balls": partial(basis, degree=degree),
+        }
         for dtype in (torch.float32, torch.float64):
             points, weights = exact_points.to(dtype), torch.randn_like(exact, dtype=dtype)
-            contenders: dict[str, Callable[[Tensor], Tensor]] = {
-                "sphericart": SphericalHarmonics(degree),
-                "norm_balls": partial(basis, degree=degree),
-            }
-            for quantity in ("value", "gradient"):
-                calls = {
-                    name: partial(evaluate, points)
-                    if quantity == "value"
-                    else partial(gradient, evaluate, points, weights)
-                    for name, evaluate in contenders.items()
-                }
-                times = times_in_turn(calls, rounds)
-                for name, evaluate in contenders.items():
-                    low, middle, high = quartiles_of_ratio(times[name], times["sphericart"])
-                    # Libraries may differ in the signs of harmonics.
-                    error = relative_error(evaluate(points).abs(), exact.abs())
-                    rows.append(
-                        {
-                            "part": quantity,
-                            "setting": f"degree {degree}, {str(dtype).removeprefix('torch.')}",
-                            "library": name,
-                            "time_ms": sorted(times[name])[len(times[name]) // 2],
-                            "ratio": middle,
-                            "ratio_low": low,
-                            "ratio_high": high,
-                            "error": error,
-                            "changed": None,
-                        }
-                    )
-                    print(rows[-1], flush=True)
+            setting = f"degree {degree}, {str(dtype).removeprefix('torch.')}"
+            results: dict[str, Row] = {}
+            values_of, gradients_of = {}, {}
+            for name, evaluate in contenders.items():
+                # Libraries may differ in the signs of harmonics.
+                error = relative_error(evaluate(points).abs(), exact.abs())
+                results[name] = {"error": error, "changed": None}
+                values_of[name] = partial(evaluate, points)
+                gradients_of[name] = partial(gradient, evaluate, points, weights)
+            rows += compare("value", setting, values_of, rounds, results)
+            rows += compare("gradient", setting, gradients_of, rounds, results)
     return rows
 
 
@@ -130,24 +147,12 @@ def attacks(rounds: int, count: int) -> list[Row]:
         for name, margin in (("norm_balls", 0.0), ("no early stop", UNREACHED_MARGIN)):
             attack = partial(our_attack, scene, max_steps=steps, margin=margin)
             calls[name] = lambda attack=attack: attack().images
-        times = times_in_turn(calls, rounds)
+        results: dict[str, Row] = {}
         for name, call in calls.items():
             is_changed = classifier(call()).argmax(1) != labels
-            low, middle, high = quartiles_of_ratio(times[name], times["foolbox"])
-            rows.append(
-                {
-                    "part": "attack on pixels",
-                    "setting": f"{steps} steps, {len(images)} images",
-                    "library": name,
-                    "time_ms": sorted(times[name])[len(times[name]) // 2],
-                    "ratio": middle,
-                    "ratio_low": low,
-                    "ratio_high": high,
-                    "error": None,
-                    "changed": is_changed.float().mean().item(),
-                }
-            )
-            print(rows[-1], flush=True)
+            results[name] = {"error": None, "changed": is_changed.float().mean().item()}
+        setting = f"{steps} steps, {len(images)} images"
+        rows += compare("attack on pixels", setting, calls, rounds, results)
     return rows
 
 

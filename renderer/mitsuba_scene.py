@@ -52,8 +52,7 @@ SCENE = "scene.xml"
 # Number of samples per pixel in Mitsuba. With 256
 # samples, the noise under smooth lighting is below 1/255.
 SAMPLES = 256
-# Default variant of Mitsuba. It does not need the library
-# LLVM, and renders the same bits with any number of threads.
+# Default variant of Mitsuba. It does not need the library LLVM.
 VARIANT = "scalar_rgb"
 # XML tag in a Mitsuba scene file for a value of each Python type.
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}

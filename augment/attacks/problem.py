@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.attack_settings import AttackSettings
 from augment.attacks.objective import Examples, Images, Values
 from augment.attacks.parameters import make_parameter
-from augment.attacks.parameters.lights import Lighting, Skylight
+from augment.attacks.parameters.lights import Lighting, Skylight, environment_light
 from augment.attacks.parameters.parameter import Parameter
 from augment.classifier import TaskNetwork
 from augment.progress import progress
@@ -152,8 +152,7 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
     """
     if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
         return
-    # The first light of a scene is its environment.
-    rows, basis = given.basis.lights[0]
+    rows, basis = environment_light(given)
     error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
     if error > MAX_IRRADIANCE_ERROR:
         reason = "the light has negative radiance, and after its removal the irradiance is off by"

@@ -67,6 +67,12 @@ class LightParameter(Parameter):
         return self._basis.nearest_nonnegative(coefficients, ball).flatten(1)
 
 
+def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
+    """Return the rows of the environment lighting among all lights of a scene, and its basis."""
+    # The environment is the first light of a scene.
+    return scene.basis.lights[0]
+
+
 def replace_light(
     conditions: Conditions, rows: slice, coefficients: Float[Tensor, "A K 3"]
 ) -> Conditions:
@@ -95,8 +101,7 @@ class Lighting(LightParameter):
     name = "lighting"
 
     def __init__(self, scene: Scene, settings: StepSettings, nonnegative: bool = False):
-        # The first light of a scene is its environment.
-        rows, basis = scene.basis.lights[0]
+        rows, basis = environment_light(scene)
         super().__init__(scene, settings, rows=rows, basis=basis, nonnegative=nonnegative)
 
 
@@ -145,8 +150,7 @@ class Skylight(Parameter):
 
     def __init__(self, scene: Scene, settings: SkylightSettings, nonnegative: bool = False):
         """Compute the initial sky and its brightness."""
-        # The first light of a scene is its environment, which the sky replaces.
-        self._rows, self._basis = scene.basis.lights[0]
+        self._rows, self._basis = environment_light(scene)
         initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
         sky_luminance = mean_luminance(initial_sky)
         replaced_lights = scene.lights[:, self._rows]
