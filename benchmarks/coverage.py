@@ -153,7 +153,8 @@ def population_metrics(positives: np.ndarray, negatives: np.ndarray) -> np.ndarr
     class_count = min(CLASSES, found.shape[-1])
     by_class = [found[..., first::CLASSES].mean(axis=-1) for first in range(class_count)]
     top1 = np.mean(by_class, axis=0)
-    return np.stack([*auc_and_recalls(*groups), recall, false_positive_rate, top1])
+    of_roc = np.vectorize(auc_and_recalls, signature="(n),(m)->(k)")(*groups)
+    return np.stack([*np.moveaxis(of_roc, -1, 0), recall, false_positive_rate, top1])
 
 
 def true_values(setup: Setup) -> np.ndarray:
@@ -221,12 +222,24 @@ def jackknives(
     positives, negatives = scores
     is_found, is_false = positives[None] > 0, negatives[None] > 0
     of_positives, of_negatives = Units(units[:1], ""), Units(units[1:], "")
+    # The jackknives of one draw after the other.
+    of_draws = [leave_out_of_roc(*pair, Units(units, "")) for pair in zip(*scores, strict=True)]
     return [
-        *leave_out_of_roc(positives, negatives, Units(units, "")),
+        *map(stack, zip(*of_draws, strict=True)),
         *leave_out(partial(weighted_means, is_found.astype(float)), of_positives),
         *leave_out(partial(weighted_means, is_false.astype(float)), of_negatives),
         *leave_out(partial(class_means, is_found, classes), of_positives),
     ]
+
+
+def stack(of_draws: Sequence[Jackknife]) -> Jackknife:
+    """Join the jackknives of a metric, which each draw has."""
+    first = of_draws[0]
+    without = [np.stack(group) for group in zip(*(one.without for one in of_draws), strict=True)]
+    ends = [one.at_ends for one in of_draws if one.at_ends is not None]
+    at_ends = np.stack(ends, axis=-1) if ends else None
+    values = np.stack([one.value for one in of_draws])
+    return Jackknife(values, without, first.unit_count, first.over, at_ends)
 
 
 def intervals(

@@ -25,7 +25,7 @@ from renderer.solids import HARD_NEGATIVES
 from train.checkpoints import write_published
 from train.detectors import small_detector
 from train.networks import DETECTOR, VERSION
-from train.results.detections import Found, Marked, match_images, score
+from train.results.detections import Found, Marked, join, match_image, score
 
 # Pixels per side of the images.
 SIZE = 128
@@ -155,7 +155,7 @@ def test(network: nn.Module, images: Tensor, targets: list[dict[str, Tensor]]) -
         Marked(item["boxes"].numpy(), item["labels"].numpy(), item["labels"].numpy() < 0)
         for item in targets
     ]
-    matches = match_images(found, marked)
+    matches = join([*map(match_image, found, marked)])
     every = range(1, len(CLASSES))
     scored = {"all": [*every], **{CLASSES[label]: [label] for label in every}}
     threshold = nb.Detection().threshold

@@ -133,8 +133,7 @@ def find_in_lights(
 
 def _match(pairs: Sequence[tuple[Found, Marked]], iou: float) -> Matches:
     """Return the matches of detections and true boxes in all views."""
-    found, marked = zip(*pairs, strict=True)
-    return detections.match_images(found, marked, iou)
+    return detections.join([detections.match_image(*pair, iou) for pair in pairs])
 
 
 def _curve(matches: Matches) -> list[tuple[float, ...]]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from augment.classifier import TaskNetwork
@@ -32,7 +32,7 @@ from train.data.annotations import (
     read_masks,
 )
 from train.results import detections, tables
-from train.results.detections import DetectionMetrics, Found, Marked, mean_iou
+from train.results.detections import DetectionMetrics, Found, Marked, Matches, mean_iou
 from train.results.pictures import evenly_spaced
 from train.results.predictions import CONTACT_SHEET, begin_scores, write_summary
 from train.results.tables import Estimate, Table
@@ -52,7 +52,6 @@ class AnnotatedScores(ShortRepr):
     """Scores of a network on photographs with boxes or masks.
 
     Attributes:
-        file: File or folder of the annotations.
         size: Height and width of the images of the network.
         fit: How photographs are brought to this size, "letterbox" or "stretch".
         photograph_count: Number of scored photographs.
@@ -61,7 +60,6 @@ class AnnotatedScores(ShortRepr):
         pictures: Some photographs with what is found in them, by name.
     """
 
-    file: Path
     size: tuple[int, int]
     fit: str
     photograph_count: int
@@ -213,23 +211,22 @@ def evaluate_detector(
     label_of_class = _choose_labels(annotations, network.classes, labels)
     task = network.task
     assert isinstance(task, Detection)
-    # Detections, true boxes and folder of each photograph. `listed` has all detections.
-    found: list[Found] = []
-    marked: list[Marked] = []
-    sources: list[str] = []
+    # Matches of the photographs in each folder: those for recall, and those for AP50, whose IoU
+    # is always 0.5. `listed` has all detections.
+    matches: dict[str, list[list[Matches]]] = {}
     listed: list[dict[str, Any]] = []
     pictures: dict[str, Tensor] = {}
     options = pictures, how, skip_unreadable, device
     for item, fitted, output in _outputs(network, annotations.photographs, *options):
-        sources.append(item.source)
         boxes, own, scores = (output[key].cpu().numpy() for key in ("boxes", "labels", "scores"))
         # From pixels of the network's image to those of the photograph.
         boxes, scores = fitted.to_photograph(boxes.astype(float)), scores.astype(float)
-        found.append(Found(boxes, own, scores))
         names = [annotations.classes[label] for label in item.labels[fitted.is_kept]]
         # Classes that are not scored have a label that no detection has.
         true = np.array([label_of_class.get(name, -1) for name in names], int)
-        marked.append(Marked(fitted.boxes, true, item.is_crowd[fitted.is_kept]))
+        pair = Found(boxes, own, scores), Marked(fitted.boxes, true, item.is_crowd[fitted.is_kept])
+        matched = [detections.match_image(*pair, iou) for iou in (task.iou, 0.5)]
+        matches.setdefault(item.source or ".", []).append(matched)
         for box, label, score in zip(boxes, own, scores, strict=True):
             left, top, right, bottom = box.round(2).tolist()
             # COCO's form of a box is left, top, width and height.
@@ -238,13 +235,17 @@ def evaluate_detector(
             listed.append(entry | {"score": round(float(score), 4)})
         if not fitted.is_kept.all():
             console.warning("%s: a box without an area in the photograph is left out", item.name)
-    overall, by_label, by_source = _score(found, marked, label_of_class, sources, task)
+    all_matches = [matched for of_source in matches.values() for matched in of_source]
+    by_label = _score(all_matches, label_of_class, task)
+    by_source = {}
+    for source in sorted(matches) if len(matches) > 1 else ():
+        by_source[source] = _score(matches[source], label_of_class, task)
+    overall = by_label.pop(ALL)
     missing = f" ({len(annotations.missing)} files are missing)" if annotations.missing else ""
     return DetectionScores(
-        file=annotations.file,
         size=height_and_width(network.size),
         fit=how,
-        photograph_count=len(found),
+        photograph_count=len(all_matches),
         missing=annotations.missing,
         contents=f"{missing} with {overall.n} objects",
         pictures=pictures,
@@ -281,32 +282,15 @@ def _choose_labels(
 
 
 def _score(
-    found: Sequence[Found],
-    marked: Sequence[Marked],
-    labels: Mapping[str, int],
-    sources: Sequence[str],
-    task: Detection,
-) -> tuple[DetectionMetrics, dict[str, DetectionMetrics], dict[str, dict[str, DetectionMetrics]]]:
-    """Return the metrics of all classes, of each class, and of both in each source."""
-    # The matches for recall, and those for AP50, whose IoU is always 0.5.
-    matches = [detections.match_images(found, marked, iou) for iou in (task.iou, 0.5)]
+    matches: Sequence[Sequence[Matches]], labels: Mapping[str, int], task: Detection
+) -> dict[str, DetectionMetrics]:
+    """Return the metrics of all classes, and of each class, in some photographs."""
+    at_iou, at_half = map(detections.join, zip(*matches, strict=True))
     groups = {ALL: [*labels.values()], **{name: [label] for name, label in labels.items()}}
-
-    def score(is_chosen: Bool[np.ndarray, " N"]) -> dict[str, DetectionMetrics]:
-        at_iou, at_half = (item.in_images(is_chosen) for item in matches)
-        return {
-            name: detections.score(at_iou, chosen, task.threshold, at_half)
-            for name, chosen in groups.items()
-        }
-
-    by_source = {}
-    names = sorted({*sources})
-    # The name of a source can be empty: the folder itself.
-    for source in names if len(names) > 1 else []:
-        by_source[source or "."] = score(np.array([item == source for item in sources]))
-    by_label = score(np.ones(len(found), bool))
-    overall = by_label.pop(ALL)
-    return overall, by_label, by_source
+    return {
+        name: detections.score(at_iou, chosen, task.threshold, at_half)
+        for name, chosen in groups.items()
+    }
 
 
 def evaluate_segmenter(
@@ -336,7 +320,6 @@ def evaluate_segmenter(
     # The IoU of a class that no pixel has is NaN.
     known = {name: iou for name, iou in named if np.isfinite(iou)}
     return SegmentationScores(
-        file=folder,
         size=height_and_width(network.size),
         fit=how,
         photograph_count=count,

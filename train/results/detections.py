@@ -109,17 +109,6 @@ class Matches:
         """Return the matches of some classes."""
         return self.choose(np.isin(self.label, labels), np.isin(self.object_label, labels))
 
-    def in_images(self, is_chosen: Bool[np.ndarray, " image_count"]) -> "Matches":
-        """Return the matches in some of the images, whose indices then count these alone."""
-        index = np.cumsum(is_chosen) - 1
-        chosen = self.choose(is_chosen[self.image], is_chosen[self.object_image])
-        return replace(
-            chosen,
-            image_count=int(is_chosen.sum()),
-            image=index[chosen.image],
-            object_image=index[chosen.object_image],
-        )
-
     def choose(self, detections: Any, objects: Any) -> "Matches":
         """Return the matches of some detections and objects, by masks or indices of NumPy."""
         of_detections = {name: getattr(self, name)[detections] for name in DETECTION_COLUMNS}
@@ -163,21 +152,22 @@ class Matches:
         return float(np.append(highest, 0)[places].mean())
 
 
-def match_images(found: Sequence[Found], marked: Sequence[Marked], iou: float = 0.5) -> Matches:
-    """Match the detections in all images."""
-    images = zip(found, marked, strict=True)
-    parts = [_match_image(image, *pair, iou) for image, pair in enumerate(images)]
+def join(parts: Sequence[Matches]) -> Matches:
+    """Join the matches in several images, each of one image."""
     columns = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in (*DETECTION_COLUMNS, *OBJECT_COLUMNS)
     }
+    # The index of the image in each part is 0.
+    for name, of in (("image", "label"), ("object_image", "object_label")):
+        columns[name] = np.arange(len(parts)).repeat([len(getattr(part, of)) for part in parts])
     matches = Matches(len(parts), **columns)
     # In descending order of the scores, as `Matches` says.
     return matches.choose(np.argsort(-matches.score, kind="stable"), ...)
 
 
-def _match_image(image: int, found: Found, marked: Marked, iou: float) -> Matches:
-    """Match the detections in the image with this index, without crowds and what is of them."""
+def match_image(found: Found, marked: Marked, iou: float = 0.5) -> Matches:
+    """Match the detections in an image, without crowds and what is of them."""
     index = match(found, marked, iou)
     is_right = index >= 0
     # Objects without a detection have the score -inf.
@@ -186,11 +176,11 @@ def _match_image(image: int, found: Found, marked: Marked, iou: float) -> Matche
     matches = Matches(
         1,
         label=found.labels,
-        image=np.full(len(index), image),
+        image=np.zeros(len(index), int),
         score=found.scores,
         is_right=is_right,
         object_label=marked.labels,
-        object_image=np.full(len(marked.labels), image),
+        object_image=np.zeros(len(marked.labels), int),
         object_score=score_of_object,
     )
     return matches.choose(index != CROWD, ~marked.is_crowd)

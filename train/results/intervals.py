@@ -142,7 +142,7 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
 
 
 def leave_out_of_roc(
-    positives: Num[np.ndarray, "... n"], negatives: Num[np.ndarray, "... m"], units: Units
+    positives: Num[np.ndarray, " n"], negatives: Num[np.ndarray, " m"], units: Units
 ) -> list[Jackknife]:
     """Evaluate ROC_METRICS without each unit, and the recalls at the ends of their thresholds.
 
@@ -150,26 +150,24 @@ def leave_out_of_roc(
     ends of the interval of the threshold are the scores that these fractions of the negatives
     exceed (Woodruff 1952). If less than half a negative exceeds an end, it may be above all scores.
     """
-    # The axis before the last is for the units that are left out.
-    statistic = partial(auc_and_recalls, positives[..., None, :], negatives[..., None, :])
-    auc, *recalls = leave_out(statistic, units)
-    count = negatives.shape[-1]
+    auc, *recalls = leave_out(partial(auc_and_recalls, positives, negatives), units)
+    count = len(negatives)
     # Exactly i negatives score above entry i, if no scores are equal.
-    descending = -np.sort(-negatives, axis=-1)
+    descending = -np.sort(-negatives)
     results = [auc]
     levels = thresholds(negatives, np.ones(count, int))
     for rate, recall, threshold in zip(RATES, recalls, levels, strict=True):
-        is_above = negatives > threshold[..., None]
-        is_tied = negatives == threshold[..., None]
+        is_above = negatives > threshold
+        is_tied = negatives == threshold
         # Negatives at the threshold count in part, so that the rate is the nominal one.
-        missing = float(rate) * count - is_above.sum(axis=-1, keepdims=True)
+        missing = float(rate) * count - is_above.sum()
         # `hits` says which part of each negative counts as above the threshold.
-        hits = is_above + is_tied * missing / is_tied.sum(axis=-1, keepdims=True)
+        hits = is_above + is_tied * missing / is_tied.sum()
         (rates,) = leave_out(partial(weighted_means, hits[None]), Units(units.groups[1:], ""))
-        # Numbers of negatives above both ends of the interval of the threshold, shape (2, ...).
+        # Numbers of negatives above both ends of the interval of the threshold, shape (2,).
         exceeding = rates.interval * count
-        places = exceeding.astype(int).clip(max=count - 1)[..., None]
-        is_detected = positives > _take(descending, places)
+        places = exceeding.astype(int).clip(max=count - 1)
+        is_detected = positives > descending[places, None]
         # Nothing is detected if the threshold may be above all scores.
         at_ends = np.where(exceeding < 0.5, 0.0, is_detected.mean(axis=-1))
         results.append(replace(recall, at_ends=at_ends))
@@ -309,8 +307,8 @@ def class_means(
 
 
 def auc_and_recalls(
-    positives: Num[np.ndarray, "... n"],
-    negatives: Num[np.ndarray, "... m"],
+    positives: Num[np.ndarray, " n"],
+    negatives: Num[np.ndarray, " m"],
     positive_counts: Int[np.ndarray, "... n"] | None = None,
     negative_counts: Int[np.ndarray, "... m"] | None = None,
 ) -> Float[np.ndarray, "4 ..."]:
@@ -323,21 +321,21 @@ def auc_and_recalls(
     image counts. None counts each once.
     """
     if positive_counts is None:
-        positive_counts = np.ones(positives.shape[-1], int)
+        positive_counts = np.ones(len(positives), int)
     if negative_counts is None:
-        negative_counts = np.ones(negatives.shape[-1], int)
+        negative_counts = np.ones(len(negatives), int)
     positive_total = positive_counts.sum(axis=-1)
 
-    order = negatives.argsort(axis=-1)
-    sorted_negatives = _take(negatives, order)
+    order = negatives.argsort()
+    ascending = negatives[order]
     # Entry i of `counts_below` is the sum of the counts of the i negatives with the
     # lowest scores, for i from 0 to m, shape (..., m + 1).
-    counts_below = np.insert(_take(negative_counts, order).cumsum(axis=-1), 0, 0, axis=-1)
+    counts_below = np.insert(negative_counts[..., order].cumsum(axis=-1), 0, 0, axis=-1)
     negative_total = counts_below[..., -1]
     # Number of negatives with a lower score than each positive, shape (..., n).
-    lower = _take(counts_below, _search(sorted_negatives, positives, "left"))
+    lower = counts_below[..., ascending.searchsorted(positives, "left")]
     # Number of negatives whose score is lower than that of each positive, or equal to it.
-    lower_or_equal = _take(counts_below, _search(sorted_negatives, positives, "right"))
+    lower_or_equal = counts_below[..., ascending.searchsorted(positives, "right")]
     wins = (positive_counts * lower).sum(axis=-1)
     wins_and_ties = (positive_counts * lower_or_equal).sum(axis=-1)
     # The mean of both numbers counts a tie half.
@@ -351,9 +349,7 @@ def auc_and_recalls(
 
 
 def thresholds(
-    negatives: Num[np.ndarray, "... m"],
-    counts: Int[np.ndarray, "... m"],
-    rates: Sequence[str] = RATES,
+    negatives: Num[np.ndarray, " m"], counts: Int[np.ndarray, "... m"], rates: Sequence[str] = RATES
 ) -> list[np.ndarray]:
     """Find the score threshold for each false-positive rate.
 
@@ -362,11 +358,10 @@ def thresholds(
     20 negatives, at most 2 negatives exceed the threshold. `rates` are decimal strings, because
     these are exact.
     """
-    order = negatives.argsort(axis=-1)
-    sorted_negatives = _take(negatives, order)
+    order = negatives.argsort()
     # Entry i is the sum of the counts of the i + 1 negatives with the lowest scores,
     # shape (..., m).
-    counts_up_to = _take(counts, order).cumsum(axis=-1)
+    counts_up_to = counts[..., order].cumsum(axis=-1)
     total = counts_up_to[..., -1]
     thresholds_by_rate = []
     for rate in rates:
@@ -376,21 +371,8 @@ def thresholds(
         needed_up_to = total - allowed_above
         # The index is the number of scores that too many negatives exceed.
         index = (counts_up_to < needed_up_to[..., None]).sum(axis=-1)
-        thresholds_by_rate.append(_take(sorted_negatives, index[..., None])[..., 0])
+        thresholds_by_rate.append(negatives[order[index]])
     return thresholds_by_rate
-
-
-def _take(values: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Take entries of the last axis: (..., n) and (..., k) to (..., k)."""
-    shape = np.broadcast_shapes(values.shape[:-1], indices.shape[:-1])
-    values, indices = (np.broadcast_to(item, shape + item.shape[-1:]) for item in (values, indices))
-    return np.take_along_axis(values, indices, axis=-1)
-
-
-def _search(ascending: np.ndarray, scores: np.ndarray, side: str) -> np.ndarray:
-    """Find the places of scores in sorted arrays: (..., m) and (..., n) to (..., n)."""
-    search = np.vectorize(partial(np.searchsorted, side=side), signature="(m),(n)->(n)")
-    return search(ascending, scores)
 
 
 def roc_curve(

@@ -19,6 +19,10 @@ def _marked(boxes, labels, is_crowd=None):
     return Marked(np.reshape(boxes, (-1, 4)).astype(float), np.array(labels, int), is_crowd)
 
 
+def _match(found, marked):
+    return detections.join([*map(detections.match_image, found, marked)])
+
+
 def _random_image(rng, class_count=3):
     """Draw objects, some of them crowds, and detections near and far from them."""
     count = rng.integers(0, 5)
@@ -65,7 +69,7 @@ def test_recall_and_average_precision_are_those_of_coco(seed):
         evaluation = COCOeval(coco, coco.loadRes(results), "bbox")
         evaluation.evaluate()
         evaluation.accumulate()
-    matches = detections.match_images(*zip(*pairs, strict=True))
+    matches = _match(*zip(*pairs, strict=True))
     every = np.ones((1, len(pairs)))
     for label in range(3):
         precision = evaluation.eval["precision"][0, :, label, 0, 2].mean()
@@ -79,7 +83,7 @@ def test_average_precision_of_three_detections_is_that_of_the_definition():
     # Ranks: right, false, right. Of two objects: precision 1 up to recall 0.5, then 2 / 3.
     boxes = [BOX[0], BOX[0] + 100, BOX[0] + 200]
     found = _found(boxes, [0, 0, 0], [0.9, 0.8, 0.7])
-    matches = detections.match_images([found], [_marked([boxes[0], boxes[2]], [0, 0])])
+    matches = _match([found], [_marked([boxes[0], boxes[2]], [0, 0])])
     expected = (51 * 1 + 50 * 2 / 3) / 101
     assert matches.average_precision(np.ones((1, 1))) == pytest.approx(expected)
 
@@ -104,7 +108,7 @@ def test_an_object_has_at_most_one_detection_of_its_class(boxes, labels, scores,
 def test_numbers_of_two_images_are_the_counted_ones():
     found = [_found([BOX, BOX + 50], [0, 0], [0.9, 0.5]), _found([BOX, BOX], [0, 1], [0.3, 0.6])]
     marked = [_marked([BOX], [0]), _marked([BOX], [0])]
-    matches = detections.match_images(found, marked)
+    matches = _match(found, marked)
     metrics = detections.score(matches, [0], threshold=0.4)
     assert metrics.n == 2
     assert metrics.recall.value == 0.5
@@ -119,7 +123,7 @@ def test_objects_of_the_same_photograph_add_nothing_to_its_interval():
     def recall(copies):
         shifts = 50 * np.arange(copies)[:, None]
         image = [_found(BOX + shifts, [0] * copies, [0.9] * copies), _found([], [], [])]
-        matches = detections.match_images(image * 9, [_marked(BOX + shifts, [0] * copies)] * 18)
+        matches = _match(image * 9, [_marked(BOX + shifts, [0] * copies)] * 18)
         return detections.score(matches, [0], 0.4).recall
 
     assert recall(4) == recall(1)
@@ -129,7 +133,7 @@ def test_objects_of_the_same_photograph_add_nothing_to_its_interval():
 
 def test_no_false_detection_has_an_upper_limit_like_the_rule_of_three():
     empty = [_found([], [], [])] * 100
-    matches = detections.match_images(empty, [_marked([], [])] * 100)
+    matches = _match(empty, [_marked([], [])] * 100)
     metrics = detections.score(matches, [0], 0.4)
     assert metrics.false_per_image.value == 0
     assert 0.03 < metrics.false_per_image.high < 0.05
