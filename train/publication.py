@@ -164,8 +164,10 @@ def publish(
         found = summarize(folder)
         state["settings"] = mapped(dict(found.settings), _without_folder)
         state["versions"] = dict(found.config.versions)
-        photographs = {key: scores.to_published() for key, scores in found.photographs.items()}
-        state["scores"] = {**found.scores, **photographs}
+        state["scores"] = dict(found.scores)
+        for name, scores in found.photographs.items():
+            facts = {"images": scores.images, "label": [*scores.labels]}
+            state["scores"][name] = facts | scores.overall.to_summary()
     points: list[OperatingPoint] = []
     # A Python function of the user may build the network. It is called only if the
     # network must be calibrated.

@@ -217,11 +217,8 @@ class _Plan:
                 item.label = OTHER_PREFIX + class_names.name_of_mesh(item.mesh)
         for item in meshes:
             if item.label != self.label:
-                raise InputError(
-                    f"meshes has {item.mesh} of the class {item.label}, but label={self.label}: "
-                    "give only meshes of this class, and others as hard_negatives",
-                    "meshes",
-                )
+                fault = f"meshes has {item.mesh} of the class {item.label}, not {self.label}"
+                raise InputError(f"{fault}: give others as hard_negatives", "meshes")
         self.items = [*meshes, *hard_negatives]
         folders = {LABORATORY: settings.laboratory, PHOTOGRAPHS: settings.photos}
         self.has_classes = all(isinstance(network, Classifier) for network in networks.values())

@@ -233,9 +233,8 @@ def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndar
     height, width = image.shape[:2]
     left, top, right, bottom = box if len(box) == 4 else [0, 0, 0, 0]
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):
-        raise InputError(
-            f"box={box}: give [left, top, right, bottom] within {width} × {height} pixels"
-        )
+        expected = f"[left, top, right, bottom] within {width} × {height} pixels"
+        raise InputError(f"box={box}: give {expected}")
     rectangle = (left, top, right - left, bottom - top)
     labels = np.zeros((height, width), np.uint8)
     # OpenCV takes the color channels in the order blue, green, red.

@@ -225,10 +225,8 @@ def write_laboratory(settings: LabSettings) -> int:
             for file in (out / DESCRIPTION, out / TABLE, *out.glob(RENDERS)):
                 file.unlink(missing_ok=True)
         elif any(path.name != LOCK for path in out.iterdir()):
-            raise InputError(
-                f"out={out} holds files, but the renders need an empty folder: "
-                "choose another folder, or set overwrite=true to replace earlier renders in it"
-            )
+            fault = f"out={out} holds files, but the renders need an empty folder"
+            raise InputError(f"{fault}: choose another, or set overwrite=true")
         rows = []
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
             for group in groups:
@@ -268,10 +266,8 @@ def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[
     for label, group in zip(labels, groups, strict=True):
         # A metric of a single class needs negatives.
         if not group or (len(labels) == 1 and not negatives):
-            raise InputError(
-                f"meshes has {len(group)} meshes of the class label={label} and "
-                f"{len(negatives)} of other classes: name at least one of each"
-            )
+            counts = f"{len(group)} meshes of label={label} and {len(negatives)} of other classes"
+            raise InputError(f"meshes has {counts}: name at least one of each")
     return [*groups, negatives] if negatives else groups
 
 
@@ -306,10 +302,7 @@ def _read_environment(path: Path) -> Float[np.ndarray, "H W 3"]:
     upper_half = radiance[: len(radiance) // 2]
     # `not ... > 0` is also true for NaN, which `... <= 0` is not.
     if not upper_half.max() > 0:
-        raise InputError(
-            f"environments: {path} has no light above the horizon: "
-            "give an environment map whose upper half is not black"
-        )
+        raise InputError(f"environments: {path} has no light above the horizon: give another")
     return radiance
 
 
@@ -325,16 +318,13 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
     if not label and name:
         label = OTHER_PREFIX + name if name in HARD_NEGATIVES else name
     if not label:
-        raise InputError(
-            f"meshes[{index}] has no label: write {{mesh: {settings.mesh}, label: CLASS}}, "
-            f"or label: {OTHER_PREFIX}NAME for an object of another class"
-        )
+        labels = f"CLASS, or {OTHER_PREFIX}NAME for an object of another class"
+        advice = f"write {{mesh: {settings.mesh}, label: {labels}}}"
+        raise InputError(f"meshes[{index}] has no label: {advice}")
     # The label is the name of the folder of the images.
     if Path(label).name != label or label == "..":
-        raise InputError(
-            f"meshes[{index}] has the label {label!r}, which cannot be the name of a folder: "
-            "remove slashes and dots"
-        )
+        fault = f"meshes[{index}] has the label {label!r}, which cannot be the name of a folder"
+        raise InputError(f"{fault}: remove slashes and dots")
     parts = lab_parts(load_object(settings).mesh, settings.albedo_scale)
     return Subject(label, settings.mesh, parts)
 

@@ -272,10 +272,8 @@ def _choose_labels(
     lacking = [name for name in chosen if known[name] is None]
     # A class that the caller names must be known. Of all classes, unknown ones are left out.
     if len(lacking) == len(chosen) or (labels and lacking):
-        raise InputError(
-            f"{annotations.file} marks {', '.join(lacking[:10])}, which are no classes of the "
-            f"network (such as {', '.join(classes[:3])}): give classes"
-        )
+        fault = f"{annotations.file} marks {', '.join(lacking[:10])}, which are no classes of the"
+        raise InputError(f"{fault} network (such as {', '.join(classes[:3])}): give classes")
     if lacking:
         console.warning("not scored, because the network lacks them: %s", ", ".join(lacking))
     return {name: classes.index(own) for name in chosen if (own := known[name]) is not None}
@@ -298,10 +296,8 @@ def evaluate_segmenter(
 ) -> SegmentationScores:
     """Segment photographs, and compare the classes of the pixels with those of masks."""
     if len(network.classes) > NO_CLASS_PIXEL:
-        reason = f"{network.title} has {len(network.classes)} classes"
-        raise InputError(
-            f"{reason}: masks can have at most {NO_CLASS_PIXEL}, as {NO_CLASS_PIXEL} is no class"
-        )
+        reason = f"masks can have at most {NO_CLASS_PIXEL}, as {NO_CLASS_PIXEL} is no class"
+        raise InputError(f"{network.title} has {len(network.classes)} classes: {reason}")
     photographs, masks, missing = read_masks(folder)
     pictures: dict[str, Tensor] = {}
     count = 0

@@ -44,20 +44,11 @@ def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[s
     if overwrite or not path.exists():
         return
     if not path.is_dir():
-        raise InputError(
-            f"{key}={path} exists: choose another file, or set overwrite=true to replace it"
-        )
-    for pattern in RESULTS:
-        if pattern in own:
-            continue
-        # The first file that matches the pattern.
-        found = next(path.glob(pattern), None)
-        if found:
-            name = found.relative_to(path)
-            raise InputError(
-                f"{key}={path} holds results of an earlier command ({name}): "
-                "choose another folder, or set overwrite=true to write over them"
-            )
+        raise InputError(f"{key}={path} exists: choose another file, or set overwrite=true")
+    for pattern in (one for one in RESULTS if one not in own):
+        for found in path.glob(pattern):
+            fault = f"{key}={path} holds results of an earlier command ({found.relative_to(path)})"
+            raise InputError(f"{fault}: choose another folder, or set overwrite=true")
 
 
 def require_new_run(folder: Path, key: str, overwrite: bool, resume: bool) -> None:

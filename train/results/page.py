@@ -334,11 +334,11 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
 def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:
     """Collect the content of a section of the page about an attack."""
     images = {}
-    for row in evenly_spaced(attack.rows, ATTACK_EXAMPLES):
-        title = f"Example {row.number}, {row.label}: {row.outcome}"
+    for number, label, before, after, outcome in evenly_spaced(attack.rows, ATTACK_EXAMPLES):
+        title = f"Example {number}, {label}: {outcome}"
         alt = f"{title}; before, after, their difference and the lights; "
-        alt += f"predicted {row.before}, then {row.after}"
-        path = attack.folder / f"example_{row.number:03d}.png"
+        alt += f"predicted {before}, then {after}"
+        path = attack.folder / f"example_{number:03d}.png"
         images[title] = read_pictures(path, alt, SHEET_WIDTH)
     # The folder of an attack may have no config.yaml.
     config: Mapping[str, Any] = {}

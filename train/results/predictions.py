@@ -200,7 +200,5 @@ def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
         }
         return Predictions.of_labels(shared, by_label)
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
-        raise InputError(
-            f"{path} is not a table of predictions for label={label} ({single_line(error)}): "
-            f"score the photographs again with pnb-evaluate label={label}"
-        ) from error
+        fault = f"{path} is no table of predictions for label={label} ({single_line(error)})"
+        raise InputError(f"{fault}: score the photographs again with pnb-evaluate") from error

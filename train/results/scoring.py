@@ -338,10 +338,8 @@ def score(
     """
     require_choice("by", by, GROUPS)
     if by == "mesh" and not any(item.mesh for item in predicted.predictions.photograph):
-        raise InputError(
-            f"by=mesh needs the meshes of the photographs, but {predicted.folder} has no "
-            f"{TABLE} with a column mesh: add this table, or remove by=mesh"
-        )
+        fault = f"by=mesh, but {predicted.folder} has no {TABLE} with a column mesh"
+        raise InputError(f"{fault}: add this table, or remove by=mesh")
     thresholds_by_label = {point.label: point.threshold for point in points}
     pooled = Pooled(predicted.predictions, thresholds=thresholds_by_label)
     return Scores(predicted, pooled, points, by)
@@ -386,11 +384,9 @@ def choose_operating_points(
         count = len(log_odds)
         # With fewer than 1 / rate negatives, not even one may score above the threshold.
         if count * exact_rate < 1:
-            min_count = math.ceil(1 / exact_rate)
+            advice = f"give at least {math.ceil(1 / exact_rate)} for false_positive_rate={rate}"
             raise InputError(
-                f"folder={folder} has {count} negatives for {name}: "
-                f"give at least {min_count} for false_positive_rate={rate}",
-                "folder",
+                f"folder={folder} has {count} negatives for {name}: {advice}", "folder"
             )
         (threshold,) = thresholds(log_odds, np.ones(count, int), [str(rate)])
         chosen_on = (folder.resolve().name, predicted.images_hash, count)

@@ -75,10 +75,6 @@ class StoredScores:
             operating_point=" or ".join(dict.fromkeys(map(describe_point, points))),
         )
 
-    def to_published(self) -> dict[str, Any]:
-        """Convert the scores to a mapping for the file of a published network."""
-        return {"images": self.images, "label": [*self.labels], **self.overall.to_summary()}
-
 
 @dataclass(frozen=True)
 class RunSummary:
@@ -176,11 +172,9 @@ def summarize(folder: Path) -> RunSummary:
         raise
     except Exception as error:
         # An entry that is missing or of a wrong type raises errors of many types.
-        files = f"{CONFIG}, {run_folder.METRICS} or a {SUMMARY}"
         reason = f"{type(error).__name__}: {single_line(error)}"
-        raise InputError(
-            f"{folder}: {files} is not as `pnb-train` wrote it ({reason}): use another run"
-        ) from error
+        fault = f"{folder} has a file that is not as `pnb-train` wrote it ({reason})"
+        raise InputError(f"{fault}: use another run") from error
 
 
 def trained_labels(folder: Path) -> list[str]:
@@ -318,40 +312,27 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     return named
 
 
-class ExampleRow(NamedTuple):
-    """Row of a table about an example, which an attack changes to fool a classifier.
+# Row of a table about an example that is attacked: its number, the true classes of its views, the
+# predicted classes before and after the attack, such as "81.0% orange, 55.3% lemon", and the
+# outcome, such as "success in 12 steps".
+ExampleRow = tuple[int, str, str, str, str]
 
-    Attributes:
-        number: Number of the example.
-        label: True class of the example, or the true classes of its views.
-        before: Predicted class of each view and its probability before the
-            attack, such as "81.0% orange, 55.3% lemon".
-        after: The same after the attack.
-        outcome: Success or failure in words, such as "success in 12 steps".
-    """
 
-    number: int
-    label: str
-    before: str
-    after: str
-    outcome: str
-
-    @classmethod
-    def read(cls, line: Mapping[str, Any]) -> "ExampleRow":
-        """Make the row from a line of attack.jsonl."""
-        views = []
-        for end in ("_before", ""):
-            pairs = zip(line[f"predicted{end}"], line[f"confidence{end}"], strict=True)
-            # The predicted class of each view.
-            views.append(", ".join(f"{probability:.1%} {name}" for name, probability in pairs))
-        outcome = "success only without noise" if line["success_without_noise"] else "no success"
-        outcome = f"{'success' if line['success'] else outcome} in {int(line['steps'])} steps"
-        if line["success_before"]:
-            outcome = "wrong before any step"
-        # The dictionary removes the class of a view if an earlier view has the same class.
-        label = ", ".join(dict.fromkeys(map(str, line["label"])))
-        before, after = views
-        return cls(int(line["example"]), label, before, after, outcome)
+def _example_row(line: Mapping[str, Any]) -> ExampleRow:
+    """Make the row of an example from its line of attack.jsonl."""
+    views = []
+    for end in ("_before", ""):
+        pairs = zip(line[f"predicted{end}"], line[f"confidence{end}"], strict=True)
+        # The predicted class of each view.
+        views.append(", ".join(f"{probability:.1%} {name}" for name, probability in pairs))
+    outcome = "success only without noise" if line["success_without_noise"] else "no success"
+    outcome = f"{'success' if line['success'] else outcome} in {int(line['steps'])} steps"
+    if line["success_before"]:
+        outcome = "wrong before any step"
+    # The dictionary removes the class of a view if an earlier view has the same class.
+    label = ", ".join(dict.fromkeys(map(str, line["label"])))
+    before, after = views
+    return int(line["example"]), label, before, after, outcome
 
 
 @dataclass(frozen=True)
@@ -392,7 +373,7 @@ def read_attack(folder: Path) -> AttackSummary:
         correct = [line for line in examples if not line["success_before"]]
         return AttackSummary(
             folder=folder,
-            rows=[*map(ExampleRow.read, examples)],
+            rows=[*map(_example_row, examples)],
             successes=sum(bool(line["success"]) for line in correct),
             without_noise=sum(bool(line["success_without_noise"]) for line in correct),
             correct=len(correct),
@@ -400,10 +381,8 @@ def read_attack(folder: Path) -> AttackSummary:
         )
     except Exception as error:
         # A file with other contents than expected raises errors of many types.
-        raise InputError(
-            f"{path} is damaged or was written by no attack ({single_line(error)}): "
-            "use the folder of another attack"
-        ) from error
+        fault = f"{path} is damaged or was written by no attack ({single_line(error)})"
+        raise InputError(f"{fault}: use the folder of another attack") from error
 
 
 class Unfinished(NamedTuple):
@@ -442,9 +421,7 @@ def find(folders: Sequence[Path]) -> Findings:
     paths: dict[Path, Path] = {}
     for folder in map(published_folder, folders):
         if not folder.is_dir():
-            raise InputError(
-                f"runs: {folder} is not a folder: give folders of runs, of a sweep or of attacks"
-            )
+            raise InputError(f"runs: {folder} is not a folder: give folders of runs or of attacks")
         for path in _walk(folder):
             paths.setdefault(path.resolve(), path)
     if not paths:
@@ -477,12 +454,9 @@ def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
         found = find([folder])
         if not found.runs:
             reasons = [f" ({run.folder}: {run.state})" for run in found.unfinished]
-            raise InputError(
-                f"runs: {folder} holds no finished run{''.join(reasons[:1])}: "
-                "let its run finish or resume it, or give another folder"
-            )
-        if found.unfinished:
-            first = found.unfinished[0]
+            fault = f"runs: {folder} holds no finished run{''.join(reasons[:1])}"
+            raise InputError(f"{fault}: finish or resume it, or give another folder")
+        for first in found.unfinished[:1]:
             left_out = f"{len(found.unfinished)} unfinished of {folder}"
             console.warning("left out: %s (%s: %s)", left_out, first.folder, first.state)
         for summary in found.runs:
