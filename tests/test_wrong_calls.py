@@ -473,9 +473,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("name", "call"), [pytest.param(name, call, id=title) for name, title, call in CALLS]
 )
-def test_a_wrong_call_is_refused_by_a_sentence_that_names_the_argument(
-    folder, monkeypatch, name, call
-):
+def test_a_wrong_call_is_refused_by_a_sentence_naming_the_argument(folder, monkeypatch, name, call):
     monkeypatch.chdir(folder)
     with pytest.raises(InputError) as refused:
         call()

@@ -287,9 +287,7 @@ def test_position_embeddings_tell_the_size(said, tmp_path):
     assert "64 × 64 pixels, stated by the file; normalized by mean (0.5, 0.5, 0.5) and std" in line
 
 
-def test_onnx_gives_the_scores_of_its_graph_and_the_size_that_it_tells_is_not_assumed(
-    said, tmp_path
-):
+def test_onnx_gives_the_scores_of_its_graph_and_a_size_that_it_tells_is_not_assumed(said, tmp_path):
     """The graph takes the mean of each channel, which is written without a library of networks."""
     pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")

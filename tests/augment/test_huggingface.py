@@ -224,7 +224,7 @@ def test_a_detector_or_segmenter_finds_what_the_processor_of_transformers_reads(
 
 
 @pytest.mark.parametrize("name", ZERO_SHOT)
-def test_hardening_a_zero_shot_network_trains_its_texts_and_its_run_scores_the_same(
+def test_hardening_trains_the_texts_and_a_run_scores_the_same(
     name, save, tokenizer, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)

@@ -50,9 +50,7 @@ def peak_memory(function: Callable[[], object]) -> int:
     ],
     ids=["few images", "all images", "camera effects"],
 )
-def test_an_attack_on_light_takes_half_to_all_of_the_memory_that_it_must_find_free(
-    monkeypatch, at_once, camera
-):
+def test_attacks_on_light_take_half_to_all_of_the_memory_they_require(monkeypatch, at_once, camera):
     """The renders are bytes, as they are in training."""
     required = []
     monkeypatch.setattr(scene, "AT_ONCE", at_once)

@@ -44,9 +44,7 @@ def result(photographs):
     return attack_photographs(HueNetwork().eval(), photographs, SETTINGS, seed=1)
 
 
-def test_a_result_has_the_predictions_of_its_images_and_gains_within_the_norm_ball(
-    result, photographs
-):
+def test_a_result_has_predictions_of_its_images_and_gains_within_the_norm_ball(result, photographs):
     means = to_unit(photographs)[:, :, : SIZE // 2].mean((2, 3))
     assert torch.equal(result.source, means.argmax(1))
     for log_gain in result.log_gain.values():

@@ -14,9 +14,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize("stream", [Terminal(), io.StringIO()], ids=["terminal", "log"])
-def test_progress_is_shown_on_a_terminal_before_the_first_item_is_done_and_nothing_of_it_is_left(
-    monkeypatch, stream
-):
+def test_progress_is_shown_on_a_terminal_before_the_first_item_then_removed(monkeypatch, stream):
     monkeypatch.setattr(progress_module, "PATIENCE", 0.03)
     monkeypatch.setattr(sys, "stderr", stream)
     for _ in progress([1, 2], "attack"):

@@ -149,9 +149,7 @@ def test_all_images_of_a_folder_are_shown_before_any_is_shown_again(examples, sh
 @pytest.mark.parametrize(
     ("classified", "rows"), [(250, list(range(EXAMPLE_COUNT))), (4, [0, 33, 66, 99])]
 )
-def test_diagnostics_of_random_light_are_those_of_the_classified_images(
-    serve, model, monkeypatch, classified, rows
-):
+def test_diagnostics_of_random_light_count_its_images(serve, model, monkeypatch, classified, rows):
     monkeypatch.setattr("augment.service.CLASSIFIED", classified)
     renders = serve(mode="random").regenerate(model, 0)
     labels = renders.labels[rows]
@@ -302,9 +300,7 @@ def probability_rises(model: nn.Module, scene: Scene, after: Tensor) -> Tensor:
     return logits_of(model, after).softmax(1) - logits_of(model, before).softmax(1)
 
 
-def test_hard_negatives_are_attacked_towards_the_label_and_the_label_away_from_it(
-    serve, scene, model, labels
-):
+def test_negatives_are_attacked_towards_a_label_and_its_objects_away(serve, scene, model, labels):
     """Tables are complementary to a plate, so that every step raises the plate's probability."""
     is_plate = labels == 0
     mixed = torch.where(is_plate, labels, complementary_label(0))
@@ -324,9 +320,7 @@ def test_hard_negatives_with_a_class_succeed_as_the_studied_class_alone(serve, m
     assert renders.diagnostics["attack_success"] == expected
 
 
-def test_hard_negatives_of_several_classes_are_attacked_towards_each_in_turn(
-    serve, scene, model, labels
-):
+def test_hard_negatives_are_attacked_towards_several_labels_in_turn(serve, scene, model, labels):
     """Plates belong to neither of the two classes, and tables to the second."""
     is_plate = labels == 0
     mixed = torch.where(is_plate, complementary_label(1), labels)

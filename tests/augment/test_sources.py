@@ -128,9 +128,7 @@ def as_in_2017(state: dict) -> dict:
     ("model", "arguments", "published"),
     [("densenet121", {}, as_in_2017), ("googlenet", {"init_weights": False}, dict)],
 )
-def test_a_torchvision_model_gives_torchvisions_logits_from_a_file_and_a_download(
-    hub, model, arguments, published
-):
+def test_torchvision_models_give_its_logits_from_file_or_download(hub, model, arguments, published):
     """The file lies where torchvision would have downloaded it."""
     torch.manual_seed(0)
     weights = get_model_weights(model).DEFAULT
@@ -167,9 +165,7 @@ class Harmful:
         ({"classifier.1.bias": torch.zeros(10)}, "torchvision:squeezenet1_1"),
     ],
 )
-def test_a_file_of_other_weights_is_refused_by_name_and_runs_no_code(
-    tmp_path, monkeypatch, content, message
-):
+def test_a_file_of_other_weights_is_named_and_runs_no_code(tmp_path, monkeypatch, content, message):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "squeezenet.pth"
     if isinstance(content, dict):

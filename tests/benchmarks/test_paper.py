@@ -117,9 +117,7 @@ def test_the_change_of_light_is_a_mean_over_the_renders_that_are_attacked(tmp_pa
 
 
 @pytest.mark.parametrize(("fraction_of_radius", "success"), [(0.9, True), (1.1, False)])
-def test_a_pixel_attack_lowers_a_mean_by_its_radius_and_random_draws_do_not(
-    fraction_of_radius, success
-):
+def test_a_pixel_attack_lowers_means_by_its_radius_unlike_random_draws(fraction_of_radius, success):
     radius = 0.02
     scene = make_scene(1)
     image = common.render_all(scene)

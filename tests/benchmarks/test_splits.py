@@ -59,9 +59,7 @@ def test_the_splits_share_no_photograph(photographs):
     assert len(names[0] | names[1]) == 15
 
 
-def test_each_evaluation_on_the_test_split_is_logged_before_it(
-    photographs, tmp_path, monkeypatch, capsys
-):
+def test_evaluations_on_the_test_split_are_logged_first(photographs, tmp_path, monkeypatch, capsys):
     log = tmp_path / "log.csv"
     log.write_text("date,commit,table,network,weights,parts,images\n")
     monkeypatch.setattr(splits, "LOG", log)

@@ -8,21 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from renderer import errors
 from renderer.camera import OrthographicCamera
-from renderer.errors import (
-    MAX_MAGNITUDE,
-    InputError,
-    as_array,
-    as_integers,
-    as_list,
-    as_path,
-    as_tensor,
-    require_choice,
-    require_flag,
-    require_number,
-    require_range,
-    require_whole,
-)
 from renderer.light.harmonics import basis, project, rotate
 from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
@@ -65,15 +52,15 @@ def test_nan_and_infinity_are_refused_by_the_name_of_the_tensor(name, good, take
     take(good.clone())
     spoiled = good.clone()
     spoiled.view(-1)[position] = bad
-    with pytest.raises(InputError, match=f"^{name} "):
+    with pytest.raises(errors.InputError, match=f"^{name} "):
         take(spoiled)
 
 
 @pytest.mark.parametrize(("name", "good", "take"), BOUNDED)
 def test_magnitudes_that_would_overflow_are_refused_by_name(name, good, take):
-    take(good * MAX_MAGNITUDE * 0.99)
-    with pytest.raises(InputError, match=f"^{name} "):
-        take(good * MAX_MAGNITUDE * 1.01)
+    take(good * errors.MAX_MAGNITUDE * 0.99)
+    with pytest.raises(errors.InputError, match=f"^{name} "):
+        take(good * errors.MAX_MAGNITUDE * 1.01)
 
 
 COMPLEX = torch.ones(2, 3) * 1j
@@ -83,19 +70,25 @@ NO_SCALARS = ("2", None, True, 1j, [1.0, 2.0], (5,), torch.ones(2), MESH)
 OUT_OF_RANGE = (-1, 10, math.nan, math.inf)
 # Checks of an argument x, from 0 to 9 if it is a number, and wrong values of each kind.
 CHECKS = [
-    (lambda x: as_tensor("x", x), NO_NUMBERS),
-    (lambda x: as_tensor("x", x), ([torch.ones(1), torch.ones(2)], [torch.ones(1), "a"])),
-    (lambda x: as_integers("x", x), (*NO_NUMBERS, 0.5, [0.5, 1], torch.ones(2))),
-    (lambda x: as_array("x", x), NO_NUMBERS),
-    (lambda x: as_array("x", x, "iu"), (0.5, [0.5], np.ones(2))),
-    (lambda x: as_path("x", x), (None, 3, b"a", ["a"], True, MESH)),
-    (lambda x: as_list("x", x, int, "numbers"), ("ab", b"ab", {}, {1}, 3, None, torch.tensor(1))),
-    (lambda x: as_list("x", x, int, "numbers"), ([None], [1, "a"], torch.ones(2))),
-    (lambda x: require_whole("x", x, 0, 9), (*NO_SCALARS, *OUT_OF_RANGE, 0.5, 1.0)),
-    (lambda x: require_number("x", x, 0, 9), (*NO_SCALARS, *OUT_OF_RANGE, -1e-9, 9.001)),
-    (lambda x: require_range("x", x, 0, 9), (*OUT_OF_RANGE, "2", True, 1j, [1.0])),
-    (lambda x: require_choice("x", x, ("a", "b")), ("c", "A", "", None, 3, ["a"], True)),
-    (lambda x: require_flag("x", x), ("no", None, 2, -1, 0.5, 1.0, [True], torch.ones(2) > 0)),
+    (lambda x: errors.as_tensor("x", x), NO_NUMBERS),
+    (lambda x: errors.as_tensor("x", x), ([torch.ones(1), torch.ones(2)], [torch.ones(1), "a"])),
+    (lambda x: errors.as_integers("x", x), (*NO_NUMBERS, 0.5, [0.5, 1], torch.ones(2))),
+    (lambda x: errors.as_array("x", x), NO_NUMBERS),
+    (lambda x: errors.as_array("x", x, "iu"), (0.5, [0.5], np.ones(2))),
+    (lambda x: errors.as_path("x", x), (None, 3, b"a", ["a"], True, MESH)),
+    (
+        lambda x: errors.as_list("x", x, int, "numbers"),
+        ("ab", b"ab", {}, {1}, 3, None, torch.tensor(1)),
+    ),
+    (lambda x: errors.as_list("x", x, int, "numbers"), ([None], [1, "a"], torch.ones(2))),
+    (lambda x: errors.require_whole("x", x, 0, 9), (*NO_SCALARS, *OUT_OF_RANGE, 0.5, 1.0)),
+    (lambda x: errors.require_number("x", x, 0, 9), (*NO_SCALARS, *OUT_OF_RANGE, -1e-9, 9.001)),
+    (lambda x: errors.require_range("x", x, 0, 9), (*OUT_OF_RANGE, "2", True, 1j, [1.0])),
+    (lambda x: errors.require_choice("x", x, ("a", "b")), ("c", "A", "", None, 3, ["a"], True)),
+    (
+        lambda x: errors.require_flag("x", x),
+        ("no", None, 2, -1, 0.5, 1.0, [True], torch.ones(2) > 0),
+    ),
 ]
 
 
@@ -103,11 +96,11 @@ CHECKS = [
     ("check", "value"), [(check, value) for check, values in CHECKS for value in values]
 )
 def test_a_value_of_a_wrong_kind_or_range_is_refused_by_its_name(check, value):
-    with pytest.raises(InputError, match=r"^x\b"):
+    with pytest.raises(errors.InputError, match=r"^x\b"):
         check(value)
 
 
 @pytest.mark.parametrize("value", [0, 9, np.int64(3), np.uint8(9)])
 def test_the_ends_of_a_range_are_inside(value):
-    for check in (require_whole, require_number, require_range):
+    for check in (errors.require_whole, errors.require_number, errors.require_range):
         check("x", value, 0, 9)

@@ -96,9 +96,7 @@ MESHES = {
 
 
 @pytest.mark.parametrize(("min_count", "expected_count"), [(0, 12), (11, 12), (12, 42), (42, 162)])
-def test_an_icosahedron_is_subdivided_until_it_has_more_vertices_than_asked(
-    min_count, expected_count
-):
+def test_an_icosahedron_is_divided_until_it_has_more_vertices_than_asked(min_count, expected_count):
     mesh = subdivide(mesh_of(trimesh.creation.icosahedron()), min_count)
     assert len(mesh.vertices) == expected_count
     # Euler's formula for a closed surface of triangles.

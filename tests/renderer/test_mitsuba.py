@@ -135,9 +135,7 @@ def mean_square(values: np.ndarray) -> float:
     ("size", "samples", "ray_count"),
     [(16, 32, 128), pytest.param(64, 64, 512, marks=pytest.mark.slow)],
 )
-def test_a_convex_mesh_is_rendered_as_by_mitsuba_within_its_noise(
-    tmp_path, make_mesh, view, size, samples, ray_count
-):
+def test_a_convex_mesh_looks_as_in_mitsuba(tmp_path, make_mesh, view, size, samples, ray_count):
     """Errors in units of the standard errors of n images follow Student's t distribution.
 
     The three channels share their rays, so a pixel counts once. At the outline, s rows of samples
@@ -186,9 +184,7 @@ SLOW_BOUNCES = [
         *(pytest.param(*scene, marks=pytest.mark.slow) for scene in SLOW_BOUNCES),
     ],
 )
-def test_shadows_and_bounces_are_those_of_mitsuba_within_its_noise(
-    tmp_path, make_mesh, view, bounces, normals, monkeypatch
-):
+def test_shadows_and_bounces_are_mitsubas(tmp_path, make_mesh, view, bounces, normals, monkeypatch):
     """The rays are enough for errors of 0.5 % of the brightest value, and 0.1 % on average.
 
     Light bounces off flat faces here, and off smooth normals in Mitsuba, so that both have to be

@@ -106,9 +106,7 @@ def test_a_leaf_with_two_sides_has_the_image_of_a_leaf_with_one(light, shadows, 
     ("kind", "name", "bounces", "encoding"),
     [("a color per face", "plate", 0, "linear"), ("a texture", "cup", 2, "srgb")],
 )
-def test_a_given_albedo_replaces_that_of_the_mesh_and_light_bounces_off_it(
-    light, kind, name, bounces, encoding
-):
+def test_a_given_albedo_replaces_the_meshs_also_in_bounces(light, kind, name, bounces, encoding):
     mesh = renderer.solid(name)
     rng = np.random.default_rng(3)
     if kind == "a texture":
@@ -152,9 +150,7 @@ BACKDROPS = draw_uniform(3, 3, 9, 9)
     ],
     ids=["gray", "color", "image", "image per view"],
 )
-def test_backgrounds_are_grays_colors_and_images_of_one_view_or_all(
-    stone, light, background, expected
-):
+def test_backgrounds_are_grays_colors_images_of_one_view_or_all(stone, light, background, expected):
     beside_the_image = replace(stone, vertices=stone.vertices + 10)
     found = renderer.render(beside_the_image, CAMERAS, light, background=background, **SMALL)
     assert torch.equal(found, expected.expand(3, 3, 9, 9))
@@ -223,9 +219,7 @@ def test_a_light_sphere_shows_a_lamp_by_the_inverse_square_law():
 
 
 @pytest.mark.parametrize("function", ["render", "precompute_transfer"])
-def test_images_that_need_more_than_the_free_memory_are_refused(
-    stone, light, function, monkeypatch
-):
+def test_images_that_need_more_than_free_memory_are_refused(stone, light, function, monkeypatch):
     monkeypatch.setattr("renderer.errors.free_memory", lambda device: 10**6)
     arguments = (stone, CAMERAS, light)[: 3 if function == "render" else 2]
     getattr(renderer, function)(*arguments, **SMALL)

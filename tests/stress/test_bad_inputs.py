@@ -252,9 +252,7 @@ def require_finite(result: Any) -> None:
         *(pytest.param(file, MANY // 5, marks=pytest.mark.slow) for file in COMMANDS),
     ],
 )
-def test_a_damaged_file_is_used_or_refused_in_one_sentence_that_names_it(
-    corpus, outcome, file, examples
-):
+def test_a_damaged_file_is_used_or_refused_in_a_sentence_naming_it(corpus, outcome, file, examples):
     good = (corpus / file).read_bytes()
 
     @settings(max_examples=examples, derandomize=examples == QUICK, **UNLIMITED)

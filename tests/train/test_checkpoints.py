@@ -26,9 +26,7 @@ class Harmful:
 
 
 @pytest.mark.parametrize("function", ["fsync", "replace"])
-def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new_one(
-    tmp_path, monkeypatch, function
-):
+def test_a_full_disk_leaves_the_old_checkpoint_and_names_the_new(tmp_path, monkeypatch, function):
     save(tmp_path / LAST, STATE)
     before = (tmp_path / LAST).read_bytes()
 
@@ -59,9 +57,7 @@ SPOILED = {
 
 
 @pytest.mark.parametrize("spoil", SPOILED)
-def test_a_file_without_a_usable_network_is_refused_by_name_and_runs_no_code(
-    tmp_path, monkeypatch, spoil
-):
+def test_a_file_without_a_network_is_refused_by_name_and_runs_no_code(tmp_path, monkeypatch, spoil):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / BEST
     save(path, STATE)

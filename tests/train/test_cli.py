@@ -44,7 +44,7 @@ def no_report(monkeypatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_training_of_two_methods_ends_with_their_table_and_records_its_command(
+def test_two_methods_end_with_their_table_and_the_command(
     call, capsys, tmp_path, two_methods, photos
 ):
     """It runs in the background of a shell, which ignores SIGINT."""
@@ -108,9 +108,7 @@ def test_a_mistake_is_an_error_in_one_line(call, capsys, monkeypatch, tmp_path, 
     assert sorted(tmp_path.rglob(unchanged)) == before
 
 
-def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(
-    call, capsys, tmp_path, two_methods
-):
+def test_a_mistake_in_an_arm_stops_the_command_before_training(call, capsys, tmp_path, two_methods):
     assert call("train", "out=here", *two_methods, *SMALL, "meshes=[missing.glb]") == USER_ERROR
     assert "missing.glb" in capsys.readouterr().err
     assert not list(tmp_path.rglob(LAST))
@@ -127,9 +125,7 @@ def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, two_met
 
 
 @pytest.mark.slow
-def test_a_stopped_run_is_resumed_by_its_folder_alone(
-    call, capsys, no_report, tmp_path, two_methods, photos
-):
+def test_a_stopped_run_is_resumed_by_folder(call, capsys, no_report, tmp_path, two_methods, photos):
     """The folder was moved; only settings that do not affect the result may change."""
     folder = tmp_path / "begun"
     overrides = [*two_methods, f"photos={photos}", "seed=3", *SMALL, "train.epochs=2"]

@@ -33,9 +33,7 @@ def test_a_device_that_is_not_there_is_one_error():
 @pytest.mark.parametrize(
     "quota, cores", [("300000 100000", 3), ("20000 100000", 1), ("max 100000", 8), (None, 8)]
 )
-def test_threads_are_no_more_than_the_containers_quota_of_cores(
-    tmp_path, monkeypatch, quota, cores
-):
+def test_threads_are_at_most_the_containers_quota_of_cores(tmp_path, monkeypatch, quota, cores):
     if quota:
         (tmp_path / "cpu.max").write_text(quota)
     monkeypatch.setattr(device, "QUOTA", tmp_path / "cpu.max")
@@ -59,9 +57,7 @@ def test_a_large_training_gets_all_threads_and_a_small_one_gets_one(monkeypatch)
         (CPU, "aarch64", "torch.ops.mkldnn._is_mkldnn_bf16_supported", "float32"),
     ],
 )
-def test_auto_is_bfloat16_where_the_hardware_computes_in_it(
-    monkeypatch, where, machine, rule, otherwise
-):
+def test_auto_is_bfloat16_where_hardware_computes_it(monkeypatch, where, machine, rule, otherwise):
     """A depthwise convolution is faster in float32 on every CPU."""
     grouped, depthwise = (torch.nn.Conv2d(4, 8, 3, groups=groups) for groups in (2, 4))
     monkeypatch.setattr(device.platform, "machine", lambda: machine)

@@ -235,9 +235,7 @@ def test_other_networks_are_loaded_by_their_name_and_copied_without_their_code(t
     ],
     ids=str,
 )
-def test_a_description_that_does_not_fit_the_weights_is_refused_in_one_sentence(
-    network, tmp_path, changes
-):
+def test_a_description_of_other_weights_is_refused_in_one_sentence(network, tmp_path, changes):
     write(tmp_path, network, **changes)
     for name in (BEST, PUBLISHED):
         with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name} [^\n]+$"):

@@ -16,9 +16,7 @@ from train.results.store import summarize
 from train.run_folder import PUBLISHED
 
 
-def test_a_published_network_is_one_file_with_its_settings_without_paths_and_its_scores(
-    finished, tmp_path
-):
+def test_a_published_network_is_one_file_with_settings_without_paths_and_scores(finished, tmp_path):
     published = tmp_path / "tiny"
     nb.publish(finished, published)
     assert [path.name for path in published.iterdir()] == [PUBLISHED]
@@ -38,9 +36,7 @@ def test_a_published_network_is_one_file_with_its_settings_without_paths_and_its
     assert found.photographs == expected.photographs
 
 
-def test_an_operating_point_is_the_second_lowest_log_odds_of_four_negatives_and_stays(
-    finished, photos, tmp_path
-):
+def test_an_operating_point_is_the_second_lowest_log_odds_and_stays(finished, photos, tmp_path):
     """With a rate of 1/2, 2 of the negatives may exceed the threshold."""
     calibrated = tmp_path / "first"
     nb.publish(finished, calibrated, calibrate=photos, false_positive_rate=0.5)

@@ -166,9 +166,7 @@ def write_epochs(folder: Path, epochs: range, history=()) -> None:
 
 
 @pytest.mark.parametrize("done", [0, 2, 3])
-def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(
-    tmp_path, done, monkeypatch
-):
+def test_resuming_continues_the_metrics_from_the_checkpoints_epoch(tmp_path, done, monkeypatch):
     """Later lines and scores are written again. Lines that were cut or lost come back."""
     # TensorBoard orders the files by their seconds.
     monkeypatch.setattr(time, "time", itertools.count(1e9).__next__)

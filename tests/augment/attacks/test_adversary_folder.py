@@ -169,9 +169,7 @@ def test_an_attack_on_albedo_paints_the_object_alone(pear_with_prop):
     assert not painted[~pear_with_prop.own_faces].any()
 
 
-def test_an_attack_on_shape_moves_the_object_alone_even_after_it_is_read_back(
-    pear_with_prop, tmp_path
-):
+def test_an_attack_on_shape_moves_the_object_alone_even_if_read_back(pear_with_prop, tmp_path):
     """A file has its faces in the order of textures, and its vertices in that of places."""
     scene = scene_with(pear_with_prop)
     for round_name in ("first", "second"):

@@ -57,7 +57,7 @@ def test_the_images_are_those_of_the_values(result):
 
 
 @pytest.mark.parametrize(("views", "dimensions"), [(1, ()), (2, (2,))])
-def test_images_and_logits_have_a_dimension_for_views_only_if_there_are_several(
+def test_only_several_views_have_a_dimension_in_results(
     attacked, by_color, tmp_path, views, dimensions
 ):
     scene = {"views": views, "shared": True, "backgrounds": [0.2, 0.4, 0.6]}
@@ -110,9 +110,7 @@ def test_the_same_seed_gives_the_same_result(attacked):
 
 
 @pytest.mark.parametrize("bounces", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_the_final_images_have_the_shadows_of_the_final_shape_and_colors(
-    by_color, tmp_path, bounces
-):
+def test_final_images_have_the_shadows_of_the_final_shape_and_colors(by_color, tmp_path, bounces):
     options = {"shadows": True, "bounces": bounces, "rasterizer": "numpy", "width": 2.4}
     scene = augment.build_scene([("solid:cup:3", "orange")], 8, **SHARED, **options)
     steps = augment.StepSettings("linf", 0.05, "sign", 0.03)
@@ -125,7 +123,7 @@ def test_the_final_images_have_the_shadows_of_the_final_shape_and_colors(
 
 
 @pytest.mark.parametrize(("parameter", "nonnegative"), [("geometry", True), ("albedo", False)])
-def test_light_is_nonnegative_whatever_is_attacked_unless_negative_light_is_allowed(
+def test_light_is_nonnegative_unless_negative_light_is_allowed(
     attacked, parameter, nonnegative, tmp_path
 ):
     """Only then can an environment map show it."""

@@ -22,9 +22,7 @@ CLASSES = ("orange", "lime", "sky", "night")
 
 
 @pytest.mark.parametrize("margin", [0.5, 100.0])
-def test_the_lines_of_an_attack_have_its_numbers_and_its_checks(
-    attacked, by_color, tmp_path, margin
-):
+def test_the_lines_of_an_attack_have_its_numbers_and_checks(attacked, by_color, tmp_path, margin):
     scene = {"backgrounds": [0.4, 0.6]}
     result = attacked("lighting", scene, target="lime", max_steps=4, margin=margin)
     checks = augment.check(result)

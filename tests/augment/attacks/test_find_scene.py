@@ -50,9 +50,7 @@ def test_a_scene_that_is_classified_correctly_stays_as_it_is():
 
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("settings", [SceneSettings(views=2), SceneSettings(fov=40.0)])
-def test_a_camera_and_a_light_are_found_in_which_all_views_are_classified_correctly(
-    settings, shared
-):
+def test_a_camera_and_light_are_found_in_which_all_views_are_classified_correctly(settings, shared):
     chosen = found(bright_and_small, settings, shared=shared)
     assert chosen != settings
     other_settings = {name: getattr(settings, name) for name in CHANGED}

@@ -78,9 +78,7 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
 
 @pytest.mark.parametrize("optimizer", ["gradient", *OPTIMIZERS])
 @pytest.mark.parametrize("max_queries", [1, 20])
-def test_all_starts_together_show_at_most_the_given_number_of_images(
-    attacked, optimizer, max_queries
-):
+def test_all_starts_together_show_at_most_that_number_of_images(attacked, optimizer, max_queries):
     pytest.importorskip("cma")
     steps = {"lighting": augment.StepSettings("l2", 0.1)}
     options = {"optimizer": optimizer, "restarts": 2, "margin": 100.0}
@@ -136,9 +134,7 @@ def test_a_function_without_gradients_is_attacked_by_random_search_with_one_sent
 
 
 @pytest.mark.parametrize("is_plain", [True, False])
-def test_a_function_that_takes_only_the_dtype_of_the_scene_keeps_its_gradients(
-    make_linear, is_plain
-):
+def test_a_function_that_takes_only_the_scenes_dtype_keeps_its_gradients(make_linear, is_plain):
     network = make_linear(2).eval()
 
     def function(images):

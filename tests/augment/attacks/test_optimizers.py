@@ -86,9 +86,7 @@ REACHES = arrays(np.float64, (2, 3), elements=st.one_of(st.floats(0, 2), st.just
 
 @pytest.mark.parametrize("name", NORMS)
 @given(pair=SMALL_PAIRS, reaches=REACHES, radius=st.floats(0.01, 4), dtype=DTYPES)
-def test_within_a_box_no_descent_by_scipy_gets_nearer_than_the_projection(
-    name, dtype, pair, reaches, radius
-):
+def test_in_a_box_scipy_gets_no_nearer_than_the_projection(name, dtype, pair, reaches, radius):
     values, center = torch.from_numpy(pair).to(dtype)
     down, up = torch.from_numpy(reaches).to(dtype)
     low = center - down

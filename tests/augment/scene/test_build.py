@@ -56,9 +56,7 @@ def lowest_roughness(scene: Scene, settings: MaterialSettings) -> float:
 
 
 @pytest.mark.parametrize(("smoothest", "radius"), [(0.6, 0.3), (0.5, 0.64)])
-def test_the_degree_shows_the_least_roughness_that_an_attack_on_the_material_reaches(
-    smoothest, radius
-):
+def test_the_degree_shows_the_least_roughness_that_an_attack_on_material_reaches(smoothest, radius):
     mesh = solid("pear")
     roughness = torch.full((len(mesh.faces),), 0.6)
     roughness[:9] = smoothest

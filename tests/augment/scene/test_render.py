@@ -113,9 +113,7 @@ def test_colors_at_their_bounds_keep_their_gradient(make_scene, stone, bound):
 
 
 @pytest.mark.parametrize("part", ["light", "vertices", "albedo"])
-def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(
-    make_scene, stone, part
-):
+def test_a_mesh_outside_the_image_leaves_backgrounds_and_a_zero_gradient(make_scene, stone, part):
     scene = make_scene(mesh=replace(stone, vertices=stone.vertices + 10))
     starts = {
         "light": scene.lights[0],

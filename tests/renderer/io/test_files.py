@@ -131,9 +131,7 @@ def test_the_temporary_files_of_a_killed_process_are_removed(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".exr", ".hdr"])
-def test_a_map_of_light_that_is_negative_in_places_has_its_flux_and_tells_the_error(
-    suffix, tmp_path
-):
+def test_a_map_of_light_negative_in_places_has_its_flux_and_tells_the_error(suffix, tmp_path):
     """Radiance 1 + 2 z has the irradiance π (1 + 4/3 z), with a mean square of π² (1 + 16/27)."""
     light = torch.zeros(49, 3)
     light[0] = math.sqrt(4 * math.pi)

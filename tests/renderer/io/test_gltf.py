@@ -101,9 +101,7 @@ def test_normalized_integers_are_those_of_the_specification(tmp_path):
     ("dtype", "channels", "has_material"),
     [("uint8", 3, True), ("uint8", 4, False), ("uint16", 4, True), ("float32", 3, False)],
 )
-def test_vertex_colors_of_every_type_are_multiplied_by_the_material(
-    tmp_path, dtype, channels, has_material
-):
+def test_vertex_colors_are_multiplied_by_the_material(tmp_path, dtype, channels, has_material):
     largest = 1 if dtype == "float32" else np.iinfo(dtype).max
     colors = np.array([[0.5, 0.25, 0.1, 0.3]] * 3)[:, :channels]
     stored = (np.rint(colors * largest) if largest > 1 else colors).astype(dtype)
@@ -327,9 +325,7 @@ def test_a_specular_color_that_gloss_cannot_hold_is_named(tmp_path):
     ("mesh_weights", "node_weights", "height"),
     [([1.0], None, 3), ([0.5], None, 2), ([1.0], [0.25], 1.5), (None, None, 1), (None, [1.0], 3)],
 )
-def test_morph_targets_move_vertices_by_their_default_weights(
-    tmp_path, mesh_weights, node_weights, height
-):
+def test_morph_targets_move_vertices_by_their_weights(tmp_path, mesh_weights, node_weights, height):
     gltf = Gltf()
     tip = np.float32([[0, 0, 0], [1, 0, 0], [0, 0, 1]])
     primitive = gltf.mesh({"POSITION": tip})

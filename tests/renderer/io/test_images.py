@@ -217,9 +217,7 @@ def test_a_png_file_of_high_dynamic_range_is_refused(tmp_path):
 @pytest.mark.parametrize("suffix", ["png", "tif"])
 @pytest.mark.parametrize("depth", [8, 16])
 @pytest.mark.parametrize("gamma", [1.0, 1.8])
-def test_linear_light_of_16_bits_is_refused_and_never_loses_its_dark_values(
-    tmp_path, suffix, depth, gamma
-):
+def test_linear_16_bits_are_refused_and_never_lose_dark_values(tmp_path, suffix, depth, gamma):
     """The upper 8 bits of 0.003 in linear light are 0, although its sRGB value is 10."""
     pixels = np.full((8, 8), round(0.003 * (2**depth - 1)), np.uint16 if depth == 16 else np.uint8)
     path = tmp_path / f"a.{suffix}"
@@ -302,9 +300,7 @@ def tiff(content: bytes, bits: int, photometric: int, extra: int | None = None) 
     ],
     ids=["white is 0", "12 bits", "premultiplied alpha"],
 )
-def test_gray_tiff_files_have_the_values_of_their_tags(
-    tmp_path, content, bits, photometric, extra, expected
-):
+def test_gray_tiffs_are_read_by_their_tags(tmp_path, content, bits, photometric, extra, expected):
     (tmp_path / "a.tif").write_bytes(tiff(content, bits, photometric, extra))
     np.testing.assert_array_equal(read(tmp_path / "a.tif")[0, :, 1], expected)
 

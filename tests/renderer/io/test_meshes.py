@@ -169,9 +169,7 @@ def test_unused_vertices_are_removed_and_both_zeros_are_one_position(tmp_path):
         ("schäl.png", "bäume.mtl", "schäl.png"),
     ],
 )
-def test_the_texture_of_an_obj_is_found_by_the_names_that_any_system_writes(
-    tmp_path, texture, library, location
-):
+def test_textures_of_obj_are_found_by_the_names_of_any_system(tmp_path, texture, library, location):
     folder = tmp_path / "mesh"
     path = write_obj(folder, texture, library)
     (folder / location).parent.mkdir(exist_ok=True)

@@ -186,9 +186,7 @@ def test_materials_with_different_textures_keep_them_apart(tmp_path):
 
 
 @pytest.mark.parametrize("library", ["sub/m.mtl", "sub\\m.mtl", "./sub/m.mtl"])
-def test_images_are_sought_in_the_folder_of_the_library_and_then_in_that_of_the_mesh(
-    tmp_path, library
-):
+def test_images_are_sought_in_the_folder_of_the_library_then_in_that_of_the_mesh(tmp_path, library):
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "a.png").write_bytes(png_of(255, 0, 0))
     (tmp_path / "a.png").write_bytes(png_of(0, 0, 255))

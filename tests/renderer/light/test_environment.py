@@ -196,9 +196,7 @@ def test_colors_beyond_rec_709_have_no_negative_radiance_and_a_warning(tmp_path)
         ("PRIMARIES=.64 .33 .3 .6 .15 .06 .3127 .329", 1),
     ],
 )
-def test_the_radiance_of_a_hdr_file_is_divided_by_all_factors_of_its_header(
-    tmp_path, header, factors
-):
+def test_radiance_of_a_hdr_file_is_divided_by_all_factors_of_its_header(tmp_path, header, factors):
     """The factors are cumulative. Indented lines belong to other pictures."""
     radiance = read_map(write_hdr(tmp_path / "map.hdr", header, np.array([1, 0.5, 0.25])))
     expected = np.array([1, 0.5, 0.25]) / factors

@@ -214,9 +214,7 @@ def test_a_surface_behind_a_lamp_casts_no_shadow():
 
 
 @pytest.mark.parametrize(("batch", "make_mesh"), [((), ball), ((2, 3), ball_on_a_table)])
-def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
-    monkeypatch, batch, make_mesh
-):
+def test_sparse_and_dense_transfer_give_equal_radiance_and_gradient(monkeypatch, batch, make_mesh):
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
     mesh = make_mesh()
     monkeypatch.setattr("renderer.operators.build.SMALL_MATRIX_SIZE", 0)

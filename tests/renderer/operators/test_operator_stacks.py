@@ -80,9 +80,7 @@ BEHIND = draw(VIEW_COUNT, 2, 3, SIZE, SIZE, seed=3).abs().clamp(max=1)
     ids=["gray", "image of view", "image", "all images"],
 )
 @pytest.mark.parametrize("scene", SCENES)
-def test_all_views_in_one_call_are_the_single_views(
-    scene, batch, per_view, background, background_of_view
-):
+def test_batched_views_are_the_single_views(scene, batch, per_view, background, background_of_view):
     operators = scene_operators(scene)
     tolerance = 1e-5 if scene == "float32" else 1e-12
     lights = 0.3 * draw(*batch, operators[0].basis.size, 3)

@@ -96,9 +96,7 @@ def compose(operator: TransferOperator, lights: Tensor, background: float | Tens
     ids=str,
 )
 @pytest.mark.parametrize(("mesh", "samples"), LAYOUTS.values(), ids=LAYOUTS)
-def test_an_image_and_its_gradient_are_those_of_plain_operations(
-    mesh, samples, batch, kind, encoding
-):
+def test_image_and_gradient_are_those_of_plain_operations(mesh, samples, batch, kind, encoding):
     """At least a tenth of the values of visible meshes is clamped."""
     operator = operator_of(mesh, IN_FRONT, ImageSettings(SIZE, samples, encoding), torch.float64)
     lights = draw(*batch, 49, 3).requires_grad_()

@@ -289,9 +289,7 @@ FLOOR_VIEWS = [
     ("roughness", "metallic", "specular_factor"),
     [(0.2, 0.0, 1.0), (1.0, 0.0, 0.4), (0.2, 1.0, 1.0), (1.0, 0.5, 0.7)],
 )
-def test_lamps_and_projectors_are_reflected_as_by_kulla_and_conty(
-    roughness, metallic, specular_factor
-):
+def test_local_lights_are_reflected_as_by_kulla_and_conty(roughness, metallic, specular_factor):
     gloss = Gloss(roughness, metallic, specular_factor)
     surface = WhiteSurface(roughness, metallic, specular_factor)
     for view in FLOOR_VIEWS:
@@ -328,9 +326,7 @@ class FloorUnderSky:
     ("roughness", "metallic", "specular_factor"),
     [(0.2, 0.0, 1.0), (0.2, 1.0, 1.0), (1.0, 0.5, 0.7)],
 )
-def test_environment_light_is_reflected_reciprocally_with_no_more_than_its_energy(
-    roughness, metallic, specular_factor
-):
+def test_a_sky_is_reflected_reciprocally_without_gain(roughness, metallic, specular_factor):
     """The transfer onto harmonics is symmetric. Varnish reflects all, A_l Y_l0 in closed form."""
     floor = FloorUnderSky(Gloss(roughness, metallic, specular_factor))
     matrix = (floor.harmonics * floor.measure[:, None]).T @ floor.transfer

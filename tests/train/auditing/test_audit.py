@@ -226,9 +226,7 @@ class TestAWholeAudit:
             run_audit(AuditSettings(**given, hardened="guessing", seed=1))
 
 
-def test_an_audit_killed_while_it_removes_results_leaves_no_part_of_them(
-    tmp_path, given, monkeypatch
-):
+def test_an_audit_killed_as_it_removes_results_leaves_no_part_of_them(tmp_path, given, monkeypatch):
     out = tmp_path / "audit"
     for name in ("classifier/laboratory/summary.json", "renders/lab.json"):
         (out / name).parent.mkdir(parents=True)
@@ -243,9 +241,7 @@ def test_an_audit_killed_while_it_removes_results_leaves_no_part_of_them(
     assert [path.name for path in out.iterdir()] == ["config.yaml"]
 
 
-def test_an_audit_without_mitsuba_leaves_the_laboratory_out_and_says_so(
-    given, tmp_path, monkeypatch
-):
+def test_an_audit_without_mitsuba_says_that_it_has_no_laboratory(given, tmp_path, monkeypatch):
     counts = {"n": 2, "correct": 2}
     for method in ("adversarial", "random"):
         counts |= {method: [0, 0, 0, 0], f"{method}_without_noise": [0, 0, 0, 0]}
@@ -274,9 +270,7 @@ ORANGE_PEAR = {"mesh": "solid:pear", "label": "orange"}
         ({"laboratory": "nowhere"}, "laboratory=nowhere"),
     ],
 )
-def test_what_cannot_be_audited_is_refused_before_anything_is_written(
-    given, tmp_path, changes, message
-):
+def test_what_cannot_be_audited_is_refused_and_nothing_written(given, tmp_path, changes, message):
     with pytest.raises(InputError, match=message):
         run_audit(AuditSettings(**given | changes))
     assert not (tmp_path / "audit").exists()

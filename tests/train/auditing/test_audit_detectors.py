@@ -20,9 +20,7 @@ from train.command_settings import AuditSettings
 SIZE = 32
 
 
-def test_recall_on_renders_is_the_fraction_of_views_in_which_the_object_is_found(
-    monkeypatch, tmp_path
-):
+def test_recall_on_renders_is_the_part_of_views_in_which_the_object_is_found(monkeypatch, tmp_path):
     monkeypatch.setattr(found, "KINDS", {})
     network = as_network(find_red, SIZE, ["orange", "apple"])
     solids = {

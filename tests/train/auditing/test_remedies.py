@@ -63,9 +63,7 @@ MOST = range(50)
         ((), range(11), range(11), None),
     ],
 )
-def test_the_cheapest_remedy_is_recommended_that_no_other_improves_on(
-    light_alone, hardening, both, expected
-):
+def test_the_cheapest_best_remedy_is_recommended(light_alone, hardening, both, expected):
     labels = ["orange", "lemon"]
     found = {ORIGINAL: FEW, LIGHT_ALONE: light_alone, HARDENING: hardening, BOTH: both}
     evaluations = {name: [evaluation(images, labels)] for name, images in found.items()}

@@ -41,9 +41,7 @@ ADVERSARY_FILES = {
 }
 
 
-def test_an_attack_prints_what_it_attacked_writes_its_files_and_records_its_settings(
-    run, tmp_path, capsys
-):
+def test_an_attack_prints_its_parameters_writes_files_and_records_settings(run, tmp_path, capsys):
     names = ["skylight", "geometry", "albedo", "pixels"]
     attacked = f"attack=[{','.join(names)}]"
     assert run(attacked) == 0
@@ -111,9 +109,7 @@ def test_an_adversary_of_a_detector_is_rendered_and_detected_again(tmp_path):
 
 
 @pytest.mark.slow
-def test_success_against_radius_is_a_table_and_a_figure_of_meshes_of_the_classes_they_name(
-    run, tmp_path, capsys
-):
+def test_success_by_radius_is_a_table_and_a_figure_of_meshes_by_their_names(run, tmp_path, capsys):
     meshes = "meshes=[solid:orange:0,solid:apple:0]"
     radii = "attack.radius_scales=[1,0.2]"
     assert run("attack=lighting", meshes, *WITHOUT_CHECKS, radii) == 0
@@ -137,9 +133,7 @@ def test_success_against_radius_is_a_table_and_a_figure_of_meshes_of_the_classes
 
 
 @pytest.mark.slow
-def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_other_meshes(
-    run, tmp_path, capsys
-):
+def test_adversaries_are_shown_to_other_networks_azimuths_and_meshes(run, tmp_path, capsys):
     targets = [
         f"transfer.networks=[run:{PRETRAINED / 'none'},run:{PRETRAINED / 'best'}]",
         "transfer.azimuths=[-20,0]",

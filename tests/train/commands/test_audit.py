@@ -71,9 +71,7 @@ def counts_of(report: nb.AuditReport) -> tuple:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*deprecated")
-def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index_without_a_folder(
-    options, tmp_path, monkeypatch
-):
+def test_a_mesh_in_memory_and_a_networks_file_are_audited_by_index(options, tmp_path, monkeypatch):
     """The numbers are those of the mesh's file and of the network itself, by name."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")

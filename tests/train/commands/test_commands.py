@@ -64,9 +64,7 @@ class TestEvaluationWithoutALabel:
         assert "give classes or label" in capsys.readouterr().err
 
     @pytest.mark.parametrize("recorded", [False, True])
-    def test_takes_the_class_of_the_run_or_else_those_with_a_folder(
-        self, call, here, capsys, monkeypatch, recorded
-    ):
+    def test_takes_the_runs_class_or_else_folders(self, call, here, capsys, monkeypatch, recorded):
         save_noise(here / "2024" / "fig" / "a.png", np.random.default_rng(0), (64, 64))
         monkeypatch.setattr("train.results.scoring.write_roc", lambda *_: None)
         if recorded:
@@ -106,9 +104,7 @@ MISTAKES = [
 @pytest.mark.parametrize(
     ("command", "message"), MISTAKES, ids=[" ".join([c[0], *c[-2:]]) for c, _ in MISTAKES]
 )
-def test_a_mistake_is_an_error_in_one_line_before_anything_is_written(
-    call, here, capsys, command, message
-):
+def test_a_mistake_is_one_line_of_error_and_nothing_written(call, here, capsys, command, message):
     before = sorted(here.rglob("*"))
     assert call(*command) == USER_ERROR
     printed = capsys.readouterr()

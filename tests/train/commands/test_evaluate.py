@@ -56,9 +56,7 @@ def test_a_label_may_be_an_index(photographs):
     assert (scores.overall.false_positive_rate.hits, scores.overall.false_positive_rate.n) == (1, 4)
 
 
-def test_files_are_written_only_if_a_folder_is_given_and_the_network_is_left_as_it_was(
-    photographs, tmp_path, monkeypatch
-):
+def test_only_a_given_folder_is_written_and_the_network_stays(photographs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.rglob("*"))
     network = Brightness().eval()

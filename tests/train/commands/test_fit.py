@@ -26,9 +26,7 @@ ROUNDING = 0.0005  # Rounding error of a printed percentage with one decimal.
 
 
 @pytest.mark.slow
-def test_camera_and_light_of_a_solid_are_found_and_attacked_by_the_printed_command(
-    call, tmp_path, capsys
-):
+def test_camera_and_light_are_found_and_attacked_by_the_printed_command(call, tmp_path, capsys):
     mesh = load_object(ObjectSettings("solid:mushroom", label="orange")).mesh
     camera = PerspectiveCamera(63.0, 57.3, 3.0, 0.2, -0.1, distance=6.0)
     light = 0.2 * load_light("grace")

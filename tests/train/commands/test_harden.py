@@ -64,9 +64,7 @@ def harden(
     return nb.harden(network, meshes, photographs, **options)
 
 
-def test_the_result_loads_where_the_network_was_loaded_and_nothing_else_changes(
-    network, photographs, tmp_path, monkeypatch
-):
+def test_the_result_loads_alike_and_nothing_changes(network, photographs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     weights = deepcopy(network.state_dict())
     random_state = torch.get_rng_state()

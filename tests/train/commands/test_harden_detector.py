@@ -111,9 +111,7 @@ def test_the_loss_in_low_light_falls_and_boxes_in_unchanged_light_stay(detector,
 
 
 @pytest.mark.slow
-def test_without_the_boxes_of_the_teacher_renders_change_those_in_photographs(
-    detector, photographs
-):
+def test_without_boxes_of_the_teacher_renders_change_those_in_photographs(detector, photographs):
     train = SHORT["train"] | {"learning_rate": 0.003}
     free = train | {"distillation_weight": 1e-9, "consistency_weight": 0.0}
     both = (harden(detector, photographs, train=one) for one in (train, free))
@@ -122,9 +120,7 @@ def test_without_the_boxes_of_the_teacher_renders_change_those_in_photographs(
 
 
 @pytest.mark.slow
-def test_a_resumed_run_gives_the_weights_of_a_run_without_a_break(
-    detector, photographs, tmp_path, monkeypatch
-):
+def test_a_resumed_run_gives_the_same_weights(detector, photographs, tmp_path, monkeypatch):
     def fail_after_an_epoch(trainer: Trainer, *options) -> bool:
         if trainer.epoch:
             raise KeyboardInterrupt

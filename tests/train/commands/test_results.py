@@ -77,9 +77,7 @@ def test_a_folder_with_results_of_any_command_is_refused_by_its_argument(tmp_pat
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_refuses_the_folder_of_another_command_and_leaves_it_as_it_is(
-    call, here, capsys, command
-):
+def test_every_command_refuses_and_leaves_the_folder_of_another(call, here, capsys, command):
     write_results(here / "out", "evaluate")
     before = contents(here)
     assert call(command, *COMMANDS[command], "out=out") == USER_ERROR

@@ -83,9 +83,7 @@ def test_a_broken_file_is_named_or_another_of_its_folder_stands_in(tmp_path, cap
     assert "1 images cannot be read" in caplog.text
 
 
-def test_batches_from_disk_hold_images_and_renders_with_their_labels_and_go_on_where_they_stopped(
-    tmp_path,
-):
+def test_batches_from_disk_have_labeled_images_and_renders_and_go_on_where_they_stopped(tmp_path):
     for name, color in {"a": (10, 0, 0), "b": (20, 0, 0), "c": (30, 0, 0)}.items():
         (tmp_path / name).mkdir()
         for number in range(4):
@@ -109,9 +107,7 @@ def test_batches_from_disk_hold_images_and_renders_with_their_labels_and_go_on_w
             assert torch.equal(part, expected_part)
 
 
-def test_nothing_of_a_large_folder_is_read_before_it_is_shown_and_few_are_held_out(
-    tmp_path, monkeypatch
-):
+def test_no_file_of_a_folder_is_read_before_it_is_shown_and_few_are_held_out(tmp_path, monkeypatch):
     (tmp_path / "a.png").write_bytes(b"no image")
     for number in range(9):
         (tmp_path / f"{number}.png").symlink_to("a.png")

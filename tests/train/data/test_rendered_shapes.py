@@ -46,9 +46,7 @@ def test_every_class_has_the_images_asked_for_of_instances_that_no_other_part_sh
     assert len(set(instances)) == len(instances)
 
 
-def test_images_are_rendered_again_for_other_settings_or_other_code_alone(
-    tmp_path, instances, monkeypatch
-):
+def test_images_are_rendered_again_for_other_settings_or_code(tmp_path, instances, monkeypatch):
     def load(**settings):
         before = len(instances)
         arguments = {"train": 1, "test": 2, "size": SIZE, "seed": 0} | settings

@@ -33,9 +33,7 @@ def test_hard_negatives_have_the_class_of_the_network_or_none(settings, tmp_path
 
 
 @pytest.mark.parametrize("label", ["mug", "sweet pepper"])
-def test_a_class_has_its_meshes_of_training_only_if_it_cannot_be_generated(
-    settings, label, tmp_path
-):
+def test_a_class_has_meshes_of_training_only_if_it_cannot_be_generated(settings, label, tmp_path):
     own = replace(settings, label=label, meshes=[{"mesh": "own.glb", "label": label}])
     aside = kept_aside_settings(own, [label], 32, tmp_path)
     meshes = [item["mesh"] for item in aside.meshes if item["label"] == label]

@@ -121,17 +121,13 @@ def test_each_setup_shows_an_object_of_each_of_several_classes_and_one_other(tmp
         ({"patterns": ["stripe"]}, "patterns=stripe"),
     ],
 )
-def test_what_cannot_be_photographed_is_refused_before_anything_is_written(
-    tmp_path, changes, message
-):
+def test_what_cannot_be_photographed_is_refused_and_nothing_written(tmp_path, changes, message):
     with pytest.raises(InputError, match=message):
         lab.write_laboratory(settings(tmp_path / "lab", **changes))
     assert not (tmp_path / "lab").exists()
 
 
-def test_renders_that_replace_others_count_as_complete_only_at_their_end(
-    tmp_path, laboratory, monkeypatch
-):
+def test_renders_that_replace_others_are_complete_at_their_end(tmp_path, laboratory, monkeypatch):
     folder = tmp_path / "lab"
     shutil.copytree(laboratory, folder)
     again = settings(folder, overwrite=True)

@@ -179,9 +179,7 @@ class TestAHardenedNetwork:
             folders.append(folder)
         return folders
 
-    def test_stands_beside_the_network_it_started_from_in_tables_and_differences(
-        self, initial, hardened, tmp_path
-    ):
+    def test_stands_beside_its_initial_network_in_all_tables(self, initial, hardened, tmp_path):
         _, *rows = compare(hardened)[""]
         assert [row[:3] for row in rows] == [
             ["the initial network", "", "0.500"],

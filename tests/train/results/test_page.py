@@ -136,9 +136,7 @@ def test_an_attack_is_shown_with_its_rates_and_the_outcome_of_each_example(page)
     ]
 
 
-def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_training(
-    finished, tmp_path, monkeypatch
-):
+def test_an_exception_of_a_report_is_printed_and_ends_no_training(finished, tmp_path, monkeypatch):
     monkeypatch.setattr("train.results.page.plot_curves", lambda *_: 1 / 0)
     first, *_, last = report_of([finished], tmp_path).strip().splitlines()
     assert first.startswith("no report: Traceback")

@@ -424,9 +424,7 @@ def test_the_contact_sheet_frames_each_hit_miss_and_false_positive(fruit, tmp_pa
         assert count_frames(sheet) == [1, 4, 2]
 
 
-def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both_kinds(
-    fruit, tmp_path
-):
+def test_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both_kinds(fruit, tmp_path):
     """In the street, the ranks are 6 and 2 for oranges, and 1 and 5 for others."""
     evaluate(*fruit, "orange", tmp_path)
     curves = defaultdict(list)
@@ -445,9 +443,7 @@ def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both
         assert values[-1] == -np.inf
 
 
-def test_a_folder_without_negatives_has_an_empty_table_and_figure(
-    known_model, tmp_path, monkeypatch
-):
+def test_without_negatives_the_table_and_the_figure_are_empty(known_model, tmp_path, monkeypatch):
     monkeypatch.undo()
     evaluate(*known_model(["a.png"], [[1, 0]], ["orange", "pear"]), "orange", tmp_path)
     header = "source,false_positive_rate,recall,threshold\n"

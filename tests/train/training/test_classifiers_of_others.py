@@ -143,9 +143,7 @@ def test_of_networks_with_equal_agreement_the_last_one_is_kept(almost_fixed):
     assert scores["test/epoch"] == 2
 
 
-def test_labeled_folders_are_scored_in_the_classes_of_the_network_before_and_after(
-    tuned, weights, photos
-):
+def test_labeled_folders_are_scored_in_a_networks_classes_before_and_after(tuned, weights, photos):
     _, scores = tuned("folder", ALMOST_FIXED)
     assert scores["test/agreement"] == 1
     assert scores["test/accuracy"] == scores["test/accuracy_before"]

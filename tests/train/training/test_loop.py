@@ -190,9 +190,7 @@ PLAIN_SGD = {"momentum": 0.0, "weight_decay": 0.0, "learning_rate": 1.0}
     "precision, clip, tolerance",
     [("float32", None, 1e-6), ("float32", 0.1, 1e-6), ("float16", 0.1, 2e-3)],
 )
-def test_a_step_follows_the_clipped_mean_gradient_of_the_batch(
-    tmp_path, precision, clip, tolerance
-):
+def test_a_step_follows_the_clipped_mean_gradient_of_a_batch(tmp_path, precision, clip, tolerance):
     """In float16 the gradient is clipped after the scale of the loss is divided out."""
     parts = one_step(tmp_path, precision=precision, clip_gradient=clip, **PLAIN_SGD)
     length = torch.cat([gradient.flatten() for *_, gradient in parts]).norm()
@@ -242,9 +240,7 @@ def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path, stage, trai
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_evaluation_is_the_mean_over_all_images_in_eval_mode_and_leaves_the_mode(
-    monkeypatch, training
-):
+def test_evaluation_is_the_mean_of_images_in_eval_mode_and_leaves_the_mode(monkeypatch, training):
     monkeypatch.setattr(loop, "EVALUATION_BATCH", 7)
     torch.manual_seed(0)
     model = WideResNet(3, 10, 1, dropout=0.5).train(training)

@@ -92,9 +92,7 @@ def chain(small):
 
 
 @pytest.mark.slow
-def test_one_command_trains_on_photographs_and_then_the_last_layer_on_renders(
-    chain, weights, tmp_path
-):
+def test_one_command_trains_on_photographs_then_the_last_layer_on_renders(chain, weights, tmp_path):
     folder = tmp_path / "run"
     chain(folder)
     original = torch.load(weights)
@@ -111,9 +109,7 @@ def test_one_command_trains_on_photographs_and_then_the_last_layer_on_renders(
 
 
 @pytest.mark.slow
-def test_a_command_that_was_stopped_in_its_first_training_ends_as_one_that_was_not(
-    chain, tmp_path, monkeypatch
-):
+def test_a_command_stopped_in_its_first_training_ends_the_same(chain, tmp_path, monkeypatch):
     whole = tmp_path / "whole"
     chain(whole)
     stopped = tmp_path / "stopped"

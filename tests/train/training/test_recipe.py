@@ -121,9 +121,7 @@ def test_unlabeled_images_have_the_teachers_answers_but_no_cross_entropy(model, 
 
 
 @pytest.mark.parametrize("positive_classes", [(1,), (1, 3)])
-def test_the_mean_ranking_of_the_positive_classes_is_added_by_its_weight(
-    model, images, positive_classes
-):
+def test_the_mean_ranking_of_positive_classes_is_added_by_weight(model, images, positive_classes):
     # Two images show anything but class 0.
     labels = LABELS - 1
     batch = (images, labels, labels == 0)
@@ -152,9 +150,7 @@ def test_a_hard_negative_shows_none_of_several_positive_classes(model, images):
 
 
 @pytest.mark.parametrize("name", ["none", *TRANSFORMS, "pgd"])
-def test_an_augmentation_is_a_function_of_seed_and_step_and_leaves_the_model_alone(
-    name, images, model
-):
+def test_an_augmentation_is_a_function_of_seed_and_step_and_keeps_the_model(name, images, model):
     before = torch.get_rng_state()
     first = augmentation(name, model, 3).apply(images, LABELS, 7)
     assert torch.equal(torch.get_rng_state(), before)
@@ -171,9 +167,7 @@ def test_an_augmentation_is_a_function_of_seed_and_step_and_leaves_the_model_alo
 
 
 @pytest.mark.parametrize("name", TRANSFORMS)
-def test_draws_of_an_image_do_not_depend_on_the_number_of_processes(
-    name, images, model, monkeypatch
-):
+def test_an_image_has_the_same_draws_in_any_number_of_processes(name, images, model, monkeypatch):
     same = images[:1].expand(6, -1, -1, -1)
     whole = augmentation(name, model, 0).apply(same, LABELS, 1)
     assert len(whole.unique(dim=0)) > 1

@@ -130,9 +130,7 @@ def test_a_signal_ends_a_run_after_the_step_and_resuming_ends_as_if_it_had_not_c
     assert (stopped / picture).read_bytes() == (whole / picture).read_bytes()
 
 
-def test_the_signal_of_a_batch_system_writes_a_checkpoint_before_its_own_handler_acts(
-    tiny, tmp_path
-):
+def test_the_signal_of_a_batch_system_writes_a_checkpoint_before_its_handler_acts(tiny, tmp_path):
     epochs = []
 
     def requeue(number, frame):
@@ -168,9 +166,7 @@ def test_a_second_signal_acts_at_once(tiny, tmp_path, monkeypatch):
         (["train.resume=true", "seed=8"], "seed=7, not 8"),
     ],
 )
-def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(
-    tiny, finished, overrides, message
-):
+def test_no_run_is_written_over_or_resumed_with_other_settings(tiny, finished, overrides, message):
     before = modification_times(finished)
     with pytest.raises(InputError, match=message):
         loaded_run(tiny(*overrides), finished)
@@ -181,9 +177,7 @@ class TestARunThatReplacesAnother:
     """A run that is killed leaves nothing of the earlier run that its resumption would take."""
 
     @pytest.mark.slow
-    def test_renders_once_if_it_is_resumed_and_anew_with_other_settings(
-        self, tiny, tmp_path, photos, monkeypatch
-    ):
+    def test_renders_once_if_resumed_and_anew_if_changed(self, tiny, tmp_path, photos, monkeypatch):
         """Photographs take the place of the renders kept aside."""
         setups = []
 
@@ -199,9 +193,7 @@ class TestARunThatReplacesAnother:
         assert setups == [5, 10]
 
     @pytest.mark.parametrize("kept", range(12))
-    def test_removes_the_earlier_run_or_leaves_it_as_it_was_configured(
-        self, tmp_path, monkeypatch, kept
-    ):
+    def test_removes_an_earlier_run_or_leaves_it_as_configured(self, tmp_path, monkeypatch, kept):
         names = ["metrics.jsonl", "last.pt", "best.pt", "report.html", "photographs/summary.json"]
         names += ["before/summary.json", "kept_aside/lab.json", "random/metrics.jsonl"]
         for name in names:
@@ -231,9 +223,7 @@ class TestARunThatReplacesAnother:
 
 
 @pytest.mark.slow
-def test_a_resumed_run_has_its_recorded_threads_unless_the_settings_give_others(
-    tiny, tmp_path, monkeypatch
-):
+def test_a_resumed_run_has_its_recorded_threads_unless_given_others(tiny, tmp_path, monkeypatch):
     before = torch.get_num_threads()
     try:
         for chosen, threads, expected in ((2, "null", 2), (1, "null", 2), (1, "3", 3)):
@@ -255,9 +245,7 @@ TENSORBOARD_APPEND = "tensorboard.compat.tensorflow_stub.io.gfile.LocalFileSyste
 # The thread of TensorBoard raises the error, too.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("writer", [TENSORBOARD_APPEND, "renderer.io.files.os.fsync"])
-def test_a_full_disk_is_one_error_for_every_writer_and_the_run_can_be_resumed(
-    tiny, tmp_path, writer
-):
+def test_a_full_disk_is_one_error_for_each_writer_and_a_run_can_be_resumed(tiny, tmp_path, writer):
     settings = tiny(*WITHOUT_RENDERS, "train.resume=true")
     full_disk = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     with pytest.MonkeyPatch.context() as patch:
@@ -279,9 +267,7 @@ def test_arms_with_and_without_renders_draw_the_same_in_training(tiny, tmp_path)
 APPLE, ORANGE, PEAR = range(3)
 
 
-def test_meshes_and_hard_negatives_are_rendered_with_their_own_labels(
-    tiny, tmp_path, renders_of_rounds
-):
+def test_meshes_and_negatives_are_rendered_with_their_own_labels(tiny, tmp_path, renders_of_rounds):
     """A hard negative without a class has the complementary label."""
     meshes = "meshes=[{mesh: 'solid:pear', label: pear}, 'solid:orange']"
     negatives = "hard_negatives=['solid:fruit', {mesh: 'solid:apple:2', label: apple}]"
@@ -292,9 +278,7 @@ def test_meshes_and_hard_negatives_are_rendered_with_their_own_labels(
     assert len(renders.images.unique(dim=0)) == 16
 
 
-def test_folders_of_photographs_are_scored_in_sub_folders_for_each_class_with_a_folder(
-    tiny, photos, tmp_path
-):
+def test_folders_of_photographs_are_scored_for_each_class_with_a_folder(tiny, photos, tmp_path):
     (tmp_path / "oranges").mkdir()
     (tmp_path / "oranges/orange").symlink_to(photos / "orange")
     named = f"photos={{lab: {photos}, wild-1: {tmp_path / 'oranges'}}}"
@@ -311,9 +295,7 @@ def test_folders_of_photographs_are_scored_in_sub_folders_for_each_class_with_a_
     assert not (run / "photographs").exists()
 
 
-def test_the_selected_network_is_the_best_on_validation_and_scored_once_after_the_last_epoch(
-    tiny, tmp_path
-):
+def test_the_network_best_on_validation_is_scored_once_after_the_last_epoch(tiny, tmp_path):
     data = load_data(tiny())
     epochs_of_looks = []
 
@@ -406,9 +388,7 @@ def test_the_initial_network_is_scored_on_the_same_images(tiny, finished, photos
         assert before.read_text() == (finished / "photographs" / file).read_text()
 
 
-def test_a_run_killed_within_its_first_epoch_is_resumed_there_and_ends_the_same(
-    tiny, tmp_path, monkeypatch
-):
+def test_a_run_killed_in_its_first_epoch_goes_on_to_the_same_end(tiny, tmp_path, monkeypatch):
     """After KeyboardInterrupt nothing is saved, as after a kill."""
     settings = tiny(*WITHOUT_RENDERS, "train.resume=true")
     completed_run(settings, tmp_path / "whole")

@@ -89,9 +89,7 @@ def test_each_example_starts_at_the_sky_of_the_settings_with_its_own_mean_lumina
 @pytest.mark.parametrize(
     ("zenith", "turbidity"), [(ZENITH[0], TURBIDITY[0]), (ZENITH[1], TURBIDITY[1]), (45.0, 3.0)]
 )
-def test_without_negative_light_a_sky_keeps_its_mean_and_nearly_its_irradiance(
-    make_scene, zenith, turbidity
-):
+def test_a_nonnegative_sky_keeps_its_mean_and_nearly_its_irradiance(make_scene, zenith, turbidity):
     scene = make_scene()
     lights = []
     for is_negative_allowed in (True, False):
@@ -252,9 +250,7 @@ def scenes_by_dtype(make_scene) -> dict[torch.dtype, Scene]:
     norm=st.sampled_from(["linf", "l2"]),
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
-def test_a_sky_stays_in_its_domain_and_its_ball(
-    scenes_by_dtype, norm, dtype, start, values, radius
-):
+def test_a_sky_stays_in_its_domain_and_ball(scenes_by_dtype, norm, dtype, start, values, radius):
     """Starts include the horizon and the clearest and haziest air of the sky model."""
     scene = scenes_by_dtype[dtype]
     sky = make_parameter("skylight", scene, sky_at(start, norm=norm, radius=radius))
