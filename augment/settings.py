@@ -138,7 +138,7 @@ AUTO = "auto"
 class SceneSettings(Settings):
     """Cameras, backgrounds and lighting of a scene."""
 
-    backgrounds: list[Any] = setting([0.5], "Gray values in [0, 1] or image files.")
+    backgrounds: list[Any] = setting([0.5], "Gray values in [0, 1] or image files.", is_filled=True)
     views: int | None = setting(1, "Cameras per mesh at even azimuths.", within=(1, base.MAX_VIEWS))
     polar: float = setting(60.0, "Polar angle of the cameras from +z.", "degrees", within=(0, 180))
     azimuth: float = setting(0.0, "First azimuth from +x toward +y.", "degrees", within=(-360, 360))

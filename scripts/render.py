@@ -24,7 +24,6 @@ main = Command(
     common=["out", "format", "count", "meshes", "size", "network", "scene.light", "maps"],
     groups=["launcher"],
     rewrite=name_light,
-    sweep="train.commands.render:start",
 )
 
 if __name__ == "__main__":

@@ -19,11 +19,11 @@ from zipfile import ZipFile
 import safetensors.torch
 import torch
 from safetensors import safe_open
-from torch import Tensor, cuda, nn
+from torch import Tensor, cuda
 
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.files import as_facts, is_network_file, require_no_facts
-from augment.network import FROM_FILE, Inputs, say_inputs, unwrapped, with_normalized_light
+from augment.network import FROM_FILE, Inputs, say_inputs, with_normalized_light
 from augment.settings import PYTHON, NormalizeLight
 from augment.sources import SOURCES, import_function, load_classifier
 from augment.tasks.detection import Detection
@@ -48,14 +48,6 @@ NORMALIZE_LIGHT = "normalize_light"
 LIGHT_PREFIX = "network."
 # Largest number of characters of a reason that an error message quotes.
 LONGEST_REASON = 300
-
-
-def export(path: Path, network: nn.Module) -> None:
-    """Write the trained weights of a classifier of the user, so that the user can load them.
-
-    The weights have the names of the user's own network, without wrappers of this library.
-    """
-    save(path, {name: value.cpu() for name, value in unwrapped(network).state_dict().items()})
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:

@@ -79,7 +79,7 @@ class Command:
             whose files set augment.attack.
         rewrite: Function that changes the arguments of the command line before Hydra reads them.
         sweep: Function that starts several runs for --multirun, as "module:function". If it is
-            empty, the command does not accept --multirun.
+            empty, Hydra starts them. A command without the group "launcher" has no --multirun.
     """
 
     name: str
@@ -136,7 +136,7 @@ class Command:
             sys.argv[1:] = self.to_overrides(words)
             start = hydra.main("pkg://conf", self.name, version_base="1.3")(self.run)
             # With --multirun, the function `sweep` of this command starts several runs.
-            if SWEEP_FLAGS.isdisjoint(words):
+            if SWEEP_FLAGS.isdisjoint(words) or not self.sweep:
                 start()
             else:
                 system.import_function(self.sweep)(start, sys.argv[1:])
@@ -144,7 +144,7 @@ class Command:
     def to_overrides(self, arguments: Sequence[str]) -> list[str]:
         """Convert the arguments of the command line to overrides that Hydra reads."""
         for flag in SWEEP_FLAGS.intersection(arguments):
-            if not self.sweep:
+            if "launcher" not in self.groups:
                 raise InputError(f"{flag} is not an option of this command: see --help")
         # Hydra's parser of options wants --multirun before the settings.
         words = self.rewrite(sorted(arguments, key=lambda argument: argument not in SWEEP_FLAGS))

@@ -81,12 +81,6 @@ class AttackSceneSettings(SceneSettings):
     views: int = setting_like(SceneSettings, "views", 1)
     search: int = setting(10, "Cameras tried for a misclassified mesh.", within=(0, base.MAX_VIEWS))
 
-    def __post_init__(self) -> None:
-        """Check all values, and that there is a background."""
-        if not self.backgrounds:
-            raise InputError("backgrounds must not be empty: name one or more", "backgrounds")
-        super().__post_init__()
-
 
 @dataclass
 class TransferSettings(Settings):

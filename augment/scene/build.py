@@ -289,8 +289,6 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: Size) -> Tenso
     """
     expected = "gray values in [0, 1] or image files"
     choices = errors.as_list("backgrounds", choices, object, f"a list of {expected}")
-    if not choices:
-        raise InputError(f"backgrounds is empty: give {expected}")
     images = [gray_or_image("backgrounds", choice, size) for choice in choices]
     channels = max(len(image) for image in images)
     return torch.stack([image.expand(channels, -1, -1) for image in images])

@@ -110,7 +110,7 @@ TWO_CLASSES += ["scene.views=1", "augment.examples=null"]
             ["hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
             "hard_negatives[0] is solid:orange, of the positive class orange",
         ),
-        (["label=null"], "label is not set: set it to the class of the meshes, one of the 3 class"),
+        (["label=null"], "label is not set: give a class of the meshes"),
         ([*TWO_CLASSES, "label=[orange,pear,orange]"], "a list of several, each once"),
         (["label=[orange,apple]"], "label=['orange', 'apple'] has no mesh of apple"),
         ([*TWO_CLASSES, "meshes=[a.glb,'solid:pear']"], "meshes[0] has no class"),

@@ -1,7 +1,6 @@
 """pnb-render: labeled renders on disk, as a data set for other programs."""
 
 import json
-from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -100,8 +99,3 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
         raise InputError(f"out={folder} is not empty: choose a new folder", "out")
     else:
         atomic_write(path, json.dumps(facts, indent=1))
-
-
-def start(start_shards: Callable[[], None], words: Sequence[str]) -> None:
-    """Start the shards of a --multirun, for which Hydra's launchers need nothing else."""
-    start_shards()

@@ -14,9 +14,9 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from itertools import product
 from pathlib import Path
 
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
@@ -94,25 +94,20 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
         sys.exit(1)
 
 
-def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
+def _expand(overrides: Sequence[str]) -> list[list[str]]:
     """List the settings of each run of a sweep, in the order in which Hydra starts them.
 
-    "seed=0,1" and "train.epochs=3" become a tuple of overrides for each combination.
+    "seed=0,1" and "train.epochs=3" become a list of overrides for each combination.
     """
-    choices_of_key: dict[str, list[str]] = {}
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    for override in parsed:
         key = override.get_key_element()
         if key == "out":
             raise InputError("out= is the folder of a single run: name that of a sweep with sweep=")
         if key == "launcher" and override.value() == "slurm" and not shutil.which("sbatch"):
             raise InputError("launcher=slurm needs the command sbatch: start on the cluster")
-        # A sweep lists several values of a key. Any other override has one value.
-        if override.is_sweep_override():
-            values = list(override.sweep_string_iterator())
-        else:
-            values = [override.get_value_element_as_str()]
-        choices_of_key[key] = [f"{key}={value}" for value in values]
-    return list(product(*choices_of_key.values()))
+    (runs,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
+    return runs
 
 
 def run_in_sweep(config: DictConfig) -> None:

@@ -5,10 +5,9 @@ A photograph is shown upright, as its EXIF orientation says, and brought to the 
 
 import json
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -207,8 +206,14 @@ def _read_coco(file: Path) -> Annotations:
         names = {item["id"]: str(item["name"]) for item in content["categories"]}
         classes = tuple(dict.fromkeys(names[key] for key in sorted(names)))
         images = {item["id"]: item for item in content["images"]}
-        names_of_images = {item["file_name"] for item in images.values()}
-        for key, found in (("images", images), ("images", names_of_images), ("categories", names)):
+        for item in images.values():
+            item["file_name"] = str(item["file_name"]).replace("\\", "/")
+        names_of_images = [item["file_name"] for item in images.values()]
+        for key, found in (
+            ("images", images),
+            ("images", {*names_of_images}),
+            ("categories", names),
+        ):
             if len(found) < len(content[key]):
                 raise ValueError(f"two of the {key} have the same id or file_name")
         # For each image id, the rows that `_annotated` takes: label, four sides and `is_crowd`.
@@ -224,16 +229,15 @@ def _read_coco(file: Path) -> Annotations:
             # COCO gives left, top, width and height. The result is left, top, right and bottom.
             corners = (*box[:2], *(box[:2] + box[2:]))
             rows[item["image_id"]].append((label, *corners, bool(item.get("iscrowd"))))
-        find = _Finder(file)
+        paths = _find_images(file, names_of_images)
         photographs, missing = [], []
         for key, image in images.items():
-            name = str(image["file_name"]).replace("\\", "/")
-            path = find(name)
+            name = image["file_name"]
             size = (image["width"], image["height"]) if image.get("width") else None
-            if path is None:
-                missing.append(name)
+            if name in paths:
+                photographs.append(_annotated(paths[name], name, size, rows[key]))
             else:
-                photographs.append(_annotated(path, name, size, rows[key]))
+                missing.append(name)
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         if isinstance(error, InputError):
             raise
@@ -246,32 +250,25 @@ def _read_coco(file: Path) -> Annotations:
     return Annotations(file, photographs, classes, missing)
 
 
-class _Finder:
-    """Function from the name of an image in a COCO file to its path. None if it is missing."""
-
-    def __init__(self, file: Path):
-        self.file = file
-        is_beside = file.parent.name != "annotations"
-        self.folders = [file.parent] if is_beside else [file.parent, file.parent.parent]
-
-    @cached_property
-    def by_name(self) -> Mapping[str, list[Path]]:
-        """Images anywhere in the folder, by name without folder. Most files need no search."""
-        found = defaultdict(list)
-        for path in visible_files(self.folders[-1]):
-            if path.suffix.lower() in SUFFIXES:
-                found[path.name].append(self.folders[-1] / path)
-        return found
-
-    def __call__(self, name: str) -> Path | None:
-        for folder in self.folders:
-            if (folder / name).is_file():
-                return folder / name
-        paths = self.by_name.get(PurePosixPath(name).name, [])
-        if len(paths) > 1:
-            listed = " and ".join(map(str, paths[:2]))
-            raise InputError(f"{self.file} names the image {name}, which may be {listed}")
-        return paths[0] if paths else None
+def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Find the images that a COCO file names, beside it or anywhere in its folder."""
+    is_beside = file.parent.name != "annotations"
+    folders = [file.parent] if is_beside else [file.parent.parent, file.parent]
+    # An image beside the file replaces one in the folder above.
+    paths = {name: of / name for of in folders for name in names if (of / name).is_file()}
+    # Other images in the folder, by name without folder. Most files need no search.
+    others: dict[str, list[Path]] = defaultdict(list)
+    for path in visible_files(folders[0]) if len(paths) < len(names) else ():
+        if path.suffix.lower() in SUFFIXES:
+            others[path.name].append(folders[0] / path)
+    for name in [name for name in names if name not in paths]:
+        found = others[PurePosixPath(name).name]
+        if len(found) > 1:
+            listed = " and ".join(map(str, found[:2]))
+            raise InputError(f"{file} names the image {name}, which may be {listed}")
+        if found:
+            paths[name] = found[0]
+    return paths
 
 
 def _read_yolo(folder: Path) -> Annotations:

@@ -265,10 +265,10 @@ def require_label(settings: ExperimentSettings, data: sets.DataSet) -> None:
     # Renders and the ranking loss are of a positive class.
     needs_label = settings.augment.renders or settings.train.ranking_weight > 0
     if settings.label is None and needs_label:
-        choices = ", ".join(data.classes[:5]) + (", ..." if len(data.classes) > 5 else "")
-        count = len(data.classes)
-        reason = "label is not set: set it to the class of the meshes, one of the"
-        raise InputError(f"{reason} {count} classes {choices}", "label")
+        choices = ", ".join(data.classes[:5])
+        raise InputError(
+            f"label is not set: give a class of the meshes, such as {choices}", "label"
+        )
     for label in () if settings.label is None else label_names(settings.label):
         name = data.classes[class_index(data.classes, label, "label")]
         if name != label and settings.scored_folders:

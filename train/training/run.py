@@ -216,7 +216,9 @@ class Run:
         if CLASSIFIER not in self.trainer.architecture:
             return
         path = self.folder / WEIGHTS
-        checkpoints.export(path, self.trainer.selected.network)
+        # The weights have the names of the user's own network, without wrappers of this library.
+        weights = wrappers.unwrapped(self.trainer.selected.network).state_dict()
+        checkpoints.save(path, {name: value.cpu() for name, value in weights.items()})
         console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
         # Settings of the wrapper that normalizes the light of images. None without one.
         light = wrappers.light_settings(self.trainer.selected.network)
