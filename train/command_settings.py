@@ -109,9 +109,7 @@ class AttackExperimentSettings(TaskSettings):
 
     network: str = setting("efficientnet_lite0", f"The attacked network: {NETWORKS}.")
     label: Any = text(LABEL)
-    target: Any = text(
-        "Class to reach: a class, least_likely, or one per view. null: any other class."
-    )
+    target: Any = text("Class to reach, least_likely, or one per view. null: any other class.")
     goal: str | None = setting(
         None, "Goal of an attack on a detector. null: hide.", choices=("hide", "mislabel")
     )
@@ -121,13 +119,10 @@ class AttackExperimentSettings(TaskSettings):
     unlabeled: str | None = setting(None, "Folder of photographs for attack=relighting.")
     reload: str | None = setting(None, "Folder of an adversary to classify, or to attack further.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
-    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
     attack: AttackCommandSettings = setting(
         AttackCommandSettings, "What is attacked, and how. attack=NAME+NAME names it."
     )
-    transfer: TransferSettings = setting(
-        TransferSettings, "Where else successful adversaries are tried."
-    )
+    transfer: TransferSettings = setting(TransferSettings, "Where else adversaries are tried.")
     scene: AttackSceneSettings = setting(AttackSceneSettings, "The scene.")
     renderer: RendererSettings = setting(
         lambda: RendererSettings(shadows=True), "How images are rendered."
@@ -192,9 +187,7 @@ class LabSettings(Settings):
     )
     ambient: list[float] = pair([0.01, 0.06], "radiance of the uniform environment.", (0, 1))
     albedo: list[float] = pair([0.04, 0.16], "albedo of table and wall.", (0, 1))
-    walls: float = setting(
-        0.0, "Fraction of the setups with a wall behind the object.", within=(0, 1)
-    )
+    walls: float = setting(0.0, "Fraction of setups with a wall behind the object.", within=(0, 1))
     roughness: list[float] = pair(
         [0.5, 0.5], "roughness of the object. 0.1 is glossy, 1 is matte.", (0.05, 1)
     )
@@ -237,31 +230,22 @@ class AuditSettings(TaskSettings):
     """
 
     network: str = setting(REQUIRED, f"The audited network: {NETWORKS}.")
-    hardened: str | None = setting(
-        None, "Another network to compare with, such as run:runs/harden."
-    )
+    hardened: str | None = setting(None, "A network to compare with, such as run:runs/harden.")
     label: Any = text(LABEL)
     meshes: list[Any] = setting([], "Meshes of the class. []: only `unlabeled` is audited.")
     unlabeled: str | None = setting(
         None, "Folder of photographs, of which 100 × `budget` are relit by a projector."
     )
-    hard_negatives: list[Any] = setting(
-        [], "Meshes of other classes. []: generated fruit and balls."
-    )
+    hard_negatives: list[Any] = setting([], "Meshes of other classes. []: fruit and balls.")
     photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")
-    laboratory: str | None = setting(
-        None, "Folder of renders of pnb-lab. null: Mitsuba renders the meshes."
-    )
+    laboratory: str | None = setting(None, "Renders of pnb-lab. null: Mitsuba renders the meshes.")
     environments: list[str] = setting([*ENVIRONMENTS], "Environment lightings, or maps (.hdr ...).")
     budget: float = setting(
         1.0, "Factor of the numbers of views, lightings and renders.", within=(0.01, 100)
     )
     overwrite: bool = setting(False, "Start anew in a folder that holds an audit or other results.")
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
-    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
-    out: str = setting(
-        f"runs/audits/{TIME_FOLDER}", "Folder of the audit. A stopped audit continues in it."
-    )
+    out: str = setting(f"runs/audits/{TIME_FOLDER}", "Folder of the audit. A stopped one goes on.")
 
     def __post_init__(self) -> None:
         """Check all values, and that there is something to audit: meshes or photographs."""
@@ -298,23 +282,16 @@ class EvaluateSettings(TaskSettings):
         "Folder of a run, instead of `network`. Both may be set if a python: function built the "
         "network of the run.",
     )
-    label: Any = text(
-        "Positive class, or several. null: that of the run, or each class with a folder."
-    )
+    label: Any = text("Positive class, or several. null: that of the run, or all with a folder.")
     out: str = setting(f"runs/photographs/{TIME_FOLDER}", "Folder of the scores.")
     false_positive_rate: float | None = setting(
         None, "False-positive rate on `calibrate` that sets the threshold.", within=PROBABILITY
     )
-    calibrate: str | None = setting(
-        None, "A folder like photos. null: the threshold of the network, if it has one."
-    )
-    by: str = setting(
-        "source", "Groups of the tables: a column of photos.csv, or class.", choices=common.GROUPS
-    )
+    calibrate: str | None = setting(None, "A folder like photos. null: the network's threshold.")
+    by: str = setting("source", "Groups: a column of photos.csv, or class.", choices=common.GROUPS)
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
     precision: str = setting("auto", "auto (bfloat16 where it is fast), bfloat16 or float32.")
-    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
 
     def __post_init__(self) -> None:
         """Check all values, and that the settings name one network."""
@@ -349,9 +326,7 @@ class FitSettings(Settings):
     photograph: str = setting(REQUIRED, "An image file.")
     mesh: str = setting(REQUIRED, "A mesh file or solid:NAME:SEED, upright as in the photograph.")
     mask: str | None = setting(None, "Image of the photograph's size, white where the object is.")
-    box: list[int] = setting(
-        [], "Box of the object instead of a mask, [left, top, right, bottom] in pixels."
-    )
+    box: list[int] = setting([], "Box instead of a mask, [left, top, right, bottom] in pixels.")
     fov: float | None = setting(
         None,
         "Angle across a square 1.6 times as wide as the object. null: orthographic.",
@@ -367,9 +342,7 @@ class FitSettings(Settings):
     bounces: int = setting(
         3, "Bounces of light between surfaces. 0: no shadows, either.", within=(0, base.MAX_BOUNCES)
     )
-    label: str | None = setting(
-        None, "Class in the command that is printed. null: that of the name of the mesh."
-    )
+    label: str | None = setting(None, "Class in the printed command. null: the name of the mesh.")
     size: int = setting(64, "Pixels per side that are compared.", within=(16, 512))
     out: str = setting("runs/fit", "Folder of the background, the mask, the light and a picture.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
@@ -388,14 +361,7 @@ class RenderSettings(TaskSettings):
     The renders show the meshes in turn, then the next background, then the next view.
     """
 
-    network: str | None = setting(
-        None, f"Network that each render is attacked to fool: {NETWORKS}."
-    )
-    size: Any = setting(
-        None,
-        "Pixels per side, or [height, width]. null: those of the network, or 224.",
-        within=(1, base.MAX_SIZE),
-    )
+    network: str | None = setting(None, f"Network that each render shall fool: {NETWORKS}.")
     meshes: list[Any] = setting(
         ["solid:orange", "solid:apple", "solid:cup"], MESHES, is_filled=True
     )
@@ -412,7 +378,6 @@ class RenderSettings(TaskSettings):
     shards: int = setting(1, "Parts of the work that --multirun shard=0,1,... shares.")
     shard: int = setting(0, "Index of the part that this process renders.", within=(0, None))
     out: str = setting(REQUIRED, "Folder of the data set. A stopped command continues in it.")
-    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
     augment: augmentation.AugmentationSettings = setting(
         lambda: augmentation.AugmentationSettings(
             mode="random",
@@ -463,9 +428,7 @@ class RenderSettings(TaskSettings):
 class CompareSettings(Settings):
     """Settings of the command pnb-compare, which prints tables of the metrics of training runs."""
 
-    runs: list[str] = setting(
-        REQUIRED, "Folders of runs and sweeps, or folders above them.", is_filled=True
-    )
+    runs: list[str] = setting(REQUIRED, "Runs, sweeps, or folders above.", is_filled=True)
     by: str = setting_like(EvaluateSettings, "by", "source")
 
 

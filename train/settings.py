@@ -184,7 +184,7 @@ class NetworkSettings(Settings):
 
 @dataclass(kw_only=True)
 class TaskSettings(NetworkSettings):
-    """Settings that choose a network, and say what its outputs mean."""
+    """Settings that choose a network, and say what its outputs mean and what computes them."""
 
     task: str | None = setting(
         None, "What the outputs of the network are. null: their type tells.", choices=TASKS
@@ -196,6 +196,7 @@ class TaskSettings(NetworkSettings):
         "Python function package.module:function from the outputs of the network in a file, such "
         "as ONNX, to boxes, as in nb.Detection.",
     )
+    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
 
 
 @dataclass
@@ -230,9 +231,7 @@ class ExperimentSettings(NetworkSettings):
     renderer: RendererSettings = setting(
         lambda: RendererSettings(samples=8, normals="flat"), "The renderer, by default the paper's."
     )
-    model: ModelSettings = setting(
-        ModelSettings, "The architecture. model=NAME is short for model.name=NAME."
-    )
+    model: ModelSettings = setting(ModelSettings, "The architecture. model=NAME sets model.name.")
     train: TrainSettings = setting(TrainSettings, "How the network is trained.")
     evaluate: EvaluationSettings = setting(EvaluationSettings, "What the network is scored on.")
 

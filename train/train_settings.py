@@ -27,8 +27,15 @@ LOW_LIGHT, RELIGHT_AND_LOW_LIGHT = "low_light", "relight+low_light"
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT, LOW_LIGHT, RELIGHT_AND_LOW_LIGHT)
 # Choices of train.optimizer.
 OPTIMIZERS = ("sgd", "adamw")
+# Choices of train.flips.
+FLIPS = ("random", "alternating")
 # Choices of train.schedule.
 SCHEDULES = ("step", "cosine", "one_cycle")
+
+
+def weight(term: str) -> Any:
+    """Create a field for the weight of a term of the loss, by default 0."""
+    return setting(0.0, f"Weight of {term}", within=(0, MAX_SCALE))
 
 
 @dataclass
@@ -74,11 +81,7 @@ class TrainSettings(Settings):
         None, "Last module that stays as is. all_but_last: only the last layer learns. null: none."
     )
     schedule: str = setting("step", "step: times 0.2 at 30%, 60% and 80%.", choices=SCHEDULES)
-    flips: str = setting(
-        "random",
-        "Flips of random images, or in alternate epochs.",
-        choices=("random", "alternating"),
-    )
+    flips: str = setting("random", "Flips of random images, or in alternate epochs.", choices=FLIPS)
     augmentation: str = setting(
         "none",
         "relight: light of a projector. low_light: few photons. relight+low_light: both in turn.",
@@ -91,15 +94,9 @@ class TrainSettings(Settings):
         0, "Gradient steps that find the factors. 0: random factors.", within=(0, 1000)
     )
     label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
-    ranking_weight: float = setting(
-        0.0, "Weight of the loss that ranks `label` above other classes.", within=(0, MAX_SCALE)
-    )
-    distillation_weight: float = setting(
-        0.0, "Weight of the divergence from the predictions of `network`.", within=(0, MAX_SCALE)
-    )
-    consistency_weight: float = setting(
-        0.0, "Weight of the same divergence on augmented images.", within=(0, MAX_SCALE)
-    )
+    ranking_weight: float = weight("the loss that ranks `label` above other classes.")
+    distillation_weight: float = weight("the divergence from the predictions of `network`.")
+    consistency_weight: float = weight("the same divergence on augmented images.")
     interpolate: bool = setting(False, "Mix weights before and after by validation (WiSE-FT).")
     ema_decay: float = setting(0.0, "Decay of averaged weights. 0: none.", minimum=0, below=1)
     soup: bool = setting(False, "Keep the mean of all epochs, which all start with `network`.")

@@ -14,6 +14,7 @@ from PIL import Image
 from renderer.io.images import read_center
 from train.data.photo import DESCRIPTION
 from train.results import compare
+from train.results.compare import Difference
 from train.results.metrics import Pool
 from train.results.pictures import Picture, encode_picture
 from train.results.predictions import Predictions
@@ -241,12 +242,7 @@ def _classes_with_trained_objects(
     return [in_words(label) for label in labels if label in repeated]
 
 
-def _answer(
-    change: str,
-    recall: compare.Difference,
-    false_positives: compare.Difference,
-    auc: compare.Difference,
-) -> str:
+def _answer(change: str, recall: Difference, false_positives: Difference, auc: Difference) -> str:
     """Write a short sentence that says whether a change of a network helped.
 
     A proven change of the AUC decides. Recall and false positives decide what the sentence says in
@@ -266,7 +262,7 @@ def _answer(
     return f"It is not proven that {change} improved the ranking ({gain})."
 
 
-def gain_sentence(subject: str, change: compare.Difference) -> str:
+def gain_sentence(subject: str, change: Difference) -> str:
     """Write a sentence that compares a metric of two networks."""
     verdict = {1: "a gain", -1: "a loss", 0: "a difference is not proven"}[change.direction]
     # Percentage points, such as "+3", "−0.4" or "0".

@@ -31,13 +31,7 @@ TOP_RANKS = {"class_top1": 1, "class_top5": 5}
 FRACTION_METRICS: tuple[str, ...] = ("recall", "top5", "false_positive_rate", *AT_THRESHOLD)
 # Names of the metrics that reports show, in this order. "recall_at/0.05" is the entry
 # "0.05" of the entry "recall_at" in summary.json.
-METRICS: tuple[str, ...] = (
-    "recall",
-    "false_positive_rate",
-    *ROC_METRICS,
-    *AT_THRESHOLD,
-    *TOP_RANKS,
-)
+METRICS = ("recall", "false_positive_rate", *ROC_METRICS, *AT_THRESHOLD, *TOP_RANKS)
 # Titles of the metrics in tables, by the name of the metric.
 TITLES = {
     "recall": "recall",
