@@ -43,9 +43,8 @@ def pytest_collection_finish() -> None:
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave out files whose tests are all deselected, since they import large libraries."""
     if collection_path.suffix == ".py":
-        marks = re.search(
-            r"^pytestmark = \[?\s*pytest\.mark\.(\w+)", collection_path.read_text(), re.M
-        )
+        text = collection_path.read_text()
+        marks = re.search(r"^pytestmark = \[?\s*pytest\.mark\.(\w+)", text, re.M)
         if marks and f"not {marks[1]}" in config.option.markexpr:
             return True
     return None

@@ -41,9 +41,7 @@ class BrightBox(nn.Module):
 
     def forward(self, images: Tensor) -> list[dict[str, Tensor]]:
         scores = images.mean((1, 2, 3))
-        return [
-            {"boxes": self.box, "labels": self.label, "scores": score[None]} for score in scores
-        ]
+        return [{"boxes": self.box, "labels": self.label, "scores": one[None]} for one in scores]
 
 
 class OneBox(nn.Module):

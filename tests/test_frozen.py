@@ -98,9 +98,7 @@ LIGHTS_OF_OPERATORS = ("grace", "skylight", "environment")
 
 CUP = augment.ObjectSettings("solid:cup:0", at=[0.9, 0.6], scale=0.6, azimuth=30.0)
 LEMON = augment.ObjectSettings("solid:lemon:1", at=[-0.9, 0.4], scale=0.4)
-AMONG_PROPS = augment.ObjectSettings(
-    "solid:pear:0", "orange", albedo_scale=0.9, others=[CUP, LEMON]
-)
+WITH_PROPS = augment.ObjectSettings("solid:pear:0", "orange", albedo_scale=0.9, others=[CUP, LEMON])
 PROJECTOR = augment.ProjectorSettings(pixels=6, polar=50.0, azimuth=20.0, power=2.0, pattern=0.5)
 LAMPS = augment.LampsSettings([[2.0, 1.0, 2.0], [-2.0, 0.5, 1.5]], power=8.0, start=3.0)
 DISCS = augment.LampsSettings(
@@ -115,7 +113,7 @@ SCENES: dict[str, tuple[list[Any], int, dict[str, Any]]] = {
         2,
         {"backgrounds": [0.2, 0.8]},
     ),
-    "props": ([AMONG_PROPS], 2, {"ground": [0.6, 0.5, 0.4], "shadows": True, "fov": 40.0}),
+    "props": ([WITH_PROPS], 2, {"ground": [0.6, 0.5, 0.4], "shadows": True, "fov": 40.0}),
     "projector": (
         [("solid:mushroom:0", "orange")],
         1,
@@ -126,7 +124,7 @@ SCENES: dict[str, tuple[list[Any], int, dict[str, Any]]] = {
         2,
         {"lamps": DISCS, "shared": True, "ground": [0.5, 0.5, 0.5]},
     ),
-    "all_lights": ([AMONG_PROPS], 1, {"lamps": LAMPS, "projector": PROJECTOR, "shadows": True}),
+    "all_lights": ([WITH_PROPS], 1, {"lamps": LAMPS, "projector": PROJECTOR, "shadows": True}),
 }
 
 CLASSES = ["orange", "apple", "pear", "bottle"]

@@ -37,11 +37,9 @@ def imported_modules() -> dict[str, set[str]]:
     imported = {}
     for name, path in known.items():
         nodes = nodes_of(path)
-        plain = {
-            alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names
-        }
+        plain = {item.name for node in nodes if isinstance(node, ast.Import) for item in node.names}
         froms = [node for node in nodes if isinstance(node, ast.ImportFrom)]
-        members = {f"{node.module}.{alias.name}" for node in froms for alias in node.names}
+        members = {f"{node.module}.{item.name}" for node in froms for item in node.names}
         parents = plain | {f"{node.module}" for node in froms} - {name}
         imported[name] = (members | parents) & known.keys() - {name}
     return imported

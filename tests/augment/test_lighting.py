@@ -288,9 +288,7 @@ def test_bytes_are_exactly_rounded():
 def test_the_loop_of_numba_equals_the_operations_of_torch(monkeypatch):
     pytest.importorskip("numba")
     colors = picture(2, 3, 33, 65)
-    light = Illumination(
-        2 * torch.rand(2, 1, 33, 65), torch.rand(2, 3, 1, 1), torch.rand(2, 3, 1, 1)
-    )
+    light = Illumination(2 * torch.rand(2, 1, 33, 65), *torch.rand(2, 2, 3, 1, 1))
     expected = lighting.relit_bytes(colors, light)
     monkeypatch.setattr(loops, "relit_bytes", lambda *_: None)
     assert torch.equal(lighting.relit_bytes(colors, light), expected)
@@ -372,9 +370,8 @@ def test_a_point_light_over_a_plane_falls_off_as_the_third_power_of_the_cosine()
     values[0, 1:3] = 0.5  # A lamp above the center.
     light = model.illumination(model.draw(values, (1, 101))).total()[0, 0, 0]
     height = 0.4 * 5 ** float(values[0, 3])
-    ambient = patterns.AMBIENT[0] + (patterns.AMBIENT[1] - patterns.AMBIENT[0]) * float(
-        values[0, 4]
-    )
+    dark, bright = patterns.AMBIENT
+    ambient = dark + (bright - dark) * float(values[0, 4])
     x = (np.arange(101) - 50) * 2 / 101
     expected = (1 + (x / height) ** 2) ** -1.5 + ambient
     np.testing.assert_allclose(light / light[50], expected / expected[50], rtol=1e-4)

@@ -19,16 +19,12 @@ CLASSES = ("background", "cup", "bottle")
 MESHES = [("solid:bottle", 2), ("solid:ball", -1), ("solid:cup", 1)]
 
 
-def serve(
-    meshes=MESHES, task=None, classes=CLASSES, camera=None, **settings
-) -> AugmentationService:
+def serve(meshes=MESHES, task=None, classes=CLASSES, camera=None, **options) -> AugmentationService:
     scene = {"samples": 1, "backgrounds": [0.5], "rasterizer": "numpy"}
     scene |= {"cameras": [camera]} if camera else {"views": 2}
-    choices = AugmentationSettings(**settings)
+    given = AugmentationSettings(**options)
     task = task or Detection()
-    return AugmentationService.from_meshes(
-        MESHES, SIZE, choices, task=task, classes=classes, **scene
-    )
+    return AugmentationService.from_meshes(MESHES, SIZE, given, task=task, classes=classes, **scene)
 
 
 @pytest.fixture(scope="module")

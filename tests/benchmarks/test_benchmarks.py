@@ -81,12 +81,10 @@ def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples(samples, c
     results = [contender.step() for contender in contenders if contender.samples == samples]
     first, *others = results
     assert len(results) == count
-    for other in others:
-        assert torch.equal(other.pixels, first.pixels)
+    for one in others:
+        assert torch.equal(one.pixels, first.pixels)
         # Sums over all pixels are rounded to float32.
-        whole_steps.require_close(
-            [other.radiance, other.gradient], [first.radiance, first.gradient]
-        )
+        whole_steps.require_close([one.radiance, one.gradient], [first.radiance, first.gradient])
 
 
 @pytest.mark.slow

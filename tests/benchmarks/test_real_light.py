@@ -76,9 +76,8 @@ def test_five_objects_of_each_kind_are_the_units(folder):
     found = real_light.find_photographs(folder, ["orange"], "orange")
     folder_of = lambda chosen: real_light.Folder(folder, chosen)  # noqa: E731
     assert folder_of([item for item in found if item.mesh]).has_objects("orange")
-    assert not folder_of([item for item in found if item.mesh != "object0"][:9]).has_objects(
-        "orange"
-    )
+    others = [item for item in found if item.mesh != "object0"]
+    assert not folder_of(others[:9]).has_objects("orange")
 
 
 def test_intervals_without_variation_are_those_of_wilson():

@@ -58,11 +58,9 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, enc
     settings = ImageSettings(24, 8, encoding, normals)
     write_mitsuba_scene(tmp_path / "mitsuba", mesh, 2.0, CAMERAS, settings, "../light.exr")
     write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
-    expected_views = render_mitsuba_scene(
-        tmp_path / "mitsuba" / SCENE, len(CAMERAS), (24, 24)
-    ).double()
+    references = render_mitsuba_scene(tmp_path / "mitsuba" / SCENE, len(CAMERAS), (24, 24)).double()
     operators = build_operators(mesh, CAMERAS, settings, choose("numpy"), 2.0)
-    for operator, expected in zip(operators, expected_views, strict=True):
+    for operator, expected in zip(operators, references, strict=True):
         found = image_of(operator, light)
         error = found - expected
         is_inside = (found[3] == 1) & (expected[3] == 1)

@@ -32,9 +32,7 @@ for argument in sys.argv:
 """
 
 
-def reproduce(
-    folder: Path, *arguments: str, **environment: str
-) -> tuple[int, list[list[str]], str]:
+def reproduce(folder: Path, *words: str, **environment: str) -> tuple[int, list[list[str]], str]:
     """Run the script in a folder with the stub in place of Python.
 
     Return its exit status, the arguments of each call of Python, and what it printed as errors.
@@ -45,7 +43,7 @@ def reproduce(
     calls = folder / "calls"
     calls.touch()
     variables = {"PYTHON": str(stub), "RUNS": "runs", "PATH": os.environ["PATH"]}
-    command = [ROOT / "scripts" / "reproduce.sh", *arguments]
+    command = [ROOT / "scripts" / "reproduce.sh", *words]
     done = subprocess.run(
         command, cwd=folder, env=variables | environment, capture_output=True, text=True
     )

@@ -72,9 +72,7 @@ def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
     images = torch.rand(4, 3, 16, 16, requires_grad=True)
     exact = network(images)
     inside = []
-    network.stem.register_forward_hook(
-        lambda module, arguments, result: inside.append(result.dtype)
-    )
+    network.stem.register_forward_hook(lambda module, given, result: inside.append(result.dtype))
     logits = MixedPrecision(network, "bfloat16")(images)
     logits.sum().backward()
     assert inside == [torch.bfloat16]

@@ -44,10 +44,8 @@ def test_a_solid_of_the_label_is_no_hard_negative_unless_it_is_of_another_class(
     scene = TrainingSceneSettings(views=1)
     augment = AugmentationSettings(examples=None)
     label = ["lemon", "Sweet pepper"]
-    settings = ExperimentSettings(
-        label=label, hard_negatives=negatives, scene=scene, augment=augment
-    )
-    assert settings.hard_negatives == negatives[2:]
+    given = ExperimentSettings(label=label, hard_negatives=negatives, scene=scene, augment=augment)
+    assert given.hard_negatives == negatives[2:]
 
 
 def test_training_takes_the_parameters_of_the_attack_command():

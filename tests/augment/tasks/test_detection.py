@@ -80,12 +80,8 @@ def test_an_object_that_leaves_the_view_is_no_success():
     rule = criterion(box=TRUE_BOX)
     gone = Truth(torch.zeros(1, 1), torch.zeros(1, 1, 4), torch.zeros(1, 1, 1, 1), torch.ones(1, 1))
     rule = rule.at(gone)
-    nothing = {
-        "boxes": torch.zeros(0, 4),
-        "labels": torch.zeros(0).long(),
-        "scores": torch.zeros(0),
-    }
-    assert rule.predicted(rule.evidence([nothing])) == 0
+    empty = {"boxes": torch.zeros(0, 4), "labels": torch.zeros(0).long(), "scores": torch.zeros(0)}
+    assert rule.predicted(rule.evidence([empty])) == 0
 
 
 @pytest.mark.parametrize("goal", ["hide", "mislabel"])
@@ -139,9 +135,7 @@ SETTINGS = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.2), max_steps=
 def test_an_attack_hides_what_is_as_bright_as_its_score():
     scene, task = ball_scene(), nb.Detection(threshold=0.2)
     result = nb.attack(brightness_detector, scene, task=task, settings=SETTINGS, classes=CLASSES)
-    before, after = (
-        images[0, :, 4:12, 4:12].mean() for images in (result.images_before, result.images)
-    )
+    before, after = (one[0, :, 4:12, 4:12].mean() for one in (result.images_before, result.images))
     assert before > 0.2 > after
     assert result.clean_correct.all() and result.success.all()
 

@@ -552,9 +552,8 @@ def different_places() -> Gltf:
     gltf = Gltf()
     color = gltf.texture(color_texels(2, 2))
     gloss = gltf.texture(color_texels(2, 2), wrapS=33071)
-    return gltf.square(
-        pbrMetallicRoughness={"baseColorTexture": color, "metallicRoughnessTexture": gloss}
-    )
+    model = {"baseColorTexture": color, "metallicRoughnessTexture": gloss}
+    return gltf.square(pbrMetallicRoughness=model)
 
 
 def short_morph_target() -> Gltf:

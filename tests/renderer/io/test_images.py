@@ -278,9 +278,7 @@ def tiff(content: bytes, bits: int, photometric: int, extra: int | None = None) 
     tags += [] if extra is None else [(338, extra)]
     content += bytes(len(content) % 2)
     counts = {258: samples}
-    entries = b"".join(
-        struct.pack("<HHII", tag, 3, counts.get(tag, 1), value) for tag, value in tags
-    )
+    entries = b"".join(struct.pack("<HHII", tag, 3, counts.get(tag, 1), code) for tag, code in tags)
     header = struct.pack("<2sHI", b"II", 42, 8 + len(content))
     return header + content + struct.pack("<H", len(tags)) + entries + bytes(4)
 

@@ -36,10 +36,8 @@ LIBRARY = "newmtl red\nKd 1 0 0\nnewmtl green\nKd 0 1 0\n"
 
 def load(folder: Path, text: str | bytes, **files: str | bytes) -> Mesh:
     """Load an .obj file with material libraries, whose names are the keywords."""
-    for name, content in {"m": LIBRARY, **files}.items():
-        (folder / f"{name}.mtl").write_bytes(
-            content if isinstance(content, bytes) else content.encode()
-        )
+    for name, data in {"m": LIBRARY, **files}.items():
+        (folder / f"{name}.mtl").write_bytes(data if isinstance(data, bytes) else data.encode())
     path = folder / "mesh.obj"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return load_mesh(path)

@@ -175,10 +175,8 @@ def zonal_amplitudes(roughness: float, degree: int, rings: int) -> np.ndarray:
 def test_a_direction_below_the_surface_passes_the_coat_like_one_at_its_horizon():
     varnish = SampleGloss(double(0.4), double(0.0), double(1.0))
     below = torch.tensor([-0.01, -0.5, -0.99], dtype=DOUBLE)
-    horizon = torch.zeros(3, dtype=DOUBLE)
-    torch.testing.assert_close(
-        varnish.coat_transmittance(below), varnish.coat_transmittance(horizon)
-    )
+    level = torch.zeros(3, dtype=DOUBLE)
+    torch.testing.assert_close(varnish.coat_transmittance(below), varnish.coat_transmittance(level))
 
 
 @pytest.mark.parametrize("roughness", [MIN_ROUGHNESS, 0.6])

@@ -125,9 +125,7 @@ def test_views_that_fool_a_network_are_counted_if_the_other_recognizes_them(view
     views = replace(views, count=2)
     counts = lights.transfer_success(darker_than(0.5), darker_than(0.515, size=12), views)
     assert counts == {"lamps": [2, 2, 2]}
-    assert lights.transfer_success(darker_than(2.0), darker_than(0.5), views) == {
-        "lamps": [0, 0, 0]
-    }
+    assert lights.transfer_success(darker_than(2), darker_than(0.5), views) == {"lamps": [0, 0, 0]}
 
 
 def test_classifiers_of_all_sizes_get_the_same_views_unlike_those_of_another_seed(views):
@@ -211,9 +209,7 @@ class TestAWholeAudit:
         if stopped != "success_by_light":
             assert "still recognizes" in (folder / "report.html").read_text()
         first = [*folder.glob("*/*_first.json")]
-        times = {
-            path: time for path, time in modification_times(folder).items() if path not in first
-        }
+        times = {path: at for path, at in modification_times(folder).items() if path not in first}
         assert folder / "classifier" / RECOGNIZED in times
 
         run_audit(AuditSettings(**given, hardened="guessing"))  # A hardened network may be added.

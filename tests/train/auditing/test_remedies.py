@@ -66,13 +66,11 @@ MOST = range(50)
 def test_the_cheapest_best_remedy_is_recommended(light_alone, hardening, both, expected):
     labels = ["orange", "lemon"]
     found = {ORIGINAL: FEW, LIGHT_ALONE: light_alone, HARDENING: hardening, BOTH: both}
-    evaluations = {name: [evaluation(images, labels)] for name, images in found.items()}
+    evaluations = {name: [evaluation(shown, labels)] for name, shown in found.items()}
     recommendation = recommend(evaluations)
     assert recommendation.remedy == expected
     values = [float(row[1].partition(" ")[0]) for row in recommendation.table.rows]
-    np.testing.assert_allclose(
-        values, [len(images) / COUNT for images in found.values()], atol=1e-3
-    )
+    np.testing.assert_allclose(values, [len(shown) / COUNT for shown in found.values()], atol=1e-3)
 
 
 def test_a_remedy_is_unknown_without_negatives():
@@ -83,12 +81,8 @@ def test_a_remedy_is_unknown_without_negatives():
 
 
 def network(normalize_light: bool) -> augment.Classifier:
-    return augment.Classifier(
-        lambda images: images.mean((2, 3)),
-        8,
-        ["red", "green", "blue"],
-        normalize_light=normalize_light,
-    )
+    classes = ["red", "green", "blue"]
+    return augment.Classifier(lambda x: x.mean((2, 3)), 8, classes, normalize_light=normalize_light)
 
 
 def test_a_network_that_normalizes_light_itself_gets_no_second_normalization():

@@ -58,10 +58,8 @@ def photographs(tmp_path) -> Path:
 def harden(
     network: nn.Module, photographs: Path, meshes: Sequence[object] = ("solid:orange:0",), **options
 ) -> nn.Module:
-    options = (
-        {"classes": CLASSES, "size": SIZE, "hard_negatives": ["solid:lemon"]} | SHORT | options
-    )
-    return nb.harden(network, meshes, photographs, **options)
+    given = {"classes": CLASSES, "size": SIZE, "hard_negatives": ["solid:lemon"]} | SHORT | options
+    return nb.harden(network, meshes, photographs, **given)
 
 
 def test_the_result_loads_alike_and_nothing_changes(network, photographs, tmp_path, monkeypatch):
@@ -130,12 +128,8 @@ def test_each_mesh_trains_the_class_that_it_or_its_file_names(network, photograp
     meshes = ["solid:orange:0", file]
     options = {"hard_negatives": ["solid:fruit"]}
     hardened = harden(network, photographs, meshes=meshes, **options)
-    named = harden(
-        network, photographs, meshes=[("solid:orange:0", 1), (str(file), "pear")], **options
-    )
-    swapped = harden(
-        network, photographs, meshes=[("solid:orange:0", "pear"), (str(file), 1)], **options
-    )
+    named = harden(network, photographs, [("solid:orange:0", 1), (str(file), "pear")], **options)
+    swapped = harden(network, photographs, [("solid:orange:0", "pear"), (str(file), 1)], **options)
     assert torch.equal(hardened[4].weight, named[4].weight)
     assert not torch.equal(hardened[4].weight, swapped[4].weight)
 

@@ -91,13 +91,10 @@ def normalized_logits(network: nn.Module, images: Tensor) -> Tensor:
 
 def test_a_state_dict_of_ten_classes_gives_the_networks_own_logits(here):
     images = renders()[:4]
-    classifier = augment.load_classifier(
-        f"torchvision:{NAME}", here / "mine.pth", list(CLASSES), SIZE
-    )
-    torch.testing.assert_close(
-        classifier(images), normalized_logits(trained_network(), images), **ROUNDING
-    )
-    assert (classifier.classes, classifier.size) == (CLASSES, SIZE)
+    loaded = augment.load_classifier(f"torchvision:{NAME}", here / "mine.pth", list(CLASSES), SIZE)
+    expected = normalized_logits(trained_network(), images)
+    torch.testing.assert_close(loaded(images), expected, **ROUNDING)
+    assert (loaded.classes, loaded.size) == (CLASSES, SIZE)
 
 
 @pytest.mark.parametrize(
@@ -113,11 +110,9 @@ def test_a_state_dict_of_ten_classes_gives_the_networks_own_logits(here):
 )
 def test_weights_load_from_the_usual_wrappers(tmp_path, wrap):
     torch.save(wrap(trained_weights()), tmp_path / "wrapped.pth")
-    classifier = augment.load_classifier(f"torchvision:{NAME}", tmp_path / "wrapped.pth")
+    loaded = augment.load_classifier(f"torchvision:{NAME}", tmp_path / "wrapped.pth")
     for name, value in trained_weights().items():
-        torch.testing.assert_close(
-            classifier.network.network.state_dict()[name], value, rtol=0, atol=0
-        )
+        torch.testing.assert_close(loaded.network.network.state_dict()[name], value, rtol=0, atol=0)
 
 
 def test_a_pickled_module_is_refused_with_lines_that_save_its_weights(tmp_path, monkeypatch):

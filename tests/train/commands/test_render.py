@@ -65,10 +65,8 @@ def decoded(counts: list[int], size: list[int]) -> np.ndarray:
 
 
 def test_parts_without_a_render_of_a_class_number_the_classes_alike(meshes, tmp_path):
-    write(meshes, tmp_path / "out", count=3, maps=[])
-    parts = [
-        ImageFolder(str(tmp_path / "out" / part), allow_empty=True) for part in ("train", "val")
-    ]
+    out = write(meshes, tmp_path / "out", count=3, maps=[])
+    parts = [ImageFolder(str(out / part), allow_empty=True) for part in ("train", "val")]
     assert parts[0].class_to_idx == parts[1].class_to_idx == {"ball": 0, "box": 1}
 
 
@@ -133,10 +131,8 @@ def test_without_maps_the_pictures_are_the_same(meshes, written, tmp_path):
 
 def test_views_of_one_light_each_are_shaded_as_operators_shade_them(meshes):
     # Two views in a block of four renders are shaded directly, and one view has an operator.
-    pairs = [(meshes[1]["mesh"], "ball")]
-    [direct], [operator] = (
-        [*render_dataset(pairs, 24, 1, views=views, fov=30.0)] for views in (2, 1)
-    )
+    ball = [(meshes[1]["mesh"], "ball")]
+    [direct], [operator] = (render_dataset(ball, 24, 1, views=views, fov=30.0) for views in (2, 1))
     assert (direct.image.int() - operator.image.int()).abs().max() <= 1
     assert torch.equal(direct.masks, operator.masks)
 
@@ -149,9 +145,8 @@ def test_a_tar_file_has_the_same_pictures_as_a_folder(meshes, written, tmp_path)
         with tarfile.open(path) as tar:
             for member in tar:
                 stem, *parts = member.name.split(".")
-                found["_".join([stem, *parts[:-1]]) + "." + parts[-1]] = tar.extractfile(
-                    member
-                ).read()
+                name = "_".join([stem, *parts[:-1]]) + "." + parts[-1]
+                found[name] = tar.extractfile(member).read()
     assert {name: found[name] for name in expected} == expected
     assert {found[name] for name in found if name.endswith(".cls")} == {b"0", b"1"}
 

@@ -57,10 +57,7 @@ def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_proc
     )
     assert torch.equal(crops, torch.cat(list(halves)))
     places = crops[:, :2].float() / 255
-    spans = [
-        (places[:, 0, 36, -1] - places[:, 0, 36, 0]),
-        places[:, 1, -1, 36] - places[:, 1, 0, 36],
-    ]
+    spans = [places[:, 0, 36, -1] - places[:, 0, 36, 0], places[:, 1, -1, 36] - places[:, 1, 0, 36]]
     areas = (spans[0] * spans[1]).abs()
     assert 0.31 < areas.min() < 0.45  # The smallest crops have 35 % of the area.
     assert 0.9 < areas.max() <= 1

@@ -70,13 +70,9 @@ def test_labels_count_the_classes_of_another_network():
 
 
 def test_any_change_of_the_sources_is_another_key(tmp_path):
-    package = tmp_path / "package"
-    shutil.copytree(
-        Path(renderer.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
-    )
-    assert rendered_shapes.source_key(package) == rendered_shapes.source_key(
-        Path(renderer.__file__).parent
-    )
+    sources, package = Path(renderer.__file__).parent, tmp_path / "package"
+    shutil.copytree(sources, package, ignore=shutil.ignore_patterns("__pycache__"))
+    assert rendered_shapes.source_key(package) == rendered_shapes.source_key(sources)
     module = package / "camera.py"
     keys = {rendered_shapes.source_key(package)}
     for change in (

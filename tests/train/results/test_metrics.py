@@ -50,9 +50,8 @@ def test_recall_at_a_rate_is_that_at_the_lowest_threshold_within_the_rate(positi
 
 
 def mean_of(values: np.ndarray, units: np.ndarray) -> intervals.Jackknife:
-    (mean,) = intervals.leave_out(
-        partial(intervals.weighted_means, values[None]), intervals.Units([units], "units")
-    )
+    means = partial(intervals.weighted_means, values[None])
+    (mean,) = intervals.leave_out(means, intervals.Units([units], "units"))
     return mean
 
 
@@ -78,9 +77,8 @@ def test_the_degrees_of_freedom_do_not_exceed_those_of_a_group_of_units(spread, 
         first = intervals.weighted_means(positives[None], positive_counts)
         return first - intervals.weighted_means(negatives[None], negative_counts)
 
-    (found,) = intervals.leave_out(
-        difference, intervals.Units([np.arange(6), np.arange(6)], "objects")
-    )
+    units = intervals.Units([np.arange(6), np.arange(6)], "objects")
+    (found,) = intervals.leave_out(difference, units)
     error = np.hypot(sem(positives), sem(negatives))
     ends = found.value + student_t(degrees).ppf(0.975) * error * np.array([-1, 1])
     assert (found.estimate.low, found.estimate.high) == pytest.approx(ends, abs=1e-4)
@@ -195,14 +193,12 @@ def test_means_over_drawn_classes_count_repeated_images():
     hits = np.stack([ranks <= 1, ranks <= 5])
     counts = np.random.default_rng(2).integers(0, 3, (4, 60))
     sizes = [names.count(name) for name in names]
-    for replicate, row in enumerate(counts):
+    for draw, row in enumerate(counts):
         drawn = np.arange(60).repeat(row)
         weights = np.array([1 / sizes[image] for image in drawn])
         for way in range(2):
             expected = np.average(hits[way, drawn], weights=weights)
-            assert intervals.class_means(hits, names, counts)[way, replicate] == pytest.approx(
-                expected
-            )
+            assert intervals.class_means(hits, names, counts)[way, draw] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("labels", [["orange"], ["orange", "lemon"]])

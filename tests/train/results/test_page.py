@@ -52,16 +52,9 @@ def write_unfinished_runs(folder: Path) -> None:
 
 
 SUCCESSFUL_EXAMPLE = {
-    "example": 0,
-    "label": [HOSTILE],
-    "predicted_before": ["a"],
-    "confidence_before": [0.5],
-    "predicted": ["b"],
-    "confidence": [0.5],
-    "success": True,
-    "success_without_noise": True,
-    "success_before": False,
-    "steps": 3,
+    **{"example": 0, "label": [HOSTILE], "predicted": ["b"], "predicted_before": ["a"], "steps": 3},
+    **{"confidence": [0.5], "confidence_before": [0.5], "success_before": False},
+    **{"success": True, "success_without_noise": True},
 }
 
 
@@ -128,12 +121,8 @@ def test_an_attack_is_shown_with_its_rates_and_the_outcome_of_each_example(page)
     assert "Attacks succeed on 1 of 3 examples, 2 without a sensor's noise; 1 more" in text
     assert "renders succeeds on 50%." in text
     outcomes = [cells[-1] for cells in Page(text).rows if cells[1:2] == [HOSTILE]]
-    assert outcomes == [
-        "success in 3 steps",
-        "wrong before any step",
-        "no success in 3 steps",
-        "success only without noise in 3 steps",
-    ]
+    assert outcomes[:2] == ["success in 3 steps", "wrong before any step"]
+    assert outcomes[2:] == ["no success in 3 steps", "success only without noise in 3 steps"]
 
 
 def test_an_exception_of_a_report_is_printed_and_ends_no_training(finished, tmp_path, monkeypatch):

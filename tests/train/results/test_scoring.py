@@ -223,10 +223,9 @@ class TestAnOperatingPoint:
     def test_is_the_lowest_threshold_within_its_rate(
         self, fruit, tmp_path, rate, recall, false_positives, is_in_sample
     ):
-        model, classes, folder = fruit
-        (point,) = scoring.choose_operating_points(
-            scoring.Predictor(model, classes), folder, "orange", rate
-        )
+        *network, folder = fruit
+        predictor = scoring.Predictor(*network)
+        (point,) = scoring.choose_operating_points(predictor, folder, "orange", rate)
         if not is_in_sample:
             # Another image that has the same predictions takes the place of an orange.
             Image.new("RGB", (32, 32), (1, 1, 0)).save(folder / "orange" / "b.png")
@@ -236,11 +235,9 @@ class TestAnOperatingPoint:
         assert summary["operating_point"] == vars(point) | {"in_sample": is_in_sample}
 
     def test_needs_a_negative_per_step_of_its_rate(self, fruit):
-        model, classes, folder = fruit
+        *network, folder = fruit
         with pytest.raises(InputError, match=r"5 negatives .* at least 10 .*=0\.1$"):
-            scoring.choose_operating_points(
-                scoring.Predictor(model, classes), folder, "orange", 0.1
-            )
+            scoring.choose_operating_points(scoring.Predictor(*network), folder, "orange", 0.1)
 
 
 def pooled_auc(labels: list[str], own_letters: str, source: str | None = None) -> float:

@@ -163,10 +163,8 @@ def test_gradient_steps_lower_the_confidence_of_relit_batches():
     labels = torch.zeros(16, dtype=torch.int64)
     confidence = {}
     for steps in (0, 3):
-        settings = TrainSettings(
-            augmentation="relight", consistency_weight=1.0, relight_steps=steps
-        )
-        batches = Augmentation(settings, network, network, seed=0)
+        chosen = TrainSettings(augmentation="relight", consistency_weight=1.0, relight_steps=steps)
+        batches = Augmentation(chosen, network, network, seed=0)
         relit = batches.apply(images, labels, step=0)
         assert torch.equal(relit, batches.apply(images, labels, step=0))
         assert not torch.equal(relit, batches.apply(images, labels, step=1))
