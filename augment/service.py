@@ -122,7 +122,7 @@ class AugmentationService:
             raise InputError(f"{source} is None, but mode={self.settings.mode} needs it: give one")
         attack = self.settings.attack
         if self.scene is not None and self.settings.renders:
-            self.scene = with_needed_degree(self.scene, attack.material, self.settings.vary.gloss)
+            self.scene = with_needed_degree(self.scene, attack, self.settings.vary.gloss)
             if not attack.allow_negative:
                 warn_of_changed_light(self.scene, build_problem(attack, self.scene).scene)
 

@@ -150,6 +150,7 @@ class Adversary(ShortRepr):
             settings=self.settings,
             rasterizer=rasterizer,
             basis=self.basis,
+            one_light=True,
         )
 
     def render(self, rasterizer: Rasterizer | str | None = None) -> Tensor:

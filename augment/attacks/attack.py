@@ -163,7 +163,7 @@ def _attack(
 ) -> AttackResult:
     """Attack a classifier whose arguments have been checked. See `attack`."""
     settings.require_parameters()
-    scene = with_needed_degree(scene, settings.material)
+    scene = with_needed_degree(scene, settings)
     problem = build_problem(settings, scene)
     warn_of_changed_light(scene, problem.scene, stacklevel=4)
     images_before = problem.images(problem.start)

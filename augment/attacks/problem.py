@@ -12,7 +12,10 @@ from augment.attack_settings import AttackSettings
 from augment.attacks.objective import Examples, Images, Values
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.lights import Lighting, Skylight, environment_light
+from augment.attacks.parameters.material import Material
+from augment.attacks.parameters.offsets import Albedo, Geometry
 from augment.attacks.parameters.parameter import Parameter
+from augment.attacks.parameters.pose import Pose
 from augment.classifier import TaskNetwork
 from augment.progress import progress
 from augment.scene.build import MAX_IRRADIANCE_ERROR
@@ -134,6 +137,9 @@ def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
         physical = scene.basis.project_nonnegative(scene.lights)
         if not torch.equal(physical, scene.lights):
             scene = scene.changed(lights=physical)
+    if settings.parameters.keys() <= {kind.name for kind in (Albedo, Geometry, Material, Pose)}:
+        # Each view has one light, so operators would take more time than they save.
+        scene = scene.changed(one_light=True)
     of_light = {"nonnegative": not settings.allow_negative}
     options = {Lighting.name: of_light, Skylight.name: of_light}
     parameters = [

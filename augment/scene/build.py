@@ -41,6 +41,7 @@ from renderer.image import clamp, encode
 from renderer.io.images import gray_or_image
 from renderer.light import harmonics, ringing
 from renderer.light.basis import DEGREE, Basis, LocalBasis, harmonics_of, with_local_lights
+from renderer.light.environment import SUFFIXES
 from renderer.light.files import load_light
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.mesh import Mesh, require_mesh
@@ -161,7 +162,8 @@ def build_scene(
     # stays None if the user gave coefficients or chose the degree.
     lights_of_degree = None
     if isinstance(environment, str | Path):
-        material = attack.material if attack else None
+        # Only a map has detail that a smoother surface would show.
+        material = _shown_material(attack, Path(environment).suffix.lower() in SUFFIXES)
         smoothest = reached_gloss(objects, material, vary.gloss if vary else None)
         pixels = views * len(objects) * image.pixel_count
         degree = degree_of_scene(smoothest, settings.degree, pixels)
@@ -427,8 +429,15 @@ def _warn_of_wrong_irradiance(name: str, light: Tensor, degree: int) -> None:
         warnings.warn(f"light {name} of degree={degree} {reason}, {advice}", stacklevel=3)
 
 
+def _shown_material(attack: AttackSettings | None, has_detail: bool) -> MaterialSettings | None:
+    """Return the material that an attack changes, or None if its highlights show no more detail."""
+    if attack and (has_detail or attack.lighting or attack.skylight):
+        return attack.material
+    return None
+
+
 def with_needed_degree(
-    scene: Scene, material: MaterialSettings | None, layer: SpecularLayerSettings | None = None
+    scene: Scene, attack: AttackSettings, layer: SpecularLayerSettings | None = None
 ) -> Scene:
     """Raise the degree of a scene's lighting if an attack or a variation needs it.
 
@@ -436,8 +445,11 @@ def with_needed_degree(
     need a higher degree. Only a degree that `build_scene` chose is raised. If
     the user gave the degree or the coefficients, a warning is given instead.
     """
-    smoothest = reached_gloss(scene.objects, material, layer)
     degree = harmonics_of(scene.basis).degree
+    # If the coefficients of the highest degree are zero, the lighting is so smooth that a higher
+    # degree would add nothing.
+    has_detail = bool(scene.lights[:, degree**2 : (degree + 1) ** 2].any())
+    smoothest = reached_gloss(scene.objects, _shown_material(attack, has_detail), layer)
     needed = smoothest.affordable_degree(len(scene) * scene.views * scene.settings.pixel_count)
     if needed <= degree:
         return scene
@@ -450,9 +462,7 @@ def with_needed_degree(
             smoothest.warn(f"degree={degree} takes less time, but", degree)
             basis, lights = scene.lights_of_degree(needed, smoothest.gloss_roughness)
             return scene.changed(basis=basis, lights=lights.to(scene.lights))
-    # If the coefficients of the highest degree are zero, the lighting is so smooth that a higher
-    # degree would add nothing, and no warning is needed.
-    if scene.lights[:, degree**2 : (degree + 1) ** 2].any():
+    if has_detail:
         smoothest.warn(f"degree={degree}", degree)
     return scene
 

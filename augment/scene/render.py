@@ -186,6 +186,8 @@ class OperatorRenderer:
         return _BuiltStack(stack, image_to_stack_image, background_terms)
 
 
+# Number of rasterized views that are kept.
+KEPT_VIEWS = 256
 # Shadows and bounces are computed again if a coordinate of a vertex has changed by more than this
 # distance in world units.
 NEAR = 0.001
@@ -195,6 +197,8 @@ NEAR = 0.001
 # each of the K harmonic coefficients of the light, and the sum of the albedo of the samples of
 # each pixel with which it was computed.
 FrozenView = tuple[Float[Tensor, "3 K P"], Float[Tensor, "3 P"]]
+# Example (None for all of them) and camera of a view.
+ViewKey = tuple[int | None, Camera]
 
 
 class FrozenTransport:
@@ -206,14 +210,13 @@ class FrozenTransport:
 
     Attributes:
         mesh: The mesh that casts the shadows.
-        views: Added radiance for each camera. None if shadows and bounces add
-            nothing.
+        views: Added radiance for each view. None if shadows and bounces add nothing.
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis):
         """Trace the paths of light between the faces of a mesh."""
         self.mesh = mesh
-        self.views: dict[Camera, FrozenView | None] = {}
+        self.views: dict[ViewKey, FrozenView | None] = {}
         self._settings = settings
         self._transport = build_transport(mesh, settings, albedo_scale, basis)
 
@@ -221,16 +224,25 @@ class FrozenTransport:
         """Return whether a shape is so close to the mesh that shadows and bounces are the same."""
         return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
 
-    def add(self, camera: Camera, fragments: Fragments, albedo: Float[Tensor, "S 3"]) -> None:
-        """Compute and keep the radiance that shadows and bounces add to a view of the mesh."""
+    def add(
+        self,
+        view: ViewKey,
+        fragments: Fragments,
+        albedo: Float[Tensor, "S 3"],
+        light: Tensor | None,
+    ) -> None:
+        """Compute and keep the radiance that shadows and bounces add to a view of the mesh.
+
+        With a light, only the radiance in this light is kept.
+        """
         # None says that shadows and bounces add nothing to the view.
-        self.views[camera] = None
+        self.views[view] = None
         if not self._transport:
             return
         surface = Surface(self.mesh, fragments.to("cpu"), self._settings)
         # Added radiance for each of the K harmonic coefficients of the light, in the P pixels
         # that the mesh covers, shape (3, K, P).
-        added_transfer = self._transport.change(surface, albedo.cpu().double())
+        added_transfer = self._transport.change(surface, albedo.cpu().double(), light)
         if added_transfer is None:
             return
         # A slightly different shape may cover other pixels, so expand the radiance to all pixels
@@ -239,23 +251,28 @@ class FrozenTransport:
         all_pixels[..., surface.fragments.pixels] = added_transfer
         # The method `radiance` scales the added radiance of a pixel by the ratio of its new albedo
         # to this albedo.
-        self.views[camera] = all_pixels.to(albedo), _sum_by_pixel(fragments, albedo)
+        self.views[view] = all_pixels.to(albedo), _sum_by_pixel(fragments, albedo)
 
     def radiance(
-        self, camera: Camera, fragments: Fragments, albedo: Float[Tensor, "S 3"], light: Tensor
+        self, view: ViewKey, fragments: Fragments, albedo: Float[Tensor, "S 3"], light: Tensor
     ) -> Float[Tensor, "3 P"]:
         """Compute the radiance that shadows and bounces add to a view of a shape.
 
-        It is differentiable in albedo and light. `add` has been called for the camera, and the
-        shape may differ a little from the mesh. There are S samples in P pixels.
+        It is differentiable in albedo and light, unless the light was given before. `add` has been
+        called for the view, and the shape may differ a little from the mesh. There are S samples in
+        P pixels.
         """
-        view = self.views[camera]
-        if view is None:
+        kept = self.views[view]
+        if kept is None:
             return light.new_zeros(3, len(fragments.pixels))
-        added_transfer, old_sums = (part[..., fragments.pixels] for part in view)
+        added_transfer, old_sums = (part[..., fragments.pixels] for part in kept)
         new_sums = _sum_by_pixel(fragments, albedo)[:, fragments.pixels]
         # Radiance with the albedo of the mesh, shape (3, P).
-        added = torch.einsum("ckp,kc->cp", added_transfer.to(light), light)
+        added_transfer = added_transfer.to(light)
+        if added_transfer.shape[1] == 1:
+            added = added_transfer[:, 0]
+        else:
+            added = torch.einsum("ckp,kc->cp", added_transfer, light)
         # Scale the radiance by the ratio of new to old albedo. Where the old albedo is 0, there
         # is no ratio, and the radiance is not scaled.
         ratios = new_sums / old_sums.masked_fill(old_sums == 0, 1)
@@ -280,7 +297,7 @@ class DirectRenderer:
         rasterizer: The rasterizer.
         basis: Basis of the lights.
         like: A tensor with the dtype and the device of the images.
-        cached: Whether the rasterized views of unmoved objects are kept, instead of the last one.
+        one_light: Whether each example is rendered in one light only.
     """
 
     objects: Sequence[SceneObject]
@@ -288,7 +305,7 @@ class DirectRenderer:
     rasterizer: Rasterizer
     basis: Basis
     like: Tensor
-    cached: bool = True
+    one_light: bool = False
 
     def __post_init__(self) -> None:
         """Create empty caches."""
@@ -314,7 +331,7 @@ class DirectRenderer:
         """
         key = (object_index, camera)
         if key not in self._views:
-            if not self.cached:
+            if len(self._views) == KEPT_VIEWS:
                 self._views.clear()
             mesh = self.objects[object_index].mesh
             vertices = torch.as_tensor(mesh.vertices, device=self.like.device)
@@ -454,14 +471,16 @@ class DirectRenderer:
         def indirect(albedo: Float[Tensor, "S 3"], light: Float[Tensor, "K 3"]) -> Tensor:
             """Compute the radiance that shadows and bounces of environment light add."""
             frozen = self._transport(example, object_index, _moved(item.mesh, moved).vertices)
-            if fixed_camera not in frozen.views:
+            view = (example if self.one_light else None, fixed_camera)
+            if view not in frozen.views:
                 vertices = torch.as_tensor(frozen.mesh.vertices, device=self.like.device)
-                frozen.add(fixed_camera, *self._rasterize(object_index, fixed_camera, vertices))
-            added = frozen.radiance(fixed_camera, fragments, albedo, light)
+                fragments_and_albedo = self._rasterize(object_index, fixed_camera, vertices)
+                frozen.add(view, *fragments_and_albedo, light if self.one_light else None)
+            added = frozen.radiance(view, fragments, albedo, light)
             # A camera whose fields are tensors is attacked, so it differs in each call. Its views
             # are not kept. `fixed` returns the same camera if no field is a tensor.
             if camera is not fixed_camera:
-                del frozen.views[fixed_camera]
+                del frozen.views[view]
             return added
 
         corner_normals = None

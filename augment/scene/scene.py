@@ -158,7 +158,7 @@ class Scene:
             attack_bytes=self.attack_bytes,
         )
         self._direct_renderer = DirectRenderer(
-            self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light
+            self.objects, settings, rasterizer, basis, like=self.lights, one_light=one_light
         )
 
     def _count_attack_bytes(self) -> int:

@@ -214,13 +214,24 @@ class Transport:
             self.has_colored_light = self._sent.shape[2] > 1
 
     def change(
-        self, surface: Surface, albedo: Float[Tensor, "S C"]
-    ) -> Float[Tensor, "C K P"] | None:
+        self,
+        surface: Surface,
+        albedo: Float[Tensor, "S C"],
+        light: Float[Tensor, "K 3"] | None = None,
+    ) -> Float[Tensor, "C _ P"] | None:
         """Compute how shadows and bounces change the transfer matrix of a view.
+
+        The second axis of the result has the K coefficients of the light, or the size 1 if a light
+        is given.
 
         The albedo has 3 channels if `has_colored_light` is true, and otherwise 1 or 3. None
         means that no surface blocks light.
         """
+
+        def shown(radiance: Float[Tensor, "N K"], channel: int) -> Float[Tensor, "N _"]:
+            """Return the radiance of each SH coefficient, or its sum in the light."""
+            return radiance if light is None else radiance @ light[:, channel, None].cpu().double()
+
         change = None
         fragments = surface.fragments
         gloss = surface.gloss
@@ -235,7 +246,8 @@ class Transport:
             if not hits.weight.any():
                 continue
             if change is None:
-                shape = (len(albedo_by_channel), self._sky.shape[1], len(fragments.pixels))
+                columns = self._sky.shape[1] if light is None else 1
+                shape = (len(albedo_by_channel), columns, len(fragments.pixels))
                 change = self._sky.new_zeros(shape)
             sample_of_ray = hits.sample_of_ray
             if gloss is not None:
@@ -254,14 +266,15 @@ class Transport:
                     specular = colored + white / fragments.samples**2
                     reflectance = reflectance * transmittance + specular
                 blocked = hits.weight * reflectance
-                # Subtract the light of the sky that the mesh blocks: one row for each SH
-                # coefficient, one column for each pixel.
-                channel_change[:, hits.pixels] = -(blocked @ self._sky).T
+                # Subtract the light of the sky that the mesh blocks: one row for each column of
+                # the sky, one column for each pixel.
+                channel_change[:, hits.pixels] = -(blocked @ shown(self._sky, channel)).T
                 if self._patches:
                     # Add the light that the pixels receive from patches and reflect.
-                    sent = self._sent[..., channel if self.has_colored_light else 0].numpy()
+                    sent = self._sent[..., channel if self.has_colored_light else 0]
                     weights = self._patches.weights_by_patch(hits, self._directions, blocked)
-                    channel_change[:, hits.pixels] += torch.from_numpy(weights @ sent).T
+                    added = torch.from_numpy(weights @ shown(sent, channel).numpy())
+                    channel_change[:, hits.pixels] += added.T
         return change
 
     def _reflect_rays(

@@ -28,9 +28,10 @@ from renderer.surface.gloss import Gloss, smallest_roughness
 
 MATTE = ("solid:pear", "pear")
 OPTIONS = {"samples": 1, "rasterizer": "numpy"}
-# An attack without a radius reaches a roughness of 0.2.
+# An attack without a radius reaches a roughness of 0.2. Attacked light gets detail of any degree.
 UNLIMITED = MaterialSettings()
-ON_UNLIMITED_MATERIAL = augment.AttackSettings(material=UNLIMITED)
+LIGHTING = augment.StepSettings()
+ON_UNLIMITED_MATERIAL = augment.AttackSettings(material=UNLIMITED, lighting=LIGHTING)
 
 
 def recorded(build: Callable, *arguments, **options) -> tuple[Any, str]:
@@ -61,7 +62,7 @@ def test_the_degree_shows_the_least_roughness_that_an_attack_on_material_reaches
     roughness = torch.full((len(mesh.faces),), 0.6)
     roughness[:9] = smoothest
     settings = MaterialSettings(radius=radius)
-    attack = augment.AttackSettings(material=settings)
+    attack = augment.AttackSettings(material=settings, lighting=LIGHTING)
     scene, told = scene_of((Gloss(roughness).on(mesh), "pear"), attack=attack)
     expected = required_degree(lowest_roughness(scene, settings))
     assert scene.basis == Harmonics(max(6, expected))
@@ -77,9 +78,11 @@ HUE_ALONE = MaterialSettings(roughness=0, metallic=0, specular_factor=0, hue=30)
 
 
 @pytest.mark.parametrize(
-    "changed", [{"material": HUE_ALONE}, {"lighting": augment.StepSettings()}], ids=["hue", "light"]
+    "changed",
+    [{"material": HUE_ALONE}, {"lighting": LIGHTING}, {"material": UNLIMITED}],
+    ids=["hue", "light", "gloss in light without detail"],
 )
-def test_attacks_that_change_no_gloss_keep_degree_6_without_a_warning(changed):
+def test_attacks_that_show_no_sharper_highlights_keep_degree_6_without_a_warning(changed):
     scene, told = scene_of(MATTE, attack=augment.AttackSettings(**changed))
     assert scene.basis == Harmonics(6)
     assert told == ""

@@ -307,8 +307,9 @@ def test_shadows_of_unmoved_vertices_and_colors_are_those_of_the_operators(names
     face_count = max(len(item.mesh.faces) for item in scene.objects)
     unmoved = {"vertices": scene.vertices[scene.object_of]}
     unpainted = {"albedo": torch.zeros(len(scene), face_count, 3)}
-    for change in ({}, unmoved, unpainted):
-        images = scene.render(Conditions(lights, **change), rows)[:, 0]
+    in_one_light = scene.changed(lights=lights, one_light=True)
+    for shown, change in ((scene, {}), (scene, unmoved), (scene, unpainted), (in_one_light, {})):
+        images = shown.render(Conditions(lights, **change), rows)[:, 0]
         torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=1000 * EPS32)
 
 
