@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -237,8 +237,6 @@ class ExperimentSettings(NetworkSettings):
 
     def __post_init__(self) -> None:
         """Check all values, and compute the number of renders."""
-        if self.network == "":
-            raise InputError("network is not set: give a run or torchvision:NAME", "network")
         super().__post_init__()
         for name in NEEDS_INITIAL:
             value = getattr(self.train, name)
@@ -247,10 +245,9 @@ class ExperimentSettings(NetworkSettings):
                 raise InputError(f"{key}={value} needs an initial network: set network", key)
         self._check_photographs()
         renders_meshes = self.augment.renders and self.augment.mode != "folder"
-        attacks_pose = renders_meshes and "pose" in self.augment.attack.parameters
-        if attacks_pose and not self.renderer.silhouettes:
-            key = "renderer.silhouettes"
-            raise InputError(f"{key}=false: set it to true to attack the pose", key)
+        # The gradient of an attack on the pose needs the silhouettes of objects.
+        if renders_meshes and "pose" in self.augment.attack.parameters:
+            self.renderer = replace(self.renderer, silhouettes=True)
         if self.label is None:
             # The classes of the meshes will become the label when the classes of the network
             # are known. `with_class_names` then creates these settings again.

@@ -134,18 +134,14 @@ class DetectionScores(AnnotatedScores):
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""
-        by_source = {
-            source: {name: asdict(metrics) for name, metrics in of_source.items()}
-            for source, of_source in self.by_source.items()
-        }
         return {
             "task": self.task.name,
             "threshold": self.task.threshold,
             "iou": self.task.iou,
             "label": self.labels,
             **asdict(self.overall),
-            "by_label": {name: asdict(metrics) for name, metrics in self.by_label.items()},
-            "by_source": by_source,
+            "by_label": self.by_label,
+            "by_source": self.by_source,
             **super().to_summary(),
             "n": {"photographs": self.photograph_count, "objects": self.overall.n},
         }
@@ -172,7 +168,7 @@ class SegmentationScores(AnnotatedScores):
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""
-        scores = {"miou": asdict(self.miou), "by_class": self.by_class}
+        scores = {"miou": self.miou, "by_class": self.by_class}
         return {"task": "segmentation", **scores, **super().to_summary()}
 
 

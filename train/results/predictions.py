@@ -7,7 +7,7 @@ of a photograph and a label.
 import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -158,8 +158,8 @@ def begin_scores(out: Path) -> None:
 
 
 def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
-    """Write summary.json, the last file of a folder of scores."""
-    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
+    """Write summary.json, the last file of a folder of scores. Its values may be dataclasses."""
+    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False, default=asdict)
     atomic_write(out / SUMMARY, text + "\n")
 
 
