@@ -40,6 +40,7 @@ from renderer.camera import orbit_cameras
 from renderer.errors import MAX_SCALE
 from renderer.image import to_bytes
 from renderer.io.files import atomic_write
+from renderer.io.images import encode_image
 from renderer.light.basis import HARMONICS, with_local_lights
 from renderer.light.files import UNIFORM, load_light, perturb
 from renderer.rendering import light_sphere
@@ -382,11 +383,10 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
 
 def _encode_jpeg(image: Float[Tensor, "3 H W"], height: int) -> str:
     """Resize an image in [0, 1] to a height, and encode it as a JPEG file in base64."""
-    file = io.BytesIO()
     picture = Image.fromarray(to_bytes(image.clamp(0, 1).cpu()).permute(1, 2, 0).numpy())
     width = round(height * picture.width / picture.height)
-    picture.resize((width, height)).save(file, "JPEG", quality=85)
-    return base64.b64encode(file.getvalue()).decode()
+    content = encode_image(picture.resize((width, height)), "JPEG", quality=85)
+    return base64.b64encode(content).decode()
 
 
 @dataclass(frozen=True)

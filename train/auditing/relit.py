@@ -259,20 +259,12 @@ def read_relit(folder: Path) -> RelitScores:
 def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]:
     """Write pictures that show photographs in each kind of light, side by side.
 
-    Up to PICTURE_COUNT photographs are chosen. Photographs whose class changes in only one kind of
-    light come first, which is usually the gradient attack. Photographs whose class changes in more
-    kinds of light follow. Photographs whose class never changes come last. Return the file name of
-    each picture by the index of its photograph.
+    Up to PICTURE_COUNT photographs are chosen, those whose class changes in the strongest light
+    first. Return the file name of each picture by the index of its photograph.
     """
-    # Each entry is about one kind of light: whether any slide changes the class of each
-    # photograph, shape (N,).
-    is_changed = [changed.any(dim=1) for changed in result.changed.values()]
-    change_count = torch.stack(is_changed).sum(dim=0)
-    # A rank above all counts puts photographs that never change at the end.
-    rank = torch.where(change_count > 0, change_count, len(is_changed) + 1)
-    order = torch.argsort(rank, stable=True)
     # The kinds of light are in the order of their strength.
     *_, changed_in_strongest = result.changed.values()
+    order = changed_in_strongest.any(dim=1).int().argsort(descending=True, stable=True)
     names = {}
     for photograph in order[:PICTURE_COUNT].tolist():
         # The first slide that changes the class in the strongest light, or 0.

@@ -106,15 +106,13 @@ def run(settings: AttackExperimentSettings) -> None:
 
 
 class _AttackedMesh(NamedTuple):
-    """Numbers of examples of an attacked mesh, and lines about it for the console.
+    """Row of an attacked mesh in a table, and lines about it for the console.
 
-    Only examples that were classified correctly before the attack count as successes.
+    The row has its name, and the numbers of its examples, of those that were classified correctly
+    before the attack, and of successes among these.
     """
 
-    name: str
-    examples: int
-    correct_before: int
-    successes: int
+    row: tuple[str, int, int, int]
     heading: str
     details: list[str]
 
@@ -123,10 +121,9 @@ def _headings(attacked: Sequence[_AttackedMesh]) -> list[str]:
     """Return the heading of a mesh, or the sum and a table of several."""
     if len(attacked) < 2:
         return [mesh.heading for mesh in attacked]
-    hits = sum(mesh.successes for mesh in attacked)
-    correct_count = sum(mesh.correct_before for mesh in attacked)
-    total = f"success on {hits} of {correct_count} examples that were correct before"
-    rows = [(mesh.name, mesh.examples, mesh.correct_before, mesh.successes) for mesh in attacked]
+    rows = [mesh.row for mesh in attacked]
+    _, _, correct, successes = zip(*rows, strict=True)
+    total = f"success on {sum(successes)} of {sum(correct)} examples that were correct before"
     table = Table("", ["mesh", "examples", "correct before", "success"], rows)
     return [f"{len(rows)} meshes: {total}", *str(table).splitlines()]
 
@@ -181,8 +178,8 @@ def _write_attack(
         table = attack_tables.write_transfers(transfer(result, **targets), folder / TRANSFERS)
         details += table.splitlines()
     correct = result.clean_correct
-    hits = int(result.success[correct].sum())
-    return _AttackedMesh(name, len(correct), int(correct.sum()), hits, heading, details)
+    row = (name, len(correct), int(correct.sum()), int(result.success[correct].sum()))
+    return _AttackedMesh(row, heading, details)
 
 
 def attacks(

@@ -57,12 +57,12 @@ def run(settings: RenderSettings) -> None:
     options: dict[str, Any] = {"settings": settings.augment, "network": network, "device": device}
     options |= {"scene": settings.scene, "renderer": settings.renderer, "seed": settings.seed}
     options |= {"first": indices.start, "skip": finished, "views": settings.scene.views}
-    options["rasterizer"] = choose_rasterizer(settings.renderer)
     # Depth and normals are computed only if files of them are asked for.
     options["maps"] = not {"depth", "normals"}.isdisjoint(settings.maps)
     # An error names an argument by its setting, such as scene.views.
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
+        options["rasterizer"] = choose_rasterizer(settings.renderer)
         renders = dataset.render_dataset(
             [*objects.values()], settings.size, len(indices), **options
         )

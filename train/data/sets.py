@@ -179,16 +179,13 @@ def channel_statistics(images: UInt8[Tensor, "N 3 H W"]) -> tuple[list[float], l
     0.001.
     """
     values = torch.arange(256, dtype=torch.float64) / 255
-    means = []
-    deviations = []
-    for channel in range(3):
-        # Number of pixels with each of the 256 values.
-        histogram = torch.bincount(images[:, channel].flatten(), minlength=256).double()
-        mean = float(histogram @ values / histogram.sum())
-        variance = histogram @ (values - mean) ** 2 / histogram.sum()
-        means.append(mean)
-        deviations.append(max(float(variance.sqrt()), 1e-3))
-    return means, deviations
+    # Number of pixels of each channel with each of the 256 values.
+    counts = [torch.bincount(channel.flatten(), minlength=256) for channel in images.unbind(1)]
+    histograms = torch.stack(counts).double()
+    fractions = histograms / histograms.sum(1, keepdim=True)
+    means = fractions @ values
+    variances = (fractions * (values - means[:, None]) ** 2).sum(1)
+    return means.tolist(), variances.sqrt().clamp(min=1e-3).tolist()
 
 
 def load_cifar100(path: str) -> DataSet:

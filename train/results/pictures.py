@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from renderer.io.files import atomic_write
-from renderer.io.images import PAPER, Tile, draw_grid, open_image
+from renderer.io.images import PAPER, Tile, draw_grid, encode_image, open_image
 from train.results.intervals import RATES, auc_and_recalls, roc_curve
 from train.results.predictions import ROC_FIGURE, ROC_TABLE, Predictions
 from train.results.tables import Estimate, write_csv
@@ -221,12 +221,11 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
 
 def encode_picture(image: Image.Image, alt: str, caption: str = "") -> Picture:
     """Encode an image for a page: a small image as PNG, a larger one as JPEG."""
-    file = io.BytesIO()
     if max(image.size) <= SMALL:
-        image.save(file, "PNG", optimize=True)
-        return Picture(file.getvalue(), "png", alt, image.width, caption)
-    image.convert("RGB").save(file, "JPEG", optimize=True, quality=82)
-    return Picture(file.getvalue(), "jpeg", alt, image.width, caption)
+        content = encode_image(image, "PNG", optimize=True)
+        return Picture(content, "png", alt, image.width, caption)
+    content = encode_image(image.convert("RGB"), "JPEG", optimize=True, quality=82)
+    return Picture(content, "jpeg", alt, image.width, caption)
 
 
 def read_pictures(path: Path, alt: str, widest: int, caption: str = "") -> list[Picture]:
