@@ -55,14 +55,10 @@ class AttackCommandSettings(AttackSettings):
     shared: bool = setting(False, "The views share one lighting, shape or color.")
     force: bool = setting(False, "Also attack images that are misclassified before the attack.")
     checks: bool | None = setting(
-        None,
-        "Compare with random draws, and with 3 and 10 times as many steps. null: true if the "
-        "network has gradients.",
+        None, "Try random draws, and 3 and 10 times as many steps. null: if there are gradients."
     )
     radius_scales: list[float] = setting(
-        [],
-        "Factors of each radius, such as [0.5, 1, 2], for which success is measured.",
-        within=SCALES,
+        [], "Factors of each radius, such as [0.5, 1, 2], to measure success for.", within=SCALES
     )
     verify: str | None = setting(
         "reload", "Render the written files again: reload (here), mitsuba, reload+mitsuba or null."
@@ -273,9 +269,7 @@ class EvaluateSettings(TaskSettings):
         "COCO, or a folder of images with labels of YOLO. Of a segmenter: images/ and masks/.",
     )
     fit: str = setting(
-        "letterbox",
-        "How photographs get the size of a detector or segmenter.",
-        choices=("letterbox", "stretch"),
+        "letterbox", "How photographs get the network's size.", choices=("letterbox", "stretch")
     )
     run: str | None = setting(
         None,

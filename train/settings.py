@@ -92,9 +92,7 @@ class DataSettings(Settings):
         None, "Validation fraction. null: what `network` left out, or 0.1.", above=0, below=1
     )
     path: str = setting("", "File or folder of the data.", may_be_empty=True)
-    test_fraction: float = setting(
-        0.1, "Test fraction of a folder without a sub-folder `test`.", above=0, below=1
-    )
+    test_fraction: float = setting(0.1, "Test fraction without a folder `test`.", above=0, below=1)
     workers: int = setting(2, "Processes that read images above 64 pixels.", within=(0, 1024))
     train_per_class: int = setting(300, "Training images of each shape.", within=(1, MAX_IMAGES))
     test_per_class: int = setting(60, "Test images of each shape.", within=(1, MAX_IMAGES))
@@ -155,9 +153,7 @@ class NetworkSettings(Settings):
         "Normalization before the classifier: imagenet, or [MEAN,STD] in units of [0, 1], such as "
         "[[0,0,0],[1,1,1]] for none. null: that of the network, and none before a file's."
     )
-    prompt: str | None = setting(
-        None, "Prompt of a zero-shot network, in which {} is the class. null: a photo of a {}."
-    )
+    prompt: str | None = setting(None, "Zero-shot prompt; {} is the class. null: a photo of a {}.")
     normalize_light: Any = setting(
         None,
         "Normalize the light of each image before the network sees it: true, or "
@@ -186,9 +182,7 @@ class NetworkSettings(Settings):
 class TaskSettings(NetworkSettings):
     """Settings that choose a network, and say what its outputs mean and what computes them."""
 
-    task: str | None = setting(
-        None, "What the outputs of the network are. null: their type tells.", choices=TASKS
-    )
+    task: str | None = setting(None, "What the outputs are. null: their type tells.", choices=TASKS)
     threshold: float | None = setting(None, "Threshold of scores. null: 0.4.", within=PROBABILITY)
     iou: float | None = setting(None, "Least intersection over union. null: 0.5.", within=(0.01, 1))
     decode: str | None = setting(

@@ -67,10 +67,7 @@ class TrainSettings(Settings):
     optimizer: str = setting("sgd", "adamw decays neither biases nor norms.", choices=OPTIMIZERS)
     learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
     feature_norm: float | None = setting(
-        None,
-        "Norm of the features for which the rate of the last layer is meant. null: any norm.",
-        above=0,
-        maximum=MAX_SCALE,
+        None, "Norm of features that this rate is for. null: any norm.", above=0, maximum=MAX_SCALE
     )
     momentum: float = setting(0.9, "Nesterov momentum.", minimum=0, below=1)
     weight_decay: float = setting(5e-4, "Weight decay.", within=(0, MAX_SCALE))
@@ -101,8 +98,7 @@ class TrainSettings(Settings):
     ema_decay: float = setting(0.0, "Decay of averaged weights. 0: none.", minimum=0, below=1)
     soup: bool = setting(False, "Keep the mean of all epochs, which all start with `network`.")
     eval_mode: bool | None = setting(
-        None,
-        "Train with the statistics of `network`, without dropout. null: true for other libraries.",
+        None, "Train with statistics of `network`, no dropout. null: true for other libraries."
     )
     precision: str = setting("auto", "bfloat16, float16, float32, or auto: by the hardware.")
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")

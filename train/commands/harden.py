@@ -145,9 +145,6 @@ def harden(
     device = device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with folder_or_temporary(out) as folder:
-        given = asdict(train) if isinstance(train, TrainSettings) else train
-        resumes = isinstance(given, Mapping) and bool(given.get("resume"))
-        require_new_run(folder, "out", overwrite, resumes)
         classifier = as_network(
             _trainable_copy(network), *options, normalize_light=normalize_light, task=task
         )
@@ -179,6 +176,7 @@ def harden(
         sections: dict[str, Any] = {"train": train, "augment": augment, "scene": scene}
         sections |= {"renderer": renderer, "data": data}
         settings = _read_settings(experiment, changes, sections)
+        require_new_run(folder, "out", overwrite, settings.train.resume)
         if meshes or label is not None:
             settings = class_names.with_class_names(settings, classifier.classes)
         with sole_writer("out", folder), _restores_torch():

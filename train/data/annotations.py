@@ -193,8 +193,7 @@ def read_annotations(photos: Path) -> Annotations:
         raise InputError(f"photos={photos} does not exist: give a COCO file, or a folder", "photos")
     files = sorted(photos.glob("*.json"))
     if len(files) > 1:
-        names = ", ".join(file.name for file in files)
-        raise InputError(f"photos={photos} has several files {names}: give one of them", "photos")
+        raise InputError(f"photos={photos} has {len(files)} JSON files: give one of them", "photos")
     return _read_coco(files[0]) if files else _read_yolo(photos)
 
 
