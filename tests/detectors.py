@@ -15,12 +15,8 @@ def small_detector(class_count: int, size: int) -> nn.Module:
 
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        backbone = nn.Sequential(
-            nn.Conv2d(3, 8, 3, stride=2, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(8, 16, 3, stride=2, padding=1),
-            nn.ReLU(),
-        )
+        first, second = (nn.Conv2d(*sizes, 3, stride=2, padding=1) for sizes in ((3, 8), (8, 16)))
+        backbone = nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
         backbone.out_channels = 16
         options = {
             "anchor_generator": AnchorGenerator(((size / 2, 0.8 * size),), ((1.0,),)),

@@ -38,9 +38,7 @@ def colored_noise(labels: np.ndarray, rng: np.random.Generator, contrast: int) -
     return images.astype(np.uint8)
 
 
-def save_noise(
-    path: Path, rng: np.random.Generator, shape: tuple[int, int] = (20, 24), low=0, high=256
-) -> None:
+def save_noise(path: Path, rng: np.random.Generator, shape=(20, 24), low=0, high=256) -> None:
     """Save an image of noise of some 8-bit levels, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = rng.integers(low, high, (*shape, 3)).astype(np.uint8)
@@ -74,11 +72,6 @@ def find_red(images):
             continue
         sides = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
         red, green, _ = image[:, is_object].mean(1)
-        outputs.append(
-            {
-                "boxes": torch.stack(sides).float()[None],
-                "labels": torch.tensor([0]),
-                "scores": (12 * (red - green) - 1).sigmoid()[None],
-            }
-        )
+        found = {"boxes": torch.stack(sides).float()[None], "labels": torch.tensor([0])}
+        outputs.append(found | {"scores": (12 * (red - green) - 1).sigmoid()[None]})
     return outputs

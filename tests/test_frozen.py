@@ -292,14 +292,8 @@ def test_attack(name, verify):
     settings = augment.AttackSettings(**case.attacked, **ATTACK_SETTINGS | case.settings)
     result = augment.attack(classifier(), scene, case.target, settings, seed=5, force=True)
     assert (result.images - result.images_before).abs().max() > 1e-3
-    verify(
-        result.images_in_views_before,
-        result.images_in_views,
-        result.logits_in_views,
-        result.minimum.values,
-        result.minimum.cost,
-        result.steps,
-    )
+    in_views = result.images_in_views_before, result.images_in_views, result.logits_in_views
+    verify(*in_views, result.minimum.values, result.minimum.cost, result.steps)
 
 
 @pytest.mark.parametrize("name", ["demonstration/none", "demonstration", "harden"])
@@ -425,14 +419,8 @@ def gradients(images: Tensor, leaves: list[Tensor]) -> list[Tensor]:
 def classifier() -> augment.Classifier:
     with torch.random.fork_rng():
         torch.manual_seed(3)
-        network = nn.Sequential(
-            nn.Conv2d(3, 8, 3, stride=2),
-            nn.ReLU(),
-            nn.Conv2d(8, 16, 3, stride=2),
-            nn.ReLU(),
-            nn.Flatten(),
-            nn.Linear(400, len(CLASSES)),
-        )
+        layers = [nn.Conv2d(3, 8, 3, stride=2), nn.ReLU(), nn.Conv2d(8, 16, 3, stride=2), nn.ReLU()]
+        network = nn.Sequential(*layers, nn.Flatten(), nn.Linear(400, len(CLASSES)))
     with torch.no_grad():
         network[-1].weight.mul_(60)
         network[-1].bias[0] -= 0.8

@@ -4,7 +4,7 @@ The scene shows an icosahedron, which has few faces. It is turned and scaled, so
 symmetry. The classifiers are linear, so that their gradients are known.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -25,6 +25,7 @@ from renderer.visibility import choose
 SIZE = 6
 ANGLES = (51.6, 17.2), (74.5, 108.9), (63.0, 200.5)  # polar angles and azimuths in degrees
 FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth in ANGLES)
+PAIRS = ((FRONT, SIDE), (SIDE, BACK), (FRONT, BACK))
 
 
 @pytest.fixture(scope="session")
@@ -43,17 +44,13 @@ def make_scene(stone) -> Callable[..., Scene]:
     """Return a function that builds three examples of two views without a clamped pixel."""
 
     def build(
-        mesh: Mesh = stone,
-        cameras: Sequence[Sequence[OrthographicCamera]] = (
-            (FRONT, SIDE),
-            (SIDE, BACK),
-            (FRONT, BACK),
-        ),
-        backgrounds: Tensor | None = None,
-        dtype: torch.dtype = torch.float64,
-        encoding: str = "linear",
-        albedo_scale: float = 1.0,
-        size: int = SIZE,
+        mesh=stone,
+        cameras=PAIRS,
+        backgrounds=None,
+        dtype=torch.float64,
+        encoding="linear",
+        albedo_scale=1.0,
+        size=SIZE,
     ) -> Scene:
         draws = torch.Generator().manual_seed(0)
         soft_front_light = ambient(torch.full((3,), 0.22))
@@ -72,13 +69,7 @@ def make_scene(stone) -> Callable[..., Scene]:
 def make_linear() -> Callable[..., nn.Module]:
     """Return a function that builds a linear classifier, of which only class 0 has a bias."""
 
-    def build(
-        classes: int,
-        bias: float = 0.0,
-        size: int = SIZE,
-        dtype: torch.dtype = torch.float64,
-        seed: int = 1,
-    ) -> nn.Module:
+    def build(classes, bias=0.0, size=SIZE, dtype=torch.float64, seed=1) -> nn.Module:
         linear = nn.Linear(3 * size**2, classes)
         draws = torch.Generator().manual_seed(seed)
         with torch.no_grad():
@@ -114,11 +105,8 @@ OTHER_STEPS = augment.StepSettings(step_size=0.1)
 LAMPS = augment.LampsSettings([[2, 2, 2], [-2, 2, 2]], start=0.5)
 PROJECTOR = augment.ProjectorSettings(pixels=4, pattern=0.2)
 # The local light that the attack on each of these parameters requires in the scene.
-REQUIRED_LIGHTS = {
-    "projector": {"projector": PROJECTOR},
-    "lamps": {"lamps": LAMPS},
-    "positions": {"lamps": LAMPS},
-}
+REQUIRED_LIGHTS = dict.fromkeys(("lamps", "positions"), {"lamps": LAMPS})
+REQUIRED_LIGHTS["projector"] = {"projector": PROJECTOR}
 
 
 @pytest.fixture(scope="session")
@@ -128,37 +116,20 @@ def attacked(by_color) -> Callable[..., augment.AttackResult]:
     orange = Mesh.plain(ball.vertices, ball.faces, (0.9, 0.5, 0.1))
 
     def run(
-        parameters: str | dict,
-        scene: dict | None = None,
-        classifier: augment.Classifier = by_color,
-        target: str | list[str] | None = None,
-        seed: int = 0,
-        force: bool = False,
-        **settings,
-    ) -> augment.AttackResult:
+        parameters, scene=None, classifier=by_color, target=None, seed=0, force=False, **settings
+    ):
         steps = parameters
         if isinstance(parameters, str):
             steps = {name: STEPS.get(name, OTHER_STEPS) for name in parameters.split("+")}
-        options = {
-            "rasterizer": "numpy",
-            "degree": 6,
-            "width": 2.4,
-            "normals": "flat",
-            "silhouettes": "pose" in steps,
-        }
+        options = {"rasterizer": "numpy", "degree": 6, "width": 2.4, "normals": "flat"}
+        options["silhouettes"] = "pose" in steps
         for name in steps:
             options |= REQUIRED_LIGHTS.get(name, {})
         options |= scene or {}
         label = classifier.classes[0]
         shown = augment.build_scene([(orange, label)], classifier.size, **options)
-        choices = {
-            "allow_negative": True,
-            "margin": 0.0,
-            "quantized": False,
-            "sensor_noise": 0.0,
-            "max_steps": 8,
-        }
-        chosen = augment.AttackSettings(**steps, **choices | settings)
+        choices = {"allow_negative": True, "quantized": False, "margin": 0.0, "sensor_noise": 0.0}
+        chosen = augment.AttackSettings(**steps, **choices | {"max_steps": 8} | settings)
         return augment.attack(classifier, shown, target, chosen, seed=seed, force=force)
 
     return run

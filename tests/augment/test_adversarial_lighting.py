@@ -79,11 +79,8 @@ def test_neither_the_mode_of_gradients_nor_the_bits_of_a_pixel_matter(images):
     lighting = nb.AdversarialLighting(Mean(), steps=2, lights="point")
     found = []
     of_16_bits = (images.int() * 257).to(torch.uint16)
-    for mode, given in (
-        (torch.enable_grad, images / 255),
-        (torch.no_grad, of_16_bits),
-        (torch.inference_mode, of_16_bits),
-    ):
+    modes = torch.enable_grad, torch.no_grad, torch.inference_mode
+    for mode, given in zip(modes, (images / 255, of_16_bits, of_16_bits), strict=True):
         torch.manual_seed(0)
         with mode():
             found.append(lighting(given, torch.zeros(8, dtype=torch.int64)))

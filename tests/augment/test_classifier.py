@@ -293,12 +293,10 @@ def test_onnx_gives_the_scores_of_its_graph_and_a_size_that_it_tells_is_not_assu
     onnx = pytest.importorskip("onnx")
     helper, kind = onnx.helper, onnx.TensorProto.FLOAT
     for size, path in ((64, tmp_path / "fixed.onnx"), ("size", tmp_path / "free.onnx")):
-        graph = helper.make_graph(
-            [helper.make_node("ReduceMean", ["x"], ["y"], axes=[2, 3], keepdims=0)],
-            "graph",
-            [helper.make_tensor_value_info("x", kind, ["n", 3, size, size])],
-            [helper.make_tensor_value_info("y", kind, ["n", 3])],
-        )
+        node = helper.make_node("ReduceMean", ["x"], ["y"], axes=[2, 3], keepdims=0)
+        sizes = {"x": ["n", 3, size, size], "y": ["n", 3]}
+        x, y = (helper.make_tensor_value_info(name, kind, sizes[name]) for name in sizes)
+        graph = helper.make_graph([node], "graph", [x], [y])
         opsets = [helper.make_opsetid("", 13)]
         onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
         classifier = nb.load_classifier(str(path))

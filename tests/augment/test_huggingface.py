@@ -100,11 +100,8 @@ def save(tmp_path):
         torch.manual_seed(0)
         kind = getattr(transformers, name)
         if "detr" in name.lower():
-            options = options | {
-                "backbone_config": transformers.ResNetConfig(
-                    **WIDTHS, embedding_size=16, out_features=["stage2"]
-                )
-            }
+            last = {"embedding_size": 16, "out_features": ["stage2"]}
+            options = options | {"backbone_config": transformers.ResNetConfig(**WIDTHS, **last)}
         if "Mask2" in name:
             stages = {"depths": [1] * 4, "num_heads": [2] * 4, "image_size": SIZE}
             stages |= {"out_features": [f"stage{index}" for index in range(1, 5)]}
@@ -162,12 +159,8 @@ def test_a_classifier_gives_the_scores_of_the_pipeline_of_transformers(name, sav
     expected = {row["label"]: row["score"] for row in pipe(picture, top_k=3)}
     images = as_images(picture).requires_grad_()
     logits = classifier(images)
-    torch.testing.assert_close(
-        logits.softmax(1)[0].detach(),
-        torch.tensor([expected[c] for c in CLASSES]),
-        atol=1e-4,
-        rtol=0,
-    )
+    scores = torch.tensor([expected[c] for c in CLASSES])
+    torch.testing.assert_close(logits.softmax(1)[0].detach(), scores, atol=1e-4, rtol=0)
     (gradient,) = torch.autograd.grad(logits[0, 0], images)
     assert gradient.abs().max() > 0
 

@@ -59,16 +59,10 @@ def fit(tmp_path, max_epochs=2, enable_checkpointing=False, ckpt_path=None, **of
     callback = nb.lightning_callback(service)
     data = [(torch.zeros(3, 8, 8), 0)] * 2
     module = Module()
-    trainer = lightning.Trainer(
-        max_epochs=max_epochs,
-        callbacks=[callback],
-        logger=False,
-        enable_checkpointing=enable_checkpointing,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        accelerator="cpu",
-        default_root_dir=tmp_path,
-    )
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+    quiet |= {"enable_checkpointing": enable_checkpointing, "accelerator": "cpu"}
+    options = {"max_epochs": max_epochs, "callbacks": [callback], "default_root_dir": tmp_path}
+    trainer = lightning.Trainer(**options, **quiet)
     both = torch.utils.data.ConcatDataset([data, callback.renders])
     trainer.fit(module, DataLoader(both, batch_size=6, **of_loader), ckpt_path=ckpt_path)
     return service, module

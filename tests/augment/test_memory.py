@@ -57,15 +57,9 @@ def test_attacks_on_light_take_half_to_all_of_the_memory_they_require(monkeypatc
     monkeypatch.setattr(errors, "require_memory", lambda *arguments: required.append(arguments[1]))
     settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=1))
     settings.vary.camera = camera
-    service = AugmentationService.from_meshes(
-        [("solid:orange:0", 0)],
-        32,
-        settings,
-        views=2,
-        backgrounds=[row / 128 for row in range(128)],
-        samples=1,
-        rasterizer="numpy",
-    )
+    grays = [row / 128 for row in range(128)]
+    shown = {"views": 2, "backgrounds": grays, "samples": 1, "rasterizer": "numpy"}
+    service = AugmentationService.from_meshes([("solid:orange:0", 0)], 32, settings, **shown)
     model = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 2))
     peak = peak_memory(lambda: to_bytes(service.regenerate(model, 0).images))
     assert required[-1] / 2 < peak <= required[-1]

@@ -69,14 +69,10 @@ def test_an_attack_hides_objects_and_draws_random_light_for_images_without_a_cla
 def test_all_objects_of_an_image_are_targets_except_those_without_a_class():
     names = ("bottle", "cup", "")
     others = [nb.ObjectSettings(f"solid:{name or 'ball'}", label=name) for name in names]
-    service = AugmentationService.from_meshes(
-        [others],
-        SIZE,
-        AugmentationSettings(mode="random"),
-        task=Detection(),
-        classes=CLASSES,
-        **{"views": 1, "samples": 1, "backgrounds": [0.5], "width": 8, "rasterizer": "numpy"},
-    )
+    settings = AugmentationSettings(mode="random")
+    scene = {"views": 1, "samples": 1, "backgrounds": [0.5], "width": 8, "rasterizer": "numpy"}
+    options = {"task": Detection(), "classes": CLASSES, **scene}
+    service = AugmentationService.from_meshes([others], SIZE, settings, **options)
     (target,) = service.regenerate(BrightBox((0, 0, SIZE, SIZE)), 0).targets
     assert target["labels"].tolist() == [2, 1]
     corners = masks_to_boxes(target["masks"]) + torch.tensor([0, 0, 1, 1])

@@ -32,9 +32,7 @@ BALL = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
 SUBJECT = SceneObject("orange", Mesh.plain(BALL.vertices, BALL.faces, (0.5, 0.4, 0.3)), name="ball")
 
 
-def classify_by_brightness(
-    gray: float = 0.2, name: str = "source", rows: slice = slice(4, 8)
-) -> Classifier:
+def classify_by_brightness(gray=0.2, name="source", rows=slice(4, 8)) -> Classifier:
     """Make a classifier that predicts an orange if a square of an image is brighter than `gray`."""
 
     def logits(images: Tensor) -> Tensor:

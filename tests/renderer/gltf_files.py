@@ -23,16 +23,9 @@ SQUARE_FACES = np.uint16([0, 1, 2, 0, 2, 3])
 class Gltf:
     def __init__(self) -> None:
         self.buffer = b""
-        self.tree: dict[str, Any] = {
-            "asset": {"version": "2.0"},
-            "nodes": [{"mesh": 0}],
-            "scenes": [{"nodes": [0]}],
-            "scene": 0,
-            "accessors": [],
-            "bufferViews": [],
-            "materials": [],
-            "meshes": [],
-        }
+        self.tree: dict[str, Any] = {"asset": {"version": "2.0"}, "nodes": [{"mesh": 0}]}
+        self.tree |= {"scenes": [{"nodes": [0]}], "scene": 0}
+        self.tree |= {name: [] for name in ("accessors", "bufferViews", "materials", "meshes")}
 
     def view(self, content: bytes, **entries: Any) -> int:
         """Append bytes to the buffer, and return the index of their view."""
@@ -45,25 +38,17 @@ class Gltf:
     def array(self, values: np.ndarray, normalized: bool = False) -> int:
         values = np.asarray(values)
         width = values[0].size
-        accessor = {
-            "bufferView": self.view(values.tobytes()),
-            "componentType": TYPES.get(values.dtype.name, 5126),
-            "count": len(values),
-            "type": KINDS[width],
-            "normalized": normalized,
-        }
+        accessor = {"bufferView": self.view(values.tobytes()), "count": len(values)}
+        accessor |= {"componentType": TYPES.get(values.dtype.name, 5126), "normalized": normalized}
+        accessor["type"] = KINDS[width]
         self.tree["accessors"].append(accessor)
         return len(self.tree["accessors"]) - 1
 
     def sparse(self, index: int, rows: np.ndarray, values: np.ndarray) -> None:
-        self.tree["accessors"][index]["sparse"] = {
-            "count": len(rows),
-            "indices": {
-                "bufferView": self.view(rows.tobytes()),
-                "componentType": TYPES[rows.dtype.name],
-            },
-            "values": {"bufferView": self.view(values.tobytes())},
-        }
+        indices = {"bufferView": self.view(rows.tobytes()), "componentType": TYPES[rows.dtype.name]}
+        sparse = {"count": len(rows), "indices": indices}
+        sparse["values"] = {"bufferView": self.view(values.tobytes())}
+        self.tree["accessors"][index]["sparse"] = sparse
 
     def mesh(self, attributes, indices=None, **entries) -> dict[str, Any]:
         """Append a mesh with one primitive, and return the primitive."""

@@ -70,9 +70,7 @@ LOG = (
 def made_up_run(tiny) -> Callable[..., Path]:
     """Return a function that writes a finished run without checkpoints, with these summaries."""
 
-    def make(
-        folder: Path, method: str = "none", photographs: dict | None = None, *overrides: str
-    ) -> Path:
+    def make(folder: Path, method="none", photographs=None, *overrides: str) -> Path:
         write_config(folder, tiny(f"augment={method}", "seed=0", *overrides))
         (folder / "metrics.jsonl").write_text(LOG)
         for name, summary in (photographs or {}).items():

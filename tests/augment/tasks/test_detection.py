@@ -64,11 +64,8 @@ def test_a_score_at_the_threshold_counts_and_one_below_does_not():
 
 
 def test_a_target_is_reached_by_its_own_box_alone():
-    item = {
-        "boxes": TRUE_BOX.expand(2, 4),
-        "labels": torch.tensor([1, 0]),
-        "scores": torch.tensor([0.9, 0.5]),
-    }
+    item = {"boxes": TRUE_BOX.expand(2, 4), "labels": torch.tensor([1, 0])}
+    item["scores"] = torch.tensor([0.9, 0.5])
     for target, expected in ((1, True), (2, False)):
         rule = criterion(target=target, goal="mislabel")
         evidence = rule.evidence([item])

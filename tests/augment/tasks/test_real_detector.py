@@ -24,14 +24,10 @@ def test_light_hides_an_orange_from_fastestdet_within_a_few_steps():
     meshes = [(str(DATA / "meshes/orange_studio.glb"), "orange")]
     scene = nb.build_scene(meshes, size=SIZE, views=4, light="grace", width=3.0)
     light = nb.StepSettings(step_size=0.25, radius=2.0)
-    result = nb.attack(
-        FastestDet(DATA / "weights/fastestdet_coco.onnx").eval(),
-        scene,
-        task=nb.Detection(decode=decode),
-        settings=nb.AttackSettings(lighting=light, max_steps=30, margin=0.0),
-        classes=names,
-        force=True,
-    )
+    network = FastestDet(DATA / "weights/fastestdet_coco.onnx").eval()
+    settings = nb.AttackSettings(lighting=light, max_steps=30, margin=0.0)
+    options = {"task": nb.Detection(decode=decode), "settings": settings, "classes": names}
+    result = nb.attack(network, scene, force=True, **options)
     # From one side, the detector takes the orange for an apple.
     assert result.clean_correct.sum() == 3
     assert torch.equal(result.success, result.clean_correct)

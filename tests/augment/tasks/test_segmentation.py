@@ -52,12 +52,9 @@ def bright(images: Tensor) -> Tensor:
 def test_an_attack_darkens_an_object_until_its_segment_is_lost(wrap):
     scene = nb.build_scene([("solid:ball", "ball")], size=SIZE, backgrounds=[0.0])
     light = nb.StepSettings(step_size=0.3)
-    result = nb.attack(
-        lambda images: wrap(bright(images)),
-        scene,
-        settings=nb.AttackSettings(lighting=light, max_steps=60, margin=0.1),
-        classes=["dark", "ball"],
-    )
+    options = {"settings": nb.AttackSettings(lighting=light, max_steps=60, margin=0.1)}
+    options["classes"] = ["dark", "ball"]
+    result = nb.attack(lambda images: wrap(bright(images)), scene, **options)
     mask = scene.truth(lambda label: 1).masks[0, 0, 0]
     kept = (result.images[0].mean(0) > 0.15) & mask
     assert result.clean_correct.all() and result.success.all()

@@ -22,13 +22,7 @@ AREAS = (16 - 6, 2, 12)
 
 
 def write_ply(
-    path: Path,
-    form: str,
-    faces: list[list[int]] | tuple[list[int], ...] = FACES,
-    position: str = "float",
-    length: str = "uchar",
-    index: str = "int",
-    line_break: str = "\n",
+    path: Path, form, faces=FACES, position="float", length="uchar", index="int", line_break="\n"
 ) -> Path:
     """Write the vertices and faces as ASCII or with struct, without a library for .ply files."""
     lines = ["ply", f"format {form} 1.0", "comment end_header", f"element vertex {len(VERTICES)}"]

@@ -10,7 +10,7 @@ from oracles import draw
 import renderer
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
-from renderer.light.basis import HARMONICS, Basis, SumBasis
+from renderer.light.basis import HARMONICS, SumBasis
 from renderer.light.lamps import Projector
 from renderer.mesh import Mesh
 from renderer.operators.build import build_operators
@@ -28,13 +28,8 @@ PLAIN = Mesh.plain(PEAR.vertices, PEAR.faces, (0.8, 0.4, 0.1))
 
 
 def operators_of(
-    mesh: Mesh = PEAR,
-    basis: Basis = HARMONICS,
-    dtype: torch.dtype = torch.float64,
-    size: int = SIZE,
-    gloss: Gloss | None = None,
-    encoding: str = "linear",
-) -> TransferOperators:
+    mesh=PEAR, basis=HARMONICS, dtype=torch.float64, size=SIZE, gloss=None, encoding="linear"
+):
     settings = ImageSettings(size, 2, encoding)
     operators = build_operators(
         mesh, CAMERAS, settings, choose("numpy"), basis=basis, dtype=dtype, gloss=gloss

@@ -279,11 +279,8 @@ def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None
     for kind in lights.KINDS:
         counts = {"correct": 4, "adversarial": adversarial}
         (folder / f"{kind}.json").write_text(json.dumps(counts))
-    scores = {
-        "label": "orange",
-        "recall": asdict(fraction(hits, n)),
-        "false_positive_rate": asdict(fraction(0, n)),
-    }
+    rates = {"recall": fraction(hits, n), "false_positive_rate": fraction(0, n)}
+    scores = {"label": "orange"} | {name: asdict(rate) for name, rate in rates.items()}
     (folder / LABORATORY).mkdir()
     (folder / LABORATORY / "summary.json").write_text(json.dumps(scores))
 
@@ -306,14 +303,6 @@ def test_the_answer_of_an_audit(tmp_path, hits, n, adversarial, answer):
     write_parts(tmp_path, hits, n, adversarial)
     text = AuditedNetwork("orange", "dark", tmp_path).answer
     assert text.startswith(f"Is dark safe under unusual lighting? {answer}")
-
-
-def test_no_interval_of_an_audit_has_zero_width(tmp_path):
-    for is_recognized in (True, False):
-        recognized = {name: [is_recognized] * 5 for name in ("uniform", "random 1")}
-        (tmp_path / RECOGNIZED).write_text(json.dumps(recognized))
-        for rate in AuditedNetwork("orange", "dark", tmp_path).rates.values():
-            assert rate.low < rate.high
 
 
 def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_path):

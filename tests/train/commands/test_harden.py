@@ -1,4 +1,3 @@
-from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
 
@@ -55,9 +54,7 @@ def photographs(tmp_path) -> Path:
     return tmp_path / "photographs"
 
 
-def harden(
-    network: nn.Module, photographs: Path, meshes: Sequence[object] = ("solid:orange:0",), **options
-) -> nn.Module:
+def harden(network, photographs, meshes=("solid:orange:0",), **options) -> nn.Module:
     given = {"classes": CLASSES, "size": SIZE, "hard_negatives": ["solid:lemon"]} | SHORT | options
     return nb.harden(network, meshes, photographs, **given)
 

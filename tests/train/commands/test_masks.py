@@ -73,12 +73,9 @@ def test_float_masks_of_zero_and_one_and_turned_masks_mark_the_object(tmp_path):
 def test_soft_edges_keep_their_coverage(tmp_path):
     soft = WHITE_ON_BLACK.copy()
     soft[2] //= 2
-    for image in (
-        Image.fromarray(soft),
-        Image.fromarray(soft.astype(np.uint16) * 257),
-        Image.fromarray(np.dstack([np.full((12, 16, 3), 90, np.uint8), soft])),
-    ):
-        path = save(tmp_path / "mask.png", image)
+    cut_out = np.dstack([np.full((12, 16, 3), 90, np.uint8), soft])
+    for pixels in (soft, soft.astype(np.uint16) * 257, cut_out):
+        path = save(tmp_path / "mask.png", Image.fromarray(pixels))
         np.testing.assert_array_equal(read_mask(path, 12, 16), soft)
 
 

@@ -247,13 +247,9 @@ def start_sweep(folder: Path, *overrides: str) -> subprocess.Popen:
     environment.pop("SUBMITIT_EXECUTOR", None)
     arguments = ["-m", "train", "-v", "--multirun", *SMALL, f"sweep={folder}", *overrides]
     with open(folder.parent / "output.txt", "w") as output:
-        return subprocess.Popen(
-            [sys.executable, *arguments],
-            cwd=folder.parent,
-            env=environment,
-            stdout=output,
-            stderr=output,
-        )
+        command = [sys.executable, *arguments]
+        options = {"cwd": folder.parent, "env": environment, "stdout": output, "stderr": output}
+        return subprocess.Popen(command, **options)
 
 
 def child_of(process_id: int) -> int:
@@ -281,6 +277,5 @@ def test_a_preempted_job_of_submitit_queues_itself_again_and_ends_with_the_same_
     assert "resumed" in log.read_text()
 
     assert run_sweep(tmp_path / "undisturbed", epochs) == 0
-    require_same_weights(
-        folder_of(tmp_path / "jobs", epochs), folder_of(tmp_path / "undisturbed", epochs)
-    )
+    folders = (folder_of(tmp_path / name, epochs) for name in ("jobs", "undisturbed"))
+    require_same_weights(*folders)

@@ -3,7 +3,7 @@
 import csv
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -25,12 +25,8 @@ from train.laboratory.shots import FOV, Shot, draw_shots
 
 pytest.importorskip("mitsuba")
 
-MESHES = [
-    "solid:orange:7",
-    {"mesh": "solid:orange:8", "albedo_scale": 0.5},
-    "solid:lemon:7",
-    "solid:pear:7",
-]
+SCALED = {"mesh": "solid:orange:8", "albedo_scale": 0.5}
+MESHES = ["solid:orange:7", SCALED, "solid:lemon:7", "solid:pear:7"]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -46,14 +42,8 @@ def settings(out: Path, **changes) -> LabSettings:
 
 
 def draw(
-    setups: int,
-    families: Sequence[str],
-    brightness: tuple[float, float] = (0.2, 2.5),
-    seed: int = 0,
-    environments: dict[str, np.ndarray] | None = None,
-    pictures: Sequence[np.ndarray] = (),
-    **changes,
-) -> list[Shot]:
+    setups, families, brightness=(0.2, 2.5), seed=0, environments=None, pictures=(), **changes
+):
     maps = environments or {}
     changes |= {"patterns": [*families], "environments": [*maps], "brightness": [*brightness]}
     lab_settings = LabSettings("out", setups=setups, seed=seed, **changes)
@@ -249,19 +239,10 @@ def frontal(**changes) -> Shot:
     (shot,) = draw(1, ["solid"], (1, 1))
     center = np.array([0, 0, 1.0])
     front = np.array([0, -6.0, 1.0])
-    shot = replace(
-        shot,
-        patterns=[np.ones((4, 4, 3), np.float32)],
-        projectors=[front],
-        ambient=np.zeros(3),
-        table=np.zeros(3),
-        camera=front,
-        center=center,
-        aim=center,
-        rotation=np.eye(3),
-        scale=1.0,
-    )
-    return replace(shot, **changes)
+    white = {"patterns": [np.ones((4, 4, 3), np.float32)], "projectors": [front]}
+    black = {"ambient": np.zeros(3), "table": np.zeros(3)}
+    pose = {"camera": front, "center": center, "aim": center, "rotation": np.eye(3), "scale": 1.0}
+    return replace(shot, **white | black | pose | changes)
 
 
 def card(texture: np.ndarray) -> Mesh:
@@ -334,10 +315,7 @@ def test_a_wall_that_faces_projectors_has_the_color_of_the_table_times_the_brigh
 
 
 def test_a_texture_lies_upright_on_its_faces():
-    red = [220, 0, 0]
-    green = [0, 220, 0]
-    blue = [0, 0, 220]
-    white = [220, 220, 220]
+    red, green, blue, white = [220, 0, 0], [0, 220, 0], [0, 0, 220], [220, 220, 220]
     quarters = np.array([[red, green], [blue, white]], dtype=np.uint8)
     texture = quarters.repeat(8, axis=0).repeat(8, axis=1)
     image = path_traced(lab_parts(card(texture), 1.0), frontal(), 16, 16, bounces=1, seed=0)

@@ -1,7 +1,7 @@
 import csv
 import json
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 
@@ -37,9 +37,7 @@ class TableModel(torch.nn.Module):
 def known_model(tmp_path) -> Callable[..., tuple[TableModel, list[str], Path]]:
     """Return a function that makes a model, its classes, and images with the given logits."""
 
-    def make(
-        names: Sequence[str], logits: Sequence, classes: list[str]
-    ) -> tuple[TableModel, list[str], Path]:
+    def make(names, logits, classes) -> tuple[TableModel, list[str], Path]:
         folder = tmp_path / "photos"
         for red, name in enumerate(names):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -115,15 +113,7 @@ def no_figure(monkeypatch) -> None:
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_: None)
 
 
-def scored(
-    model: Callable,
-    classes: list[str],
-    folder: Path,
-    label: str | list[str],
-    out: Path,
-    skip_unreadable: bool = False,
-    **options,
-) -> scoring.Scores:
+def scored(model, classes, folder, label, out, skip_unreadable=False, **options) -> scoring.Scores:
     """Write scores into a folder, as pnb-evaluate does with options, or as pnb-train without."""
     predictor = scoring.Predictor(model, classes)
     if not options:
@@ -401,24 +391,15 @@ def test_columns_of_any_class_name_are_read_bit_by_bit(tmp_path):
 
 # Colors of the frames of true positives, false negatives and false positives.
 FRAMES = [(46, 158, 91), (208, 59, 59), (232, 163, 23)]
-FRAMED = IMAGE_SIZE + 2 * FRAME_WIDTH
-
-
-def count_frames(sheet: Image.Image) -> list[int]:
-    pixels = np.asarray(sheet)
-    counts = []
-    for color in FRAMES:
-        area = int((pixels == color).all(axis=2).sum())
-        count, remainder = divmod(area, FRAMED**2 - IMAGE_SIZE**2)
-        assert remainder == 0
-        counts.append(count)
-    return counts
+FRAME_AREA = (IMAGE_SIZE + 2 * FRAME_WIDTH) ** 2 - IMAGE_SIZE**2
 
 
 def test_the_contact_sheet_frames_each_hit_miss_and_false_positive(fruit, tmp_path):
     evaluate(*fruit, "orange", tmp_path)
     with Image.open(tmp_path / "contact_sheet.png") as sheet:
-        assert count_frames(sheet) == [1, 4, 2]
+        pixels = np.asarray(sheet)
+    areas = np.array([(pixels == color).all(axis=2).sum() for color in FRAMES])
+    assert (areas / FRAME_AREA).tolist() == [1, 4, 2]
 
 
 def test_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both_kinds(fruit, tmp_path):

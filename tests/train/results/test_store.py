@@ -56,12 +56,8 @@ def folder(tmp_path_factory, made_up_run) -> Path:
     """Make up runs with recalls 0.2, 0.4 and 0.9 of 3 epochs, and of 0.5 of 9 epochs."""
     folder = tmp_path_factory.mktemp("seeds")
     for hits, *overrides in (2, "seed=0"), (4, "seed=1"), (9, "seed=2"), (5, "train.epochs=9"):
-        summary = {
-            "images": "same",
-            "label": "orange",
-            "recall": asdict(fraction(hits, 10)),
-            "false_positive_rate": asdict(fraction(1, 10)),
-        }
+        summary = {"images": "same", "label": "orange", "recall": asdict(fraction(hits, 10))}
+        summary["false_positive_rate"] = asdict(fraction(1, 10))
         made_up_run(folder / str(hits), "random", {"lab": summary}, *overrides)
     return folder
 

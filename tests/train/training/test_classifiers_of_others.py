@@ -71,12 +71,7 @@ def almost_fixed(tuned) -> tuple[Path, dict[str, float]]:
     return tuned("unlabeled", ALMOST_FIXED, "train.epochs=2")
 
 
-def normalized_logits(
-    network: nn.Module,
-    images: Tensor,
-    mean: tuple[float, ...] = IMAGENET_MEAN,
-    std: tuple[float, ...] = IMAGENET_STD,
-) -> Tensor:
+def normalized_logits(network, images, mean=IMAGENET_MEAN, std=IMAGENET_STD) -> Tensor:
     mean_of_channel = torch.tensor(mean).view(3, 1, 1)
     std_of_channel = torch.tensor(std).view(3, 1, 1)
     with torch.no_grad():

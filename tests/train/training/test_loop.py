@@ -54,11 +54,7 @@ def color_network() -> nn.Sequential:
 
 
 def make_trainer(
-    folder: Path,
-    network: nn.Module | None = None,
-    precision: str = "float32",
-    has_initial: bool = True,
-    **settings,
+    folder, network=None, precision="float32", has_initial=True, **settings
 ) -> Trainer:
     torch.manual_seed(0)
     network = network or WideResNet(3, 10, 1, dropout=0.0)

@@ -68,9 +68,7 @@ def act_at(monkeypatch, round_number: int, step: int, act: Callable[[], None]) -
     monkeypatch.setattr(loop, "training_batches", acting)
 
 
-def train_with_signal(
-    settings, folder: Path, round_number: int, step: int, number: signal.Signals
-) -> None:
+def train_with_signal(settings, folder: Path, round_number, step, number) -> None:
     with pytest.MonkeyPatch.context() as patch:
         act_at(patch, round_number, step, lambda: signal.raise_signal(number))
         completed_run(settings, folder)
