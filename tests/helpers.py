@@ -47,16 +47,12 @@ def save_noise(path: Path, rng: np.random.Generator, shape=(20, 24), low=0, high
 
 def save_colored_noise(path: Path, rng: np.random.Generator, contrast: int) -> None:
     """Save a data set of 60 training and 30 test images of three classes."""
-    train_labels = np.repeat(np.arange(3), 20)
-    test_labels = np.repeat(np.arange(3), 10)
-    np.savez(
-        path,
-        classes=np.array(FRUIT),
-        train_images=colored_noise(train_labels, rng, contrast),
-        train_labels=train_labels,
-        test_images=colored_noise(test_labels, rng, contrast),
-        test_labels=test_labels,
-    )
+    arrays = {"classes": np.array(FRUIT)}
+    for part, count in (("train", 20), ("test", 10)):
+        labels = np.repeat(np.arange(3), count)
+        images = colored_noise(labels, rng, contrast)
+        arrays |= {f"{part}_labels": labels, f"{part}_images": images}
+    np.savez(path, **arrays)
 
 
 def find_red(images):

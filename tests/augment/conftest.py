@@ -105,7 +105,7 @@ OTHER_STEPS = augment.StepSettings(step_size=0.1)
 LAMPS = augment.LampsSettings([[2, 2, 2], [-2, 2, 2]], start=0.5)
 PROJECTOR = augment.ProjectorSettings(pixels=4, pattern=0.2)
 # The local light that the attack on each of these parameters requires in the scene.
-REQUIRED_LIGHTS = dict.fromkeys(("lamps", "positions"), {"lamps": LAMPS})
+REQUIRED_LIGHTS = {name: {"lamps": LAMPS} for name in ("lamps", "positions")}
 REQUIRED_LIGHTS["projector"] = {"projector": PROJECTOR}
 
 

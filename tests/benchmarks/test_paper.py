@@ -89,20 +89,13 @@ def test_a_script_appends_records_whose_table_has_all_rows(
 
 
 def test_the_change_of_light_is_a_mean_over_the_renders_that_are_attacked(tmp_path):
-    # Renders that are misclassified before the attack count as successes in the
-    # log, with a change and steps of 0.
-    before_after_change_steps = [(1.0, 1.0, 0.0, 0.0), (0.25, 1.0, 0.3, 6.0), (0.0, 0.5, 0.4, 9.0)]
-    lines = [
-        {
-            "epoch": epoch,
-            "augment/attack_success_before": before,
-            "augment/attack_success": after,
-            "augment/light_change": change,
-            "augment/steps": steps,
-        }
-        for epoch, (before, after, change, steps) in enumerate(before_after_change_steps, 1)
-    ]
-    lines.append({"test/accuracy": 0.5})
+    # Renders that are misclassified before the attack count as successes, with 0 change and steps.
+    names = ("attack_success_before", "attack_success", "light_change", "steps")
+    values = [(1.0, 1.0, 0.0, 0.0), (0.25, 1.0, 0.3, 6.0), (0.0, 0.5, 0.4, 9.0)]
+    lines = [{"test/accuracy": 0.5}]
+    for epoch, row in enumerate(values, 1):
+        logged = {f"augment/{name}": value for name, value in zip(names, row, strict=True)}
+        lines.insert(-1, {"epoch": epoch} | logged)
     text = "".join(json.dumps(line) + "\n" for line in lines)
     (tmp_path / "metrics.jsonl").write_text(text)
 

@@ -75,15 +75,12 @@ def patchwork(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> Mesh:
     dents = rng.uniform(0.7, 1, (len(vertices), 1))
     colors = rng.uniform(0.1, 1, (face_count, 3, 3))
     uvs = rng.uniform(-1, 2, (face_count, 3, 2))
-    large_texture = rng.integers(0, 256, (3, 4, 3), dtype=np.uint8)
-    small_texture = rng.integers(0, 256, (2, 3, 3), dtype=np.uint8)
-    return replace(
-        Mesh.plain(vertices * dents, faces),
-        corner_colors=colors.astype(np.float32),
-        corner_uvs=uvs.astype(np.float32),
-        texture_ids=np.arange(face_count, dtype=np.int32) % 3 - 1,
-        textures=(large_texture, small_texture),
-    )
+    sizes = ((3, 4, 3), (2, 3, 3))
+    textures = tuple(rng.integers(0, 256, size, dtype=np.uint8) for size in sizes)
+    ids = np.arange(face_count, dtype=np.int32) % 3 - 1
+    corners = {"corner_colors": np.float32(colors), "corner_uvs": np.float32(uvs)}
+    plain = Mesh.plain(vertices * dents, faces)
+    return replace(plain, **corners, texture_ids=ids, textures=textures)
 
 
 def textured(mesh: Mesh, uvs: ArrayLike, texture: np.ndarray, texture_ids=0) -> Mesh:

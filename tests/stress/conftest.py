@@ -94,15 +94,9 @@ def run_here(name: str, *arguments: str, folder: Path) -> int:
 def start_command(*arguments, folder, limit=None, **environment) -> Process:
     """Start `python` with these arguments in a process that calls `limit` first."""
     defaults = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        [sys.executable, *arguments],
-        cwd=folder,
-        env=os.environ | defaults | environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=limit,
-    )
+    options = {"cwd": folder, "env": os.environ | defaults | environment, "preexec_fn": limit}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, *arguments], **options, **pipes)
 
 
 def end(process: Process) -> tuple[int, str, str]:

@@ -11,13 +11,9 @@ from train.checkpoints import load, load_newest, save
 from train.data.sets import content_hash
 from train.run_folder import BEST, LAST, PREVIOUS
 
-STATE = {
-    "model": {"weight": torch.arange(6.0).reshape(2, 3), "steps": torch.tensor(3)},
-    "architecture": {"classes": ["fig", "lime"]},
-    "epoch": 3,
-    "history": [{"epoch": 1, "train/loss": 0.25}],
-    "random": [torch.arange(500)],
-}
+WEIGHTS = {"weight": torch.arange(6.0).reshape(2, 3), "steps": torch.tensor(3)}
+STATE = {"model": WEIGHTS, "architecture": {"classes": ["fig", "lime"]}, "epoch": 3}
+STATE |= {"history": [{"epoch": 1, "train/loss": 0.25}], "random": [torch.arange(500)]}
 
 
 class Harmful:

@@ -62,20 +62,12 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
 
 def nearest_distance(name: str, radius: float, *points: np.ndarray) -> float:
     point, center, low, high = points
-    ball = {
-        "type": "ineq",
-        "fun": lambda x: radius**2 - ((x - center) ** 2).sum(),
-        "jac": lambda x: 2 * (center - x),
-    }
-    found = optimize.minimize(
-        lambda x: ((x - point) ** 2).sum(),
-        center,
-        jac=lambda x: 2 * (x - point),
-        bounds=optimize.Bounds(low.clip(center - radius), high.clip(max=center + radius)),
-        constraints=[ball] if name == "l2" else [],
-        method="SLSQP",
-        options={"ftol": 1e-12},
-    )
+    ball = {"type": "ineq", "fun": lambda x: radius**2 - ((x - center) ** 2).sum()}
+    ball["jac"] = lambda x: 2 * (center - x)
+    options = {"constraints": [ball] if name == "l2" else [], "method": "SLSQP"}
+    options["bounds"] = optimize.Bounds(low.clip(center - radius), high.clip(max=center + radius))
+    options |= {"jac": lambda x: 2 * (x - point), "options": {"ftol": 1e-12}}
+    found = optimize.minimize(lambda x: ((x - point) ** 2).sum(), center, **options)
     return math.sqrt(found.fun)
 
 

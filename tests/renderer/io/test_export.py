@@ -32,13 +32,9 @@ def painted(mesh: Mesh, textures: int, seed: int = 0) -> Mesh:
     uvs = rng.uniform(-1, 2, (face_count, 3, 2)).astype(np.float32)
     colors = rng.random((face_count, 3, 3), dtype=np.float32)
     shapes = [(8, 4 + number, 3) for number in range(textures)]
-    return replace(
-        mesh,
-        corner_colors=colors,
-        corner_uvs=np.where((ids < 0)[:, None, None], 0, uvs),
-        texture_ids=ids,
-        textures=tuple(rng.integers(0, 256, shape, dtype=np.uint8) for shape in shapes),
-    )
+    drawn = tuple(rng.integers(0, 256, shape, dtype=np.uint8) for shape in shapes)
+    uvs = np.where((ids < 0)[:, None, None], 0, uvs)
+    return replace(mesh, corner_colors=colors, corner_uvs=uvs, texture_ids=ids, textures=drawn)
 
 
 def box() -> Mesh:

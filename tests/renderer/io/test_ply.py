@@ -69,12 +69,9 @@ def test_all_encodings_of_a_ply_give_the_same_mesh(tmp_path, form, types, line_b
     assert_array_equal(np.unique(mesh.vertices, axis=0), np.unique(VERTICES, axis=0))
     areas = np.add.reduceat(mesh.face_areas(), [0, 3, 4])
     assert_allclose(areas, AREAS)
-    found = {
-        tuple(corner): tuple(np.rint(255 * color))
-        for corner, color in zip(
-            mesh.vertices[mesh.faces].reshape(-1, 3), mesh.corner_colors.reshape(-1, 3), strict=True
-        )
-    }
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+    colors = np.rint(255 * mesh.corner_colors).reshape(-1, 3)
+    found = {tuple(corner): tuple(color) for corner, color in zip(corners, colors, strict=True)}
     assert found == {tuple(v): tuple(c) for v, c in zip(VERTICES, COLORS, strict=True)}
 
 

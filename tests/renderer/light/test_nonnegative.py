@@ -56,15 +56,10 @@ def best_on_grid(target, weights, start, grid, **options) -> float:
     """
     [constraint] = options.pop("constraints", [None])
     radiance = {"type": "ineq", "fun": lambda values: grid @ values, "jac": lambda values: grid}
-    found = optimize.minimize(
-        lambda values: (weights**2 * (values - target) ** 2).sum(),
-        start,
-        jac=lambda values: 2 * weights**2 * (values - target),
-        constraints=[radiance, constraint] if constraint else [radiance],
-        method="SLSQP",
-        options={"ftol": 1e-12, "maxiter": 200},
-        **options,
-    )
+    options["constraints"] = [radiance, constraint] if constraint else [radiance]
+    options |= {"method": "SLSQP", "options": {"ftol": 1e-12, "maxiter": 200}}
+    options["jac"] = lambda x: 2 * weights**2 * (x - target)
+    found = optimize.minimize(lambda x: (weights**2 * (x - target) ** 2).sum(), start, **options)
     return math.sqrt(found.fun)
 
 

@@ -31,14 +31,10 @@ def _write_coco(file, names=("a.png",), size=(80, 40), box=BOX, **changes):
     if size:
         images = [image | {"width": size[0], "height": size[1]} for image in images]
     bbox = [box[0], box[1], box[2] - box[0], box[3] - box[1]]
-    content = {
-        "images": images,
-        "categories": [{"id": 3, "name": "cat"}, {"id": 90, "name": "dog"}],
-        "annotations": [
-            {"id": index, "image_id": image["id"], "category_id": 90, "bbox": bbox, "iscrowd": 0}
-            for index, image in enumerate(images)
-        ],
-    }
+    marked = {"category_id": 90, "bbox": bbox, "iscrowd": 0}
+    annotations = [{"id": index, "image_id": 7 + index, **marked} for index in range(len(images))]
+    categories = [{"id": 3, "name": "cat"}, {"id": 90, "name": "dog"}]
+    content = {"images": images, "categories": categories, "annotations": annotations}
     file.write_text(json.dumps(content | changes))
 
 

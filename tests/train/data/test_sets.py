@@ -15,13 +15,10 @@ from train.data import sets
 def arrays(**changes) -> dict[str, np.ndarray]:
     """Make the arrays of an .npz file of two classes, with changes. None removes an array."""
     rng = np.random.default_rng(0)
-    good = {
-        "train_images": rng.integers(0, 256, (5, 3, 8, 8), dtype=np.uint8),
-        "train_labels": np.array([0, 1, 1, 0, 1]),
-        "test_images": rng.integers(0, 256, (2, 3, 8, 8), dtype=np.uint8),
-        "test_labels": np.array([1, 0]),
-        "classes": np.array(["lime", "fig"]),
-    }
+    good = {"classes": np.array(["lime", "fig"])}
+    for part, labels in (("train", [0, 1, 1, 0, 1]), ("test", [1, 0])):
+        images = rng.integers(0, 256, (len(labels), 3, 8, 8), dtype=np.uint8)
+        good |= {f"{part}_images": images, f"{part}_labels": np.array(labels)}
     return {name: array for name, array in (good | changes).items() if array is not None}
 
 

@@ -57,15 +57,9 @@ def page(tmp_path_factory) -> Path:
         (folder / "lab" / label).mkdir(parents=True)
         for name, color in {"black": "black", "gray": "#808080"}.items():
             Image.new("RGB", (8, 8), color).save(folder / "lab" / label / f"{name}.png")
-    settings = AuditSettings(
-        network="original",
-        meshes=["solid:orange:0"],
-        laboratory=str(folder / "lab"),
-        environments=[],
-        budget=0.1,
-        device="cpu",
-        out=str(folder / "out"),
-    )
+    given = {"network": "original", "meshes": ["solid:orange:0"], "environments": []}
+    folders = {"laboratory": str(folder / "lab"), "out": str(folder / "out")}
+    settings = AuditSettings(**given, **folders, budget=0.1, device="cpu")
     networks = {
         "classifier": darker_than(0.52, name="original", scale=20),
         "hardened": darker_than(0.45, name="hardened", scale=20),

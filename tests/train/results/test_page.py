@@ -61,13 +61,10 @@ SUCCESSFUL_EXAMPLE = {
 def write_attack(folder: Path) -> None:
     folder.mkdir(parents=True)
     unsuccessful = SUCCESSFUL_EXAMPLE | {"success": False, "success_without_noise": False}
-    lines = [
-        SUCCESSFUL_EXAMPLE,
-        SUCCESSFUL_EXAMPLE | {"example": 1, "steps": 0, "success_before": True},
-        unsuccessful | {"example": 2},
-        unsuccessful | {"example": 3, "success_without_noise": True},
-        {"checks": {"random_search": 0.5}},
-    ]
+    wrong = SUCCESSFUL_EXAMPLE | {"example": 1, "steps": 0, "success_before": True}
+    noisy = unsuccessful | {"example": 3, "success_without_noise": True}
+    lines = [SUCCESSFUL_EXAMPLE, wrong, unsuccessful | {"example": 2}, noisy]
+    lines.append({"checks": {"random_search": 0.5}})
     (folder / "attack.jsonl").write_text("\n".join(map(json.dumps, lines)))
     Image.new("RGB", (8, 8)).save(folder / "example_000.png")
 
