@@ -544,12 +544,7 @@ def _albumentations(lighting: RandomLighting) -> Any:
 @cache
 def _albumentations_class() -> Any:
     """Define the transform of Albumentations once, as its `from_dict` looks for it by its name."""
-    try:
-        import albumentations
-    except ImportError as error:
-        raise InputError(
-            f"Albumentations cannot be imported ({error}): pip install albumentations==2.0.8"
-        ) from error
+    albumentations = errors.import_package("albumentations", "albumentations==2.0.8")
 
     class Lighting(albumentations.ImageOnlyTransform):  # type: ignore[misc, unused-ignore]
         """Random light on arrays (H, W, C)."""

@@ -8,6 +8,7 @@ them themselves.
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import reprlib
@@ -104,7 +105,31 @@ def keys_of(key: str, settings: object) -> dict[str, str]:
 
 def single_line(error: Exception) -> str:
     """Return the message of an error in one line, or the name of its class if it has none."""
-    return " ".join(str(error).split()) or type(error).__name__
+    message = " ".join(str(error).split()) or type(error).__name__
+    # The message of a missing key is only this key.
+    return f"the entry {message} is missing or unknown" if isinstance(error, KeyError) else message
+
+
+@contextmanager
+def reading(path: str | Path, fault: str, advice: str) -> Iterator[None]:
+    """Name a file in the errors that its content raises, of which a damaged file has many types."""
+    try:
+        yield
+    except InputError as error:
+        # The message may begin with another file of the same folder.
+        if str(error).startswith(str(Path(path).parent)):
+            raise
+        raise InputError(f"{path}: {error}") from error
+    except Exception as error:
+        raise InputError(f"{path} {fault} ({single_line(error)}): {advice}") from error
+
+
+def import_package(name: str, install: str) -> Any:
+    """Import a package that the project needs only for some tasks."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(f"{name} cannot be imported ({error}): pip install {install}") from error
 
 
 def composed(name: str) -> str:

@@ -34,7 +34,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 
 from renderer.camera import Camera
-from renderer.errors import InputError
+from renderer.errors import InputError, import_package
 from renderer.image import decode, encode, to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
@@ -85,11 +85,8 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
     The previous variant is restored at the end of the block. A variant that needs LLVM raises an
     `InputError` without it.
     """
-    try:
-        import drjit
-        import mitsuba as module
-    except ImportError as error:
-        raise InputError("Mitsuba is not installed: run pip install '.[lab]'") from error
+    install = '"parametric-norm-balls[lab]"'
+    drjit, module = (import_package(name, install) for name in ("drjit", "mitsuba"))
     previous = module.variant()
     try:
         module.set_variant(variant)

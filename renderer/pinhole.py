@@ -249,13 +249,8 @@ def load_cameras(path: str | Path, whole: bool = False) -> dict[str, PinholeCame
 def _reading(path: Path) -> Iterator[str]:
     """Read the text of a file for a `with` block, and name the file in errors of the block."""
     errors.require_file(path, "give transforms.json, or a folder with cameras.txt and images.txt")
-    try:
+    with errors.reading(path, "is no file of cameras", "export it again"):
         yield path.read_text(encoding="utf-8-sig")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    # Python raises almost any exception if a file lacks an entry or has a wrong one.
-    except Exception as error:
-        raise InputError(f"{path} is no file of cameras ({error!r}): export it again") from error
 
 
 def _add(values: dict[str, Any], name: str, value: object) -> None:

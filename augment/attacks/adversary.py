@@ -19,7 +19,7 @@ from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.scene import Scene
 from renderer import errors
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.errors import MAX_SCALE, InputError, ShortRepr
+from renderer.errors import MAX_SCALE, ShortRepr
 from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.io.images import gray_or_image, write_image
 from renderer.io.meshes import export_mesh, load_mesh
@@ -297,17 +297,8 @@ def reload(folder: str | Path) -> Adversary:
     folder = errors.as_folder("folder", folder)
     path = folder / DESCRIPTION
     errors.require_file(path, "give a folder that an attack wrote, such as .../example_000")
-    try:
+    with errors.reading(path, "does not describe an adversary", "write it again"):
         return _read_adversary(folder, json.loads(path.read_text(encoding="utf-8")))
-    except InputError as error:
-        # Name the file, unless the message begins with one of this folder.
-        if str(error).startswith(str(folder)):
-            raise
-        raise InputError(f"{path}: {error}") from error
-    # A damaged file, or JSON of another kind, can raise errors of many types here.
-    except Exception as error:
-        reason = f"does not describe an adversary ({errors.single_line(error)})"
-        raise InputError(f"{path} {reason}: write it again") from error
 
 
 def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
@@ -357,14 +348,10 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
 def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
     """Read images from a .npy file."""
     errors.require_file(path, "write the adversary again")
-    try:
+    with errors.reading(path, "cannot be read", "write the adversary again"):
         images = torch.from_numpy(read_numbers(path))
         errors.require_bounded(images=images)
         errors.require_shape("images", images, *shape)
-    # A damaged file may raise many types of errors.
-    except Exception as error:
-        message = f"{path} cannot be read ({errors.single_line(error)}): write the adversary again"
-        raise InputError(message) from error
     return images
 
 

@@ -7,7 +7,6 @@ A candidate is a vector of attack values that is evaluated next.
 - `CMAES`: covariance matrix adaptation (Hansen 2016).
 """
 
-import importlib
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from augment.attack_settings import AttackSettings, StepSettings
 from augment.attacks.objective import Examples, Images, Score, Values
 from augment.random_streams import generator, stream_seed
 from augment.scene.truth import Truth
-from renderer.errors import InputError
+from renderer.errors import import_package
 from renderer.vectors import Ball, nearest_in_box
 
 # Random search multiplies the length of its random changes by GROWTH after an accepted candidate
@@ -413,11 +412,7 @@ class CMAES(Optimizer):
 
     def _strategy(self, seed: int) -> Any:
         """Start an evolution strategy at 0 with standard deviation 1."""
-        try:
-            cma: Any = importlib.import_module("cma")
-        except ImportError as error:
-            advice = 'pip install "parametric-norm-balls[search]"'
-            raise InputError(f"optimizer=cma_es needs cma: {advice}", "optimizer") from error
+        cma = import_package("cma", '"parametric-norm-balls[search]"')
         draws = np.random.default_rng(seed)
         value_count = self.values.shape[1]
         options = {

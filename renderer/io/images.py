@@ -28,7 +28,7 @@ from jaxtyping import Float, UInt8
 from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont, ImageOps, features
 from PIL.TiffImagePlugin import BITSPERSAMPLE, PHOTOMETRIC_INTERPRETATION, TiffImageFile
 
-from renderer.errors import InputError, require_file
+from renderer.errors import InputError, reading, require_file
 from renderer.io.files import atomic_write
 from renderer.settings import REC_709, Size, height_and_width
 
@@ -55,11 +55,8 @@ MAX_STEP = 4
 def read_image(path: str | Path, size: Size) -> Float[Tensor, "3 height width"]:
     """Read the center of an image file, in the shape of `size`, as RGB values in [0, 1]."""
     require_file(path, "give an image file")
-    # Pillow can raise almost any exception for a damaged file.
-    try:
+    with reading(path, "cannot be read as an image", "give another"):
         square = read_center(path, size)
-    except Exception as error:
-        raise InputError(f"{path} cannot be read as an image ({error}): give another") from error
     # Pages of results need no tensors, and do not wait for this import.
     import torch
 

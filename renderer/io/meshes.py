@@ -122,9 +122,6 @@ def read_parts(path: Path, gloss: bool = False) -> list[Part]:
         parts = read(file)
     except Exception as error:
         message = errors.single_line(error)
-        # The message of a missing key is only this key.
-        if isinstance(error, KeyError):
-            message = f"the entry {message} is missing or unknown, so export the mesh again"
         raise InputError(f"{path} cannot be read as a mesh: {message}") from error
     file.warn(stacklevel=3)
     return parts
@@ -182,7 +179,8 @@ def export_mesh(
         aspect: Width of the images of the cameras, divided by their height.
 
     Raises:
-        InputError: If an argument is invalid, or if the file cannot be written.
+        InputError: If an argument is invalid.
+        OSError: If the file cannot be written.
 
     >>> import norm_balls as nb
     >>> apple = nb.normalize(nb.solid("apple"))
@@ -198,11 +196,8 @@ def export_mesh(
     if path.suffix.lower() != ".glb":
         raise InputError(f"{path} cannot be written as a mesh: choose a name that ends in .glb")
     content = _glb(mesh, unit_normals, cameras, len(mesh.faces) if first is None else first, aspect)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write(path, content)
-    except OSError as error:
-        raise InputError(f"the mesh file {path} cannot be written: {error}") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(path, content)
 
 
 class _Tree(dict[str, Any]):

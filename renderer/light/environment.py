@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from renderer.errors import MAX_MAGNITUDE, InputError, require_file
+from renderer.errors import MAX_MAGNITUDE, InputError, reading, require_file
 from renderer.image import to_rec709
 from renderer.io.files import read_numbers, replacing, write_numbers
 from renderer.light.harmonics import basis, equirectangular
@@ -108,17 +108,13 @@ def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
     """
     path = Path(path)
     require_file(path, "give the path of an .npy, .hdr or .exr file")
-    try:
+    with reading(path, "cannot be read as an environment map", "export it again"):
         if path.suffix.lower() == ".npy":
             texels, names = _read_array(path)
             chromaticities: Sequence[float] = REC_709
         else:
             texels, names, chromaticities = _read_image(path)
         radiance = _in_rec709(texels[..., _color_channels(names)], chromaticities)
-    # NumPy and OpenImageIO raise many kinds of errors for a damaged file.
-    except Exception as error:
-        message = str(error).partition("\n")[0]
-        raise InputError(f"environment map {path} cannot be read: {message}") from error
     # NaN is refused, too, because a comparison with NaN is False.
     if not (np.abs(radiance) <= MAX_MAGNITUDE).all():
         raise InputError(
@@ -164,17 +160,13 @@ def write_map(path: str | Path, radiance: Float[Tensor, "H W 3"]) -> None:
     if suffix not in SUFFIXES:
         raise InputError(f"{path} has an unknown suffix: use one of {', '.join(SUFFIXES)}")
     radiance = radiance.detach().cpu().float()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if suffix == ".npy":
-            write_numbers(path, radiance.numpy())
-        elif suffix == ".hdr":
-            _write_image(path, _to_rgbe_precision(radiance), "hdr")
-        else:
-            _write_image(path, radiance, "openexr")
-    # OpenImageIO raises ValueError for a file name that is not UTF-8.
-    except (OSError, ValueError) as error:
-        raise InputError(f"environment map {path} cannot be written: {error}") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if suffix == ".npy":
+        write_numbers(path, radiance.numpy())
+    elif suffix == ".hdr":
+        _write_image(path, _to_rgbe_precision(radiance), "hdr")
+    else:
+        _write_image(path, radiance, "openexr")
 
 
 def _write_image(path: Path, texels: Float[Tensor, "H W 3"], file_format: str) -> None:
@@ -183,7 +175,7 @@ def _write_image(path: Path, texels: Float[Tensor, "H W 3"], file_format: str) -
     with replacing(path) as temporary:
         # The data type "unknown" keeps the float32 values of the image.
         if not image.write(str(temporary), "unknown", file_format):
-            raise OSError(image.geterror())
+            raise OSError(f"{path} cannot be written: {image.geterror()}")
 
 
 def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:

@@ -62,8 +62,9 @@ def save_light(
         all normals. It is 0 for a .json file.
 
     Raises:
-        InputError: If the suffix is of no such file, if the file cannot be written,
-            or if the coefficients have another shape or hold NaN.
+        InputError: If the suffix is of no such file, or if the coefficients have another shape
+            or hold NaN.
+        OSError: If the file cannot be written.
 
     Example:
         >>> import torch
@@ -96,13 +97,10 @@ def save_light(
         return float(harmonics.irradiance_error(physical, coefficients))
     description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
     picture = basis.picture(coefficients)
-    try:
-        atomic_write(path, json.dumps(description, allow_nan=False) + "\n")
-        if picture is not None:
-            image = Image.fromarray(to_bytes(picture.clamp(0, 1)).numpy())
-            write_image(path.with_suffix(".png"), image)
-    except OSError as error:
-        raise InputError(f"light {path} cannot be written: {error}") from error
+    atomic_write(path, json.dumps(description, allow_nan=False) + "\n")
+    if picture is not None:
+        image = Image.fromarray(to_bytes(picture.clamp(0, 1)).numpy())
+        write_image(path.with_suffix(".png"), image)
     return 0.0
 
 
@@ -116,7 +114,7 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
     errors.require_file(path, "give the path of a .json file of coefficients")
     # Classes by the names that files have under "basis".
     kind_of_name = {kind.name: kind for kind in kinds}
-    try:
+    with errors.reading(path, "does not describe a light", "write it again"):
         description = json.loads(path.read_text(encoding="utf-8-sig"))
         if not isinstance(description, dict):
             description = {"basis": HARMONICS.name, "coefficients": description}
@@ -127,10 +125,6 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
             raise InputError(f"basis is {name!r}: give a light with the basis {known}")
         # All other entries are the fields of the class.
         basis = kind_of_name[name](**description)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    except Exception as error:  # A damaged file raises many kinds of errors.
-        raise InputError(f"{path} does not describe a light ({error}): write it again") from error
     # The comparison is False for NaN, so NaN counts as too large.
     is_bounded = bool((coefficients.abs() <= errors.MAX_SCALE).all())
     if coefficients.shape != (basis.size, 3) or not is_bounded:

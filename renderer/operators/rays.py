@@ -27,7 +27,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from renderer.errors import InputError
+from renderer.errors import import_package
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.harmonics import cache_tensors
 from renderer.mesh import Mesh
@@ -234,18 +234,12 @@ class Rays:
     @cached_property
     def _scene(self) -> Any:
         """Embree scene with all faces of the mesh, in which rays are cast."""
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError as error:
-            raise InputError(
-                "shadows need the package embreex, which is not installed: "
-                "pip install embreex, or set shadows=false and use no lamps and no projectors"
-            ) from error
-        scene = EmbreeScene(robust=True)
+        advice = "embreex, or set shadows=false and use no lamps and no projectors"
+        scene = import_package("embreex.rtcore_scene", advice).EmbreeScene(robust=True)
         vertices = self._mesh.vertices.astype(np.float32)
         # The constructor of `TriangleMesh` adds the triangles to the scene.
-        TriangleMesh(scene, vertices, self._mesh.faces.astype(np.int32))
+        meshes = import_package("embreex.mesh_construction", advice)
+        meshes.TriangleMesh(scene, vertices, self._mesh.faces.astype(np.int32))
         return scene
 
     @cached_property

@@ -17,16 +17,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from renderer.errors import InputError
+from renderer.errors import import_package
 from renderer.visibility.numpy import FAR, SUBSAMPLE_BITS, to_fixed_point
 
-try:
-    import numba
-except ImportError as error:  # numba also raises ImportError for an unsupported NumPy.
-    raise InputError(
-        f"numba cannot be imported ({error}): pip install numba, or choose the rasterizer numpy"
-    ) from error
-
+# numba also raises ImportError for an unsupported NumPy.
+numba = import_package("numba", "numba, or choose the rasterizer numpy")
 VERSION = numba.__version__
 # Types of the arguments and of the result of `_draw`, for which numba compiles it: positions (2, V)
 # and depths (V,) of the vertices, faces (F, 3), and the index of the nearest face and its depth at
