@@ -544,7 +544,7 @@ def _albumentations(lighting: RandomLighting) -> Any:
 @cache
 def _albumentations_class() -> Any:
     """Define the transform of Albumentations once, as its `from_dict` looks for it by its name."""
-    albumentations = errors.import_package("albumentations", "albumentations==2.0.8")
+    albumentations: Any = errors.import_package("albumentations", "albumentations==2.0.8")
 
     class Lighting(albumentations.ImageOnlyTransform):  # type: ignore[misc, unused-ignore]
         """Random light on arrays (H, W, C)."""

@@ -255,14 +255,6 @@ class Mesh:
         """True if the three corners of each face have the same color."""
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
 
-    def moved(self, vertices: np.ndarray) -> Mesh:
-        """Return a copy of the mesh with other vertex positions.
-
-        Args:
-            vertices: Vertex positions of the copy, shape (V, 3).
-        """
-        return replace(self, vertices=vertices)
-
     @cached_property
     def closed(self) -> bool:
         """True if no camera outside of the mesh can see a face from behind.

@@ -71,9 +71,6 @@ class ShadedView:
             vertices include the movement of silhouettes.
         gloss: Gloss (specular reflection) of the shape. None uses the gloss of the
             mesh.
-        corner_normals: Unit normals of the corners of the F faces (see
-            `Mesh.corner_normals`), shape (F, 3, 3). None computes the normals if
-            they are needed.
         indirect: Function that takes the albedo at the samples and the SH
             coefficients of environment light, and returns the radiance that
             shadows and bounces add to the covered pixels, shape (3, P). None
@@ -91,7 +88,6 @@ class ShadedView:
     lamp_view: LocalLightView | None = None
     is_moved: bool = True
     gloss: Gloss | None = None
-    corner_normals: Float[Tensor, "F 3 3"] | None = None
     indirect: Callable[[Tensor, Tensor], Tensor] | None = None
     lamp_positions: Float[Tensor, "L 3"] | None = None
 
@@ -206,7 +202,9 @@ class ShadedView:
         """Normals at the corners of the G seen faces, shape (G, 3, 3), or None for flat shading."""
         if self.settings.normals == "flat":
             return None
-        if self.corner_normals is not None:
-            return self.corner_normals[self.fragments.faces]
+        if not self.is_moved:
+            # The mesh caches these normals, so all its views share them.
+            corner_normals = torch.from_numpy(self.mesh.corner_normals).to(self.vertices.device)
+            return corner_normals[self.fragments.faces]
         normal_ids = torch.from_numpy(self.mesh.normal_ids).to(self._faces)
         return normals_in_sight(self.fragments, self.vertices, self._faces, normal_ids)

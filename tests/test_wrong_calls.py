@@ -209,7 +209,6 @@ MESHES = [
     *calls_of("mesh", lambda x: renderer.export_mesh(x, "a.glb"), "b.glb"),
     *calls_of("path", lambda x: renderer.export_mesh(MESH, x), None),
     *calls_of("a.obj", lambda x: renderer.export_mesh(MESH, x), "a.obj"),
-    *calls_of("folder.glb", lambda x: renderer.export_mesh(MESH, x), "folder.glb"),
     *by_name(
         partial(renderer.export_mesh, MESH, "a.glb"),
         normals=["hard"],

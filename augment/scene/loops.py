@@ -269,13 +269,3 @@ def multiply_slides(log_gain: Any, grid: Any, shading: Any, slides: Any) -> None
             for power in range(6, -1, -1):
                 factor = factor * gain[pixel] + EXPONENTIAL[power]
             shown[pixel] *= factor * shade[pixel]
-
-
-@_loop("int32[:,::1], int32[:,::1], int32[:,::1]")
-def lowest_sums(columns: Any, rows: Any, out: Any) -> None:
-    """Compute the lowest sum of the numbers of a column and of a row."""
-    for row in range(len(out)):
-        out[row] = 2**31 - 1
-        for cell in range(len(columns)):
-            for column in range(out.shape[1]):
-                out[row, column] = min(out[row, column], columns[cell, column] + rows[cell, row])

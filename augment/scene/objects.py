@@ -263,7 +263,7 @@ def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObjec
     They stand at the height of its new lowest vertex.
     """
     mesh = item.own_mesh
-    return with_own_mesh(item, mesh.moved(_rounded(mesh.vertices @ rotation.T)))
+    return with_own_mesh(item, replace(mesh, vertices=_rounded(mesh.vertices @ rotation.T)))
 
 
 def with_own_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:

@@ -21,7 +21,6 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Generator, Tensor
 
-from augment.scene import loops
 from augment.scene.surfaces import draw_shading, smooth
 from renderer import errors
 from renderer.errors import InputError
@@ -277,11 +276,7 @@ def draw_cells(count: int, size: Size, draws: Generator) -> Pictures:
             for axis, place in zip((x, y), places[:used].T[..., None, None], strict=True)
         )
         columns += torch.arange(used, dtype=torch.int32)[:, None, None]
-        if loop := loops.lowest_sums(rows):
-            nearest = torch.empty(height, width, dtype=torch.int32)
-            loop(columns[:, 0], rows[..., 0], nearest)
-        else:
-            nearest = (columns + rows).amin(0)
+        nearest = (columns + rows).amin(0)
         shown = palette.index_select(1, (nearest & (CELL_CODE - 1)).flatten())
         pictures.append(shown.unflatten(1, (height, width)))
     return torch.stack(pictures)

@@ -483,9 +483,6 @@ class DirectRenderer:
                 del frozen.views[view]
             return added
 
-        corner_normals = None
-        if moved is None and self.settings.normals == "smooth":
-            corner_normals = torch.from_numpy(item.mesh.corner_normals).to(self.like.device)
         shown = ShadedView(
             mesh=item.mesh,
             fragments=fragments,
@@ -495,7 +492,6 @@ class DirectRenderer:
             light=split,
             is_moved=moved is not None,
             gloss=gloss,
-            corner_normals=corner_normals,
             lamp_view=lamp_view,
             indirect=indirect if self.settings.global_illumination else None,
             lamp_positions=changed.positions,

@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from renderer.errors import InputError, require_whole
+from renderer.errors import require_whole
 from renderer.light import harmonics
 from renderer.settings import MAX_DEGREE
 from renderer.vectors import Ball, nearest_in_box, unit
@@ -336,11 +336,6 @@ class SumBasis(Basis):
     """
 
     parts: tuple[Harmonics | LocalBasis, ...]
-
-    def __post_init__(self) -> None:
-        """Check that at most one of the bases in `parts` is environment light."""
-        if sum(isinstance(part, Harmonics) for part in self.parts) > 1:
-            raise InputError("parts has two environment lights: give their sum as one light")
 
     def __str__(self) -> str:
         return " and ".join(map(str, self.parts))

@@ -14,26 +14,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer.camera import MAX_FOV, MIN_FOV, OrthographicCamera, PerspectiveCamera
-from renderer.errors import (
-    MAX_SCALE,
-    InputError,
-    as_array,
-    as_tensor,
-    require_number,
-    require_whole,
-)
+from renderer.errors import MAX_SCALE, InputError, as_array, as_tensor, require_number
 from renderer.io.images import gray_or_image
 from renderer.io.mitsuba_entries import pose_of, projector
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.files import read_light
+from renderer.settings import Settings, setting
 from renderer.vectors import tangent_axes
-
-# Largest number of pixels along one side of a projected pattern.
-MAX_PIXELS = 256
 
 
 @dataclass(frozen=True)
-class Projector(LocalBasis):
+class Projector(Settings, LocalBasis):
     """Projector that aims at the origin, with one RGB coefficient for each pixel of its pattern.
 
     The pattern has pixels² pixels. Their coefficients are in row-major order
@@ -61,23 +52,14 @@ class Projector(LocalBasis):
         (16, 'a projector of 4² pixels')
     """
 
-    pixels: int = 16
-    polar: float = 60.0
-    azimuth: float = 30.0
-    distance: float = 4.0
-    fov: float = 30.0
-    power: float = 1.0
+    pixels: int = setting(16, "Pixels per side of the pattern.", within=(1, 256))
+    polar: float = setting(60.0, "Its polar angle.", "degrees", within=(-MAX_SCALE, MAX_SCALE))
+    azimuth: float = setting(30.0, "Its azimuth.", "degrees", within=(-MAX_SCALE, MAX_SCALE))
+    distance: float = setting(4.0, "Its distance in world units.", within=(2, MAX_SCALE))
+    fov: float = setting(30.0, "Its field of view.", "degrees", within=(MIN_FOV, MAX_FOV))
+    power: float = setting(1.0, "Largest coefficient.", within=(1 / MAX_SCALE, MAX_SCALE))
 
     name = "projector"
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        require_whole("projector.pixels", self.pixels, 1, MAX_PIXELS)
-        for name in ("polar", "azimuth"):
-            require_number(f"projector.{name}", getattr(self, name), -MAX_SCALE, MAX_SCALE)
-        require_number("projector.distance", self.distance, 2, MAX_SCALE)
-        require_number("projector.fov", self.fov, MIN_FOV, MAX_FOV)
-        require_number("projector.power", self.power, 1 / MAX_SCALE, MAX_SCALE)
 
     @classmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:

@@ -111,11 +111,7 @@ class Fragments:
         w is 1 for the position of a perspective camera, and 0 for the direction
         to an orthographic camera. Without a camera, all four numbers are 0.
         """
-        if self.camera is None:
-            return torch.zeros(4)
-        if self.camera.fixed() is self.camera:
-            return torch.from_numpy(self.camera.eye())
-        return self.camera.differentiable_eye()
+        return torch.zeros(4) if self.camera is None else self.camera.differentiable_eye()
 
     @cached_property
     def barycentric(self) -> Tensor:

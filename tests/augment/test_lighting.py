@@ -295,7 +295,6 @@ def test_the_loop_of_numba_equals_the_operations_of_torch(monkeypatch):
 
 
 LOOPS = ("relit_bytes", "noisy_bytes", "ramps", "shadows", "lamps", "multiply_slides")
-LOOPS += ("lowest_sums",)
 
 
 @pytest.mark.parametrize("name", [*lights.CastShadow().kinds, *MODELS])

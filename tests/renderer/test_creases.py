@@ -169,7 +169,7 @@ def test_joined_and_selected_meshes_keep_their_normals():
 
 def test_moved_vertices_keep_the_sharp_edges_of_the_mesh():
     """A flattened rim stays sharp, so that images have no jump as the vertices move."""
-    moved = CAN.moved(CAN.vertices * [1, 1, 0.01])
+    moved = replace(CAN, vertices=CAN.vertices * [1, 1, 0.01])
     assert_array_equal(moved.normal_ids, CAN.normal_ids)
     light = nb.load_light("grace").double()
     camera = nb.OrthographicCamera(50.0, 20.0, 1.6)
