@@ -13,9 +13,9 @@ from train.publication import publish as publish
 from train.settings import DataSettings as DataSettings
 from train.settings import EvaluationSettings as EvaluationSettings
 from train.settings import ExperimentSettings as ExperimentSettings
+from train.settings import ModelSettings as ModelSettings
 from train.settings import TrainingSceneSettings as TrainingSceneSettings
-from train.train_settings import ModelSettings as ModelSettings
-from train.train_settings import TrainSettings as TrainSettings
+from train.settings import TrainSettings as TrainSettings
 
 console: logging.Logger
 __version__: str

@@ -26,7 +26,7 @@ from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, keyed, require_choice
 from renderer.visibility import Rasterizer, choose
 from train import console
-from train.train_settings import TrainSettings
+from train.settings import TrainSettings
 
 # File in which Linux stores how much time of the cores a container may use: a quota and a
 # period. The quota divided by the period is the number of cores.

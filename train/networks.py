@@ -19,7 +19,7 @@ from augment.settings import PYTHON
 from augment.sources import build_classifier, call_python, require_architecture
 from renderer.errors import InputError, single_line
 from renderer.settings import Size
-from train.train_settings import WIDERESNET
+from train.settings import WIDERESNET
 
 # The name of a network begins with this text if it is an architecture of torchvision.
 TORCHVISION = "torchvision:"

@@ -66,19 +66,16 @@ PASS_THRESHOLD = 0.9
 
 
 class _Words(NamedTuple):
-    """A kind of light in a table, above a number at the top of the report, and in a sentence."""
+    """A kind of light in a table, and in a sentence."""
 
     title: str
-    number_title: str
     clause: str
 
 
 WORDS = {
-    SLIDE: _Words("random slide", "Kept under a random slide", "under a random slide"),
-    RANDOM: _Words("random search", "… after random search", "after random search"),
-    ADVERSARIAL: _Words(
-        "gradient", "… after as many passes along the gradient", "after the gradient attack"
-    ),
+    SLIDE: _Words("random slide", "under a random slide"),
+    RANDOM: _Words("random search", "after random search"),
+    ADVERSARIAL: _Words("gradient", "after the gradient attack"),
 }
 
 
@@ -294,8 +291,8 @@ def screen_of_photographs(results: Mapping[str, Path]) -> FirstScreen:
     for light in first.lights:
         if light in last.lights:
             before = first.kept(light) if len(scores) > 1 else None
-            number = (WORDS[light].number_title, "higher is better", before, last.kept(light))
-            numbers.append(ShownMetric(*number))
+            title = f"Kept {WORDS[light].clause}"
+            numbers.append(ShownMetric(title, "higher is better", before, last.kept(light)))
     answer = "Random slides seldom change its predictions."
     kept = last.kept(SLIDE).value
     if kept is not None and kept < PASS_THRESHOLD:

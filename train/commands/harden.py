@@ -27,8 +27,7 @@ from train.cli import read_settings
 from train.results.overwrite import require_new_run
 from train.results.page import report_of
 from train.run_folder import folder_or_temporary, sole_writer
-from train.settings import DataSettings, ExperimentSettings, TrainingSceneSettings
-from train.train_settings import TrainSettings
+from train.settings import DataSettings, ExperimentSettings, TrainingSceneSettings, TrainSettings
 from train.training.detection import require_losses
 from train.training.inputs import initial_of, load_data
 from train.training.run import Run

@@ -25,7 +25,7 @@ from augment.tasks.classification import ClassCriterion, label_loss
 from renderer.errors import MAX_SCALE
 from renderer.image import decode, to_bytes, to_unit
 from renderer.vectors import Ball, nearest_in_box
-from train.train_settings import LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, TrainSettings
+from train.settings import LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, TrainSettings
 
 # Norm-ball and step size of the attack on pixels. Madry et al. (2018) use a radius of
 # 8/255 on CIFAR-10.

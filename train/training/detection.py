@@ -29,7 +29,7 @@ from renderer.settings import height_and_width
 from train.data.sets import Split
 from train.device import all_reduce_sum
 from train.results.detections import Found, Marked, match
-from train.train_settings import TrainSettings
+from train.settings import TrainSettings
 
 # Number of photographs in a pass of the validation.
 BATCH = 32

@@ -31,7 +31,7 @@ from train import checkpoints, console, run_folder
 from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_batches
 from train.data.sets import Split
 from train.device import MixedPrecision, SignalHandler, all_reduce_sum
-from train.train_settings import TrainSettings
+from train.settings import TrainSettings
 from train.training.averages import Averages
 from train.training.detection import object_maps, validate
 from train.training.recipe import set_training_mode

@@ -21,7 +21,7 @@ from augment.tasks.classification import is_correct, label_loss
 from renderer.errors import MAX_SCALE, InputError
 from renderer.image import to_unit
 from train.device import PRECISIONS, MixedPrecision
-from train.train_settings import ALL_BUT_LAST, TrainSettings
+from train.settings import ALL_BUT_LAST, TrainSettings
 
 # The schedule "step" multiplies the learning rate by STEP_FACTOR after each of these
 # fractions of the training, like Zagoruyko and Komodakis (2016).

@@ -28,8 +28,7 @@ from train.results.overwrite import remove_run
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, BEST, WEIGHTS
-from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
-from train.train_settings import WIDERESNET
+from train.settings import KEPT_ASIDE, LABORATORY, WIDERESNET, ExperimentSettings
 from train.training import inputs
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate

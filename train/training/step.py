@@ -19,7 +19,7 @@ from renderer.errors import InputError, keyed, require_memory
 from train import console
 from train.data.batches import Batch
 from train.device import MixedPrecision, compiles, wrap_ddp
-from train.train_settings import TrainSettings
+from train.settings import TrainSettings
 from train.training.augmentations import Augmentation
 from train.training.detection import DetectionLoss
 from train.training.recipe import TrainingLoss, build_optimizer, learning_rate, share_layers

@@ -22,8 +22,7 @@ from augment.tasks.detection import Detection
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
 from tests.detectors import BrightBox, OneBox, RawCells, small_detector
-from train.settings import ExperimentSettings
-from train.train_settings import TrainSettings
+from train.settings import ExperimentSettings, TrainSettings
 from train.training.augmentations import Augmentation
 from train.training.detection import candidate_loss, detected, losses_of
 from train.training.inputs import load_initial

@@ -18,7 +18,7 @@ from train.data.sets import Split
 from train.device import MixedPrecision
 from train.networks import WideResNet
 from train.run_folder import read_metrics
-from train.train_settings import TrainSettings
+from train.settings import TrainSettings
 from train.training import loop
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze

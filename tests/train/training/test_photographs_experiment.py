@@ -15,8 +15,7 @@ from train.checkpoints import load
 from train.commands.experiment import train
 from train.results.page import PAGE
 from train.run_folder import BEST, LAST, read_metrics
-from train.settings import PHOTOGRAPHS_FIRST
-from train.train_settings import TrainSettings
+from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
 from train.training import run
 from train.training.augmentations import Augmentation
 from train.training.averages import FACTORS, INTERPOLATION

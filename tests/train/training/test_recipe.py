@@ -16,7 +16,7 @@ from renderer.image import to_unit
 from train.commands.harden import _trainable_copy
 from train.device import MixedPrecision
 from train.networks import WideResNet
-from train.train_settings import TRANSFORMS, TrainSettings
+from train.settings import TRANSFORMS, TrainSettings
 from train.training import recipe
 from train.training.augmentations import PGD, Augmentation
 
