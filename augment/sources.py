@@ -301,7 +301,7 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         raise
     except (Exception, SystemExit) as error:  # The user's code may raise any exception.
         place = traceback.extract_tb(error.__traceback__)[-1]
-        kind = f"{type(error).__name__}: {single_line(error)}"  # type: ignore[arg-type]
+        kind = f"{type(error).__name__}: {single_line(error)}"
         advice = "use python:package.module:function, which returns (module, size, classes)"
         reason = f"fails ({kind}, in line {place.lineno} of {place.filename}): {advice}"
         if isinstance(error, ModuleNotFoundError) and error.name == module_name:

@@ -12,6 +12,7 @@ import importlib
 import os
 import re
 import reprlib
+import textwrap
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
@@ -33,6 +34,8 @@ MAX_MAGNITUDE = 1e12
 MAX_SCALE = 1e5
 # Largest seed of random numbers, which is also the largest of other whole numbers.
 MAX_SEED = 2**63 - 1
+# Largest number of characters of a reason that `explained` quotes.
+LONGEST_REASON = 300
 # Values of `dtype.kind` for arrays of real numbers: "f" is floating-point, "i" is a signed
 # integer, and "u" is an unsigned integer.
 _NUMBERS = "fiu"
@@ -98,12 +101,32 @@ def keyed(group: str = "", /, **keys: str) -> Iterator[None]:
         raise
 
 
+@contextmanager
+def explained(
+    fault: str, advice: str, argument: str = "", *kinds: type[BaseException]
+) -> Iterator[None]:
+    """Turn an error in a `with` block into an InputError: fault, reason in brackets, and advice.
+
+    Without `kinds`, any Exception but an InputError is turned, since libraries raise errors of
+    almost any type for a damaged file.
+    """
+    turned = kinds or (Exception,)
+    try:
+        yield
+    except turned as error:
+        if isinstance(error, InputError) and not kinds:
+            raise
+        reason = f"no key {error}" if isinstance(error, KeyError) else single_line(error)
+        reason = textwrap.shorten(reason, LONGEST_REASON)
+        raise InputError(f"{fault} ({reason}): {advice}", argument) from error
+
+
 def keys_of(key: str, settings: object) -> dict[str, str]:
     """List the dotted key of each field of a group of settings, as `keyed` takes them."""
     return {name: f"{key}.{name}" for name in vars(settings)}
 
 
-def single_line(error: Exception) -> str:
+def single_line(error: BaseException) -> str:
     """Return the message of an error in one line, or the name of its class if it has none."""
     message = " ".join(str(error).split()) or type(error).__name__
     # The message of a missing key is only this key.

@@ -8,9 +8,8 @@ last.pt has all of `train.training.loop.Trainer.state_dict`.
 
 import io
 import json
-import textwrap
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from augment.network import FROM_FILE, Inputs, say_inputs, with_normalized_light
 from augment.settings import PYTHON, NormalizeLight
 from augment.sources import SOURCES, import_function, load_classifier
 from augment.tasks.detection import Detection
-from renderer.errors import InputError, as_path, keyed, require_file, require_kind, single_line
+from renderer.errors import InputError, as_path, explained, keyed, require_file, require_kind
 from renderer.io.files import atomic_write
 from train.networks import DETECTOR, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
@@ -46,8 +45,6 @@ ASSUMED = "assumed"
 NORMALIZE_LIGHT = "normalize_light"
 # If a network normalizes the light of images, the names of its weights begin with this text.
 LIGHT_PREFIX = "network."
-# Largest number of characters of a reason that an error message quotes.
-LONGEST_REASON = 300
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
@@ -71,24 +68,13 @@ def load(path: Path) -> dict[str, Any]:
 
 def _refused_if_damaged(path: Path) -> AbstractContextManager[None]:
     """Turn any error of a block that reads a checkpoint into an InputError."""
-    # torch, safetensors and json raise errors of many types for a damaged file.
-    return _refused(path, "damaged or not a checkpoint", "use another one", Exception)
+    return explained(f"checkpoint {path} is damaged or not a checkpoint", "use another one")
 
 
 def checks_architecture(path: Path) -> AbstractContextManager[None]:
     """Raise InputError if the block cannot load weights into a network of another architecture."""
-    errors = (TypeError, ValueError, LookupError, AttributeError, RuntimeError)
-    return _refused(path, "from another architecture", "use the model settings of its run", *errors)
-
-
-@contextmanager
-def _refused(path: Path, fault: str, advice: str, *errors: type[Exception]) -> Iterator[None]:
-    """Turn errors of some types into an InputError about a checkpoint."""
-    try:
-        yield
-    except errors as error:
-        reason = textwrap.shorten(single_line(error), LONGEST_REASON)
-        raise InputError(f"checkpoint {path} is {fault} ({reason}): {advice}") from error
+    fault = f"checkpoint {path} is from another architecture"
+    return explained(fault, "use the model settings of its run", "", Exception)
 
 
 def _checked(state: dict[str, Any]) -> dict[str, Any]:
@@ -181,12 +167,11 @@ def _task_that_decodes(settings: NetworkSettings) -> Detection | None:
     name = getattr(settings, "decode", None)
     if name is None:
         return None
-    try:
+    advice = "give package.module:function, and start the command in the folder of the module"
+    # The user's code may raise any exception, and even end the program.
+    kinds = (Exception, SystemExit)
+    with explained(f"decode={name} cannot be imported", advice, "decode", *kinds):
         return Detection(decode=import_function(name))
-    except (Exception, SystemExit) as error:  # The user's code may raise any exception.
-        advice = "give package.module:function, and start the command in the folder of the module"
-        reason = f"decode={name} cannot be imported ({single_line(error)})"  # type: ignore[arg-type]
-        raise InputError(f"{reason}: {advice}", "decode") from error
 
 
 def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:

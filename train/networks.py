@@ -17,7 +17,7 @@ from augment.files import as_facts
 from augment.network import ChannelNormalization, Network, eval_mode, plain_outputs
 from augment.settings import PYTHON
 from augment.sources import build_classifier, call_python, require_architecture
-from renderer.errors import InputError, single_line
+from renderer.errors import InputError, explained
 from renderer.settings import Size
 from train.settings import WIDERESNET
 
@@ -192,8 +192,9 @@ def build_network(
     if not is_own:
         require_architecture(architecture)
     network = _call_function(name, classes, size) if is_own else nn.Identity()
+    fault = f"name={name} does not give {len(classes)} logits for images of {size} pixels per side"
     # Architectures raise errors of many types if images are too small for them.
-    try:
+    with explained(fault, "choose others", "name"):
         if not is_own:
             # Networks of torchvision take normalized images, so a layer before them normalizes.
             built = _build_architecture(architecture, len(classes), size)
@@ -203,9 +204,6 @@ def build_network(
             shape_of_two = tuple(plain_outputs(network(torch.zeros(2, 3, size, size))).shape)
         if shape_of_two != (2, len(classes)):
             raise ValueError(f"it returned {shape_of_two} for 2 images")
-    except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
-        fault = f"name={name} does not give {len(classes)} logits for images of {size} pixels"
-        raise InputError(f"{fault} per side: {single_line(error)}", "name") from error
     return network
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from renderer.errors import InputError, as_folder, single_line
+from renderer.errors import InputError, as_folder, explained
 from renderer.io.files import remove_unfinished
 
 # Name of the file in a folder that a process locks while it writes to the folder.
@@ -42,13 +42,10 @@ TEST_SIZE = 2**16
 @contextmanager
 def opened_text(path: Path) -> Iterator[str]:
     """Read a text file for a `with` block that parses the text. Errors name the file."""
-    try:
+    with explained(f"{path} is damaged or of another kind", "use another run"):
         if not path.is_file():
             raise ValueError("there is no such file")
         yield path.read_text(encoding="utf-8")
-    except Exception as error:
-        fault = f"{path} is damaged or of another kind ({single_line(error)})"
-        raise InputError(f"{fault}: use another run") from error
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from PIL import ImageOps
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings, RendererSettings
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.errors import InputError, require_file, single_line
+from renderer.errors import InputError, explained, require_file
 from renderer.image import decode, encode
 from renderer.io.images import eight_bits, open_image, read_image, read_rgb, write_image
 from renderer.light.files import save_light
@@ -136,12 +136,9 @@ def render_attacked(
 def read_file(path: str) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image file in sRGB at its full size, rotated as its EXIF orientation says."""
     require_file(path, "give an image file")
-    try:
+    with explained(f"{path} cannot be read", "give an image file"):
         # Images whose shorter side has more pixels than this may be reduced.
         return np.asarray(read_rgb(Path(path), 10**6))
-    # Pillow raises errors of almost any type for a damaged file.
-    except Exception as error:
-        raise InputError(f"{path} cannot be read ({error}): give an image file") from error
 
 
 def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height width"]:
@@ -153,12 +150,8 @@ def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height w
     object is, and less where it covers a part of a pixel.
     """
     require_file(path, "give an image file as mask")
-    try:
+    with explained(f"mask={path} cannot be read", "save the object in white on black"):
         levels = _levels(path)
-    # Pillow raises errors of almost any type for a damaged file.
-    except Exception as error:
-        fault = f"mask={path} cannot be read ({single_line(error)})"
-        raise InputError(f"{fault}: save the object in white on black") from error
     if levels.shape != (height, width):
         fault = f"mask={path} has {levels.shape[1]} × {levels.shape[0]} pixels"
         raise InputError(f"{fault}: give a mask of {width} × {height}, as the photograph")

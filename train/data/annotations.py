@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from PIL import ExifTags, Image
 
 from augment.settings import NO_CLASS_PIXEL
-from renderer.errors import InputError, single_line
+from renderer.errors import InputError, explained
 from renderer.io.images import SUFFIXES, open_image, read_rgb
 from train import console
 from train.data.photographs import find_unlabeled, visible_files
@@ -158,11 +158,8 @@ def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, 
 
     Pixels of borders are NO_CLASS_PIXEL.
     """
-    try:
-        with open_image(path) as image:
-            labels = np.array(image)
-    except Exception as error:  # Pillow raises errors of almost any type.
-        raise InputError(f"{path} cannot be read ({single_line(error)}): replace it") from error
+    with explained(f"{path} cannot be read", "replace it"), open_image(path) as image:
+        labels = np.array(image)
     width, height = fitted.size
     if labels.shape != (height, width):
         advice = f"give a gray or palette image of {width:g} × {height:g} indices of classes"
@@ -199,7 +196,8 @@ def read_annotations(photos: Path) -> Annotations:
 
 def _read_coco(file: Path) -> Annotations:
     """Read a COCO file. Its images lie beside it or, from a folder annotations, beside that."""
-    try:
+    advice = "give images, categories, and annotations with image_id, category_id and bbox"
+    with explained(f"{file} is no COCO file of detections", advice):
         content = json.loads(file.read_text(encoding="utf-8-sig"))
         # Name of each category by its id. Indices of `classes` are in the order of the ids.
         names = {item["id"]: str(item["name"]) for item in content["categories"]}
@@ -237,12 +235,6 @@ def _read_coco(file: Path) -> Annotations:
                 photographs.append(_annotated(paths[name], name, size, rows[key]))
             else:
                 missing.append(name)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = f"no key {error}" if isinstance(error, KeyError) else single_line(error)
-        advice = "give images, categories, and annotations with image_id, category_id and bbox"
-        raise InputError(f"{file} is no COCO file of detections ({reason}): {advice}") from error
     if not photographs:
         first = f", such as {missing[0]}" if missing else ""
         raise InputError(f"{file} names no image that exists{first}: move the images beside it")
@@ -310,15 +302,12 @@ def _yolo_classes(folder: Path) -> tuple[str, ...]:
     # The folder itself, and the two above it.
     for parent in [folder, *list(folder.absolute().parents)[:2]]:
         for file in sorted([*parent.glob("*.yaml"), *parent.glob("*.yml")]):
-            try:
+            with explained(f"{file} cannot be read", "give names as a list, or index: name"):
                 content = yaml.safe_load(file.read_text(encoding="utf-8-sig"))
                 names = content.get("names") if isinstance(content, dict) else None
                 # Names are a list, or a mapping from index to name.
                 listed = enumerate(names) if isinstance(names, list) else dict(names or {}).items()
                 known = {int(key): str(name) for key, name in listed}
-            except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
-                fault = f"{file} cannot be read ({single_line(error)})"
-                raise InputError(f"{fault}: give names as a list, or index: name") from error
             if known:  # Some indices may be missing.
                 return tuple(known.get(i, str(i)) for i in range(max(known) + 1))
         for name in (*CLASS_FILES, *(f"labels/{name}" for name in CLASS_FILES)):
@@ -330,14 +319,12 @@ def _yolo_classes(folder: Path) -> tuple[str, ...]:
 
 def _yolo_rows(file: Path, class_count: int) -> Iterator[Sequence[float]]:
     """Yield the row of each line of a label file, as `_annotated` takes it."""
-    try:
+    with explained(f"{file} is no text", "write it again"):
         lines = file.read_text(encoding="utf-8-sig").splitlines()
-    except ValueError as error:
-        raise InputError(f"{file} is no text ({single_line(error)}): write it again") from error
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
-        try:
+        with explained(f"line {number} of {file} is no box", "write class x y width height"):
             label, *values = map(float, line.split())
             # Four numbers are a box, and at least three pairs are a polygon.
             if len(values) != 4 and (len(values) < 6 or len(values) % 2):
@@ -346,9 +333,6 @@ def _yolo_rows(file: Path, class_count: int) -> Iterator[Sequence[float]]:
                 raise ValueError(f"class {label:g} is none of {class_count} classes")
             if not all(-ROUNDING <= value <= 1 + ROUNDING for value in values):
                 raise ValueError("coordinates must be fractions of the sides, from 0 to 1")
-        except ValueError as error:
-            fault = f"line {number} of {file} is no box ({error})"
-            raise InputError(f"{fault}: write class x y width height") from error
         if len(values) == 4:
             x, y, width, height = values
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from augment.classifier import Label, class_index, nearest
 from augment.progress import progress
-from renderer.errors import InputError, composed, require_memory, single_line
+from renderer.errors import InputError, composed, explained, require_memory
 from renderer.io.images import SUFFIXES, read_center
 from renderer.settings import Size, height_and_width
 from train import console
@@ -234,7 +234,8 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
     rows: dict[PurePosixPath, Row] = {}
     if not os.path.lexists(table):
         return rows
-    try:
+    advice = "write UTF-8 text with the columns path and source_tag, separated by commas"
+    with explained(f"{table} cannot be read", advice):
         # Opening a named pipe would wait forever.
         if not table.is_file():
             raise OSError("it is not a regular file")
@@ -245,10 +246,6 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
                 row = (line["source_tag"] or None, hard_negatives, line.get("mesh") or None)
                 if rows.setdefault(path, row) != row:
                     raise ValueError(f"two different rows for {path}")
-    except (ValueError, LookupError, csv.Error, OSError) as error:
-        fault = f"{table} cannot be read ({single_line(error)})"
-        advice = "write UTF-8 text with the columns path and source_tag, separated by commas"
-        raise InputError(f"{fault}: {advice}") from error
     return rows
 
 

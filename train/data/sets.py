@@ -15,7 +15,7 @@ from torch import Tensor
 from augment.classifier import class_index
 from augment.progress import progress
 from augment.random_streams import generator
-from renderer.errors import InputError, describe, single_line
+from renderer.errors import InputError, describe, explained
 from train import console
 from train.data import photographs
 from train.data.images import MAX_SIZE_IN_MEMORY, ImageFiles
@@ -197,11 +197,9 @@ def load_cifar100(path: str) -> DataSet:
     # This import is here because torchvision takes a second to import.
     from torchvision.datasets import CIFAR100
 
-    try:
+    fault = f"path={path} does not contain CIFAR-100, and the download failed"
+    with explained(fault, "give a copy, or connect to the internet", "path"):
         both = [CIFAR100(path, train=is_train, download=True) for is_train in (True, False)]
-    except (OSError, RuntimeError) as error:
-        fault = f"path={path} does not contain CIFAR-100, and the download failed ({error})"
-        raise InputError(f"{fault}: give a copy, or connect to the internet", "path") from error
     images = [torch.from_numpy(cifar.data).permute(0, 3, 1, 2).contiguous() for cifar in both]
     labels = [torch.tensor(cifar.targets) for cifar in both]
     train, test = map(Split, images, labels)
@@ -221,7 +219,9 @@ def load_npz(path: str) -> DataSet:
     """
     if not Path(path).is_file():
         raise InputError(f"path={path} does not exist: give the path of an .npz file", "path")
-    try:
+    arrays = "train_images, train_labels, test_images, test_labels and classes"
+    fault = f"path={path} is not an .npz file of labeled images"
+    with explained(fault, f"give the arrays {arrays}", "path"):
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             classes = archive["classes"]
             if classes.ndim != 1 or classes.dtype.kind != "U" or len({*classes}) != len(classes):
@@ -234,11 +234,6 @@ def load_npz(path: str) -> DataSet:
             raise ValueError("train_images and test_images differ in size")
         train, test = splits
         return DataSet(tuple(classes.tolist()), train, test)
-    # zipfile, zlib and NumPy raise errors of many types for a damaged file.
-    except Exception as error:
-        fault = f"path={path} is not an .npz file of labeled images ({single_line(error)})"
-        arrays = "train_images, train_labels, test_images, test_labels and classes"
-        raise InputError(f"{fault}: give the arrays {arrays}", "path") from error
 
 
 def _npz_split(images: np.ndarray, labels: np.ndarray, class_count: int) -> Split:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from renderer.errors import InputError, ShortRepr, single_line
+from renderer.errors import ShortRepr, explained
 from renderer.io.files import atomic_write, remove_unfinished
 from train.data.photo import SEPARATOR, Photograph, split_sources
 from train.results.tables import write_csv
@@ -165,7 +165,8 @@ def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
 
 def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
     """Read the table predictions.csv, which `write_predictions` wrote."""
-    try:
+    fault = f"{path} is no table of predictions for label={label}"
+    with explained(fault, "score the photographs again with pnb-evaluate"):
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
         photographs = [
@@ -199,6 +200,3 @@ def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
             for name in label_names(label)
         }
         return Predictions.of_labels(shared, by_label)
-    except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
-        fault = f"{path} is no table of predictions for label={label} ({single_line(error)})"
-        raise InputError(f"{fault}: score the photographs again with pnb-evaluate") from error

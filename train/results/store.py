@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from augment.attack_settings import LINES
 from augment.augmentation_settings import MODES
-from renderer.errors import InputError, single_line
+from renderer.errors import InputError, explained
 from train import console, run_config, run_folder
 from train.results.metrics import Metrics, Pooled, Thresholds, describe_point
 from train.results.predictions import PREDICTIONS, SUMMARY, read_predictions
@@ -166,15 +166,9 @@ def is_finished(folder: Path) -> bool:
 def summarize(folder: Path) -> RunSummary:
     """Read the settings and scores in the folder of a run, an evaluation or a published network."""
     folder = published_folder(folder)
-    try:
+    # An entry that is missing or of a wrong type raises errors of many types.
+    with explained(f"{folder} has a file that is not as `pnb-train` wrote it", "use another run"):
         return _read(folder)
-    except InputError:
-        raise
-    except Exception as error:
-        # An entry that is missing or of a wrong type raises errors of many types.
-        reason = f"{type(error).__name__}: {single_line(error)}"
-        fault = f"{folder} has a file that is not as `pnb-train` wrote it ({reason})"
-        raise InputError(f"{fault}: use another run") from error
 
 
 def trained_labels(folder: Path) -> list[str]:
@@ -362,7 +356,9 @@ class AttackSummary:
 def read_attack(folder: Path) -> AttackSummary:
     """Read the outcome of an attack from its folder."""
     path = folder / LINES
-    try:
+    # A file with other contents than expected raises errors of many types.
+    fault = f"{path} is damaged or was written by no attack"
+    with explained(fault, "use the folder of another attack"):
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         # A line has the key "example" or, if it is about the whole attack, "checks".
         examples = [line for line in lines if "example" in line]
@@ -379,10 +375,6 @@ def read_attack(folder: Path) -> AttackSummary:
             correct=len(correct),
             checks=checks[0] if checks else {},
         )
-    except Exception as error:
-        # A file with other contents than expected raises errors of many types.
-        fault = f"{path} is damaged or was written by no attack ({single_line(error)})"
-        raise InputError(f"{fault}: use the folder of another attack") from error
 
 
 class Unfinished(NamedTuple):

@@ -23,7 +23,7 @@ from augment.network import device_of, eval_mode
 from augment.scene.truth import NO_OBJECT, boxes_of
 from augment.tasks import detection
 from augment.tasks.detection import SMALLEST_SCORE, Detection
-from renderer.errors import InputError, describe, single_line
+from renderer.errors import InputError, describe, explained
 from renderer.image import to_unit
 from renderer.settings import height_and_width
 from train.data.sets import Split
@@ -82,13 +82,9 @@ def require_losses(network: TaskNetwork, needs_boxes: bool) -> None:
     images = torch.full((2, 3, *height_and_width(network.size)), 0.5, device=device_of(copy))
     # Maps without objects, shape (2, 1, H, W).
     nothing = torch.full_like(images[:, :1], NO_OBJECT, dtype=torch.int32)
-    try:
+    fault = "network fails on images and targets in training mode"
+    with explained(fault, "return losses as the detectors of torchvision do"):
         losses_of(copy, images, [*map(target_of, nothing)])
-    except InputError:
-        raise
-    except Exception as error:  # Networks of users raise errors of many kinds.
-        fault = f"network fails on images and targets in training mode ({single_line(error)})"
-        raise InputError(f"{fault}: return losses as the detectors of torchvision do") from error
 
 
 @dataclass

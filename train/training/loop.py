@@ -25,7 +25,7 @@ from augment.random_streams import stream_seed
 from augment.renders import Renders
 from augment.service import AugmentationService
 from augment.tasks.detection import Detection
-from renderer.errors import InputError, single_line
+from renderer.errors import InputError, explained
 from renderer.image import to_bytes, to_unit
 from train import checkpoints, console, run_folder
 from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_batches
@@ -373,14 +373,12 @@ class Trainer:
     def resume(self) -> None:
         """Restore the newest undamaged checkpoint in the folder of the run."""
         state, problem = checkpoints.load_newest(self.folder)
-        try:
+        fault = f"{self.folder} has a checkpoint of another run"
+        with explained(fault, f"restore {run_folder.LAST}, or start elsewhere"):
             # An older checkpoint may lack entries, which are then not compared.
             if self.architecture | state["architecture"] != self.architecture:
                 raise ValueError("it has another architecture or other classes")
             self.load_state_dict(state)
-        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            fault = f"{self.folder} has a checkpoint of another run ({single_line(error)})"
-            raise InputError(f"{fault}: restore {run_folder.LAST}, or start elsewhere") from error
         if self.epoch:
             # It is read before the training, so that no time is lost if it is damaged.
             self.best = checkpoints.load(self.folder / run_folder.BEST)
