@@ -389,9 +389,7 @@ def remembering(classifier: TaskNetwork) -> TaskNetwork:
     is_remembering = isinstance(classifier.network, wrappers.Remembered)
     if is_remembering or not isinstance(classifier, Classifier):
         return classifier
-    remembered = classifier.with_network(wrappers.Remembered(classifier.network))
-    remembered.operating_points = classifier.operating_points
-    return remembered
+    return classifier.with_network(wrappers.Remembered(classifier.network))
 
 
 def log_odds(logits: Float[Tensor, "N classes"], label: int) -> Float[Tensor, " N"]:

@@ -15,6 +15,7 @@ import textwrap
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
@@ -30,7 +31,7 @@ from augment import classifier as classifiers
 from augment.classifier import Classifier, TaskNetwork
 from augment.network import ARRAYS, FILE, YOU, Function, Network, plain_outputs, say_once, unwrapped
 from augment.tasks.task import Task
-from renderer.errors import InputError, require_file, require_kind, single_line
+from renderer.errors import InputError, reading, require_file, require_kind, single_line
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
 # A network from images (N, 3, height, width) to logits, and the sizes of the four dimensions of its
@@ -145,6 +146,11 @@ def name_error(name: str | Path, reason: str) -> InputError:
     return InputError(f"name={name} {reason}", "name")
 
 
+def reading_network(name: str | Path, fault: str, advice: str) -> AbstractContextManager[None]:
+    """Name a network in the errors of its files or of a connection."""
+    return reading(f"name={name}", fault, advice, "name")
+
+
 def weights_error(path: str | Path, reason: str) -> InputError:
     """Return an error about the argument `weights`, a file."""
     return InputError(f"weights={path} {reason}", "weights")
@@ -172,14 +178,10 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
         reason = f"is a program, which can run any code and overwrite your files: {advice}"
         raise name_error(path, f"{reason}, otherwise ask for a state dict, safetensors or ONNX")
     read = {EXPORTED: _read_exported, ONNX: _read_onnx}.get(path.suffix.lower(), _read_torchscript)
-    try:
+    advice = "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
+    with reading_network(path, "cannot be read", advice):
         # The sizes are those of the four dimensions of images. None stands for any size.
         network, (batch_size, _, height, width) = read(path)
-    except InputError:
-        raise
-    except Exception as error:  # A damaged file may raise many types of errors.
-        advice = "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
-        raise name_error(path, f"cannot be read ({single_line(error)}): {advice}") from error
 
     if batch_size is not None:
         # The file takes batches of one size only. `InBatches` splits other numbers of images.

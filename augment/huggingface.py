@@ -4,7 +4,6 @@ Classifiers give logits, and zero-shot networks such as CLIP classify by prompts
 segmenters give the output of transformers, which a task reads.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +17,9 @@ from PIL import Image
 from torch import Tensor, nn
 
 from augment.classifier import IMAGENET, USUAL_SIZE, TaskNetwork, as_network, mean_and_std
-from augment.files import NetworkFacts, import_package, name_error, weights_error
+from augment.files import NetworkFacts, import_package, name_error, reading_network, weights_error
 from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network
-from renderer.errors import InputError, single_line
+from renderer.errors import InputError
 from renderer.settings import Size, height_and_width
 
 # Default prompt of a zero-shot network, in which {} stands for the name of a class.
@@ -68,11 +67,9 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
         reason = f"cannot be combined with {name}, which has weights: leave weights out"
         raise weights_error(weights, reason)
     library = import_package("transformers", name, 'install "parametric-norm-balls[hf]"')
-    try:
+    advice = "give a folder that save_pretrained wrote, or a repository of the Hugging Face Hub"
+    with reading_network(name, "cannot be read", advice):
         config = library.AutoConfig.from_pretrained(model)
-    except Exception as error:  # The folder, its files or the connection may have any fault.
-        advice = "give a folder that save_pretrained wrote, or a repository of the Hugging Face Hub"
-        raise name_error(name, f"cannot be read ({single_line(error)}): {advice}") from error
     # Name of the class of the network, by which its task is known.
     architecture = (config.architectures or [""])[0]
     auto = library.models.auto.modeling_auto
@@ -98,14 +95,11 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
     if facts.size is not None:
         size, inputs = facts.size, replace(inputs, size=YOU)
     normalization = ChannelNormalization(mean, std, is_bgr)
-    classes: Sequence[str] | None = facts.classes
     if is_zero_shot:
         gray = normalization(torch.full((1, 3, *height_and_width(size)), 0.5))
         network = _zero_shot(library, network, model, facts, gray, is_random)
-    elif architecture in _architectures(auto, _TASKS[:1]):
-        classes = classes or _class_names(config.id2label)
     normalized = Network(network.eval(), [normalization])
-    made = as_network(normalized, size, classes, name=name, says=False)
+    made = as_network(normalized, size, facts.classes, name=name, says=False)
     made.inputs = inputs
     return made
 
@@ -121,22 +115,12 @@ def _model(kind: Any, model: str, config: Any, name: str, is_random: bool) -> An
     """Load a model of transformers in single precision, or build it with random weights."""
     if is_random:
         return kind._from_config(config)
-    try:
+    with reading_network(name, "cannot be loaded", "check the files of its weights"):
         loaded, report = kind.from_pretrained(model, output_loading_info=True)
-    except Exception as error:  # The folder, its files or the connection may have any fault.
-        reason = f"cannot be loaded ({single_line(error)}): check the files of its weights"
-        raise name_error(name, reason) from error
     if missing := sorted(report["missing_keys"]):
         reason = f"lacks weights, such as {missing[0]}"
         raise name_error(name, f"{reason}: give a trained {kind.__name__}")
     return loaded.float()
-
-
-def _class_names(names: dict[int, str]) -> list[str]:
-    """Return the names of classes in their order. A name that occurs twice gets its index."""
-    count = Counter(names.values())
-    ordered = sorted(names.items())
-    return [name if count[name] == 1 else f"{name} ({index})" for index, name in ordered]
 
 
 def _read_preprocessor(
@@ -203,16 +187,14 @@ def _zero_shot(
     options: dict[str, Any] = {"padding": True}
     if "siglip" in model.config.model_type:
         options = {"padding": "max_length", "max_length": 64, "truncation": True}
-    try:
+    # Its tokenizer may lack files, or the model may be of another kind.
+    with reading_network(f"hf:{name}", "is no zero-shot network like CLIP", "use another network"):
         tokenizer = library.AutoTokenizer.from_pretrained(name)
         tokens = tokenizer(prompts, return_tensors="pt", **options)
         output = model.eval()(pixel_values=gray, **tokens)
         # Unit vectors of the prompts, times the scale of the model, shape (C, D).
         vectors = F.normalize(output.text_embeds, dim=-1) * model.logit_scale.exp()
         network = ZeroShot(model, *vectors.shape)
-    except Exception as error:  # Files of the tokenizer, or a model of another kind.
-        reason = f"is no zero-shot network like CLIP ({single_line(error)})"
-        raise name_error(f"hf:{name}", f"{reason}: use another network") from error
     network.text.weight.copy_(vectors)
     if network.text.bias is not None:
         network.text.bias.fill_(model.logit_bias.item())

@@ -118,11 +118,9 @@ def _torchvision(
     if weights is not None:
         state = files.read_weights(weights)
     else:
-        try:
+        advice = f"set weights=FILE to a copy of {published.url}"
+        with files.reading_network(f"torchvision:{model}", "cannot be downloaded", advice):
             state = published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
-        except Exception as error:  # The connection, the disk or the check of the hash may fail.
-            reason = f"cannot be downloaded ({single_line(error)}): set weights=FILE to a copy of"
-            raise files.name_error(f"torchvision:{model}", f"{reason} {published.url}") from error
     if model.startswith("densenet"):
         # Published files have names of weights such as "norm.1". The network has "norm1" instead.
         own_name = partial(re.sub, r"\.(norm|conv)\.([12])\.", r".\1\2.")

@@ -134,17 +134,17 @@ def single_line(error: BaseException) -> str:
 
 
 @contextmanager
-def reading(path: str | Path, fault: str, advice: str) -> Iterator[None]:
+def reading(path: str | Path, fault: str, advice: str, argument: str = "") -> Iterator[None]:
     """Name a file in the errors that its content raises, of which a damaged file has many types."""
     try:
         yield
     except InputError as error:
-        # The message may begin with another file of the same folder.
-        if str(error).startswith(str(Path(path).parent)):
+        # The message may begin with the file, or with another one of its folder.
+        if str(error).startswith((str(path), f"{Path(path).parent}{os.sep}")):
             raise
         raise InputError(f"{path}: {error}") from error
     except Exception as error:
-        raise InputError(f"{path} {fault} ({single_line(error)}): {advice}") from error
+        raise InputError(f"{path} {fault} ({single_line(error)}): {advice}", argument) from error
 
 
 def import_package(name: str, install: str) -> Any:

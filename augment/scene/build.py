@@ -342,12 +342,9 @@ class Smoothest(NamedTuple):
 
     def warn(self, subject: str, degree: int) -> None:
         """Warn that the degree of the lighting is too low for the highlights of the surface."""
-        error = ringing.highlight_error(degree, self.roughness)
-        least_error = ringing.highlight_error(self.degree, self.roughness)
         surface = f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}"
         needed = f"which takes light of degree {self.degree}"
-        shown = f"{subject} shows the highlight of a point of light off by {error:.0%} (rms)"
-        warnings.warn(f"{surface}, {needed}: {shown} instead of {least_error:.0%}", stacklevel=4)
+        warnings.warn(f"{surface}, {needed}: {subject} blurs its highlights", stacklevel=4)
 
 
 def reached_gloss(

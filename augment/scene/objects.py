@@ -21,7 +21,7 @@ from torch import Tensor
 
 from augment.settings import MeshSettings, ObjectSettings
 from renderer.camera import Camera
-from renderer.errors import InputError, ShortRepr, as_tensor
+from renderer.errors import InputError, ShortRepr, as_tensor, keyed
 from renderer.io.meshes import load_mesh
 from renderer.mesh import Mesh, center_and_extent, concatenate, normalize, select_faces, subdivide
 from renderer.solids import solid
@@ -302,10 +302,8 @@ def _load(item: MeshSettings) -> Mesh:
         name, _, seed = name.partition(":")
         if seed and not seed.isdecimal():
             raise InputError(f"{item.mesh} has the seed {seed!r}: give a whole number")
-        try:
+        with keyed(item.mesh):
             mesh = solid(name, int(seed or 0))
-        except ValueError as error:
-            raise InputError(f"{item.mesh}: {error}") from error
     else:
         mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
     # Meshes without colors of their own are white.

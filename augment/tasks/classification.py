@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from augment.network import are_probabilities, plain_outputs
+from augment.network import are_probabilities, plain_outputs, stored_names
 from augment.tasks.task import NO_CLASS, Criterion, GetTruth, Task
 from renderer.errors import InputError, require_range
 
@@ -62,8 +62,9 @@ class Classification(Task):
         return isinstance(plain, Tensor) and plain.ndim == 2
 
     def class_names(self, network: Any, count: int | None) -> Sequence[str]:
-        """Name the classes "0", "1" and so on."""
-        return [*map(str, range(count or 0))]
+        """Return the names that transformers stores, or otherwise "0", "1" and so on."""
+        names = stored_names(network)
+        return names if len(names) == count else [*map(str, range(count or 0))]
 
     def reader(self, title: str, class_count: int | None = None) -> _LogitReader:
         """Return a function that checks logits."""

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from augment.network import unwrapped
+from augment.network import stored_names, unique_names, unwrapped
 from augment.scene.truth import Truth
 from augment.tasks.task import NO_CLASS, GetTruth, ObjectCriterion, Task, visible_boxes
 from renderer import errors
@@ -34,8 +34,6 @@ NEAR = 0.5
 SMALLEST_SCORE = 1e-6
 # Boxes that `decode` returns are removed if a better box of their class has a larger IoU.
 MAX_OVERLAP = 0.5
-# Name of the class that torchvision gives to numbers which COCO does not use.
-UNUSED = "N/A"
 # Largest number of classes if their number is not known.
 NO_LIMIT = 1e9
 # Keys of the candidates in an output: boxes (K, 4), and scores of all classes (K, C) or, with
@@ -131,12 +129,7 @@ class Detection(Task):
             names = Weights.COCO_V1.meta["categories"]
             if len(names) != _torchvision_count(network):
                 return None
-        # Names that occur again get their number, because labels are found by name.
-        unique = [
-            f"{name} {index}" if name == UNUSED or name in names[:index] else name
-            for index, name in enumerate(names)
-        ]
-        return unique or None
+        return unique_names(names) or None
 
     def output_count(self, network: Any, outputs: Any) -> int | None:
         """Return the number of classes of the network, which may have a background as class 0."""
@@ -519,16 +512,6 @@ def _of_ultralytics(outputs: Tensor) -> list[dict[str, Tensor]]:
     boxes = torch.cat([center - size / 2, center + size / 2], dim=-1)
     pairs = zip(boxes, outputs.mT[..., 4:], strict=True)
     return [{"boxes": one, "scores": scores} for one, scores in pairs]
-
-
-def stored_names(network: Any) -> list[str]:
-    """Return the names of the classes that a network of transformers or Ultralytics stores."""
-    raw = unwrapped(network)
-    # Ultralytics has dictionaries from index to name in `names`, transformers in `id2label`.
-    names = getattr(raw, "names", None)
-    if not isinstance(names, Mapping):
-        names = getattr(getattr(raw, "config", None), "id2label", None) or {}
-    return [str(names[index]) for index in sorted(names)]
 
 
 def _is_of_torchvision(raw: Any) -> bool:

@@ -16,9 +16,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from augment.network import plain_outputs
+from augment.network import plain_outputs, stored_names
 from augment.scene.truth import Truth
-from augment.tasks.detection import log_odds_of, stored_names
+from augment.tasks.detection import log_odds_of
 from augment.tasks.task import GetTruth, ObjectCriterion, Reader, Task, visible_boxes
 from renderer.errors import InputError, describe, require_number
 

@@ -291,30 +291,6 @@ def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
     return best_window(highlight, np.sqrt(harmonics_per_degree) * weight)
 
 
-@cache
-def highlight_error(degree: int, roughness: float) -> float:
-    """Compute the error of a highlight if a point light is approximated by harmonics.
-
-    The SH coefficients of the point light are cut off at a degree and multiplied
-    by `highlight_window` for a highlight that is narrower by the factor NARROWER.
-    The highlight is the specular lobe of a metal for a camera that looks along
-    the surface normal. The error is the root mean square over all directions, as a fraction
-    of that of the highlight.
-    """
-    amplitudes = _amplitudes(max(roughness, MIN_ROUGHNESS), 4 * MAX_DEGREE)
-    window = highlight_window(degree, roughness, NARROWER)
-    # The first harmonic of degree l has the index l².
-    first_of_degree = np.arange(degree + 1) ** 2
-    # Factor of each degree in the approximation. Degrees that are cut off have 0.
-    factors = np.zeros_like(amplitudes)
-    factors[: degree + 1] = window[first_of_degree].numpy()
-    # Sum of the 2l + 1 squared coefficients of degree l of the highlight of a point light, up to a
-    # constant factor.
-    power = (2 * np.arange(len(amplitudes)) + 1) * amplitudes**2
-    relative_squared_error = float(power @ (1 - factors) ** 2 / power.sum())
-    return math.sqrt(relative_squared_error)
-
-
 def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degrees"]:
     """Compute by which factor a highlight multiplies SH coefficients of each degree of a light.
 

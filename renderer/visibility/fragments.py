@@ -203,13 +203,6 @@ class Fragments:
         image = values.new_full((math.prod(self.sample_shape),), empty)
         return image.index_copy_(0, self.sample_numbers, values).view(self.sample_shape)
 
-    def of_image(self, image: Float[Tensor, "_ _"]) -> Float[Tensor, " S"]:
-        """Read the values of the covered samples from an image with one pixel per sample.
-
-        This is the inverse of `image_of_samples`.
-        """
-        return image.flatten().index_select(0, self.sample_numbers)
-
     def interpolate(self, corners: Float[Tensor, "G 3 D"]) -> Float[Tensor, "S D"]:
         """Interpolate values at the corners of faces to the S samples.
 

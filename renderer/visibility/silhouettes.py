@@ -250,7 +250,9 @@ class _MovingView:
         # The gradient of a sample is the sum of its differences to both neighbors.
         gradient = F.pad(difference, (0, 1))
         gradient[:, 1:] += difference
-        return self.fragments.of_image(gradient if axis == X else gradient.T)
+        if axis == Y:
+            gradient = gradient.T
+        return gradient.flatten().index_select(0, self.fragments.sample_numbers)
 
     def gradient_of_silhouettes(
         self, positions: Float[Tensor, "V 3"], upstream: Float[Tensor, "3 _"]
