@@ -132,21 +132,6 @@ def unwrapped(network: Any) -> Any:
     return network
 
 
-def unique_names(names: Sequence[str]) -> list[str]:
-    """Add its index to each name that occurs twice, because labels are found by name."""
-    return [f"{name} {i}" if names.count(name) > 1 else name for i, name in enumerate(names)]
-
-
-def stored_names(network: Any) -> list[str]:
-    """Return the names of the classes that a network of transformers or Ultralytics stores."""
-    raw = unwrapped(network)
-    # Ultralytics has dictionaries from index to name in `names`, transformers in `id2label`.
-    names = getattr(raw, "names", None)
-    if not isinstance(names, Mapping):
-        names = getattr(getattr(raw, "config", None), "id2label", None) or {}
-    return unique_names([str(names[index]) for index in sorted(names)])
-
-
 def text_vectors(network: nn.Module, class_count: int) -> list[str]:
     """Return the names of matrices with a row or column for each class, outside of layers of torch.
 

@@ -16,8 +16,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from augment.network import are_probabilities, plain_outputs, stored_names
-from augment.tasks.task import NO_CLASS, Criterion, GetTruth, Task
+from augment.network import are_probabilities, plain_outputs, unwrapped
+from augment.tasks.task import NO_CLASS, Criterion, GetTruth, Task, stored_names
 from renderer.errors import InputError, require_range
 
 # Logits of N images, and labels or predicted classes of them.
@@ -63,7 +63,7 @@ class Classification(Task):
 
     def class_names(self, network: Any, count: int | None) -> Sequence[str]:
         """Return the names that transformers stores, or otherwise "0", "1" and so on."""
-        names = stored_names(network)
+        names = stored_names(unwrapped(network))
         return names if len(names) == count else [*map(str, range(count or 0))]
 
     def reader(self, title: str, class_count: int | None = None) -> _LogitReader:

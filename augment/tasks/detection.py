@@ -19,9 +19,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from augment.network import stored_names, unique_names, unwrapped
+from augment.network import unwrapped
 from augment.scene.truth import Truth
-from augment.tasks.task import NO_CLASS, GetTruth, ObjectCriterion, Task, visible_boxes
+from augment.tasks.task import (
+    NO_CLASS,
+    GetTruth,
+    ObjectCriterion,
+    Task,
+    stored_names,
+    unique_names,
+    visible_boxes,
+)
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
@@ -121,7 +129,7 @@ class Detection(Task):
 
     def class_names(self, network: Any, count: int | None) -> Sequence[str] | None:
         """Return the names of COCO for torchvision, or those that transformers stores."""
-        names = stored_names(network)
+        names = stored_names(unwrapped(network))
         if not names and _torchvision_count(network):
             from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights as Weights
 
@@ -133,7 +141,7 @@ class Detection(Task):
 
     def output_count(self, network: Any, outputs: Any) -> int | None:
         """Return the number of classes of the network, which may have a background as class 0."""
-        return len(stored_names(network)) or _torchvision_count(network)
+        return len(stored_names(unwrapped(network))) or _torchvision_count(network)
 
     def outputs(self, network: Any, images: Tensor) -> Any:
         """Return the outputs of a network. Those of torchvision get candidates, too.

@@ -16,10 +16,10 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from augment.network import plain_outputs, stored_names
+from augment.network import plain_outputs, unwrapped
 from augment.scene.truth import Truth
 from augment.tasks.detection import log_odds_of
-from augment.tasks.task import GetTruth, ObjectCriterion, Reader, Task, visible_boxes
+from augment.tasks.task import GetTruth, ObjectCriterion, Reader, Task, stored_names, visible_boxes
 from renderer.errors import InputError, describe, require_number
 
 # Class of the pixels that show no object, and the least fraction of an image that shows one.
@@ -74,7 +74,7 @@ class Segmentation(Task):
 
     def class_names(self, network: Any, count: int | None) -> Sequence[str] | None:
         """Return the names that transformers stores. A network of another library has none."""
-        return stored_names(network) or None
+        return stored_names(unwrapped(network)) or None
 
     def output_count(self, network: Any, outputs: Tensor) -> int:
         """Return the number of logits of a pixel."""

@@ -6,7 +6,7 @@ network finds each class. Loop, optimizers, checks and files of an attack know t
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -244,3 +244,17 @@ class Task(ABC):
 def _tensors(outputs: Any) -> list[Tensor]:
     """Return the tensors of outputs, also in lists and dictionaries."""
     return [item for item in tree_leaves(outputs) if isinstance(item, Tensor)]
+
+
+def unique_names(names: Sequence[str]) -> list[str]:
+    """Add its index to each name that occurs twice, because labels are found by name."""
+    return [f"{name} {i}" if names.count(name) > 1 else name for i, name in enumerate(names)]
+
+
+def stored_names(raw: Any) -> list[str]:
+    """Return the names of the classes that a network of transformers or Ultralytics stores."""
+    # Ultralytics has dictionaries from index to name in `names`, transformers in `id2label`.
+    names = getattr(raw, "names", None)
+    if not isinstance(names, Mapping):
+        names = getattr(getattr(raw, "config", None), "id2label", None) or {}
+    return unique_names([str(names[index]) for index in sorted(names)])
