@@ -116,8 +116,7 @@ def explained(
     except turned as error:
         if isinstance(error, InputError) and not kinds:
             raise
-        reason = f"no key {error}" if isinstance(error, KeyError) else single_line(error)
-        reason = textwrap.shorten(reason, LONGEST_REASON)
+        reason = textwrap.shorten(single_line(error), LONGEST_REASON)
         raise InputError(f"{fault} ({reason}): {advice}", argument) from error
 
 
@@ -135,16 +134,15 @@ def single_line(error: BaseException) -> str:
 
 @contextmanager
 def reading(path: str | Path, fault: str, advice: str, argument: str = "") -> Iterator[None]:
-    """Name a file in the errors that its content raises, of which a damaged file has many types."""
+    """Name a file in the errors that its content raises, and in InputErrors, too."""
     try:
-        yield
+        with explained(f"{path} {fault}", advice, argument):
+            yield
     except InputError as error:
         # The message may begin with the file, or with another one of its folder.
         if str(error).startswith((str(path), f"{Path(path).parent}{os.sep}")):
             raise
         raise InputError(f"{path}: {error}") from error
-    except Exception as error:
-        raise InputError(f"{path} {fault} ({single_line(error)}): {advice}", argument) from error
 
 
 def import_package(name: str, install: str) -> Any:

@@ -168,7 +168,7 @@ def test_a_wrong_line_of_yolo_is_refused_by_its_number(tmp_path, line):
         ({"annotations": [{"image_id": 8, "category_id": 90, "bbox": [0, 0, 1, 1]}]}, "image_id 8"),
         ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [0, 0, 1, 1]}]}, "category_id"),
         ({"annotations": [{"image_id": 7, "category_id": 3, "bbox": [0, 0, -1, 1]}]}, "bbox"),
-        ({"annotations": [{"image_id": 7, "category_id": 3}]}, "no key 'bbox'"),
+        ({"annotations": [{"image_id": 7, "category_id": 3}]}, "the entry 'bbox' is missing"),
         ({"images": 2 * [{"id": 7, "file_name": "a.png"}]}, "two of the images"),
         ({"images": [{"id": i, "file_name": "a.png"} for i in (7, 8)]}, "two of the images"),
         ({"categories": [{"id": 90, "name": name} for name in "ab"]}, "two of the categories"),
