@@ -2,7 +2,6 @@
 
 import shlex
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from PIL import ImageOps
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings, RendererSettings
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.errors import InputError, explained, require_file
+from renderer.errors import InputError, explained, import_package, require_file
 from renderer.image import decode, encode
 from renderer.io.images import eight_bits, open_image, read_image, read_rgb, write_image
 from renderer.light.files import save_light
@@ -219,10 +218,7 @@ def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndar
 
     The box is left, top, right and bottom in pixels. The mask is 255 on the object, otherwise 0.
     """
-    try:
-        cv2: Any = import_module("cv2")
-    except ImportError as error:
-        raise InputError("box= needs OpenCV: pip install opencv-python-headless") from error
+    cv2 = import_package("cv2", "opencv-python-headless")
     height, width = image.shape[:2]
     left, top, right, bottom = box if len(box) == 4 else [0, 0, 0, 0]
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):

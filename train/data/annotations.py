@@ -400,26 +400,21 @@ def fit_batches(
     skip_unreadable: bool = False,
 ) -> Iterator[list[tuple[Annotated, Fitted]]]:
     """Yield photographs in batches. Unreadable ones are skipped, or raise InputError."""
-
-    def read(photograph: Annotated) -> Fitted | Exception:
-        try:
-            return fit(photograph, size, how)
-        except InputError:
-            raise
-        except Exception as error:  # Pillow raises errors of almost any type.
-            return error
-
     with ThreadPoolExecutor() as pool:
         for start in range(0, len(photographs), batch_size):
             batch = photographs[start : start + batch_size]
+            futures = [pool.submit(fit, item, size, how) for item in batch]
             fitted = []
-            # `read` returns errors instead of raising them, so that a damaged file can be skipped.
-            for item, result in zip(batch, pool.map(read, batch), strict=True):
-                if isinstance(result, Fitted):
-                    fitted.append((item, result))
-                elif skip_unreadable:
+            for item, future in zip(batch, futures, strict=True):
+                try:
+                    fitted.append((item, future.result()))
+                except InputError:
+                    raise
+                except Exception as error:  # Pillow raises errors of almost any type.
+                    if not skip_unreadable:
+                        advice = "replace it, or set skip_unreadable=True"
+                        raise InputError(
+                            f"{item.path} cannot be read ({error}): {advice}"
+                        ) from error
                     console.warning("%s is skipped, because it cannot be read", item.path)
-                else:
-                    advice = "replace it, or set skip_unreadable=True"
-                    raise InputError(f"{item.path} cannot be read ({result}): {advice}")
             yield fitted
