@@ -31,7 +31,7 @@ from augment import classifier as classifiers
 from augment.classifier import Classifier, TaskNetwork
 from augment.network import ARRAYS, FILE, YOU, Function, Network, plain_outputs, say_once, unwrapped
 from augment.tasks.task import Task
-from renderer.errors import InputError, reading, require_file, require_kind, single_line
+from renderer.errors import InputError, explained, reading, require_file, require_kind, single_line
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
 # A network from images (N, 3, height, width) to logits, and the sizes of the four dimensions of its
@@ -466,9 +466,7 @@ def fill(classifier: Classifier, state: State, source: str | Path) -> Classifier
 
     The classifier is changed in place and returned.
     """
-    try:
+    misfit = f"weights={source} do not fit {classifier.name}"
+    with explained(misfit, "use weights of that network", "weights"):
         unwrapped(classifier).load_state_dict(state)
-    except (RuntimeError, ValueError) as error:
-        misfit = f"do not fit {classifier.name} ({textwrap.shorten(str(error), 300)})"
-        raise weights_error(source, f"{misfit}: use weights of that network") from error
     return classifier

@@ -416,10 +416,7 @@ def _as_depth(depth: Any, frames: Tensor, count: int) -> Float[Tensor, "N 1 H W"
     values = errors.as_tensor("depth", np.array(depth) if isinstance(depth, Image.Image) else depth)
     values = values.as_subclass(Tensor).to(frames.device, torch.float32)
     size = frames.shape[-2:]
-    if values.ndim < 2 or values.shape[-2:] != size:
-        raise InputError(
-            f"depth has shape {tuple(values.shape)}, but the image is {tuple(size)}: resize it"
-        )
+    errors.require_shape("depth", values, "...", *size)
     # A sample has one depth map, one for each image or video, or one for each frame.
     values = values.reshape(-1, 1, *size)
     if len(values) not in (1, count, len(frames)):

@@ -30,7 +30,7 @@ from augment.scene.truth import NO_OBJECT, Truth
 from augment.scene.vary import vary
 from augment.tasks.classification import ClassCriterion, Classification
 from augment.tasks.task import NO_CLASS, Criterion, Task
-from renderer.errors import InputError, as_integers, require_kind, require_whole
+from renderer.errors import InputError, as_integers, require_kind, require_shape, require_whole
 from renderer.image import to_unit
 from renderer.light.files import perturb
 from renderer.settings import Size
@@ -108,9 +108,8 @@ class AugmentationService:
         require_kind("task", self.task, Task, "a task, such as nb.Detection()")
         self.labels = as_integers("labels", self.labels)
         self.positive_classes = as_integers("positive_classes", self.positive_classes).tolist()
-        if self.scene is not None and self.labels.shape != (len(self.scene),):
-            advice = f"give one label for each of the {len(self.scene)} examples"
-            raise InputError(f"labels has shape {tuple(self.labels.shape)}: {advice}")
+        if self.scene is not None:
+            require_shape("labels", self.labels, len(self.scene))
         if self._finds_objects and self.settings.mode == "folder":
             reason = f"mode=folder has images without boxes, but the task is {self.task.name}"
             raise InputError(f"{reason}: choose random or adversarial")

@@ -243,18 +243,13 @@ def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
         # timm would give downloaded weights a random last layer for another number of classes.
         if facts.classes is not None and not downloads:
             options["num_classes"] = len(facts.classes)
-        try:
+        with files.reading_network(name, "cannot be built or downloaded", "set weights=FILE"):
             network = timm.create_model(model, **options)
             published = network.pretrained_cfg
             size = facts.size or published["input_size"][-1]
             # A transformer of a fixed size is built again for the size that the user gives.
             if wrappers.own_size(network) not in (None, size):
                 network = timm.create_model(model, img_size=size, **options)
-        except Exception as error:  # The connection, the disk or timm's hub may fail.
-            if not downloads:
-                raise
-            reason = f"cannot be downloaded ({single_line(error)}): set weights=FILE"
-            raise files.name_error(name, reason) from error
         classes = facts.classes or tuple(published.get("label_names") or ())
         if not classes:
             classes = imagenet_classes()

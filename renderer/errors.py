@@ -103,7 +103,7 @@ def keyed(group: str = "", /, **keys: str) -> Iterator[None]:
 
 @contextmanager
 def explained(
-    fault: str, advice: str, argument: str = "", *kinds: type[BaseException]
+    fault: str, advice: str = "", argument: str = "", *kinds: type[BaseException]
 ) -> Iterator[None]:
     """Turn an error in a `with` block into an InputError: fault, reason in brackets, and advice.
 
@@ -117,7 +117,8 @@ def explained(
         if isinstance(error, InputError) and not kinds:
             raise
         reason = textwrap.shorten(single_line(error), LONGEST_REASON)
-        raise InputError(f"{fault} ({reason}): {advice}", argument) from error
+        text = f"{fault} ({reason})" + (f": {advice}" if advice else "")
+        raise InputError(text, argument) from error
 
 
 def keys_of(key: str, settings: object) -> dict[str, str]:
@@ -133,7 +134,7 @@ def single_line(error: BaseException) -> str:
 
 
 @contextmanager
-def reading(path: str | Path, fault: str, advice: str, argument: str = "") -> Iterator[None]:
+def reading(path: str | Path, fault: str, advice: str = "", argument: str = "") -> Iterator[None]:
     """Name a file in the errors that its content raises, and in InputErrors, too."""
     try:
         with explained(f"{path} {fault}", advice, argument):
@@ -174,15 +175,10 @@ def as_device(device: torch.device | str) -> torch.device:
     """Convert a device name to a device of this machine."""
     import torch
 
-    try:
+    # torch raises AssertionError for "cuda" if it was built without CUDA.
+    fault = f"device={_short_text(device)} is not available here"
+    with explained(fault, "use cpu, or cuda on a machine with a GPU", "device"):
         return torch.empty(0, device=device).device
-    except (RuntimeError, AssertionError, TypeError) as error:
-        # torch raises AssertionError for "cuda" if it was built without CUDA.
-        raise InputError(
-            f"device={_short_text(device)} is not available here: "
-            "use cpu, or cuda on a machine with a GPU",
-            "device",
-        ) from error
 
 
 def require_file(path: str | Path, advice: str) -> None:

@@ -121,8 +121,7 @@ class Mesh:
             # Arrays per face have as many rows as `faces`. Other arrays may have any number of
             # rows.
             shape = (*(self.faces if name in PER_FACE else array).shape[:1], *row)
-            if array.shape != shape:
-                raise InputError(f"{name} has the shape {array.shape}: give the shape {shape}")
+            errors.require_shape(name, array, *shape)
         errors.require_range("the number of faces", len(self.faces), 1, np.inf)
         for name, channels in (("textures", 3), ("gloss_textures", 2)):
             expected = f"a list of arrays (height, width, {channels}) of uint8"
@@ -183,15 +182,11 @@ class Mesh:
         if not color.size or not (color.min() >= 0 and color.max() <= 1):
             given = reprlib.repr(color.tolist())
             raise InputError(f"color={given} is not a color: give red, green and blue from 0 to 1")
-        try:
+        shapes = "give the shapes (V, 3), (F, 3) and (3,)"
+        with errors.explained("vertices, faces and color do not fit together", shapes):
             # Vertex indices out of range are clipped, because `Mesh(...)` raises a better error.
             # Give each corner the color of its vertex, or the single color.
             corner_colors = np.broadcast_to(color, vertices.shape).take(faces, axis=0, mode="clip")
-        except (TypeError, ValueError, OverflowError, IndexError) as error:
-            raise InputError(
-                f"vertices, faces and color do not fit together ({error}): give the shapes "
-                "(V, 3), (F, 3) and (3,)"
-            ) from error
         errors.require_range("crease", crease, 0, 180)
         mesh = Mesh(
             vertices=vertices,

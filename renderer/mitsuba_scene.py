@@ -34,7 +34,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 
 from renderer.camera import Camera
-from renderer.errors import InputError, import_package
+from renderer.errors import explained, import_package, reading
 from renderer.image import decode, encode, to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
@@ -88,13 +88,9 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
     install = '"parametric-norm-balls[lab]"'
     drjit, module = (import_package(name, install) for name in ("drjit", "mitsuba"))
     previous = module.variant()
-    try:
+    advice = "install libllvm19, or set DRJIT_LIBLLVM_PATH"
+    with explained(f"the variant {variant} of Mitsuba needs LLVM, which was not found", advice):
         module.set_variant(variant)
-    except ImportError as error:
-        raise InputError(
-            f"the variant {variant} of Mitsuba needs LLVM, which was not found ({error}): install "
-            "libllvm19, or set DRJIT_LIBLLVM_PATH"
-        ) from error
     # Mitsuba needs two threads. With one, it would
     # wait forever when it reads an .exr file.
     drjit.set_thread_count(max(2, drjit.thread_count()))
@@ -122,13 +118,9 @@ def load(module: Any, scene: Mapping[str, Any]) -> Any:
 
 def render_mitsuba_scene(path: Path, views: int, shape: tuple[int, int]) -> torch.Tensor:
     """Render the first cameras of a file: linear RGB and coverage, (views, 4, *shape)."""
-    with mitsuba() as module:
-        try:
-            scene = module.load_file(str(path))
-            rendered = [np.array(module.render(scene, sensor=view)) for view in range(views)]
-        except RuntimeError as error:
-            reason = str(error).splitlines()[0]
-            raise InputError(f"Mitsuba cannot render {path}: {reason}") from error
+    with mitsuba() as module, reading(path, "cannot be rendered by Mitsuba"):
+        scene = module.load_file(str(path))
+        rendered = [np.array(module.render(scene, sensor=view)) for view in range(views)]
     images = []
     for image in rendered:
         channels = torch.from_numpy(image).permute(2, 0, 1)

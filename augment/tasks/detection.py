@@ -357,11 +357,8 @@ class _Reader:
         is_raw = task.decode is not None
         if task.decode is not None:
             given, title = outputs, f"decode of {title}"
-            try:
+            with errors.explained(f"{title} fails on {errors.describe(given)}"):
                 outputs = task.decode(given)
-            except Exception as error:  # Users' functions raise errors of many kinds.
-                kind = f"{type(error).__name__}: {errors.single_line(error)}"
-                raise InputError(f"{title} fails on {errors.describe(given)} ({kind})") from error
         elif _is_transformer(outputs):
             outputs = _of_transformer(outputs, images, title, self.class_count)
         if _is_ultralytics(outputs):

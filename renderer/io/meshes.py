@@ -116,13 +116,9 @@ def read_parts(path: Path, gloss: bool = False) -> list[Part]:
     if read is None:
         known = ", ".join(sorted([*READERS, *GLTF]))
         raise InputError(f"{path} is not of a mesh format that is read: convert it to {known}")
-    # NumPy and Pillow can raise almost any exception for a damaged file.
-    try:
+    with errors.reading(path, "cannot be read as a mesh"):
         file = MeshFile(path)
         parts = read(file)
-    except Exception as error:
-        message = errors.single_line(error)
-        raise InputError(f"{path} cannot be read as a mesh: {message}") from error
     file.warn(stacklevel=3)
     return parts
 

@@ -125,14 +125,9 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
             raise InputError(f"basis is {name!r}: give a light with the basis {known}")
         # All other entries are the fields of the class.
         basis = kind_of_name[name](**description)
-    # The comparison is False for NaN, so NaN counts as too large.
-    is_bounded = bool((coefficients.abs() <= errors.MAX_SCALE).all())
-    if coefficients.shape != (basis.size, 3) or not is_bounded:
-        shape = tuple(coefficients.shape)
-        raise InputError(
-            f"{path} has coefficients of shape {shape}, or values that are not finite: give "
-            f"{basis.size} rows [r, g, b] of numbers with magnitudes up to {errors.MAX_SCALE:g}"
-        )
+        errors.require_shape("coefficients", coefficients, basis.size, 3)
+        largest = float(coefficients.abs().max())
+        errors.require_range("the largest coefficient", largest, 0, errors.MAX_SCALE)
     return basis, coefficients
 
 

@@ -29,7 +29,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from renderer.errors import InputError, as_tensor, require_finite, require_whole
+from renderer.errors import InputError, as_tensor, require_finite, require_shape, require_whole
 from renderer.settings import MAX_DEGREE
 from renderer.vectors import unit
 
@@ -115,9 +115,7 @@ def basis(
     """
     require_degree(degree)
     directions = as_tensor("directions", directions)
-    if not directions.ndim or directions.shape[-1] != 3:
-        shape = tuple(directions.shape)
-        raise InputError(f"directions has shape {shape}: give vectors of shape (..., 3)")
+    require_shape("directions", directions, "...", 3)
     require_finite(directions=directions)
     components = unit(directions.double().movedim(-1, 0))
     values = evaluate_harmonics(components, range((degree + 1) ** 2))
@@ -500,9 +498,7 @@ def project(
     require_degree(degree)
     if not callable(radiance):
         radiance = as_tensor("radiance", radiance)
-        if radiance.ndim != 3:
-            shape = tuple(radiance.shape)
-            raise InputError(f"radiance has shape {shape}: give a map (height, width, channels)")
+        require_shape("radiance", radiance, "height", "width", "channels")
         require_finite(radiance=radiance)
         # A map may have 10⁸ texels, so the midpoint rule sums row by row to save memory.
         rows = zip(*equirectangular(*radiance.shape[:2]), radiance, strict=True)

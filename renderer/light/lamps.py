@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer.camera import MAX_FOV, MIN_FOV, OrthographicCamera, PerspectiveCamera
-from renderer.errors import MAX_SCALE, InputError, as_array, as_tensor, require_number
+from renderer.errors import MAX_SCALE, InputError, as_array, as_tensor, explained, require_number
 from renderer.io.images import gray_or_image
 from renderer.io.mitsuba_entries import pose_of, projector
 from renderer.light.basis import LightPaths, LocalBasis
@@ -236,13 +236,9 @@ class Lamps(LocalBasis):
             lamps, powers = read_light(settings.start, cls)
             return lamps, lamps.project_nonnegative(powers)
         lamps = cls(settings.positions, settings.power, settings.radius)
-        try:
+        advice = "give a number or a list with [r, g, b] for each lamp"
+        with explained(f"start={settings.start} does not fit {lamps}", advice):
             start = as_tensor("start", settings.start).float().expand(lamps.size, 3)
-        except RuntimeError as error:
-            raise InputError(
-                f"start={settings.start} does not fit {lamps}: give a number or a list with "
-                "[r, g, b] for each lamp"
-            ) from error
         # NaN is out of range, too, because both comparisons with NaN are False.
         if not ((start >= 0) & (start <= settings.power)).all():
             raise InputError(f"start={settings.start} must be from 0 to power={settings.power:g}")

@@ -26,7 +26,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
 from renderer import errors
-from renderer.errors import InputError, as_device, as_tensor, require_bounded
+from renderer.errors import as_device, as_tensor, require_bounded
 from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light.basis import HARMONICS, Basis
 from renderer.settings import ImageSettings
@@ -309,10 +309,7 @@ class TransferOperator:
         if not lights.is_floating_point():
             require_bounded(lights=lights)
         if lights.shape[-2:] != (self.basis.size, COLORS):
-            raise InputError(
-                f"lights has shape {tuple(lights.shape)}, but {self.basis} needs the shape "
-                f"(..., {self.basis.size}, 3): give lights of this basis"
-            )
+            errors.require_shape(f"lights of {self.basis}", lights, "...", self.basis.size, COLORS)
         # The sum of squares is faster to check than each value. If it is too large or NaN,
         # `require_bounded` checks each value and raises the error.
         values = lights.detach().reshape(-1)
@@ -472,10 +469,6 @@ class _Image(torch.autograd.Function):
 
 def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
     """Check that the result of a user's function `loss_gradient` has the shape of the images."""
-    if isinstance(image_gradient, Tensor) and image_gradient.shape == images.shape:
-        return
-    given = getattr(image_gradient, "shape", type(image_gradient).__name__)
-    raise InputError(
-        f"loss_gradient returned {given}: return a tensor in the shape of the images, "
-        f"{tuple(images.shape)}"
-    )
+    name = "the result of loss_gradient"
+    errors.require_kind(name, image_gradient, Tensor, "a tensor in the shape of the images")
+    errors.require_shape(name, image_gradient, *images.shape)

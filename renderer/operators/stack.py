@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, as_tensor
+from renderer.errors import InputError, as_tensor, explained
 from renderer.image import as_background, background_term, clamp, encode
 from renderer.operators import apply
 from renderer.operators.apply import COLORS, SparseTransfer, TransferOperator
@@ -148,13 +148,9 @@ class TransferOperators(Sequence[TransferOperator]):
         image_shape = (*view_lights.shape[:-2], COLORS, *first.settings.shape)
         backgrounds = as_background(background, first.settings.size, lights)
         if backgrounds.ndim > 3:
-            try:
+            fault = f"background has shape {tuple(backgrounds.shape)}"
+            with explained(fault, f"give images that broadcast to {image_shape}"):
                 backgrounds = backgrounds.expand(image_shape)
-            except RuntimeError as error:
-                given = tuple(backgrounds.shape)
-                raise InputError(
-                    f"background has shape {given}: give images that broadcast to {image_shape}"
-                ) from error
         operators_in_stack = min(len(self), self._operators_per_stack)
         if operators_in_stack >= FEWEST_STACKED and not backgrounds.requires_grad:
             return self._stacked_images(view_lights, backgrounds.flatten(-2))

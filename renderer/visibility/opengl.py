@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
-from renderer.errors import InputError
+from renderer.errors import InputError, explained
 
 if TYPE_CHECKING:
     import moderngl
@@ -94,14 +94,10 @@ def _context() -> Iterator[moderngl.Context]:
         import triton  # noqa: F401
     import moderngl
 
-    try:
+    advice = "apt install libegl1 libgl1, or choose the rasterizer numpy"
+    with explained("the rasterizer opengl found no EGL device", advice):
         # The argument `backend` has a wrong type annotation in moderngl.
         context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]
-    except Exception as error:  # moderngl raises no narrower class.
-        raise InputError(
-            "the rasterizer opengl found no EGL device: apt install libegl1 libgl1, or choose the "
-            "rasterizer numpy"
-        ) from error
     try:
         _check(context)
         yield context
