@@ -212,11 +212,9 @@ def render_arguments(case: RenderCase, folder: Path) -> dict[str, Tensor]:
     mesh = mesh_named(case.mesh, folder)
     shape = (mesh.textures or [mesh.faces])[0].shape
     draws = torch.Generator().manual_seed(2)
-    return {
-        "light": light_named(case.light, folder),
-        "vertices": torch.from_numpy(mesh.vertices),
-        "albedo": 0.2 + 0.6 * torch.rand(shape, generator=draws),
-    }
+    albedo = 0.2 + 0.6 * torch.rand(shape, generator=draws)
+    vertices = torch.from_numpy(mesh.vertices)
+    return {"light": light_named(case.light, folder), "vertices": vertices, "albedo": albedo}
 
 
 @pytest.mark.parametrize("name", RENDERS)
@@ -432,12 +430,8 @@ def textured_tent() -> renderer.Mesh:
     plain = renderer.Mesh.plain(vertices, [[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5]])
     uvs = (vertices[plain.faces][..., :2] + 1) / 2
     texture = np.random.default_rng(1).integers(0, 256, (8, 8, 3), dtype=np.uint8)
-    return replace(
-        plain,
-        corner_uvs=uvs.astype(np.float32),
-        texture_ids=np.zeros(4, dtype=np.int32),
-        textures=(texture,),
-    )
+    ids = np.zeros(4, dtype=np.int32)
+    return replace(plain, corner_uvs=np.float32(uvs), texture_ids=ids, textures=(texture,))
 
 
 def mesh_named(name: str, folder: Path) -> renderer.Mesh:

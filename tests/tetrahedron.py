@@ -12,11 +12,9 @@ from renderer.light.lamps import Lamps
 from tests.helpers import bright_or_dark
 
 SIZE = 8
-MESH = renderer.Mesh.plain(
-    [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]],
-    [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]],
-    color=(1.0, 0.5, 0.0),
-)
+VERTICES = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]
+FACES = [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]
+MESH = renderer.Mesh.plain(VERTICES, FACES, color=(1.0, 0.5, 0.0))
 CAMERA = renderer.OrthographicCamera(57.3, 28.6, 4.0)
 LIGHT = renderer.load_light("grace")
 LAMP = Lamps(((2.0, 2.0, 2.0),))

@@ -285,15 +285,6 @@ def test_bytes_are_exactly_rounded():
     assert (relit - exact).abs().max() < 0.5 + 1e-4
 
 
-def test_the_loop_of_numba_equals_the_operations_of_torch(monkeypatch):
-    pytest.importorskip("numba")
-    colors = picture(2, 3, 33, 65)
-    light = Illumination(2 * torch.rand(2, 1, 33, 65), *torch.rand(2, 2, 3, 1, 1))
-    expected = lighting.relit_bytes(colors, light)
-    monkeypatch.setattr(loops, "relit_bytes", lambda *_: None)
-    assert torch.equal(lighting.relit_bytes(colors, light), expected)
-
-
 LOOPS = ("relit_bytes", "noisy_bytes", "ramps", "shadows", "lamps", "multiply_slides")
 
 
@@ -320,16 +311,6 @@ def test_images_that_loops_relight_are_those_of_torch(name, monkeypatch):
         monkeypatch.setattr(loops, loop, lambda *_: None)
     difference = (relit - transform.apply(images, params)).abs()
     assert difference.max() <= 1 and (difference == 0).float().mean() > 0.999
-
-
-def test_noisy_bytes_of_the_loop_equal_those_of_torch(monkeypatch):
-    pytest.importorskip("numba")
-    image = picture(2, 3, 33, 65)
-    params = (transform := nb.RandomLighting("low_light")).make_params([image])
-    relit = transform.apply(image, params)
-    for loop in LOOPS:
-        monkeypatch.setattr(loops, loop, lambda *_: None)
-    assert (relit == transform.apply(image, params)).float().mean() > 0.999
 
 
 def test_noisy_bytes_equal_what_the_camera_measures():

@@ -230,11 +230,9 @@ def test_a_warm_start_continues_the_last_attack(serve, model):
 
 def test_a_warm_start_in_another_environment_lies_in_the_ball_around_it(serve):
     """Every example is misclassified as class 1, so that no step projects its values."""
-    service = serve(
-        warm_start=True,
-        vary=VariationSettings(environments=["grace", "eucalyptus", "st_peters"]),
-        attack=TrainingAttackSettings(lighting=StepSettings("l2", 0.1), max_steps=2),
-    )
+    vary = VariationSettings(environments=["grace", "eucalyptus", "st_peters"])
+    attack = TrainingAttackSettings(lighting=StepSettings("l2", 0.1), max_steps=2)
+    service = serve(warm_start=True, vary=vary, attack=attack)
     for number in range(3):
         diagnostics = service.regenerate(Always(1), number).diagnostics
         assert diagnostics["steps"] == 0
@@ -244,12 +242,9 @@ def test_a_warm_start_in_another_environment_lies_in_the_ball_around_it(serve):
 @pytest.mark.parametrize("mode", ["random", "adversarial"])
 def test_both_arms_change_shape_and_albedo_within_their_norm_balls(model, mode):
     """Shapes are rasterized in every step, so that one view before one background is enough."""
-    attack = TrainingAttackSettings(
-        geometry=StepSettings("linf", 0.02, "sign", 0.01),
-        albedo=StepSettings("linf", 0.1, "sign", 0.05),
-        max_steps=2,
-        backtracking=True,
-    )
+    steps = {"geometry": StepSettings("linf", 0.02, "sign", 0.01)}
+    steps["albedo"] = StepSettings("linf", 0.1, "sign", 0.05)
+    attack = TrainingAttackSettings(**steps, max_steps=2, backtracking=True)
     scene = built(1, 0.5)
     labels = torch.tensor(list(CLASSES.values()))
     settings = AugmentationSettings(mode=mode, examples=2, attack=attack)

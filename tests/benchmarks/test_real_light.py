@@ -100,10 +100,8 @@ def test_seeds_are_averaged_and_drawn():
 def test_networks_that_two_lights_rank_alike_have_a_rank_correlation_of_one(tmp_path):
     values = {"a": 0.2, "b": 0.3, "c": 0.7, "d": 0.9, "e": 0.95}
     for title, power in (("real", 1), ("alike", 3), ("other", -1)):
-        rows = [
-            ["orange", name, "dim", *[""] * 4, f"{x**power:.4f} [0, 1]"]
-            for name, x in values.items()
-        ]
+        cells = {name: f"{x**power:.4f} [0, 1]" for name, x in values.items()}
+        rows = [["orange", name, "dim", *[""] * 4, cell] for name, cell in cells.items()]
         real_light.write_csv(tmp_path / title, [["label", *real_light.HEADER], *rows])
     words = [f"{title}={tmp_path / title}" for title in ("real", "alike", "other")]
     scores = real_light.read_scores(words, "orange", "AUC")

@@ -21,11 +21,8 @@ from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
 
 EPS = np.finfo(np.float64).eps
-ORTHOGRAPHIC = [
-    *orbit_cameras(7, 2.0),
-    OrthographicCamera(0, 0, 2.0),
-    OrthographicCamera(180.0, 57.3, 3.0),
-]
+ORTHOGRAPHIC = [OrthographicCamera(0, 0, 2.0), OrthographicCamera(180.0, 57.3, 3.0)]
+ORTHOGRAPHIC += orbit_cameras(7, 2.0)
 PERSPECTIVE = [
     PerspectiveCamera(60.0, 0, 4.0, distance=2.0),
     PerspectiveCamera(57.3, -114.6, 2.4, right=0.3, up=-0.2, distance=3.0),

@@ -37,12 +37,9 @@ def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, s
     window = photograph.window(origin, side, above)
     eye = camera.eye()[:3]
     distance = float(np.linalg.norm(eye))
-    turned = PerspectiveCamera(
-        polar=math.degrees(math.acos(eye[2] / distance)),
-        azimuth=math.degrees(math.atan2(eye[1], eye[0])),
-        width=side * distance / focal_length,
-        distance=distance,
-    )
+    angles = math.acos(eye[2] / distance), math.atan2(eye[1], eye[0])
+    width = side * distance / focal_length
+    turned = PerspectiveCamera(*map(math.degrees, angles), width, distance=distance)
     expected = renderer.render(mesh, turned, GRACE, size, 0.0, samples=8)
     straight = Photograph(pixels, None).window(origin, side, above).cut(pixels, size)
     assert error(window.cut(pixels, size), expected) < 0.04

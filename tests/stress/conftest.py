@@ -91,11 +91,11 @@ def run_here(name: str, *arguments: str, folder: Path) -> int:
     return 0
 
 
-def start_command(*arguments, folder, limit=None, **environment) -> Process:
-    """Start `python` with these arguments in a process that calls `limit` first."""
+def start_command(*arguments, folder, **environment) -> Process:
+    """Start `python` with these arguments in a process."""
     defaults = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    options = {"cwd": folder, "env": os.environ | defaults | environment, "preexec_fn": limit}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    options = {"cwd": folder, "env": os.environ | defaults | environment, "text": True}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen([sys.executable, *arguments], **options, **pipes)
 
 

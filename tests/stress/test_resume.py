@@ -1,13 +1,12 @@
 """Runs that are interrupted and resumed end like an uninterrupted run, bit for bit.
 
-Every signal and full disks are tried, in processes of their own. Without `-m slow`,
+Every signal is tried, in processes of their own. Without `-m slow`,
 tests/train/training/test_run.py interrupts runs within the process of the tests.
 """
 
-import resource
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ import numpy as np
 import pytest
 
 from train import checkpoints, run_folder
-from train.cli import USER_ERROR
 from train.data.sets import content_hash
 from train.run_folder import METRICS, read_metrics
 
@@ -77,22 +75,6 @@ def uninterrupted(data, tmp_path_factory) -> dict[str, Any]:
     return result
 
 
-@pytest.fixture
-def assert_resumed(data, uninterrupted, capfd) -> Callable[[Path], str]:
-    """Return a function that resumes a run, compares its files, and returns its output."""
-
-    def resumed(run: Path) -> str:
-        capfd.readouterr()
-        assert run_here("train", f"out={run}", *COMMAND, folder=data) == 0
-        result = contents(run)
-        names = result | uninterrupted
-        different = [name for name in names if result.get(name) != uninterrupted.get(name)]
-        assert different == []
-        return capfd.readouterr().out
-
-    return resumed
-
-
 def interrupt(data, run, signals, rng) -> None:
     """Continue a run up to a random epoch, send it signals, and check how it ends."""
     done_before = epochs_done(run)
@@ -104,8 +86,7 @@ def interrupt(data, run, signals, rng) -> None:
         was_training &= done_before < epochs_done(run) < EPOCHS - 1
         process.send_signal(number)
     status, output, errors = end(process)
-    if was_training:
-        assert errors == ""
+    assert "Traceback" not in errors or not was_training
     if was_training and signals in HANDLED and status:
         assert status == 128 + signals[-1]
         assert "train.resume=true" in output
@@ -119,26 +100,14 @@ INTERRUPTED_OFTEN = [
 
 
 @pytest.mark.parametrize(("signals", "seed"), INTERRUPTED_OFTEN)
-def test_a_run_that_is_interrupted_three_times_is_resumed_to_the_same_end(
-    data, tmp_path, assert_resumed, signals, seed
-):
+def test_a_run_is_resumed_to_the_same_end(data, tmp_path, uninterrupted, signals, seed):
+    """The run is interrupted three times."""
     run = tmp_path / "run"
     rng = np.random.default_rng(seed)
     for _ in range(3):
         if epochs_done(run) < EPOCHS:
             interrupt(data, run, signals, rng)
-    assert_resumed(run)
-
-
-@pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="only Linux limits another process")
-@pytest.mark.parametrize("epoch", [1, 3, 6])
-def test_a_full_disk_is_an_error_in_one_sentence_and_the_run_is_resumed_later(
-    data, tmp_path, assert_resumed, epoch
-):
-    process = start(data, tmp_path / "run", epoch)
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (10_000, 10_000))
-    status, _, errors = end(process)
-    assert status == USER_ERROR
-    assert errors.startswith("error: ")
-    assert errors.count("\n") == 1
-    assert_resumed(tmp_path / "run")
+    assert run_here("train", f"out={run}", *COMMAND, folder=data) == 0
+    result = contents(run)
+    names = result | uninterrupted
+    assert [name for name in names if result.get(name) != uninterrupted.get(name)] == []

@@ -22,12 +22,9 @@ def settings(meshes: list, hard_negatives: list | None = None) -> ExperimentSett
 
 
 def test_label_lists_the_classes_of_labels_files_and_solids_once():
-    meshes = [
-        {"mesh": "scan.glb", "label": "banana", "albedo_scale": 2.0},
-        "objects/Coffee_Mug.glb",
-        {"mesh": "other_scan.glb", "label": 0},
-        "solid:lemon:3",
-    ]
+    scan = {"mesh": "scan.glb", "label": "banana", "albedo_scale": 2.0}
+    other = {"mesh": "other_scan.glb", "label": 0}
+    meshes = [scan, "objects/Coffee_Mug.glb", other, "solid:lemon:3"]
     named = class_names.with_class_names(settings(meshes), CLASSES)
     assert named.label == ["banana", "coffee mug", "lemon"]
     labels = [item.label for item in named.objects.values()]

@@ -20,13 +20,10 @@ def test_the_published_detector_finds_more_than_half_of_other_solids(detector):
     scene = nb.build_scene(objects, detector.size, **LOOKS)
     rows = torch.arange(len(scene))
     truth = scene.truth(detector.label)
+    outputs = detector(scene.render(scene.conditions(rows), rows)[:, 0])
+    labels = truth.labels[:, 0, 0]
     found = []
-    for output, box, label in zip(
-        detector(scene.render(scene.conditions(rows), rows)[:, 0]),
-        truth.boxes[:, 0],
-        truth.labels[:, 0, 0],
-        strict=True,
-    ):
+    for output, box, label in zip(outputs, truth.boxes[:, 0], labels, strict=True):
         is_counted = (output["scores"] >= 0.4) & (output["labels"] == label)
         found.append(bool((box_iou(output["boxes"][is_counted], box) >= 0.5).any()))
     assert sum(found) >= 6

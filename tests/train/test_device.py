@@ -5,14 +5,6 @@ import torch
 
 from renderer.errors import InputError
 from train import device
-from train.device import (
-    MixedPrecision,
-    choose_device,
-    choose_precision,
-    choose_threads,
-    compiles,
-    most_threads,
-)
 from train.networks import WideResNet
 
 CPU = torch.device("cpu")
@@ -27,7 +19,7 @@ def network() -> WideResNet:
 
 def test_a_device_that_is_not_there_is_one_error():
     with pytest.raises(InputError, match="device=cuda:99 is not available here: use cpu"):
-        choose_device("cuda:99")
+        device.choose_device("cuda:99")
 
 
 @pytest.mark.parametrize(
@@ -40,13 +32,13 @@ def test_threads_are_at_most_the_containers_quota_of_cores(tmp_path, monkeypatch
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)))
     for at_start, expected in [(8, cores), (1, 1)]:
         monkeypatch.setattr(device, "THREADS", at_start)
-        assert most_threads() == expected
+        assert device.most_threads() == expected
 
 
 def test_a_large_training_gets_all_threads_and_a_small_one_gets_one(monkeypatch):
     monkeypatch.setattr(device, "most_threads", lambda: 6)
-    assert choose_threads(WideResNet(3, 10, 1, dropout=0.0), 16, 16) == 1
-    assert choose_threads(WideResNet(100, 16, 4, dropout=0.0), 128, 32) == 6
+    assert device.choose_threads(WideResNet(3, 10, 1, dropout=0.0), 16, 16) == 1
+    assert device.choose_threads(WideResNet(100, 16, 4, dropout=0.0), 128, 32) == 6
 
 
 @pytest.mark.parametrize(
@@ -63,9 +55,9 @@ def test_auto_is_bfloat16_where_hardware_computes_it(monkeypatch, where, machine
     monkeypatch.setattr(device.platform, "machine", lambda: machine)
     for supported, expected in ((True, "bfloat16"), (False, otherwise)):
         monkeypatch.setattr(rule, lambda supported=supported, **_: supported)
-        assert choose_precision("auto", where, grouped) == expected
+        assert device.choose_precision("auto", where, grouped) == expected
         of_depthwise = "float32" if where.type == "cpu" else expected
-        assert choose_precision("auto", where, depthwise) == of_depthwise
+        assert device.choose_precision("auto", where, depthwise) == of_depthwise
 
 
 def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
@@ -73,7 +65,7 @@ def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
     exact = network(images)
     inside = []
     network.stem.register_forward_hook(lambda module, given, result: inside.append(result.dtype))
-    logits = MixedPrecision(network, "bfloat16")(images)
+    logits = device.MixedPrecision(network, "bfloat16")(images)
     logits.sum().backward()
     assert inside == [torch.bfloat16]
     assert logits.dtype == images.grad.dtype == torch.float32
@@ -93,13 +85,13 @@ def test_one_gpu_compiles_where_it_can_unless_disabled(monkeypatch, caplog, work
         device.torch, "compile", lambda function: (lambda images: images) if works else no_compiler
     )
     monkeypatch.setattr(device.torch, "zeros", lambda size, device: None)
-    compiles.cache_clear()
-    assert [compiles("auto", GPU), compiles("auto", GPU)] == [works, works]
+    device.compiles.cache_clear()
+    assert [device.compiles("auto", GPU), device.compiles("auto", GPU)] == [works, works]
     assert len(caplog.messages) == (not works)  # once
-    assert compiles("always", GPU)
-    assert not compiles("never", GPU)
-    assert not compiles("auto", CPU)
-    compiles.cache_clear()
+    assert device.compiles("always", GPU)
+    assert not device.compiles("never", GPU)
+    assert not device.compiles("auto", CPU)
+    device.compiles.cache_clear()
     monkeypatch.setattr(device.distributed, "world_size", lambda: 2)
-    assert not compiles("auto", GPU)
-    compiles.cache_clear()
+    assert not device.compiles("auto", GPU)
+    device.compiles.cache_clear()

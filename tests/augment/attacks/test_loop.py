@@ -135,11 +135,8 @@ def test_descent_on_a_linear_classifier_follows_its_closed_form(rule):
     before = leads
     steps = torch.zeros_like(labels)
     for _ in range(MAX_STEPS):
-        moves = {
-            "unit": slopes / slopes.norm(dim=1, keepdim=True),
-            "sign": slopes.sign(),
-            "raw": slopes * (-leads).sigmoid()[:, None],
-        }
+        moves = {"unit": slopes / slopes.norm(dim=1, keepdim=True), "sign": slopes.sign()}
+        moves["raw"] = slopes * (-leads).sigmoid()[:, None]
         values = torch.where((leads > 0)[:, None], values - STEP_SIZES[rule] * moves[rule], values)
         steps += leads > 0
         leads = (slopes * values).sum(1)

@@ -115,11 +115,8 @@ def test_colors_at_their_bounds_keep_their_gradient(make_scene, stone, bound):
 @pytest.mark.parametrize("part", ["light", "vertices", "albedo"])
 def test_a_mesh_outside_the_image_leaves_backgrounds_and_a_zero_gradient(make_scene, stone, part):
     scene = make_scene(mesh=replace(stone, vertices=stone.vertices + 10))
-    starts = {
-        "light": scene.lights[0],
-        "vertices": scene.vertices[0],
-        "albedo": torch.zeros(20, 3).double(),
-    }
+    albedo = torch.zeros(20, 3).double()
+    starts = {"light": scene.lights[0], "vertices": scene.vertices[0], "albedo": albedo}
     values = starts[part].expand(3, -1, -1).clone().requires_grad_(True)
     images = scene.render(replace(scene.conditions(EVERY), **{part: values}), EVERY)
     backgrounds = scene.backgrounds[:, None].expand_as(images)

@@ -48,12 +48,8 @@ def obj(statements="", face="f 1 2 3", mtl=None, vertex="") -> dict[str, str | b
     if mtl is None:
         return {"mesh.obj": "\n".join(lines)}
     lines[:0] = ["mtllib m.mtl", "usemtl m"]
-    return {
-        "mesh.obj": "\n".join(lines),
-        "m.mtl": f"newmtl m\n{mtl}\n",
-        "red.png": png_of(255, 0, 0),
-        "clear.png": png_of(255, 0, 0, 9),
-    }
+    pictures = {"red.png": png_of(255, 0, 0), "clear.png": png_of(255, 0, 0, 9)}
+    return {"mesh.obj": "\n".join(lines), "m.mtl": f"newmtl m\n{mtl}\n"} | pictures
 
 
 def ply(vertex="", face="", header="", at="", of="", corners=("0 0 0", "1 0 0", "0 1 0"), tail=""):

@@ -118,11 +118,8 @@ def test_all_spellings_of_a_file_give_the_same_mesh(tmp_path, spelling):
 )
 def test_all_material_libraries_are_read_and_the_first_definition_counts(tmp_path, lines):
     text = PLAIN.replace("mtllib m.mtl", lines)
-    libraries = {
-        "a": "newmtl red\nKd 1 0 0",
-        "b": "newmtl green\nKd 0 1 0\nnewmtl red\nKd 0 0 1",
-        "two words": "newmtl other\nKd 0 0 1",
-    }
+    libraries = {"a": "newmtl red\nKd 1 0 0", "two words": "newmtl other\nKd 0 0 1"}
+    libraries["b"] = "newmtl green\nKd 0 1 0\nnewmtl red\nKd 0 0 1"
     assert face_colors(load(tmp_path, text, **libraries)) == [RED, RED, GREEN, GREEN]
 
 

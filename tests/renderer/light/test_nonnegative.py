@@ -74,11 +74,8 @@ def test_scipy_finds_no_nearer_light_also_in_a_ball(norm):
         options["bounds"] = [(value - radius, value + radius) for value in center.tolist()]
     if norm == "l2":
         middle = center.numpy()
-        sphere = {
-            "type": "ineq",
-            "fun": lambda values: radius**2 - ((values - middle) ** 2).sum(),
-            "jac": lambda values: 2 * (middle - values),
-        }
+        sphere = {"type": "ineq", "fun": lambda x: radius**2 - ((x - middle) ** 2).sum()}
+        sphere["jac"] = lambda x: 2 * (middle - x)
         options["constraints"] = [sphere]
     nearest = nearest_nonnegative(target[None, :, None], ball)[0, :, 0]
     grid = icosphere_basis(3).numpy()
@@ -217,11 +214,8 @@ def test_scipy_finds_no_light_of_the_same_mean_with_a_closer_irradiance(degree):
     given = random_lights(1, 0.1)[0, : (degree + 1) ** 2, 0]
     physical = project_nonnegative(given[:, None])[:, 0]
     factors = lambertian_factors(degree).numpy()
-    same_mean = {
-        "type": "eq",
-        "fun": lambda values: values[:1] - given.numpy()[:1],
-        "jac": lambda values: np.eye(len(values))[:1],
-    }
+    same_mean = {"type": "eq", "fun": lambda x: x[:1] - given.numpy()[:1]}
+    same_mean["jac"] = lambda x: np.eye(len(x))[:1]
     grid = DENSE[:642, : len(given)].numpy()
     found = best_on_grid(given.numpy(), factors, physical.numpy(), grid, constraints=[same_mean])
     error = float((torch.from_numpy(factors) * (physical - given)).norm())

@@ -325,11 +325,8 @@ def test_a_sky_is_reflected_reciprocally_without_gain(roughness, metallic, specu
 def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty():
     """At the foot of a very high wall, half of an even sky is hidden."""
     specular_factor = 0.5
-    wall = Mesh.plain(
-        [[0.05, -99.0, 0], [0.05, 99, 0], [0.05, 99, 99], [0.05, -99, 99]],
-        [[0, 1, 2], [0, 2, 3]],
-        np.ones(3),
-    )
+    corners = [[0.05, -99.0, 0], [0.05, 99, 0], [0.05, 99, 99], [0.05, -99, 99]]
+    wall = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.ones(3))
     corner = concatenate([FLOOR, wall])
     camera = OrthographicCamera(40.1, 180.0, 1e-3)
     settings = ImageSettings(1, 1, shadows=True)

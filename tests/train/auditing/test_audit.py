@@ -153,13 +153,9 @@ def given(monkeypatch, tmp_path) -> dict[str, Any]:
     monkeypatch.setattr(patterns, "LAB_RESOLUTION", 32)
     monkeypatch.setattr(audit, "load_network", lambda name, **_: CLASSIFIERS[name])
     monkeypatch.setattr(audit, "load_chosen", lambda settings: CLASSIFIERS[settings.network])
-    return {
-        "network": "dark",
-        "environments": [],
-        "meshes": ["solid:orange:0"],
-        "hard_negatives": ["solid:lemon:0", {"mesh": "solid:pear:0", "label": "other"}],
-        "out": str(tmp_path / "audit"),
-    }
+    negatives = ["solid:lemon:0", {"mesh": "solid:pear:0", "label": "other"}]
+    settings = {"network": "dark", "environments": [], "meshes": ["solid:orange:0"]}
+    return settings | {"hard_negatives": negatives, "out": str(tmp_path / "audit")}
 
 
 def results_of(folder: Path) -> dict[str, bytes]:

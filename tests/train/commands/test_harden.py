@@ -16,12 +16,9 @@ from train.__main__ import main
 SIZE = 8
 CLASSES = ["apple", "orange", "pear"]
 # Fields of the settings with which a training takes seconds.
-SHORT = {
-    "train": {"epochs": 1, "images_per_epoch": 16, "batch_size": 8},
-    "scene": {"views": 1, "backgrounds": [0.5]},
-    "renderer": {"rasterizer": "numpy", "samples": 1},
-    "data": {"workers": 0},
-}
+SHORT = {"train": {"epochs": 1, "images_per_epoch": 16, "batch_size": 8}, "data": {"workers": 0}}
+SHORT["scene"] = {"views": 1, "backgrounds": [0.5]}
+SHORT["renderer"] = {"rasterizer": "numpy", "samples": 1}
 MODULE = """
 import torch
 from torch import nn

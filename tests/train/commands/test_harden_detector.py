@@ -31,13 +31,9 @@ from train.training.loop import Trainer
 SIZE = 32
 CLASSES = ["background", "bottle"]
 TASK = Detection(threshold=0.4)
-SHORT = {
-    "train": {"epochs": 2, "batch_size": 8, "learning_rate": 0.001},
-    "scene": {"views": 4, "backgrounds": [0.5]},
-    "renderer": {"rasterizer": "numpy", "samples": 1},
-    "data": {"workers": 0},
-    "augment": {"mode": "random"},
-}
+SHORT = {"train": {"epochs": 2, "batch_size": 8, "learning_rate": 0.001}, "data": {"workers": 0}}
+SHORT |= {"scene": {"views": 4, "backgrounds": [0.5]}, "augment": {"mode": "random"}}
+SHORT["renderer"] = {"rasterizer": "numpy", "samples": 1}
 
 
 def renders(seed: int) -> tuple[torch.Tensor, list[dict[str, torch.Tensor]]]:

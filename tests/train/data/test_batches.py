@@ -7,14 +7,7 @@ from PIL import Image
 from scipy.stats import binomtest, chisquare
 
 from augment.scene.truth import NO_OBJECT, boxes_of
-from train.data.batches import (
-    SMALL_IMAGE_SHIFT,
-    Round,
-    TrainingImages,
-    crop_and_flip,
-    rounds_of_epoch,
-    training_batches,
-)
+from train.data import batches
 from train.data.images import ImageFiles
 from train.data.sets import Split
 from train.training.detection import object_maps, target_of
@@ -25,14 +18,14 @@ def noise(*shape: int) -> torch.Tensor:
     return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
 
 
-def epoch_round(image_count: int, epoch: int) -> Round:
-    return Round(epoch, epoch, torch.arange(image_count))
+def epoch_round(image_count: int, epoch: int) -> batches.Round:
+    return batches.Round(epoch, epoch, torch.arange(image_count))
 
 
-def numbered(images: torch.Tensor) -> TrainingImages:
+def numbered(images: torch.Tensor) -> batches.TrainingImages:
     """Make training images without renders, each labeled with its row."""
     split = Split(images, torch.arange(len(images)))
-    return TrainingImages(split, split.labels, split[:0])
+    return batches.TrainingImages(split, split.labels, split[:0])
 
 
 def gray_images(count: int) -> torch.Tensor:
@@ -45,17 +38,19 @@ def gray_images(count: int) -> torch.Tensor:
 def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, is_flipped):
     height, width = shape
     images = noise(3, 3, height, width)
-    steps = torch.arange(-SMALL_IMAGE_SHIFT, SMALL_IMAGE_SHIFT + 1)
+    steps = torch.arange(-batches.SMALL_IMAGE_SHIFT, batches.SMALL_IMAGE_SHIFT + 1)
     shifts = torch.cartesian_prod(steps, steps)
     rows = torch.arange(len(shifts)) % len(images)
     flips = torch.full((len(rows),), is_flipped)
 
-    cropped = crop_and_flip(images, rows, shifts.T, flips)
+    cropped = batches.crop_and_flip(images, rows, shifts.T, flips)
 
-    padded = F.pad(images.double(), (SMALL_IMAGE_SHIFT,) * 4, mode="reflect").to(torch.uint8)
+    padded = F.pad(images.double(), (batches.SMALL_IMAGE_SHIFT,) * 4, mode="reflect").to(
+        torch.uint8
+    )
     for image, row, (down, right) in zip(cropped, rows, shifts, strict=True):
-        top = SMALL_IMAGE_SHIFT + down
-        left = SMALL_IMAGE_SHIFT + right
+        top = batches.SMALL_IMAGE_SHIFT + down
+        left = batches.SMALL_IMAGE_SHIFT + right
         expected = padded[row, :, top : top + height, left : left + width]
         if is_flipped:
             expected = expected.flip(2)
@@ -64,7 +59,7 @@ def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, is_fli
 
 @pytest.mark.parametrize(
     ("size", "largest_shift", "count"),
-    [(11, SMALL_IMAGE_SHIFT, 6000), (65, SMALL_IMAGE_SHIFT, 1200), (129, 8, 1500)],
+    [(11, batches.SMALL_IMAGE_SHIFT, 6000), (65, batches.SMALL_IMAGE_SHIFT, 1200), (129, 8, 1500)],
 )
 def test_shifts_and_flips_are_all_drawn_about_equally_often(size, largest_shift, count):
     # The first two channels of a pixel are its row and its column.
@@ -75,7 +70,7 @@ def test_shifts_and_flips_are_all_drawn_about_equally_often(size, largest_shift,
 
     middle = size // 2
     centers = []
-    for images, *_ in training_batches(data, 300, 0, epoch_round(count, 0)):
+    for images, *_ in batches.training_batches(data, 300, 0, epoch_round(count, 0)):
         centers.append(images[:, :2, middle, middle - 1 : middle + 2].long())
     center = torch.cat(centers)  # (count, 2, 3): the middle pixel and its two neighbors
 
@@ -88,10 +83,10 @@ def test_shifts_and_flips_are_all_drawn_about_equally_often(size, largest_shift,
     assert chisquare(occurrences).pvalue > 1e-4
 
 
-def mirrored_rows(now: Round) -> torch.Tensor:
+def mirrored_rows(now: batches.Round) -> torch.Tensor:
     """Return for each of 40 images whether the round shows it mirrored."""
     ramp = torch.arange(11, dtype=torch.uint8).expand(40, 3, 11, 11)
-    shown = training_batches(numbered(ramp), 40, 0, now, "alternating")
+    shown = batches.training_batches(numbered(ramp), 40, 0, now, "alternating")
     ((images, labels, _),) = shown
     is_flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
     return is_flipped[labels.argsort()]
@@ -105,7 +100,7 @@ def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
 
 
 def test_an_epoch_shows_every_image_once_and_fills_the_last_batch_with_the_first_images():
-    shown = training_batches(numbered(gray_images(100)), 7, 0, epoch_round(100, 0))
+    shown = batches.training_batches(numbered(gray_images(100)), 7, 0, epoch_round(100, 0))
     labels = [labels for _, labels, _ in shown]
     assert [len(batch) for batch in labels] == [7] * 15
     order = torch.cat(labels).tolist()
@@ -118,13 +113,13 @@ def test_an_epoch_continues_from_any_batch_as_if_one_split_held_its_rows_and_ren
     split = Split(noise(90, 3, 8, 8), torch.arange(90))
     rows = torch.arange(0, 90, 2)
     renders = Split(255 - noise(5, 3, 8, 8), torch.arange(-5, 0))
-    separate = TrainingImages(split, rows, renders)
+    separate = batches.TrainingImages(split, rows, renders)
     mixed = numbered(torch.cat([split.images[rows], renders.images]))
     mixed_labels = torch.cat([rows, renders.labels])
-    whole = list(training_batches(mixed, 8, 0, epoch_round(50, 1), flips))
+    whole = list(batches.training_batches(mixed, 8, 0, epoch_round(50, 1), flips))
 
     for first in range(len(whole) + 1):
-        continued = training_batches(separate, 8, 0, epoch_round(50, 1), flips, first)
+        continued = batches.training_batches(separate, 8, 0, epoch_round(50, 1), flips, first)
         for batch, expected in zip(continued, whole[first:], strict=True):
             images, labels, is_render = batch
             expected_images, mixed_rows, _ = expected
@@ -135,7 +130,7 @@ def test_an_epoch_continues_from_any_batch_as_if_one_split_held_its_rows_and_ren
 
 class TestRounds:
     def test_divide_the_images_of_an_epoch_and_each_has_all_renders(self):
-        rounds = rounds_of_epoch(100, 7, 0, 4, 50, 20)
+        rounds = batches.rounds_of_epoch(100, 7, 0, 4, 50, 20)
         assert [(part.number, part.epoch) for part in rounds] == [(12, 4), (13, 4), (14, 4)]
         images = []
         for part, image_count in zip(rounds, [20, 20, 10], strict=True):
@@ -147,7 +142,7 @@ class TestRounds:
 
     @pytest.mark.parametrize("images_per_epoch", [5000, None])
     def test_have_everything_if_an_epoch_is_not_shorter_than_the_data(self, images_per_epoch):
-        (everything,) = rounds_of_epoch(98, 2, 0, 3, images_per_epoch, None)
+        (everything,) = batches.rounds_of_epoch(98, 2, 0, 3, images_per_epoch, None)
         assert (everything.number, everything.epoch) == (3, 3)
         assert everything.rows.tolist() == list(range(100))
 
@@ -166,11 +161,13 @@ def test_objects_in_renders_move_with_the_pixels_that_show_them():
     renders = (masks * light).sum(1, dtype=torch.uint8)[:, None].repeat(1, 3, 1, 1)
     renders[:, 1] = torch.arange(3, dtype=torch.uint8)[:, None, None]  # Green is the index.
     photographs = Split(noise(4, 3, 12, 16), torch.zeros(4, dtype=torch.int64))
-    images = TrainingImages(photographs, torch.arange(4), Split(renders, object_maps(targets)))
+    images = batches.TrainingImages(
+        photographs, torch.arange(4), Split(renders, object_maps(targets))
+    )
     counts = []
     for number in range(20):
-        now = Round(number, number, torch.arange(7))
-        for batch, maps, is_render in training_batches(images, 7, 3, now):
+        now = batches.Round(number, number, torch.arange(7))
+        for batch, maps, is_render in batches.training_batches(images, 7, 3, now):
             assert (maps[~is_render] == NO_OBJECT).all()
             for image, objects in zip(batch[is_render], maps[is_render], strict=True):
                 red, index = image[0], int(image[1, 0, 0])
@@ -189,10 +186,10 @@ def test_a_batch_of_renders_alone_needs_no_file(tmp_path):
     files = ImageFiles(tmp_path, (PurePosixPath("photograph.png"),), 12, workers=0, skip=False)
     photographs = Split(files, torch.zeros(1, dtype=torch.int64))
     renders = Split(noise(3, 3, 12, 12), torch.ones(3, dtype=torch.int64))
-    images = TrainingImages(photographs, torch.arange(1), renders)
-    batches = [*training_batches(images, 2, 0, epoch_round(4, 0))]
-    assert sorted(int(is_render.sum()) for _, _, is_render in batches) == [1, 2]
-    for shown, labels, is_render in batches:
+    images = batches.TrainingImages(photographs, torch.arange(1), renders)
+    made = [*batches.training_batches(images, 2, 0, epoch_round(4, 0))]
+    assert sorted(int(is_render.sum()) for _, _, is_render in made) == [1, 2]
+    for shown, labels, is_render in made:
         assert labels.tolist() == is_render.int().tolist()
         is_red = (shown == torch.tensor([255, 0, 0])[:, None, None]).all(dim=(1, 2, 3))
         assert is_red.tolist() == (~is_render).tolist()

@@ -165,15 +165,6 @@ def test_a_photos_csv_that_cannot_be_used_is_refused_by_name(tmp_path, table, me
         find(tmp_path)
 
 
-def test_the_orientation_of_a_camera_is_undone(tmp_path):
-    """The image is stored with a quarter of a turn (EXIF 2.3, tag 274)."""
-    upright = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
-    exif = Image.Exif()
-    exif[274] = 6
-    path = save(tmp_path / "a.png", np.ascontiguousarray(np.rot90(upright)), exif=exif)
-    np.testing.assert_array_equal(load_one(path), upright)
-
-
 def test_only_the_central_square_is_used_whichever_way_the_image_is_turned(tmp_path):
     colors = np.uint8([(255, 0, 0), (0, 200, 0), (0, 0, 255)])
     thirds = [np.broadcast_to(color, (32, 32, 3)) for color in colors]

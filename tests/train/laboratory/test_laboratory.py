@@ -250,12 +250,8 @@ def card(texture: np.ndarray) -> Mesh:
     square = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], dtype=float)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     uvs = (square[:, [0, 2]] + 1) / 2
-    return replace(
-        Mesh.plain(square, faces),
-        corner_uvs=uvs[faces].astype(np.float32),
-        texture_ids=np.zeros(2, dtype=np.int32),
-        textures=(texture,),
-    )
+    corners = {"corner_uvs": np.float32(uvs[faces]), "texture_ids": np.zeros(2, dtype=np.int32)}
+    return replace(Mesh.plain(square, faces), **corners, textures=(texture,))
 
 
 def directions(shot: Shot, size: int) -> np.ndarray:

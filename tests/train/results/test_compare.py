@@ -10,12 +10,7 @@ import torch
 
 from tests.train.helpers import read_markdown
 from train.data.photo import Photograph
-from train.results.compare import (
-    format_comparison,
-    format_short_comparison,
-    group_table,
-    read_evaluations,
-)
+from train.results import compare as comparison
 from train.results.metrics import Pool
 from train.results.page import write_report
 from train.results.predictions import Predictions, write_predictions
@@ -74,7 +69,7 @@ def scored_run(tmp_path, made_up_run, monkeypatch) -> Callable[..., Path]:
 
 def compare(folders: list[Path]) -> dict[str, list[list[str]]]:
     """Read the tables that compare the runs in some folders, by the title before the intervals."""
-    tables = read_markdown(format_comparison([summarize(folder) for folder in folders]))
+    tables = read_markdown(comparison.format_comparison([summarize(folder) for folder in folders]))
     return {title.partition(", 95%")[0]: rows for title, rows in tables.items()}
 
 
@@ -94,7 +89,7 @@ def test_a_report_has_top_1_by_class_of_each_network(scored_run):
         folder = scored_run(method, STUDIO_AND_WEB)
         write_predictions(folder / "photographs" / "predictions.csv", with_pears(correct))
         group[method] = [ScoredRun(summarize(folder), "photographs")]
-    table = group_table(read_evaluations(group), "class")
+    table = comparison.group_table(comparison.read_evaluations(group), "class")
     column = table.header.index("top-1, mean over classes")
     shown = {(row[0], row[1]): row[column].partition(" ")[0] for row in table.rows}
     expected = {"orange": ("0.545", "0.545"), "pear": ("0.300", "0.700"), "other_lime": ("-", "-")}
@@ -105,11 +100,9 @@ def test_a_report_has_top_1_by_class_of_each_network(scored_run):
 
 def test_a_comparison_shows_every_source_and_the_total(scored_run, made_up_run, tmp_path):
     better_on_web = STUDIO_AND_WEB | {"web": ([4, 4, 4, -1, -1], [-2, 3])}
-    folders = [
-        scored_run("none", STUDIO_AND_WEB),
-        scored_run("adversarial", better_on_web, "seed=1"),
-    ]
-    tables = compare([*folders, made_up_run(tmp_path / "without_scores", "random")])
+    first = scored_run("none", STUDIO_AND_WEB)
+    second = scored_run("adversarial", better_on_web, "seed=1")
+    tables = compare([first, second, made_up_run(tmp_path / "without_scores", "random")])
     _, first, *_ = tables["photographs: differences on the same images"]
     assert first[0] == "adversarial minus none (1 and 1 seeds)"  # The seeds make no pairs.
     _, *rows = tables["photographs: by source"]
@@ -130,7 +123,7 @@ def test_only_scores_on_the_same_images_share_a_plot_and_a_table(scored_run, tmp
     assert plots == ["none 0.250, random 0.750", "adversarial 1.000"]
     assert re.findall(r"(\w+) minus (\w+)", text) == [("random", "none")]
     assert text.count("the network “none” recognizes") == 1
-    text = format_comparison([summarize(folder) for folder in folders])
+    text = comparison.format_comparison([summarize(folder) for folder in folders])
     methods = []
     for title, (_, *rows) in read_markdown(text).items():
         if title.startswith("photographs: ") and " images of orange" in title:
@@ -159,12 +152,10 @@ class TestAHardenedNetwork:
 
     def test_stands_beside_its_initial_network_in_all_tables(self, initial, hardened, tmp_path):
         _, *rows = compare(hardened)[""]
-        assert [row[:3] for row in rows] == [
-            ["the initial network", "", "0.500"],
-            ["random", "0", "0.765"],
-            ["adversarial", "0", "0.765"],
-        ]
-        text = format_short_comparison([summarize(hardened[0])])
+        accuracies = [["", "0.500"], ["0", "0.765"], ["0", "0.765"]]
+        assert [row[0] for row in rows] == ["the initial network", "random", "adversarial"]
+        assert [row[1:3] for row in rows] == accuracies
+        text = comparison.format_short_comparison([summarize(hardened[0])])
         ((header, *rows),) = read_markdown(text).values()
         assert [row[0] for row in rows] == ["before hardening", "after hardening"]
         assert [row[header.index("recall")] for row in rows] == ["0.250", "0.500"]

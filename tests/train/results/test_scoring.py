@@ -373,15 +373,10 @@ AWKWARD_CLASSES = [
 
 def test_columns_of_any_class_name_are_read_bit_by_bit(tmp_path):
     logits = 300 * torch.randn(5, len(AWKWARD_CLASSES), generator=torch.manual_seed(0))
-    photographs = [
-        Photograph(PurePosixPath(f"{number}/a, ü.png"), name, source, others, mesh)
-        for number, (name, source, others, mesh) in enumerate(
-            [
-                ("true", "web", ("lab", "studio"), "m"),
-                *((name, None, (), None) for name in ("path", "a,b", "two\nlines", "other_x")),
-            ]
-        )
-    ]
+    facts = [("true", "web", ("lab", "studio"), "m")]
+    facts += [(name, None, (), None) for name in ("path", "a,b", "two\nlines", "other_x")]
+    paths = [PurePosixPath(f"{number}/a, ü.png") for number in range(len(facts))]
+    photographs = [Photograph(path, *row) for path, row in zip(paths, facts, strict=True)]
     predictions = scoring.rank_classes(photographs, logits, AWKWARD_CLASSES, AWKWARD_CLASSES)
     write_predictions(tmp_path / "a.csv", predictions)
     found = read_predictions(tmp_path / "a.csv", AWKWARD_CLASSES)

@@ -53,9 +53,7 @@ def color_network() -> nn.Sequential:
     return nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(3, 3))
 
 
-def make_trainer(
-    folder, network=None, precision="float32", has_initial=True, **settings
-) -> Trainer:
+def make_trainer(folder, network=None, precision="float32", has_initial=True, **settings):
     torch.manual_seed(0)
     network = network or WideResNet(3, 10, 1, dropout=0.0)
     model = MixedPrecision(network, precision)

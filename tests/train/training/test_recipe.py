@@ -74,9 +74,8 @@ def test_a_schedule_is_its_closed_form(schedule, expected):
 def test_the_loss_is_the_smoothed_cross_entropy(model, images, smoothing):
     settings = TrainSettings(label_smoothing=smoothing)
     is_render = torch.arange(6) < 2
-    loss, hits = recipe.TrainingLoss(model.eval(), settings, (), None).compute(
-        images, LABELS, is_render
-    )
+    cross_entropy = recipe.TrainingLoss(model.eval(), settings, (), None)
+    loss, hits = cross_entropy.compute(images, LABELS, is_render)
     logits = model(images / 255)
     log_probabilities = logits.log_softmax(1)
     of_labels = -log_probabilities[torch.arange(6), LABELS].mean()
@@ -91,9 +90,8 @@ def test_distillation_adds_the_divergence_from_a_teacher(model, teacher, images,
     is_render = torch.arange(6) < 2
     settings = TrainSettings(distillation_weight=4.0)
     batch = (images, LABELS, is_render)
-    alone, _ = recipe.TrainingLoss(model.eval(), TrainSettings(), positive_classes, None).compute(
-        *batch
-    )
+    plain = recipe.TrainingLoss(model.eval(), TrainSettings(), positive_classes, None)
+    alone, _ = plain.compute(*batch)
     loss, _ = recipe.TrainingLoss(model, settings, positive_classes, teacher).compute(*batch)
 
     logits = model(images / 255)
@@ -125,9 +123,8 @@ def test_the_mean_ranking_of_positive_classes_is_added_by_weight(model, images, 
     # Two images show anything but class 0.
     labels = LABELS - 1
     batch = (images, labels, labels == 0)
-    alone, _ = recipe.TrainingLoss(model.eval(), TrainSettings(), positive_classes, None).compute(
-        *batch
-    )
+    plain = recipe.TrainingLoss(model.eval(), TrainSettings(), positive_classes, None)
+    alone, _ = plain.compute(*batch)
     settings = TrainSettings(ranking_weight=4.0)
     both, _ = recipe.TrainingLoss(model, settings, positive_classes, None).compute(*batch)
     logits = model(images / 255)
