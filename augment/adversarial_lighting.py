@@ -104,9 +104,8 @@ class AdversarialLighting:
             InputError: If images or targets have another shape, or if a label is
                 not that of a class.
         """
-        shape = tuple(images.shape) if isinstance(images, Tensor) else ()
-        if len(shape) != 4 or shape[1] != 3:
-            raise InputError(f"images has shape {shape}: give a tensor (N, 3, H, W)")
+        errors.require_kind("images", images, Tensor, "a tensor (N, 3, H, W)")
+        errors.require_shape("images", images, "N", 3, "H", "W")
         is_inference = torch.is_inference_mode_enabled()
         with torch.inference_mode(False):
             if is_inference:

@@ -169,9 +169,7 @@ class TaskNetwork(CheckedNetwork):
             advice = "use floating-point RGB in [0, 1], such as images / 255"
             raise InputError(f"images is {errors.describe(images)}: {advice}")
         images = errors.as_tensor("images", images)
-        if images.shape[1:] != shape:
-            reason = f"takes images (N, {', '.join(map(str, shape))}), not {tuple(images.shape)}"
-            raise InputError(f"{self.title} {reason}: give a batch of this shape")
+        errors.require_shape(f"images of {self.title}", images, "N", *shape)
         outputs = super().forward(images)
         # Check the range of the images after the call of the network. The check waits until the
         # GPU is idle.

@@ -158,11 +158,9 @@ def weights_error(path: str | Path, reason: str) -> InputError:
 
 def import_package(package: str, name: str, install: str = "") -> Any:
     """Import an optional package, which the network of a given name needs."""
-    try:
+    advice = f"pip install {install or package}"
+    with explained(f"name={name} needs {package}", advice, "name", ImportError):
         return importlib.import_module(package)
-    except ImportError as error:
-        reason = f"needs {error.name}: pip install {install or package}"
-        raise name_error(name, reason) from error
 
 
 def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:

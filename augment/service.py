@@ -308,9 +308,7 @@ class AugmentationService:
             InputError: If the state is not a result of `state_dict`, or if it
                 belongs to a service with another scene.
         """
-        expected = "the result of state_dict of a service with the same scene"
-        require_kind("state", state, Mapping, expected)
-        stored = state.get("scene")
+        stored = state.get("scene") if isinstance(state, Mapping) else None
         if stored is None or not torch.equal(torch.as_tensor(stored).cpu(), self._scene_hash):
             advice = "resume with the same meshes, labels, views and light"
             raise InputError(f"state is of another scene, or not of a service: {advice}")

@@ -148,10 +148,8 @@ def reading(path: str | Path, fault: str, advice: str = "", argument: str = "") 
 
 def import_package(name: str, install: str) -> Any:
     """Import a package that the project needs only for some tasks."""
-    try:
+    with explained(f"{name} cannot be imported", f"pip install {install}", "", ImportError):
         return importlib.import_module(name)
-    except ImportError as error:
-        raise InputError(f"{name} cannot be imported ({error}): pip install {install}") from error
 
 
 def composed(name: str) -> str:

@@ -29,7 +29,7 @@ from renderer.operators.build import build_operators
 from renderer.operators.rays import LocalLightView, Rays, Surface
 from renderer.operators.shadows import build_transport
 from renderer.operators.stack import TransferOperators
-from renderer.settings import RASTERIZERS, ImageSettings, Size, samples_per_side
+from renderer.settings import ImageSettings, Size, samples_per_side
 from renderer.shaded_view import ShadedView
 from renderer.solids import sphere
 from renderer.surface.albedo import face_albedo, surface_albedo
@@ -362,7 +362,6 @@ def _checked_cameras(
     errors.require_number("albedo_scale", albedo_scale, 0, errors.MAX_SCALE)
     expected = "nb.Gloss(roughness, metallic, specular_factor) or None"
     errors.require_kind("gloss", gloss, Gloss | None, expected)
-    errors.require_choice("rasterizer", rasterizer, RASTERIZERS)
     if isinstance(cameras, Camera):
         return [cameras]
     expected = "a camera or a list of cameras, such as nb.orbit_cameras(10, width=2.0)"

@@ -28,7 +28,7 @@ from jaxtyping import Float, UInt8
 from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont, ImageOps, features
 from PIL.TiffImagePlugin import BITSPERSAMPLE, PHOTOMETRIC_INTERPRETATION, TiffImageFile
 
-from renderer.errors import InputError, reading, require_file
+from renderer.errors import InputError, keyed, reading, require_file
 from renderer.io.files import atomic_write
 from renderer.settings import REC_709, Size, height_and_width
 
@@ -74,10 +74,8 @@ def gray_or_image(
         # NaN means that the choice is not a number. It may be the path of a file.
         gray = math.nan
     if math.isnan(gray) and isinstance(choice, str | Path):
-        try:
+        with keyed(name):
             return read_image(Path(choice), size)
-        except InputError as error:
-            raise InputError(f"{name}: {error} or a gray value") from error
     if not 0 <= gray <= 1:
         advice = "give gray values in [0, 1] or image files"
         raise InputError(f"{name}={reprlib.repr(choice)} is no image: {advice}")

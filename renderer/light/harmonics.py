@@ -72,21 +72,18 @@ def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
         InputError: If no degree has this number of coefficients.
     """
     light = as_tensor("light", light)
-    degree = _degree_of_rows(light)
-    if degree is None or light.shape[1] != 3:
-        shape = tuple(light.shape)
-        raise InputError(
-            f"light has shape {shape}: give SH coefficients of shape ((degree + 1)², 3)"
-        )
+    require_shape("light", light, "(degree + 1)²", 3)
+    return _degree_of_rows("light", light)
+
+
+def _degree_of_rows(name: str, coefficients: Tensor) -> int:
+    """Find the degree of a light from the number of its SH coefficients, which are rows."""
+    count = len(coefficients) if coefficients.ndim == 2 else 0
+    degree = math.isqrt(count) - 1
+    if not count or count != (degree + 1) ** 2:
+        given = f"{name} has shape {tuple(coefficients.shape)}"
+        raise InputError(f"{given}: give SH coefficients ((degree + 1)², channels)", name)
     return degree
-
-
-def _degree_of_rows(coefficients: Tensor) -> int | None:
-    """Find the degree of a light from the number of its SH coefficients, or None."""
-    if coefficients.ndim != 2 or len(coefficients) == 0:
-        return None
-    degree = math.isqrt(len(coefficients)) - 1
-    return degree if len(coefficients) == (degree + 1) ** 2 else None
 
 
 def basis(
@@ -534,13 +531,7 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
     coefficients = as_tensor("coefficients", coefficients)
     rotation = as_tensor("rotation", rotation)
     require_finite(coefficients=coefficients, rotation=rotation)
-    degree = _degree_of_rows(coefficients)
-    if degree is None:
-        shape = tuple(coefficients.shape)
-        raise InputError(
-            f"coefficients has shape {shape}: give SH coefficients of shape "
-            "((degree + 1)², channels)"
-        )
+    degree = _degree_of_rows("coefficients", coefficients)
     identity = torch.eye(3).to(rotation)
     if rotation.shape != (3, 3) or not torch.allclose(
         rotation @ rotation.mT, identity, rtol=0, atol=ORTHONORMALITY_TOLERANCE

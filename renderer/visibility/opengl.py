@@ -99,10 +99,9 @@ def _context() -> Iterator[moderngl.Context]:
         # The argument `backend` has a wrong type annotation in moderngl.
         context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]
     try:
-        _check(context)
-        yield context
-    except moderngl.Error as error:
-        raise InputError(f"the OpenGL driver failed ({error}): use the rasterizer numpy") from error
+        with explained("the OpenGL driver failed", "use the rasterizer numpy", "", moderngl.Error):
+            _check(context)
+            yield context
     finally:
         context.release()
 
