@@ -335,7 +335,6 @@ class Classifier(TaskNetwork):
             InputError: If the class has no operating point, or if `forward`
                 refuses the images.
         """
-        errors.require_kind("label", label, str | None, "the name of a class")
         points = [point for point in self.operating_points if label in (None, point.label)]
         if len(points) != 1:
             known = ", ".join(point.label for point in self.operating_points)

@@ -322,7 +322,6 @@ def _as_model(light: str | LightModel) -> LightModel:
     """Return a model, or that of a name."""
     if isinstance(light, LightModel):
         return light
-    errors.require_kind("lights", light, str, "names, or models of nb.lights")
     errors.require_choice("lights", light, MODELS)
     return MODELS[light]()
 

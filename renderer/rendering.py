@@ -139,7 +139,7 @@ def render(
     """
     per_side = samples_per_side(samples, silhouettes)
     settings = ImageSettings(size, per_side, encoding, normals, shadows, bounces, silhouettes)
-    all_cameras = _checked_cameras(mesh, cameras, albedo_scale, gloss, rasterizer)
+    all_cameras = _checked_cameras(mesh, cameras, albedo_scale, gloss)
     light = None if light is None else _as_light(light)
     albedo = None if albedo is None else _as_albedo(albedo, mesh)
     vertices = None if vertices is None else errors.as_tensor("vertices", vertices)
@@ -304,7 +304,7 @@ def precompute_transfer(
         (torch.Size([2, 3, 16, 16]), torch.Size([2, 2, 3, 16, 16]))
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
-    all_cameras = _checked_cameras(mesh, cameras, albedo_scale, gloss, rasterizer)
+    all_cameras = _checked_cameras(mesh, cameras, albedo_scale, gloss)
     operators = build_operators(
         mesh, all_cameras, settings, _choose(rasterizer), albedo_scale, gloss=gloss
     )
@@ -351,11 +351,7 @@ def light_sphere(
 
 
 def _checked_cameras(
-    mesh: Mesh,
-    cameras: Camera | Sequence[Camera],
-    albedo_scale: float,
-    gloss: Gloss | None,
-    rasterizer: str,
+    mesh: Mesh, cameras: Camera | Sequence[Camera], albedo_scale: float, gloss: Gloss | None
 ) -> list[Camera]:
     """Check arguments of `render` and `precompute_transfer`, and return the cameras as a list."""
     require_mesh("mesh", mesh)

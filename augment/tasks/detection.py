@@ -117,8 +117,6 @@ class Detection(Task):
         errors.require_number("threshold", self.threshold, SMALLEST_SCORE, 1 - SMALLEST_SCORE)
         errors.require_number("iou", self.iou, 0.01, 1)
         errors.require_choice("goal", self.goal, (HIDE, MISLABEL))
-        expected = "a function of outputs of the network"
-        errors.require_kind("decode", self.decode, Callable | None, expected)
 
     def recognizes(self, outputs: Any) -> bool:
         """Return whether outputs are dictionaries of boxes, or those of a library of detectors."""

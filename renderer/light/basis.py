@@ -25,9 +25,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from renderer.errors import require_whole
 from renderer.light import harmonics
-from renderer.settings import MAX_DEGREE
 from renderer.vectors import Ball, nearest_in_box, unit
 
 
@@ -131,7 +129,7 @@ class Harmonics(Basis):
 
     def __post_init__(self) -> None:
         """Check the degree."""
-        require_whole("degree", self.degree, 0, MAX_DEGREE)
+        harmonics.require_degree(self.degree)
 
     def __str__(self) -> str:
         return f"{self.name} of degree {self.degree}"
