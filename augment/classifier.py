@@ -169,7 +169,8 @@ class TaskNetwork(CheckedNetwork):
             advice = "use floating-point RGB in [0, 1], such as images / 255"
             raise InputError(f"images is {errors.describe(images)}: {advice}")
         images = errors.as_tensor("images", images)
-        errors.require_shape(f"images of {self.title}", images, "N", *shape)
+        if images.shape[1:] != shape:
+            errors.require_shape(f"images of {self.title}", images, "N", *shape)
         outputs = super().forward(images)
         # Check the range of the images after the call of the network. The check waits until the
         # GPU is idle.

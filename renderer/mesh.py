@@ -121,7 +121,8 @@ class Mesh:
             # Arrays per face have as many rows as `faces`. Other arrays may have any number of
             # rows.
             shape = (*(self.faces if name in PER_FACE else array).shape[:1], *row)
-            errors.require_shape(name, array, *shape)
+            if array.shape != shape:
+                errors.require_shape(name, array, *shape)
         errors.require_range("the number of faces", len(self.faces), 1, np.inf)
         for name, channels in (("textures", 3), ("gloss_textures", 2)):
             expected = f"a list of arrays (height, width, {channels}) of uint8"
