@@ -63,9 +63,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def one_thread() -> Iterator[None]:
     """Compute with one thread, here and in the processes that tests start.
 
-    Images and networks are so small that threads would wait for each other.
-    The last bits of a factorization by NumPy or SciPy also depend on the number
-    of threads.
+    Images and networks are so small that threads would wait for each other. The last bits of a
+    factorization by NumPy or SciPy also depend on the number of threads.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -77,10 +76,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def interrupts() -> None:
-    """Let SIGINT reach the processes that tests start.
-
-    A shell that runs the tests in the background ignores the signal.
-    """
+    """Let SIGINT reach the processes that tests start, also from a shell that ignores it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -125,10 +121,7 @@ def warnings_of_this_test() -> None:
 
 @pytest.fixture
 def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
-    """Return a function that runs a command and returns its exit status.
-
-    The command runs within this process, in the temporary folder of the test.
-    """
+    """Return a function that runs a command here, in the test's folder; it returns the status."""
     handlers = logging.root.handlers[:]
     # Hydra composes the settings a first time to read its mode, which no file sets.
     monkeypatch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)

@@ -107,9 +107,7 @@ def orbit_of(values: Any) -> list[Camera]:
     return renderer.orbit_cameras(2, width, polar, azimuth)
 
 
-@pytest.mark.parametrize(
-    "convert", [lambda x: x.numpy(), lambda x: x.tolist()], ids=["array", "list"]
-)
+@pytest.mark.parametrize("convert", [Tensor.numpy, Tensor.tolist], ids=["array", "list"])
 @pytest.mark.parametrize("name", CALLS)
 def test_an_array_or_a_list_gives_what_the_tensor_gives(name, convert):
     tensor, call = CALLS[name]

@@ -1,20 +1,16 @@
 """Weights, attacks and renders are as they were recorded, so that a refactoring changes none.
 
-There are two layers. Rounded values in float64 hold on every machine. They are
-in portable.json. Hashes of all bits hold on the machine that recorded them.
-
-frozen.json has SHA-256 hashes by case, for each machine by its fingerprint: CPU,
-instruction set and the versions of the libraries that compute. On another machine
-the tests are skipped. To use them there, record at the commit before a change, and
-verify after the change:
+Rounded values in float64 hold on every machine. They are in portable.json. Hashes of all bits hold
+on the machine that recorded them: frozen.json has SHA-256 hashes by case, for each machine by its
+CPU, instruction set and versions of libraries. On another machine the tests are skipped. To use
+them there, record at the commit before a change, and verify after the change:
 
     RECORD_FROZEN=1 python -m pytest -q tests/test_frozen.py    # or a part, by -k
     python -m pytest -q tests/test_frozen.py -k render          # or attack, or weights
 
-A change that is meant to change bits or values records anew, and its commit says
-so. Tensors are hashed by type, shape and bytes in their order, not by name. The
-tables below have everything by which the library is called, so that a renamed
-keyword or key is edited there.
+A change that is meant to change bits or values records anew, and its commit says so. Tensors are
+hashed by type, shape and bytes in their order, not by name. The tables below have everything by
+which the library is called, so that a renamed keyword or key is edited there.
 """
 
 import hashlib

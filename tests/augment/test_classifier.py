@@ -258,9 +258,7 @@ def test_normalization_is_said_in_the_units_of_the_user_and_as_a_network_states_
     assert f"{IMAGENET}, stated by the network; values from 0 to 1, assumed" in second
 
 
-@pytest.mark.parametrize(
-    "wrap", [lambda logits: {"logits": logits}, lambda logits: (logits, 0), SimpleLogits]
-)
+@pytest.mark.parametrize("wrap", [lambda x: {"logits": x}, lambda x: (x, 0), SimpleLogits])
 def test_logits_in_the_output_of_a_library_are_read_with_their_gradient(wrap, images):
     classifier = as_network(lambda given: wrap(given.mean((2, 3))), 8)
     images.requires_grad_()

@@ -101,9 +101,7 @@ def test_labels_of_a_sample_stay_and_its_image_changes():
     assert not torch.equal(relit["image"], sample["image"])
 
 
-@pytest.mark.parametrize(
-    ("kind", "key"), [(dict, "image"), (dict, "img"), (UserDict, "pixel_values")]
-)
+@pytest.mark.parametrize("kind, key", [(dict, "image"), (dict, "img"), (UserDict, "pixel_values")])
 def test_plain_tensors_before_a_named_image_stay(kind, key):
     """The processors of transformers return a `UserDict`."""
     sample = {"boxes": torch.rand(2, 4), "mask": picture(1, 6, 6), "labels": torch.tensor([1, 2])}
@@ -429,9 +427,7 @@ def test_the_light_is_differentiable_after_inference(name):
     assert values.grad.isfinite().all()
 
 
-@pytest.mark.parametrize(
-    "name", [*sorted(MODELS.keys() - {"low_light"}), *lights.CastShadow().kinds]
-)
+@pytest.mark.parametrize("name", [*sorted(set(MODELS) - {"low_light"}), *lights.CastShadow().kinds])
 def test_the_gradient_of_the_light_is_that_of_finite_differences(name):
     model = MODELS[name]() if name in MODELS else lights.CastShadow((name,))
     values = (0.1 + 0.8 * draw_values(model, seed=4)).double()

@@ -189,11 +189,8 @@ def find_bright(images):
     """Detect the left and the right half of each image, if their green light is above 0.4."""
     boxes = torch.tensor([[0.0, 0, 8, 16], [8, 0, 16, 16]])
     halves = images[:, 1].unflatten(-1, (2, 8)).mean((1, 3))
-    labels = torch.tensor([0, 1])
-    return [
-        {"boxes": boxes, "labels": labels, "scores": (10 * (half - 0.4)).sigmoid()}
-        for half in halves
-    ]
+    labels, scores = torch.tensor([0, 1]), (10 * (halves - 0.4)).sigmoid()
+    return [{"boxes": boxes, "labels": labels, "scores": one} for one in scores]
 
 
 def test_what_a_detector_finds_in_unchanged_photographs_is_attacked_one_by_one(photographs):

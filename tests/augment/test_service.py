@@ -97,17 +97,15 @@ def test_without_an_arm_or_examples_there_are_no_renders_and_no_scene_is_needed(
     assert (len(renders.images), len(renders.labels), renders.diagnostics) == (0, 0, {})
 
 
-@pytest.mark.parametrize(
-    "settings", [{"mode": "random"}, {"mode": "adversarial", "init": "random"}]
-)
-def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
-    images = serve(seed=1, **settings).regenerate(model, 3).images
-    resumed = serve(seed=1, **settings)
+@pytest.mark.parametrize("options", [{"mode": "random"}, {"mode": "adversarial", "init": "random"}])
+def test_the_seed_and_the_epoch_decide_the_draw(serve, model, options):
+    images = serve(seed=1, **options).regenerate(model, 3).images
+    resumed = serve(seed=1, **options)
     resumed.regenerate(model, 2)
     torch.rand(5)
     assert torch.equal(resumed.regenerate(model, 3).images, images)
     assert not torch.equal(resumed.regenerate(model, 4).images, images)
-    assert not torch.equal(serve(seed=2, **settings).regenerate(model, 3).images, images)
+    assert not torch.equal(serve(seed=2, **options).regenerate(model, 3).images, images)
 
 
 def test_renders_that_are_made_in_inference_mode_can_be_trained_on(serve, model):
@@ -146,9 +144,7 @@ def test_all_images_of_a_folder_are_shown_before_any_is_shown_again(examples, sh
     assert rounds[4].diagnostics["attack_success"] == pytest.approx(float(error_rate))
 
 
-@pytest.mark.parametrize(
-    ("classified", "rows"), [(250, list(range(EXAMPLE_COUNT))), (4, [0, 33, 66, 99])]
-)
+@pytest.mark.parametrize("classified, rows", [(250, [*range(EXAMPLE_COUNT)]), (4, [0, 33, 66, 99])])
 def test_diagnostics_of_random_light_count_its_images(serve, model, monkeypatch, classified, rows):
     monkeypatch.setattr("augment.service.CLASSIFIED", classified)
     renders = serve(mode="random").regenerate(model, 0)

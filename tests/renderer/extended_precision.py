@@ -1,11 +1,9 @@
 """Second implementation of the formulas of the renderer, for tests of its accuracy.
 
-It is slow, with explicit sums, without torch, and with numbers wider than
-float64. Arrays hold long doubles (`extended`: 64 bits of mantissa on x86) or
-256-bit numbers of mpmath (`exact`), real or complex. All functions take both.
-
-Derivatives are complex steps, Im f(x + ih) / h, which lose no digits (Squire and
-Trapp 1998). Vectors are columns: N vectors have the shape (3, N).
+It is slow, with explicit sums, without torch, and with numbers wider than float64. Arrays hold long
+doubles (`extended`: 64 bits of mantissa on x86) or 256-bit numbers of mpmath (`exact`), real or
+complex. Derivatives are complex steps, Im f(x + ih) / h, which lose no digits (Squire and Trapp
+1998). Vectors are columns: N vectors have the shape (3, N).
 """
 
 from collections.abc import Sequence

@@ -79,9 +79,7 @@ def test_gradients_by_radiance_coverage_and_background_are_central_differences(e
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize(
-    ("coverage", "background"), [(1.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.5, 1.0)]
-)
+@pytest.mark.parametrize("coverage, background", [(1.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.5, 1.0)])
 def test_only_values_outside_the_range_have_no_gradient(encoding, coverage, background):
     """Black and white themselves have a gradient, so that a light of zero can grow."""
     radiance = torch.tensor([[-0.3, 0, 0.2, 1, 1.4]], dtype=torch.float64, requires_grad=True)

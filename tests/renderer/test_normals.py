@@ -51,11 +51,8 @@ def exact_normal(corners: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     e. The normal moves by the tangential part of it, divided by the length of the cross product.
     """
     a, b, c = ([Fraction(value) for value in corner] for corner in corners.double().tolist())
-    opposite_edges = [
-        [end - start for start, end in zip(b, c, strict=True)],
-        [end - start for start, end in zip(c, a, strict=True)],
-        [end - start for start, end in zip(a, b, strict=True)],
-    ]
+    pairs = ((b, c), (c, a), (a, b))
+    opposite_edges = [[end - start for start, end in zip(*pair, strict=True)] for pair in pairs]
     cross = exact_cross_product(opposite_edges[2], [-value for value in opposite_edges[1]])
     # Division by the largest component keeps tiny areas in the range of float64.
     largest = max(map(abs, cross))

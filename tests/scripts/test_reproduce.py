@@ -1,7 +1,6 @@
 """scripts/reproduce.sh starts valid commands alone.
 
-A stub takes the place of Python. It writes its arguments to a file, and makes
-the folders of the runs of a sweep.
+A stub for Python writes its arguments to a file, and makes the folders of the runs of a sweep.
 """
 
 import json
@@ -50,9 +49,7 @@ def reproduce(folder: Path, *words: str, **environment: str) -> tuple[int, list[
     return done.returncode, [*map(json.loads, calls.read_text().splitlines())], done.stderr
 
 
-@pytest.mark.parametrize(
-    ("arguments", "environment"), [(["gpu"], {}), ([], INPUTS), (["tpu"], INPUTS)]
-)
+@pytest.mark.parametrize("arguments, environment", [(["gpu"], {}), ([], INPUTS), (["tpu"], INPUTS)])
 def test_missing_inputs_are_refused_before_anything_runs(tmp_path, arguments, environment):
     status, calls, errors = reproduce(tmp_path, *arguments, **environment)
     assert (status, calls) == (2, [])

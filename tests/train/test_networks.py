@@ -190,9 +190,7 @@ def test_a_network_that_does_not_take_the_data_is_refused_by_name(name, size, me
         build_network(CLASSES, size, name)
 
 
-@pytest.mark.parametrize(
-    ("argument", "value"), [("depth", 15), ("width", 0), ("depth", 6 * 10**9 + 4)]
-)
+@pytest.mark.parametrize("argument, value", [("depth", 15), ("width", 0), ("depth", 6 * 10**9 + 4)])
 def test_an_impossible_architecture_is_refused_by_its_argument(argument, value):
     with pytest.raises(InputError, match=f"{argument}={value}"):
         WideResNet(10, **{argument: value})

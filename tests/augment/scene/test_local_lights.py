@@ -191,9 +191,7 @@ def test_a_moved_mesh_and_lamps_look_as_if_built_there(normals, shadows, distanc
     assert (images - rendered(shown)).abs().max() > 0.02
 
 
-@pytest.mark.parametrize(
-    ("parameter", "light"), [("projector", "projector"), ("positions", "lamps")]
-)
+@pytest.mark.parametrize("parameter, light", [("projector", "projector"), ("positions", "lamps")])
 def test_an_attack_on_a_light_that_the_scene_lacks_is_refused(parameter, light):
     with pytest.raises(InputError, match=f"{light}"):
         make_parameter(parameter, scene(**{light: None}), StepSettings())

@@ -254,10 +254,7 @@ def test_several_meshes_are_rendered_as_each_is_alone(several, examples, changed
         torch.testing.assert_close(image, expected, rtol=0, atol=13 * 64 * EPS)
 
 
-SIZES = {
-    "geometry": lambda mesh: 3 * len(mesh.vertices),
-    "albedo": lambda mesh: 3 * len(mesh.faces),
-}
+SIZES = {"geometry": lambda one: 3 * len(one.vertices), "albedo": lambda one: 3 * len(one.faces)}
 
 
 @pytest.mark.parametrize("name", SIZES)

@@ -61,9 +61,7 @@ def test_an_attack_darkens_an_object_until_its_segment_is_lost(wrap):
     assert kept.sum() < 0.5 * mask.sum()
 
 
-@pytest.mark.parametrize(
-    "shape", [(1, 2, SIZE, SIZE), (2, 3, SIZE, SIZE), (1, 3, SIZE // 2, SIZE), (1, 3)]
-)
+@pytest.mark.parametrize("shape", [(1, 2, SIZE, SIZE), (2, 3, SIZE, SIZE), (1, 3, 6, 12), (1, 3)])
 def test_logits_of_another_size_are_refused(shape):
     reader = nb.Segmentation().reader("network", 3)
     with pytest.raises(nb.InputError, match=r"must return logits \(1, 3, 12, 12\)"):

@@ -307,8 +307,7 @@ class FloorUnderSky:
 
 
 @pytest.mark.parametrize(
-    ("roughness", "metallic", "specular_factor"),
-    [(0.2, 0.0, 1.0), (0.2, 1.0, 1.0), (1.0, 0.5, 0.7)],
+    "roughness, metallic, specular_factor", [(0.2, 0.0, 1.0), (0.2, 1.0, 1.0), (1.0, 0.5, 0.7)]
 )
 def test_a_sky_is_reflected_reciprocally_without_gain(roughness, metallic, specular_factor):
     """The transfer onto harmonics is symmetric. Varnish reflects all, A_l Y_l0 in closed form."""

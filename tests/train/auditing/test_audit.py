@@ -297,8 +297,10 @@ def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None
 )
 def test_the_answer_of_an_audit(tmp_path, hits, n, adversarial, answer):
     write_parts(tmp_path, hits, n, adversarial)
-    text = AuditedNetwork("orange", "dark", tmp_path).answer
-    assert text.startswith(f"Is dark safe under unusual lighting? {answer}")
+    network = AuditedNetwork("orange", "dark", tmp_path)
+    assert network.answer.startswith(f"Is dark safe under unusual lighting? {answer}")
+    # No interval has zero width, even if all views are recognized or none.
+    assert all(rate.low < rate.high for rate in network.rates.values())
 
 
 def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_path):

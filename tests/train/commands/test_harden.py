@@ -19,22 +19,17 @@ CLASSES = ["apple", "orange", "pear"]
 SHORT = {"train": {"epochs": 1, "images_per_epoch": 16, "batch_size": 8}, "data": {"workers": 0}}
 SHORT["scene"] = {"views": 1, "backgrounds": [0.5]}
 SHORT["renderer"] = {"rasterizer": "numpy", "samples": 1}
-MODULE = """
-import torch
-from torch import nn
-
-def make():
-    network = nn.Sequential(
-        nn.AdaptiveAvgPool2d(2), nn.Flatten(), nn.Linear(12, 8), nn.Tanh(), nn.Linear(8, 3)
-    )
-    network.load_state_dict(torch.load("weights.pth"))
-    return network.eval(), 8, ["apple", "orange", "pear"]
-"""
 
 
 def build() -> nn.Sequential:
     layers = [nn.Linear(12, 8), nn.Tanh(), nn.Linear(8, 3)]
     return nn.Sequential(nn.AdaptiveAvgPool2d(2), nn.Flatten(), *layers)
+
+
+def load() -> tuple[nn.Module, int, list[str]]:
+    network = build()
+    network.load_state_dict(torch.load("weights.pth"))
+    return network.eval(), SIZE, CLASSES
 
 
 @pytest.fixture
@@ -80,11 +75,9 @@ def test_the_result_loads_alike_and_nothing_changes(network, photographs, tmp_pa
 def test_the_weights_are_those_of_the_command(network, photographs, tmp_path, monkeypatch):
     """The command builds the network by a function of a user's module."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
     torch.save(network.state_dict(), "weights.pth")
-    (tmp_path / "module_of_a_user.py").write_text(MODULE)
     overrides = [
-        *("experiment=classifier", "network=python:module_of_a_user:make"),
+        *("experiment=classifier", "network=python:tests.train.commands.test_harden:load"),
         *(f"unlabeled={photographs}", "data.workers=0", "meshes=[solid:orange:0]"),
         *("hard_negatives=[solid:lemon]", "scene.views=1", "scene.backgrounds=[0.5]"),
         *("renderer.rasterizer=numpy", "renderer.samples=1", "train.epochs=1"),

@@ -34,14 +34,10 @@ def parent(made_up_run, tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize(
     ("given", "expected"),
-    [
-        (["sweep"], "abc"),
-        (["sweep/inner/c", "sweep"], "cab"),
-        (["sweep", "sweep/../d", "d"], "abcd"),
-    ],
+    [("sweep", "abc"), ("sweep/inner/c sweep", "cab"), ("sweep sweep/../d d", "abcd")],
 )
 def test_runs_below_folders_are_found_once_and_in_the_order_of_the_folders(parent, given, expected):
-    runs = finished_runs([parent / name for name in given])
+    runs = finished_runs([parent / name for name in given.split()])
     assert [run.folder.name for run in runs] == [*expected]
 
 
