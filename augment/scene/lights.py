@@ -486,7 +486,7 @@ class ColorTemperature(LightModel):
 
 @dataclass(frozen=True)
 class LowLight(LightModel):
-    """Little light reaches a noisy sensor, whose gain recovers a part of the brightness.
+    """Little light reaches a noisy sensor. For half of the images, gain recovers some brightness.
 
     Electrons are Poisson-distributed, the amplifier adds Gaussian noise of 1 to 5 electrons, and a
     converter of 12 bits rounds them (EMVA 1288; Hasinoff 2014). A white pixel has 15,000 electrons
@@ -500,8 +500,9 @@ class LowLight(LightModel):
     exposure: float = 0.005
     full_well: ClassVar[float] = 15000.0
     levels: ClassVar[int] = 2**12 - 1
-    # Fraction of the stops, read noise in electrons, and fraction that the gain recovers.
-    ranges = (Range(0, 1), Range(1, 5), Range(0, 1))
+    # Fraction of the stops, read noise in electrons, and fraction that the gain recovers. Below 0,
+    # it recovers nothing, and the image stays dark.
+    ranges = (Range(0, 1), Range(1, 5), Range(-1, 1))
 
     def __post_init__(self) -> None:
         errors.require_number("exposure", self.exposure, 1e-6, 1)
@@ -533,7 +534,7 @@ class LowLight(LightModel):
         mean = radiance.clamp(min=0) * (self.full_well * torch.exp2(-stops) / white)
         variance = mean + read_noise**2
         # After the gain of the amplifier, a full pixel has the largest number.
-        gain = torch.exp2(stops * recovered) * (self.levels / self.full_well)
+        gain = torch.exp2(stops * recovered.clamp(min=0)) * (self.levels / self.full_well)
         # c = gain · l / (6 σ²). The "−1" of z² − 1 subtracts c from a = gain · l.
         curve = gain / 6 * mean / variance
         return gain * mean - curve, gain * variance.sqrt(), curve

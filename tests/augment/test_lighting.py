@@ -389,15 +389,16 @@ def test_chromaticities_of_lamps_are_those_of_the_cie(kelvin, offset, x, y):
     np.testing.assert_allclose(xyz[:2] / xyz.sum(), [x, y], atol=1e-3)
 
 
+@pytest.mark.parametrize(("value", "recovered"), [(0.8, 0.6), (0.3, 0.0)])
 @pytest.mark.parametrize("linear", [0.0, 0.02, 0.2, 1.0])
-def test_low_light_has_the_mean_and_variance_of_photons_and_amplifier(linear):
+def test_low_light_has_the_mean_and_variance_of_photons_and_amplifier(linear, value, recovered):
     model = lights.LowLight()
-    values = torch.tensor([[0.8, 0.5, 0.6]])
+    values = torch.tensor([[0.8, 0.5, value]])
     radiance = torch.full((1, 1, 300, 300), linear)
     drawn = model.draw(values, (300, 300), seeds=[1])
     measured = model.camera(radiance, drawn, 1.0, torch.tensor(1.0)).flatten().double()
     stops = 0.8 * math.log2(1 / 0.005)
-    mean, gain = linear * 15000 * 2**-stops, 2 ** (0.6 * stops) / 15000
+    mean, gain = linear * 15000 * 2**-stops, 2 ** (recovered * stops) / 15000
     draws = np.random.default_rng(0)
     signal = gain * (draws.poisson(mean, 90000) + 3 * draws.normal(size=90000))
     expected = np.round(signal.clip(0, 1) * 4095) / 4095

@@ -32,6 +32,46 @@ from train.settings import LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, TrainSetti
 PGD = StepSettings(norm="linf", radius=2 / 255, step="sign", step_size=1 / 255)
 PGD_STEPS = 3
 Images = UInt8[Tensor, "B 3 H W"]
+# Light in which `relit` shows images for an augmentation, in words.
+LIT = {
+    RELIGHT: "in the light of a projector",
+    LOW_LIGHT: "in low light",
+    RELIGHT_AND_LOW_LIGHT: "in the light of a projector or in low light",
+}
+
+
+def darken(images: Images, seed: int) -> Images:
+    """Show images in low light of any color, as a camera shows them that smooths its noise.
+
+    At 224 pixels, the standard deviation of the smoothing is up to 2.5 pixels.
+    """
+    # These imports take a second, and most runs need no light.
+    from torchvision.transforms import v2
+
+    from augment.lighting import relight_photographs
+
+    colored = relight_photographs(images, stream_seed(seed, "color"), lights=["color_temperature"])
+    dark = relight_photographs(colored, seed, lights=["low_light"])
+    widest = max(images.shape[2:]) / 90
+    smooth = v2.GaussianBlur(2 * round(1.6 * widest) + 1, (0.04 * widest, widest))
+    with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
+        torch.manual_seed(seed)
+        return torch.stack([smooth(image) for image in dark])
+
+
+def relit(images: Images, seed: int, augmentation: str) -> Images:
+    """Show images in random light of an augmentation: low light, or else a projector's light.
+
+    A projector shows each image as a slide on itself.
+    """
+    from augment.lighting import relight_photographs
+
+    if augmentation == LOW_LIGHT:
+        return darken(images, seed)
+    shown = relight_photographs(images, seed, slides=images)
+    if augmentation == RELIGHT_AND_LOW_LIGHT:
+        shown[1::2] = darken(images, seed)[1::2]
+    return shown
 
 
 @dataclass
@@ -67,11 +107,7 @@ class Augmentation:
         if name == RELIGHT:
             return self._relight(images, step)
         if name in (LOW_LIGHT, RELIGHT_AND_LOW_LIGHT):
-            # This import takes a second, and most runs need no light.
-            from augment.lighting import relight_photographs
-
-            seed = stream_seed(self.seed, step, "low light", distributed.rank())
-            dark = relight_photographs(images, seed, lights=["low_light"])
+            dark = darken(images, stream_seed(self.seed, step, "low light", distributed.rank()))
             if name == RELIGHT_AND_LOW_LIGHT:
                 # Half of the images are relit, and the others stay dark.
                 dark[::2] = self._relight(images, step)[::2]

@@ -14,6 +14,8 @@ from augment.random_streams import stream_seed
 from train import console
 from train.data.sets import Split
 from train.device import MixedPrecision
+from train.settings import RELIGHT
+from train.training.augmentations import relit
 from train.training.recipe import kl_divergence
 
 # Factors of the interpolation that are tried: 0 gives the weights before the training, and
@@ -141,6 +143,7 @@ def interpolate(
     trained: Weights,
     validation: Split,
     seed: int,
+    light: str,
     weights: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[dict[str, Tensor], float]:
     """Interpolate between two sets of weights, by the factor with the lowest loss.
@@ -151,9 +154,9 @@ def interpolate(
     The loss is measured on validation images. It is a weighted sum of two
     divergences from the predictions of the initial network for these images:
     that of the predictions of the interpolated network for the same images, and
-    that of its predictions for the images in the light of a projector. `weights` belong to the
-    unchanged and to the relit images. Return the interpolated weights on the CPU, and the factor,
-    which is the smallest of equally good ones.
+    that of its predictions for the images in the `light` of an augmentation. `weights`
+    belong to the unchanged and to the relit images. Return the interpolated weights on
+    the CPU, and the factor, which is the smallest of equally good ones.
     """
     device = next(initial.parameters()).device
     initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
@@ -164,7 +167,7 @@ def interpolate(
         selected.network.load_state_dict(mix(initial_weights, trained, factor))
         unchanged = predict(selected, validation, device)
         # All factors are tried in the same light, of which these are the keys of random numbers.
-        relit = predict(selected, validation, device, seed, "validation")
+        relit = predict(selected, validation, device, seed, "validation", light=light)
         divergences = [kl_divergence(logits, targets).mean() for logits in (unchanged, relit)]
         losses[factor] = weights[0] * float(divergences[0]) + weights[1] * float(divergences[1])
     factor = min(losses, key=losses.__getitem__)
@@ -186,22 +189,22 @@ def mix(initial: Weights, trained: Weights, factor: float) -> dict[str, Tensor]:
 
 
 def predict(
-    model: Callable[[Tensor], Tensor], split: Split, device: torch.device, *light_key: int | str
+    model: Callable[[Tensor], Tensor],
+    split: Split,
+    device: torch.device,
+    *light_key: int | str,
+    light: str = RELIGHT,
 ) -> Float[Tensor, "N classes"]:
-    """Compute the logits of a network for images, as they are or in the light of a projector.
+    """Compute the logits of a network for images, as they are or in the light of an augmentation.
 
-    Without a key for the random stream of the light, there is no projector. The logits are on the
-    CPU.
+    Without a key for the random stream of the light, they are shown as they are. The logits are on
+    the CPU.
     """
     batches = torch.arange(len(split)).split(BATCH)
     shown = progress(split.squares(batches), f"{len(split)} images", len(batches))
     if light_key:
-        # This import takes a second, and most runs need no light.
-        from augment.lighting import relight_photographs
-
-        # Each photograph is also the slide that is projected onto it.
         shown = (
-            relight_photographs(images, stream_seed(*light_key, index, "relit"), slides=images)
+            relit(images, stream_seed(*light_key, index, "relit"), light)
             for index, images in enumerate(shown)
         )
     return compute_outputs(model, shown, BATCH, device).cpu()

@@ -28,8 +28,9 @@ from train.results.overwrite import remove_run
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, BEST, WEIGHTS
-from train.settings import KEPT_ASIDE, LABORATORY, WIDERESNET, ExperimentSettings
+from train.settings import KEPT_ASIDE, LABORATORY, RELIGHT, WIDERESNET, ExperimentSettings
 from train.training import inputs
+from train.training.augmentations import LIT
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, scale_learning_rate
@@ -255,8 +256,9 @@ class Run:
         return {"test/accuracy_before": accuracy}
 
     def _predict(self, model: Model, split: Split, *light_key: int | str) -> Int[Tensor, " N"]:
-        """Predict the class of each image of a split, as it is or in the light of a projector."""
-        return predict(model, split, self.trainer.device, *light_key).argmax(1)
+        """Predict the class of each image of a split, as it is or in the light of training."""
+        light = self.settings.train.augmentation
+        return predict(model, split, self.trainer.device, *light_key, light=light).argmax(1)
 
     def _render_kept_aside(self) -> None:
         """Render test images of other objects and projected patterns than those of the training.
@@ -315,23 +317,26 @@ class Run:
         validation = self.data.train[self.held_out]
         # Weights of the losses of unchanged and of relit images.
         losses = (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0)
-        weights, factor = interpolate(*networks, validation, self.settings.seed, losses)
+        weights, factor = interpolate(
+            *networks, validation, self.settings.seed, recipe.augmentation, losses
+        )
         trainer.best |= {"model": weights, INTERPOLATION: factor}
         if distributed.rank() == 0:
             checkpoints.save(self.folder / BEST, trainer.best)
 
     def _relit_agreement(self, targets: Int[Tensor, " N"], unchanged: float) -> dict[str, float]:
-        """Measure on which fraction of the test images a projector does not change the prediction.
+        """Measure on which fraction of the test images light does not change the prediction.
 
         Predictions before and after the training are compared with `targets`, those of the initial
-        network without a projector.
+        network for unchanged images.
         """
         scores = {}
         for name, model in (("before", self.trainer.initial), ("after", self.trainer.selected)):
             relit = self._predict(cast(Model, model), self.data.test, self.settings.seed, "test")
             scores[f"test/relit_agreement_{name}"] = (relit == targets).double().mean().item()
         line = "agreement with the original on %d test images: unchanged %.3f; "
-        line += "in the light of a projector %.3f before, %.3f after"
+        light = LIT.get(self.settings.train.augmentation, LIT[RELIGHT])
+        line += f"{light} %.3f before, %.3f after"
         console.info(line, len(targets), unchanged, *scores.values())
         return scores
 

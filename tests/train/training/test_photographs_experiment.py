@@ -13,12 +13,13 @@ from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.checkpoints import load
 from train.commands.experiment import train
+from train.data.sets import Split
 from train.results.page import PAGE
 from train.run_folder import BEST, LAST, read_metrics
 from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
 from train.training import run
 from train.training.augmentations import Augmentation
-from train.training.averages import FACTORS, INTERPOLATION
+from train.training.averages import FACTORS, INTERPOLATION, predict
 from train.training.recipe import TrainingLoss
 
 NAME = "shufflenet_v2_x0_5"
@@ -129,6 +130,18 @@ def test_a_command_stopped_in_its_first_training_ends_the_same(chain, tmp_path, 
     trained_at = (stopped / PHOTOGRAPHS_FIRST / LAST).stat().st_mtime_ns
     chain(stopped, "train.resume=true")
     assert (stopped / PHOTOGRAPHS_FIRST / LAST).stat().st_mtime_ns == trained_at
+
+
+def test_weights_are_interpolated_by_predictions_in_the_light_of_the_training():
+    gray = Split(torch.full((64, 3, 24, 24), 180, dtype=torch.uint8), torch.zeros(64).long())
+
+    def brightness(light: str) -> float:
+        shown = predict(
+            lambda x: x.mean((1, 2, 3))[:, None], gray, torch.device("cpu"), 0, light=light
+        )
+        return float(shown.median())
+
+    assert brightness("low_light") < 0.6 * 180 / 255 < brightness("relight")
 
 
 def test_the_loss_compares_relit_and_unchanged_images_with_the_teacher():
