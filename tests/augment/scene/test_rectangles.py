@@ -194,7 +194,7 @@ def test_an_attack_is_saved_and_read_again(tmp_path):
 def test_a_classifier_of_rectangles_refuses_other_images():
     classifier = nb.Classifier(logits, (8, 12), ["0", "1"])
     assert classifier(torch.zeros(2, 3, 8, 12)).shape == (2, 2)
-    with pytest.raises(nb.InputError, match=r"\(N, 3, 8, 12\), not \(2, 3, 12, 8\)"):
+    with pytest.raises(nb.InputError, match=r"\(2, 3, 12, 8\): give \(N, 3, 8, 12\)"):
         classifier(torch.zeros(2, 3, 12, 8))
 
 

@@ -138,7 +138,7 @@ def test_a_change_of_an_image_does_not_change_the_next_one():
 @pytest.mark.parametrize(
     ("loss_gradient", "argument"),
     [
-        (lambda image: image[0], "loss_gradient"),
+        (lambda image: image[0], "the result of loss_gradient"),
         (lambda image: image * torch.nan, "image_gradient"),
         (lambda image: torch.full_like(image, torch.inf), "image_gradient"),
     ],
