@@ -186,8 +186,8 @@ class OperatorRenderer:
         return _BuiltStack(stack, image_to_stack_image, background_terms)
 
 
-# Number of rasterized views that are kept.
-KEPT_VIEWS = 256
+# Largest number of samples of the rasterized views that are kept, which take about a gigabyte.
+KEPT_SAMPLES = 2**24
 # Shadows and bounces are computed again if a coordinate of a vertex has changed by more than this
 # distance in world units.
 NEAR = 0.001
@@ -331,7 +331,7 @@ class DirectRenderer:
         """
         key = (object_index, camera)
         if key not in self._views:
-            if len(self._views) == KEPT_VIEWS:
+            if sum(len(albedo) for _, albedo in self._views.values()) > KEPT_SAMPLES:
                 self._views.clear()
             mesh = self.objects[object_index].mesh
             vertices = torch.as_tensor(mesh.vertices, device=self.like.device)
