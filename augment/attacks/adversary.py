@@ -150,7 +150,6 @@ class Adversary(ShortRepr):
             settings=self.settings,
             rasterizer=rasterizer,
             basis=self.basis,
-            one_light=True,
         )
 
     def render(self, rasterizer: Rasterizer | str | None = None) -> Tensor:
@@ -179,7 +178,8 @@ class Adversary(ShortRepr):
             rasterizer = choose(rasterizer or "auto")
         pixels = None if self.pixels is None else self.pixels[None]
         conditions = Conditions(self.light[None], pixels=pixels)
-        return self.scene(rasterizer).render(conditions, torch.arange(1))[0]
+        scene = self.scene(rasterizer).changed(one_light=True)
+        return scene.render(conditions, torch.arange(1))[0]
 
 
 def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> SceneObject:

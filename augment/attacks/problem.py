@@ -140,6 +140,9 @@ def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
     if settings.parameters.keys() <= {kind.name for kind in (Albedo, Geometry, Material, Pose)}:
         # Each view has one light, so operators would take more time than they save.
         scene = scene.changed(one_light=True)
+    elif scene.one_light and scene.needs_rays:
+        # Shadows and bounces would stay those of the first light.
+        scene = scene.changed(one_light=False)
     of_light = {"nonnegative": not settings.allow_negative}
     options = {Lighting.name: of_light, Skylight.name: of_light}
     parameters = [

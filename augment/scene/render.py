@@ -197,7 +197,7 @@ NEAR = 0.001
 # each of the K harmonic coefficients of the light, and the sum of the albedo of the samples of
 # each pixel with which it was computed.
 FrozenView = tuple[Float[Tensor, "3 K P"], Float[Tensor, "3 P"]]
-# Example (None for all of them) and camera of a view.
+# Example and camera of a view. The example is None if the view is kept for all examples and lights.
 ViewKey = tuple[int | None, Camera]
 
 
@@ -268,11 +268,12 @@ class FrozenTransport:
         added_transfer, old_sums = (part[..., fragments.pixels] for part in kept)
         new_sums = _sum_by_pixel(fragments, albedo)[:, fragments.pixels]
         # Radiance with the albedo of the mesh, shape (3, P).
-        added_transfer = added_transfer.to(light)
-        if added_transfer.shape[1] == 1:
-            added = added_transfer[:, 0]
+        added = added_transfer.to(light)
+        example, _ = view
+        if example is None:
+            added = torch.einsum("ckp,kc->cp", added, light)
         else:
-            added = torch.einsum("ckp,kc->cp", added_transfer, light)
+            added = added[:, 0]
         # Scale the radiance by the ratio of new to old albedo. Where the old albedo is 0, there
         # is no ratio, and the radiance is not scaled.
         ratios = new_sums / old_sums.masked_fill(old_sums == 0, 1)

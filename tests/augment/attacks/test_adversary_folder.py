@@ -190,6 +190,13 @@ def test_an_attack_on_shape_moves_the_object_alone_even_if_read_back(pear_with_p
     assert len(moved) == len(before)
 
 
+def test_shadows_change_when_a_light_is_attacked_after_a_shape():
+    scene = augment.build_scene([("solid:cup", "orange")], 8, shadows=True, rasterizer="numpy")
+    again = attacked({"lighting"}, attacked({"geometry"}, scene).problem.scene)
+    expected = again.problem.scene.changed(one_light=True).render(again.conditions, torch.arange(1))
+    torch.testing.assert_close(again.images_in_views, expected, rtol=0, atol=1e-5)
+
+
 @pytest.fixture(scope="module")
 def undamaged(tmp_path_factory) -> Path:
     scene = augment.build_scene([("solid:orange", "orange")], 8, rasterizer="numpy")

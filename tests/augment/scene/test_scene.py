@@ -306,6 +306,14 @@ def test_shadows_of_unmoved_vertices_and_colors_are_those_of_the_operators(names
         torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=1000 * EPS32)
 
 
+def test_shadows_in_light_of_degree_0_grow_with_the_light():
+    scene = built("cup", shadows=True, light="uniform", degree=0)
+    painted = torch.zeros(1, len(scene.objects[0].mesh.faces), 3)
+    for light in (torch.full((1, 1, 3), radiance) for radiance in (0.2, 0.6)):
+        images = [scene.render(Conditions(light, albedo=of), FIRST) for of in (None, painted)]
+        torch.testing.assert_close(*images, rtol=0, atol=1000 * EPS32)
+
+
 def test_shadows_are_computed_anew_for_large_changes_of_shape_and_kept_for_small_ones():
     """Each example has its own shape. Where it began, it has the mesh's own shadows again."""
     scene = built("cup", shadows=True)
