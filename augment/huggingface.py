@@ -66,7 +66,7 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
     if weights is not None:
         reason = f"cannot be combined with {name}, which has weights: leave weights out"
         raise weights_error(weights, reason)
-    library = import_package("transformers", name, 'install "parametric-norm-balls[hf]"')
+    library = import_package("transformers", name, '"parametric-norm-balls[hf]"')
     advice = "give a folder that save_pretrained wrote, or a repository of the Hugging Face Hub"
     with reading_network(name, "cannot be read", advice):
         config = library.AutoConfig.from_pretrained(model)

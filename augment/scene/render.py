@@ -270,10 +270,7 @@ class FrozenTransport:
         # Radiance with the albedo of the mesh, shape (3, P).
         added = added_transfer.to(light)
         example, _ = view
-        if example is None:
-            added = torch.einsum("ckp,kc->cp", added, light)
-        else:
-            added = added[:, 0]
+        added = torch.einsum("ckp,kc->cp", added, light) if example is None else added[:, 0]
         # Scale the radiance by the ratio of new to old albedo. Where the old albedo is 0, there
         # is no ratio, and the radiance is not scaled.
         ratios = new_sums / old_sums.masked_fill(old_sums == 0, 1)

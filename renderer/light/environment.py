@@ -13,6 +13,7 @@ this project shades with the albedo. A map of strength π gives the same image i
 Blender and Mitsuba.
 """
 
+import errno
 import math
 import warnings
 from collections.abc import Sequence
@@ -175,7 +176,7 @@ def _write_image(path: Path, texels: Float[Tensor, "H W 3"], file_format: str) -
     with replacing(path) as temporary:
         # The data type "unknown" keeps the float32 values of the image.
         if not image.write(str(temporary), "unknown", file_format):
-            raise OSError(f"{path} cannot be written: {image.geterror()}")
+            raise OSError(errno.EIO, " ".join(image.geterror().split()), str(path))
 
 
 def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:

@@ -469,7 +469,7 @@ class _Image(torch.autograd.Function):
 
 def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
     """Check that the result of a user's function `loss_gradient` has the shape of the images."""
-    if getattr(image_gradient, "shape", None) != images.shape:
-        name = "the result of loss_gradient"
-        errors.require_kind(name, image_gradient, Tensor, "a tensor in the shape of the images")
+    name = "the result of loss_gradient"
+    errors.require_kind(name, image_gradient, Tensor, "a tensor in the shape of the images")
+    if image_gradient.shape != images.shape:
         errors.require_shape(name, image_gradient, *images.shape)

@@ -21,6 +21,7 @@ from renderer.light.environment import read_panorama, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.light.lamps import Projector
 from train import checkpoints
+from train.system import user_message
 
 DRAWS = torch.Generator().manual_seed(0)
 LIGHT = 0.1 * torch.rand(49, 3, generator=DRAWS)
@@ -66,8 +67,9 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path, name, has
     before = {name: b"the old file"} if has_old else {}
     for content in before.values():
         (tmp_path / name).write_bytes(content)
-    with full_disk(), pytest.raises((OSError, InputError), match=name):
+    with full_disk(), pytest.raises((OSError, InputError), match=name) as raised:
         WRITERS[name](tmp_path / name)
+    assert name in user_message(raised.value)  # A command prints this sentence.
     assert contents(tmp_path) == before
     WRITERS[name](tmp_path / name)
     assert contents(tmp_path)[name] != before.get(name)

@@ -139,10 +139,11 @@ def test_a_change_of_an_image_does_not_change_the_next_one():
     ("loss_gradient", "argument"),
     [
         (lambda image: image[0], "the result of loss_gradient"),
+        (lambda image: image.numpy(), "the result of loss_gradient"),
         (lambda image: image * torch.nan, "image_gradient"),
         (lambda image: torch.full_like(image, torch.inf), "image_gradient"),
     ],
-    ids=["another shape", "NaN", "infinity"],
+    ids=["another shape", "an array", "NaN", "infinity"],
 )
 def test_an_invalid_gradient_of_a_loss_is_refused(loss_gradient, argument):
     operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
