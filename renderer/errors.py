@@ -143,7 +143,7 @@ def reading(path: str | Path, fault: str, advice: str = "", argument: str = "") 
         # The message may begin with the file, or with another one of its folder.
         if str(error).startswith((str(path), f"{Path(path).parent}{os.sep}")):
             raise
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {error}", argument) from error
 
 
 def import_package(name: str, install: str) -> Any:

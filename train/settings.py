@@ -338,6 +338,8 @@ class ExperimentSettings(NetworkSettings):
 
     def __post_init__(self) -> None:
         """Check all values, and compute the number of renders."""
+        if self.network == "":
+            raise InputError("network is empty: give a run or torchvision:NAME", "network")
         super().__post_init__()
         for name in NEEDS_INITIAL:
             value = getattr(self.train, name)

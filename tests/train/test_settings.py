@@ -28,7 +28,7 @@ def test_every_experiment_takes_other_data(experiment):
 
 
 def test_an_experiment_that_fine_tunes_asks_for_the_initial_network():
-    with pytest.raises(InputError, match=r"^network is empty"):
+    with pytest.raises(InputError, match=r"^network is empty: give a run or "):
         train_command.read(["experiment=harden", *OTHER_DATA])
 
 

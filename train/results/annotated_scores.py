@@ -184,6 +184,7 @@ def _outputs(
     size = height_and_width(network.size)
     # Names of SHOWN photographs, whose pictures are drawn.
     shown = {item.name for item in evenly_spaced(photographs, SHOWN)}
+    outputs: Any = None
     # Skipped photographs can leave a batch empty.
     for batch in filter(None, fit_batches(photographs, size, how, BATCH, skip_unreadable)):
         images = torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch])).to(device)
@@ -193,6 +194,8 @@ def _outputs(
                 drawn = network.task.draw(to_unit(image), output, network.classes)
                 pictures[item.name] = drawn.cpu()
             yield item, fitted, output
+    if outputs is None:
+        raise InputError("photos has no photograph that can be read: give others", "photos")
 
 
 def evaluate_detector(

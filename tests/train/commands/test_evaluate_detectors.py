@@ -76,3 +76,10 @@ def test_a_class_that_the_network_lacks_is_not_scored(photographs):
         nb.evaluate(_find_white, photographs, "yak", classes=CLASSES, size=120)
     with pytest.raises(InputError, match="marks no cat"):
         nb.evaluate(_find_white, photographs, "cat", classes=CLASSES, size=120)
+
+
+def test_photographs_of_which_none_can_be_read_are_refused(photographs):
+    for name in ("light/a.png", "light/b.png", "dark/c.png"):
+        (photographs / name).write_bytes(b"no image")
+    with pytest.raises(InputError, match="no photograph that can be read"):
+        nb.evaluate(_find_white, photographs, classes=CLASSES, size=120, skip_unreadable=True)
