@@ -69,7 +69,8 @@ class Scene:
             (A, V, 3, height, width), and the indices of these examples, shape (A,). None for no
             effects.
         one_light: Whether each view is rendered in one light only. Then no transfer operators
-            are built, because direct rendering takes less time.
+            are built, because direct rendering takes less time, and shadows and bounces stay those
+            of the first light.
         lights_of_degree: A function that loads the lighting with another degree of harmonics.
             Its arguments are the degree, and the roughness of the smoothest surface (None if no
             surface has gloss). It returns the basis, and RGB coefficients of the light, shape
