@@ -240,8 +240,10 @@ class FrozenTransport:
         if not self._transport:
             return
         surface = Surface(self.mesh, fragments.to("cpu"), self._settings)
-        # Added radiance for each of the K harmonic coefficients of the light, in the P pixels
-        # that the mesh covers, shape (3, K, P).
+        if light is not None:
+            light = light.cpu().double()
+        # Added radiance for each of the K harmonic coefficients of the light, or only their sum,
+        # in the P pixels that the mesh covers, shape (3, K or 1, P).
         added_transfer = self._transport.change(surface, albedo.cpu().double(), light)
         if added_transfer is None:
             return

@@ -196,7 +196,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]
     image = _openimageio().ImageBuf(str(path))
     # Call `read` first, because `get_pixels` ends the process if it cannot read the file.
     if not image.read():
-        raise InputError(" ".join(image.geterror().split()))
+        raise OSError(image.geterror())
     texels = image.get_pixels("float")
     spec = image.spec()
     if image.file_format_name not in ("hdr", "openexr"):

@@ -228,9 +228,9 @@ class Transport:
         means that no surface blocks light.
         """
 
-        def shown(radiance: Float[Tensor, "N K"], channel: int) -> Float[Tensor, "N _"]:
+        def in_light(radiance: Float[Tensor, "N K"], channel: int) -> Float[Tensor, "N _"]:
             """Return the radiance of each SH coefficient, or its sum in the light."""
-            return radiance if light is None else radiance @ light[:, channel, None].cpu().double()
+            return radiance if light is None else radiance @ light[:, channel, None]
 
         change = None
         fragments = surface.fragments
@@ -242,12 +242,16 @@ class Transport:
         if gloss is not None:
             diffuse_factor = gloss.diffuse_factor(surface.normals, surface.toward)
             diffuse_albedo = albedo_by_channel * diffuse_factor
+        channels = range(len(albedo_by_channel))
+        skies = [in_light(self._sky, channel) for channel in channels]
+        if self._patches:
+            colors = self._sent.expand(-1, -1, len(channels)).unbind(2)
+            sent = [in_light(color, channel) for channel, color in enumerate(colors)]
         for hits in self.rays.hits(surface, self._directions):
             if not hits.weight.any():
                 continue
             if change is None:
-                columns = self._sky.shape[1] if light is None else 1
-                shape = (len(albedo_by_channel), columns, len(fragments.pixels))
+                shape = (len(channels), skies[0].shape[1], len(fragments.pixels))
                 change = self._sky.new_zeros(shape)
             sample_of_ray = hits.sample_of_ray
             if gloss is not None:
@@ -268,12 +272,11 @@ class Transport:
                 blocked = hits.weight * reflectance
                 # Subtract the light of the sky that the mesh blocks: one row for each column of
                 # the sky, one column for each pixel.
-                channel_change[:, hits.pixels] = -(blocked @ shown(self._sky, channel)).T
+                channel_change[:, hits.pixels] = -(blocked @ skies[channel]).T
                 if self._patches:
                     # Add the light that the pixels receive from patches and reflect.
-                    sent = self._sent[..., channel if self.has_colored_light else 0]
                     weights = self._patches.weights_by_patch(hits, self._directions, blocked)
-                    added = torch.from_numpy(weights @ shown(sent, channel).numpy())
+                    added = torch.from_numpy(weights @ sent[channel].numpy())
                     channel_change[:, hits.pixels] += added.T
         return change
 
