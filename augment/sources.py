@@ -187,7 +187,9 @@ def require_architecture(model: str) -> None:
     choices = models.list_models(module=models)
     if model not in choices:
         advice = f"choose one, such as {nearest(model, choices)}"
-        raise files.name_error(f"torchvision:{model}", f"is not one of torchvision: {advice}")
+        if model in models.list_models():
+            advice = "load other networks by a function, with network=python:module:function"
+        raise files.name_error(f"torchvision:{model}", f"is no classifier of torchvision: {advice}")
 
 
 def _efficientnet_lite(

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Self
 
 import torch
@@ -51,8 +50,8 @@ CANDIDATE_LABELS = "candidate_labels"
 CANDIDATES_OF = CANDIDATE_BOXES, CANDIDATE_SCORES, CANDIDATE_LABELS
 # Keys of the final boxes in an output.
 FINAL = "boxes", "scores", "labels"
-# Limits with which a detector of torchvision returns its candidates instead of its final boxes.
-CANDIDATES = {"score_thresh": 1e-4, "nms_thresh": 1.0, "detections_per_img": 5000}
+# Candidates of a detector of torchvision are so many boxes with the highest scores above this one.
+MAX_CANDIDATES, CANDIDATE_SCORE = 5000, 1e-4
 # Boxes of one image: "boxes" (n, 4) in pixels, "labels" (n,) and "scores" (n,), and candidates.
 Detections = dict[str, Tensor]
 
@@ -145,39 +144,39 @@ class Detection(Task):
         """Return the outputs of a network. Those of torchvision get candidates, too.
 
         The boxes before non-maximum suppression have the smallest scores, too, so that an attack
-        can raise those of another class. The backbone runs once.
+        can raise those of another class. The network runs once.
         """
         raw = unwrapped(network)
         # Module that computes the final boxes. In networks of two stages, it is `roi_heads`.
         owner = getattr(raw, "roi_heads", raw)
-        if not _is_of_torchvision(raw) or any(not hasattr(owner, name) for name in CANDIDATES):
+        original: Any = getattr(owner, "postprocess_detections", None)
+        # A subclass may suppress boxes in another way.
+        module = getattr(original, "__module__", "")
+        if not (_is_of_torchvision(raw) and module.startswith("torchvision.")):
             return network(images)
         from torchvision.ops import boxes as box_ops  # torchvision takes half a second.
 
-        sort = partial(torch.argsort, descending=True, stable=True)
-        original = owner.postprocess_detections
+        suppress, threshold = box_ops.batched_nms, owner.score_thresh
         # Candidates of each image, and the (height, width) to which the network resized it.
-        candidates: list[Any] = []
+        candidates: list[list[Tensor]] = []
+        sizes: list[Any] = []
 
-        # This replaces `postprocess_detections`. It returns the same boxes, and also calls the
-        # original with other limits and without suppression, to keep the candidates.
+        # Suppression gets all boxes, and passes on those above the threshold of the network.
+        def keep_candidates(boxes: Tensor, scores: Tensor, labels: Tensor, limit: float) -> Tensor:
+            best = scores.argsort(descending=True, stable=True)[:MAX_CANDIDATES]
+            candidates.append([boxes[best], scores[best], labels[best]])
+            sure = (scores > threshold).nonzero()[:, 0]
+            return sure[suppress(boxes[sure], scores[sure], labels[sure], limit)]
+
+        # This replaces `postprocess_detections`. It returns the same boxes.
         def postprocess(*args: Any) -> Any:
-            final = original(*args)
-            limits = {name: getattr(owner, name) for name in CANDIDATES}
-            suppress = box_ops.batched_nms
+            sizes.extend(args[-1])
             try:
-                vars(owner).update(CANDIDATES)
-                # At an IoU of 1, it only sorts, but takes as long as the convolutions.
-                box_ops.batched_nms = lambda _, scores, *others: sort(scores)
-                found = original(*args)
+                owner.score_thresh = min(threshold, CANDIDATE_SCORE)
+                box_ops.batched_nms = keep_candidates
+                return original(*args)
             finally:
-                vars(owner).update(limits)
-                box_ops.batched_nms = suppress
-            if isinstance(found, tuple):  # Heads with regions of interest return three lists.
-                found = [dict(zip(FINAL, item, strict=True)) for item in zip(*found, strict=True)]
-            # The last argument has the sizes of the resized images.
-            candidates.extend(zip(found, args[-1], strict=True))
-            return final
+                owner.score_thresh, box_ops.batched_nms = threshold, suppress
 
         owner.postprocess_detections = postprocess
         try:
@@ -185,11 +184,10 @@ class Detection(Task):
         finally:
             # The method of the class counts again.
             del owner.postprocess_detections
-        for item, (found, (height, width)) in zip(outputs, candidates, strict=True):
+        for item, found, (height, width) in zip(outputs, candidates, sizes, strict=True):
             # The network resizes images. The final boxes are in the pixels of the given images.
             scale = torch.tensor([images.shape[3] / width, images.shape[2] / height] * 2)
-            item[CANDIDATE_BOXES] = found["boxes"] * scale.to(found["boxes"])
-            item[CANDIDATE_SCORES], item[CANDIDATE_LABELS] = found["scores"], found["labels"]
+            item |= zip(CANDIDATES_OF, (found[0] * scale.to(found[0]), *found[1:]), strict=True)
         return outputs
 
     def reader(self, title: str, class_count: int | None = None) -> _Reader:
@@ -469,19 +467,20 @@ def _of_transformer(
 
     With a logit more than classes, the last is "no object", and each box has its best class.
     Otherwise, logits of classes are independent, and the best pairs of box and class are returned.
+    A single logit is that of a class.
     """
     given = outputs if isinstance(outputs, Mapping) else vars(outputs)
     logits, fractions = given["logits"], given["pred_boxes"]
     # Number of classes, maybe with "no object".
     columns = logits.shape[-1]
     if class_count not in (None, columns, columns - 1):
-        advice = f"give {columns - 1} names, or {columns} if there is no class for no object"
+        advice = f"give {columns} names, or one less if the last logit is for no object"
         raise InputError(f"{title} returned {columns} logits for {class_count} classes: {advice}")
     center, size = fractions[..., :2], fractions[..., 2:]
     # Width, height, width and height of the images, for left, top, right and bottom.
     scale = fractions.new_tensor([images.shape[3], images.shape[2]] * 2)
     boxes = torch.cat([center - size / 2, center + size / 2], dim=-1) * scale
-    if columns != class_count:
+    if columns not in (1, class_count):
         pairs = zip(boxes, logits.softmax(-1)[..., :-1], strict=True)
         return [{"boxes": one, "scores": scores} for one, scores in pairs]
     found = []

@@ -11,7 +11,7 @@ from torchvision.ops import box_iou
 import norm_balls as nb
 from augment.classifier import as_network
 from augment.scene.truth import Truth
-from augment.tasks.detection import CANDIDATES
+from augment.tasks.detection import CANDIDATE_SCORE, MAX_CANDIDATES
 from tests.detectors import small_detector
 
 SIZE = 64
@@ -105,7 +105,8 @@ def test_candidates_of_torchvision_are_its_boxes_without_suppression_in_the_pixe
     network = small_detector(len(CLASSES), SIZE)
     images = torch.rand(2, 3, 48, 96, generator=torch.Generator().manual_seed(0))
     opened = deepcopy(network)
-    vars(opened).update(CANDIDATES)
+    limits = {"score_thresh": CANDIDATE_SCORE, "detections_per_img": MAX_CANDIDATES}
+    vars(opened).update(limits, nms_thresh=1.0)
     with torch.no_grad():
         own, expected = network(images), opened(images)
         found = as_network(network, (48, 96), CLASSES)(images)
@@ -122,6 +123,17 @@ def test_the_gradient_in_the_pixels_is_that_of_finite_differences(goal):
     found, expected = slopes(small_detector(len(CLASSES), SIZE), nb.Detection(goal=goal), step=1e-4)
     assert found > 1e-8
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+
+
+def test_a_single_logit_of_a_detector_of_transformers_is_that_of_its_class():
+    def find(images: Tensor) -> dict[str, Tensor]:
+        logits = images.mean((1, 2, 3))[:, None, None]
+        return {"logits": logits, "pred_boxes": torch.full((len(images), 1, 4), 0.5)}
+
+    images = torch.full((2, 3, SIZE, SIZE), 0.25)
+    for item in as_network(find, SIZE, ["ball"])(images):
+        torch.testing.assert_close(item["scores"], torch.tensor([0.25]).sigmoid())
+        assert item["labels"].tolist() == [0]
 
 
 class Raw(nn.Module):
