@@ -173,9 +173,10 @@ def sections(networks: Mapping[str, Path], label: str) -> list[dict[str, Any]]:
                 tables.append(_table(by_label, f"photographs{title}", "class"))
         points = {name: [[(x, y) for x, y in content["curve"]]]}
         chart = plot_curves(points, "recall", "false detections per image")
-        about = (ABOUT if content["curve"] else ABOUT_PIXELS).format(label)
-        charts = [chart] if chart else []
-        made.append({"name": name, "about": about, "tables": tables, "charts": charts})
+        # The curve of a detector that finds nothing is empty, like that of a segmenter.
+        about = ABOUT if "recall" in content["metrics"]["plain light"] else ABOUT_PIXELS
+        shown = {"tables": tables, "charts": [chart] if chart else []}
+        made.append({"name": name, "about": about.format(label), **shown})
     return made
 
 

@@ -45,6 +45,24 @@ def test_recall_on_renders_is_the_part_of_views_in_which_the_object_is_found(mon
     assert recalls == sorted(recalls)
 
 
+def test_metrics_of_a_detector_that_finds_nothing_are_zero_and_explained(monkeypatch, tmp_path):
+    monkeypatch.setattr(found, "KINDS", {})
+
+    def find_nothing(images):
+        empty = {"boxes": torch.zeros(0, 4), "labels": torch.zeros(0).long()}
+        return [{**empty, "scores": torch.zeros(0)} for _ in images]
+
+    network = as_network(find_nothing, SIZE, ["orange", "apple"], task=nb.Detection())
+    item = load_object(ObjectSettings("solid:orange:0", label="orange"))
+    views = Views([item], 2, 0, torch.device("cpu"))
+    content = found.find_in_lights(network, views, views, views, ["uniform"], 1, tmp_path)
+    plain = content["metrics"]["plain light"]
+    assert plain["recall"]["value"] == plain["false_per_image"]["value"] == 0
+    (tmp_path / found.DETECTED).write_text(json.dumps(content))
+    [section] = found.sections({"nothing": tmp_path}, "orange")
+    assert section["about"] == found.ABOUT.format("orange")
+
+
 def test_an_audit_without_meshes_relights_what_a_detector_finds_in_photographs(tmp_path):
     photographs = tmp_path / "photographs"
     photographs.mkdir()
