@@ -60,9 +60,9 @@ class SceneProblem:
             conditions = parameter.apply(parameter_values, conditions, examples)
         return conditions
 
-    def render(self, values: Values, examples: Examples) -> Images:
-        """Render the V views of each example with the given attack values."""
-        return self.scene.render(self.conditions(values, examples), examples)
+    def render(self, values: Values, examples: Examples, is_draft: bool = True) -> Images:
+        """Render the V views of each example: drafts for a search (`Scene.render`), or exact."""
+        return self.scene.render(self.conditions(values, examples), examples, is_draft)
 
     @torch.no_grad()
     def images(self, values: Values, examples: Int[Tensor, " A"] | None = None) -> Tensor:
@@ -76,7 +76,7 @@ class SceneProblem:
         groups: Iterable[Tensor] = examples.split(self.group_size)
         if len(examples) > self.group_size:
             groups = progress(groups, "images")
-        return torch.cat([self.render(values[group], group) for group in groups])
+        return torch.cat([self.render(values[group], group, is_draft=False) for group in groups])
 
     def truth(self, values: Values, examples: Examples) -> Truth:
         """Find where the objects are in the images, which attacks on shape and pose move."""

@@ -197,8 +197,9 @@ NEAR = 0.001
 # each of the K harmonic coefficients of the light, and the sum of the albedo of the samples of
 # each pixel with which it was computed.
 FrozenView = tuple[Float[Tensor, "3 K P"], Float[Tensor, "3 P"]]
-# Example and camera of a view. The example is None if the view is kept for all examples and lights.
-ViewKey = tuple[int | None, Camera]
+# Example and camera of a view, and whether it is a draft. The example is None if the view is kept
+# for all examples and lights.
+ViewKey = tuple[int | None, Camera, bool]
 
 
 class FrozenTransport:
@@ -244,7 +245,7 @@ class FrozenTransport:
             light = light.cpu().double()
         # Added radiance for each of the K harmonic coefficients of the light, or only their sum,
         # in the P pixels that the mesh covers, shape (3, K or 1, P).
-        added_transfer = self._transport.change(surface, albedo.cpu().double(), light)
+        added_transfer = self._transport.change(surface, albedo.cpu().double(), light, view[2])
         if added_transfer is None:
             return
         # A slightly different shape may cover other pixels, so expand the radiance to all pixels
@@ -271,7 +272,7 @@ class FrozenTransport:
         new_sums = _sum_by_pixel(fragments, albedo)[:, fragments.pixels]
         # Radiance with the albedo of the mesh, shape (3, P).
         added = added_transfer.to(light)
-        example, _ = view
+        example, _, _ = view
         added = torch.einsum("ckp,kc->cp", added, light) if example is None else added[:, 0]
         # Scale the radiance by the ratio of new to old albedo. Where the old albedo is 0, there
         # is no ratio, and the radiance is not scaled.
@@ -435,12 +436,13 @@ class DirectRenderer:
         light: Float[Tensor, "K 3"],
         changed: Conditions,
         background: Float[Tensor, "_ pixels"],
+        is_draft: bool = False,
     ) -> PixelRadiance:
         """Render a view of an object with changed shape, colors, gloss or lamps.
 
         The result is differentiable in the light and in all changes. With
         `settings.silhouettes`, it is also differentiable in fields of the
-        camera that are tensors.
+        camera that are tensors. A draft approximates the shadows and bounces of moved vertices.
         """
         item = self.objects[object_index]
         fixed_camera = camera.fixed()
@@ -449,6 +451,7 @@ class DirectRenderer:
             fragments, albedo = self.view(object_index, fixed_camera)
         else:
             fragments, albedo = self._rasterize(object_index, fixed_camera, moved)
+        rasterized = fragments, albedo
         if changed.albedo is not None:
             of_view = (item.mesh, fragments, self.settings.encoding, item.albedo_scale)
             albedo = paint_faces(*of_view, changed.albedo, changed.hue)
@@ -470,12 +473,16 @@ class DirectRenderer:
 
         def indirect(albedo: Float[Tensor, "S 3"], light: Float[Tensor, "K 3"]) -> Tensor:
             """Compute the radiance that shadows and bounces of environment light add."""
-            frozen = self._transport(example, object_index, _moved(item.mesh, moved).vertices)
-            view = (example if self.one_light else None, fixed_camera)
+            positions = _moved(item.mesh, moved).vertices
+            frozen = self._transport(example, object_index, positions)
+            has_draft = is_draft and moved is not None
+            view = (example if self.one_light else None, fixed_camera, has_draft)
             if view not in frozen.views:
-                vertices = torch.as_tensor(frozen.mesh.vertices, device=self.like.device)
-                fragments_and_albedo = self._rasterize(object_index, fixed_camera, vertices)
-                frozen.add(view, *fragments_and_albedo, light if self.one_light else None)
+                shown = rasterized
+                if not np.array_equal(frozen.mesh.vertices, positions):
+                    vertices = torch.as_tensor(frozen.mesh.vertices, device=self.like.device)
+                    shown = self._rasterize(object_index, fixed_camera, vertices)
+                frozen.add(view, *shown, light if self.one_light else None)
             added = frozen.radiance(view, fragments, albedo, light)
             # A camera whose fields are tensors is attacked, so it differs in each call. Its views
             # are not kept. `fixed` returns the same camera if no field is a tensor.

@@ -336,7 +336,7 @@ class Scene:
         return Conditions(self.lights[self._as_examples(examples)])
 
     def render(
-        self, conditions: Conditions, examples: Int[Tensor, " A"]
+        self, conditions: Conditions, examples: Int[Tensor, " A"], is_draft: bool = False
     ) -> Float[Tensor, "A V 3 height width"]:
         """Render the V views of examples, differentiable in the conditions.
 
@@ -344,6 +344,7 @@ class Scene:
             conditions: Light, shape and colors of each of A examples.
             examples: Index of each of the A examples, which are objects with their views, in the
                 scene, shape (A,).
+            is_draft: Whether fewer rays may find the shadows and bounces of moved vertices.
 
         Returns:
             Images with values in [0, 1], shape (A, V, 3, height, width).
@@ -356,7 +357,7 @@ class Scene:
         errors.require_kind("conditions", conditions, Conditions, expected)
         errors.require_shape("conditions.light", conditions.light, "examples", self.basis.size, 3)
         examples = self._as_examples(examples, len(conditions.light))
-        layers = list(self.layers(conditions, examples))
+        layers = list(self.layers(conditions, examples, is_draft))
         # Start with the background of each image, shape (A · V, 3 or 1, height · width). Then
         # overwrite the pixels that objects cover.
         image_to_background = self._background[examples].repeat_interleave(self.views)
@@ -460,7 +461,9 @@ class Scene:
         """Whether direct rendering traces rays for each view, which operators do once."""
         return bool(self.basis.local_lights) or self.settings.global_illumination
 
-    def layers(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Iterator[Layer]:
+    def layers(
+        self, conditions: Conditions, examples: Int[Tensor, " A"], is_draft: bool = False
+    ) -> Iterator[Layer]:
         """Render the pixels that objects cover, by the fastest method that is exact.
 
         - If shape, albedo or gloss have changed, or if `one_light` is set, each view is rendered
@@ -475,7 +478,7 @@ class Scene:
         light = conditions.light * self._exposure[examples]
         changes = (conditions.vertices, conditions.albedo, conditions.gloss)
         if self.one_light or any(values is not None for values in changes):
-            return self._render_directly(light, conditions, examples)
+            return self._render_directly(replace(conditions, light=light), examples, is_draft)
         if conditions.positions is not None:
             return self._render_with_moved_lamps(light, conditions.positions, examples)
         return self._render_with_operators(light, examples)
@@ -523,12 +526,12 @@ class Scene:
             yield Layer(rows, pixels, composite + torch.stack(lamp_radiances))
 
     def _render_directly(
-        self, light: Float[Tensor, "A K 3"], conditions: Conditions, examples: Int[Tensor, " A"]
+        self, conditions: Conditions, examples: Int[Tensor, " A"], is_draft: bool
     ) -> Iterator[Layer]:
         """Render each view of examples by rasterization, without transfer operators.
 
-        The light, times the exposure, replaces that of the conditions. There is one layer for each
-        of the A · V images.
+        The light of the conditions is multiplied by the exposure already. There is one layer for
+        each of the A · V images.
         """
         row_and_view: Iterable[tuple[int, int]] = product(range(len(examples)), range(self.views))
         if len(examples) * self.views > MAX_VIEWS_WITHOUT_PROGRESS:
@@ -539,8 +542,8 @@ class Scene:
             camera = self.cameras_under(conditions, row, example_index)[view]
             background = self.backgrounds[example.background].flatten(1)
             changed = conditions.row(row, self.mesh(example_index))
-            shown = example_index, example.object, camera, light[row], changed, background
-            pixels, coverage, radiance = self._direct_renderer.radiance(*shown)
+            shown = example_index, example.object, camera, changed.light, changed, background
+            pixels, coverage, radiance = self._direct_renderer.radiance(*shown, is_draft)
             background_pixels = background.index_select(1, pixels)
             # Pixels at the border of the object show a part of the background.
             term = background_term(coverage[None], background_pixels, self.settings.encoding)

@@ -44,6 +44,8 @@ from renderer.visibility.fragments import Fragments
 DIRECTIONS = 512
 # Smallest number of ray directions of each sample of a pixel.
 DIRECTIONS_PER_SAMPLE = 32
+# Number of ray directions of a pixel of a draft, such as an image of a search.
+DRAFT_DIRECTIONS = 128
 # Rays start at this distance above the surface, as a fraction of the largest vertex
 # coordinate. Otherwise, a ray could hit the surface on which it starts, because Embree
 # computes in float32.

@@ -201,11 +201,8 @@ class Transport:
         # consist.
         self._patches = Patches.from_mesh(mesh) if settings.bounces else None
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
-        ray_count = max(rays.DIRECTIONS, rays.DIRECTIONS_PER_SAMPLE * settings.samples**2)
-        self._directions = rays.sphere(ray_count)
-        # Radiance of the sky: one row for each ray direction, one column for each SH
-        # coefficient.
-        self._sky = basis.radiance(self._directions)
+        self._ray_count = max(rays.DIRECTIONS, rays.DIRECTIONS_PER_SAMPLE * settings.samples**2)
+        self._basis = basis
         self.has_colored_light = False
         if self._patches:
             # Radiance that the patches send, with the axes: patch, SH coefficient, color. The
@@ -218,6 +215,7 @@ class Transport:
         surface: Surface,
         albedo: Float[Tensor, "S C"],
         light: Float[Tensor, "K 3"] | None = None,
+        is_draft: bool = False,
     ) -> Float[Tensor, "C _ P"] | None:
         """Compute how shadows and bounces change the transfer matrix of a view.
 
@@ -225,7 +223,8 @@ class Transport:
         is given.
 
         The albedo has 3 channels if `has_colored_light` is true, and otherwise 1 or 3. None
-        means that no surface blocks light.
+        means that no surface blocks light. A draft casts `rays.DRAFT_DIRECTIONS` rays from each
+        pixel.
         """
 
         def in_light(radiance: Float[Tensor, "N K"], channel: int) -> Float[Tensor, "N _"]:
@@ -233,6 +232,7 @@ class Transport:
             return radiance if light is None else radiance @ light[:, channel, None]
 
         change = None
+        directions = rays.sphere(rays.DRAFT_DIRECTIONS if is_draft else self._ray_count)
         fragments = surface.fragments
         gloss = surface.gloss
         # Albedo divided by the number of samples of a pixel: one row for each channel, one
@@ -243,23 +243,25 @@ class Transport:
             diffuse_factor = gloss.diffuse_factor(surface.normals, surface.toward)
             diffuse_albedo = albedo_by_channel * diffuse_factor
         channels = range(len(albedo_by_channel))
-        skies = [in_light(self._sky, channel) for channel in channels]
+        # Radiance of the sky: one row for each ray direction, one column for each SH coefficient.
+        sky = self._basis.radiance(directions)
+        skies = [in_light(sky, channel) for channel in channels]
         if self._patches:
             colors = self._sent.expand(-1, -1, len(channels)).unbind(2)
             sent = [in_light(color, channel) for channel, color in enumerate(colors)]
-        for hits in self.rays.hits(surface, self._directions):
+        for hits in self.rays.hits(surface, directions):
             if not hits.weight.any():
                 continue
             if change is None:
                 shape = (len(channels), skies[0].shape[1], len(fragments.pixels))
-                change = self._sky.new_zeros(shape)
+                change = sky.new_zeros(shape)
             sample_of_ray = hits.sample_of_ray
             if gloss is not None:
                 # Two specular reflectances along each ray: one that is later multiplied by
                 # the albedo, because metals color reflections, and one that is white. Axes
                 # of both: pixel, direction.
-                cosine = rays.dot(surface.normals[sample_of_ray], self._directions)
-                metallic, white = self._reflect_rays(gloss, surface, sample_of_ray, cosine)
+                cosine = rays.dot(surface.normals[sample_of_ray], directions)
+                metallic, white = _reflect_rays(gloss, surface, sample_of_ray, directions, cosine)
                 # Fraction of the light that passes the coat to the diffuse layer below it.
                 transmittance = gloss.at(sample_of_ray).coat_transmittance(cosine)
             for channel, channel_change in enumerate(change):
@@ -275,37 +277,10 @@ class Transport:
                 channel_change[:, hits.pixels] = -(blocked @ skies[channel]).T
                 if self._patches:
                     # Add the light that the pixels receive from patches and reflect.
-                    weights = self._patches.weights_by_patch(hits, self._directions, blocked)
+                    weights = self._patches.weights_by_patch(hits, directions, blocked)
                     added = torch.from_numpy(weights @ sent[channel].numpy())
                     channel_change[:, hits.pixels] += added.T
         return change
-
-    def _reflect_rays(
-        self,
-        gloss: SampleGloss,
-        surface: Surface,
-        sample_of_ray: Int[Tensor, "B D"],
-        cosine: Float[Tensor, "B D"],
-    ) -> tuple[Tensor, Tensor]:
-        """Compute the specular reflectance of B pixels for light along their rays.
-
-        The specular reflection may be narrower than the angle between two of the D ray directions.
-        The reflectances of a pixel are therefore scaled so that their sum over the directions is
-        exact for uniform light. The first result is multiplied by the albedo, because metals color
-        reflections. The second has the color of the light. `cosine` is between ray and normal.
-        """
-        to_camera = at_samples(surface.toward, sample_of_ray)
-        normals = surface.normals[sample_of_ray]
-        colored, white = gloss.at(sample_of_ray).reflect_beams(normals, to_camera, self._directions)
-        # Reflected radiance in uniform light of irradiance 1, that is, of radiance 1 / π. The
-        # D directions have the solid angle 4π / D each. Sum · 4π / D · 1 / π is 4 · mean.
-        sampled = ((colored + white) * cosine.clamp(min=0)).mean(1, keepdim=True) * 4
-        exact_colored, exact = gloss.reflect_uniform_light(surface.normals, surface.toward)
-        if exact_colored is not None:
-            exact = exact + exact_colored
-        smallest = torch.finfo(sampled.dtype).tiny
-        scale = exact[sample_of_ray].mean(1, keepdim=True) / sampled.clamp(min=smallest)
-        return colored * scale, white * scale
 
     def radiance(
         self, surface: Surface, albedo: Float[Tensor, "S 3"], light: Float[Tensor, "K 3"]
@@ -322,6 +297,34 @@ class Transport:
             return light.new_zeros(3, len(surface.fragments.pixels))
         # Sum over the coefficients k of the light, for each channel c and pixel p.
         return torch.einsum("ckp,kc->cp", change.to(light), light)
+
+
+def _reflect_rays(
+    gloss: SampleGloss,
+    surface: Surface,
+    sample_of_ray: Int[Tensor, "B D"],
+    directions: Float[Tensor, "D 3"],
+    cosine: Float[Tensor, "B D"],
+) -> tuple[Tensor, Tensor]:
+    """Compute the specular reflectance of B pixels for light along their rays.
+
+    The specular reflection may be narrower than the angle between two of the D ray directions.
+    The reflectances of a pixel are therefore scaled so that their sum over the directions is
+    exact for uniform light. The first result is multiplied by the albedo, because metals color
+    reflections. The second has the color of the light. `cosine` is between ray and normal.
+    """
+    to_camera = at_samples(surface.toward, sample_of_ray)
+    normals = surface.normals[sample_of_ray]
+    colored, white = gloss.at(sample_of_ray).reflect_beams(normals, to_camera, directions)
+    # Reflected radiance in uniform light of irradiance 1, that is, of radiance 1 / π. The
+    # D directions have the solid angle 4π / D each. Sum · 4π / D · 1 / π is 4 · mean.
+    sampled = ((colored + white) * cosine.clamp(min=0)).mean(1, keepdim=True) * 4
+    exact_colored, exact = gloss.reflect_uniform_light(surface.normals, surface.toward)
+    if exact_colored is not None:
+        exact = exact + exact_colored
+    smallest = torch.finfo(sampled.dtype).tiny
+    scale = exact[sample_of_ray].mean(1, keepdim=True) / sampled.clamp(min=smallest)
+    return colored * scale, white * scale
 
 
 def build_transport(

@@ -333,6 +333,19 @@ def test_shadows_are_computed_anew_for_large_changes_of_shape_and_kept_for_small
         assert least <= error < most
 
 
+def test_drafts_of_moved_vertices_have_nearly_the_shadows_of_all_directions():
+    """Images that are no drafts have exactly these shadows."""
+    scene = built("cup", shadows=True)
+    mesh = scene.mesh(0)
+    rows = torch.arange(len(scene))
+    lights = scene.lights
+    moved = (1.1 * mesh.vertices[None].repeat(len(scene), 0)).astype(np.float32)
+    expected = images_of_moved(scene, mesh, moved, lights)
+    for is_draft, least, most in ((False, 0, 1000 * EPS32), (True, 1e-4, 0.02)):
+        images = scene.render(Conditions(lights, torch.from_numpy(moved)), rows, is_draft)[:, 0]
+        assert least <= float((images - expected).square().mean().sqrt()) < most
+
+
 def images_of_moved(scene, mesh, vertices, lights) -> torch.Tensor:
     images = []
     for row, example in enumerate(scene.examples):
