@@ -1,0 +1,301 @@
+"""Rank networks in several lights by how well they tell oranges from similar objects.
+
+    python -m benchmarks.networks add NETWORK --out mine.csv
+
+scores a network in all simulated lights, adds its rows to a copy of docs/ranking.csv, and prints
+its rank in each light. A network is any name that `pnb-evaluate` takes as network=, a published
+name, or the folder of a run. After "normalized:" it sees normalized light. --real FOLDER also
+scores the photographs in FOLDER/low_light and FOLDER/projector, which docs/ranking.md describes.
+
+    python -m benchmarks.networks table
+
+prints the table of docs/ranking.md.
+"""
+
+import argparse
+import csv
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+import norm_balls as nb
+from augment.classifier import Classifier
+from augment.random_streams import generator
+from augment.scene.objects import Conditions, load_object
+from benchmarks import real_light
+from benchmarks.splits import current_commit
+from renderer.image import to_bytes
+from renderer.io.images import write_image
+from renderer.light.basis import HARMONICS
+from renderer.light.files import perturb
+from renderer.settings import height_and_width
+from train.auditing.audit import NEGATIVE_SOLIDS
+from train.auditing.lights import AMPLITUDE, Views
+from train.data.photo import TABLE
+from train.data.photographs import find_photographs
+from train.results.scoring import Predictor, score
+from train.results.tables import Estimate, Table, format_interval, write_csv
+from train.settings import OTHER_PREFIX, published_folder
+
+SCORES = Path(__file__).parents[1] / "docs" / "ranking.csv"
+HEADER = ["network", "light", "quantity", "value", "low", "high", "commit"]
+QUANTITIES = ("AUC", "recall at 5% FPR", "recall", "FPR")
+TOP1 = "top-1"
+LABEL = "orange"
+OTHERS = f"{OTHER_PREFIX}fruit"
+# Generated objects by class folder. No published network and no other test saw these seeds.
+OBJECTS = {
+    LABEL: [f"solid:{LABEL}:{seed}" for seed in range(4001, 4021)],
+    OTHERS: [f"solid:{name}:{seed}" for name in NEGATIVE_SOLIDS for seed in range(4001, 4005)],
+}
+MAPS = ("grace", "eucalyptus", "st_peters")
+SEED = 5
+SIZE = 224  # Pixels per side of the renders. A network sees them at its own size.
+NATURAL, RANDOM, ADVERSARIAL = "natural", "random", "adversarial"
+RELIT = {"projector, simulated": "projected_slide", "low light, simulated": "low_light"}
+PATH_TRACED = "projector, path-traced"
+MAX_PATH_TRACED_SIZE = 64  # Larger networks would see its images of 32 pixels enlarged.
+REAL = {"plain light, real": "plain", "low light, real": "low_light"}
+PROJECTED = "projector, real"
+STRIPES = "stripes_coarse+stripes_medium+stripes_fine"
+LIGHTS = (NATURAL, RANDOM, ADVERSARIAL, *RELIT, PATH_TRACED, *REAL, PROJECTED)
+# All attacks have the same norm-ball and as many steps, also after a success.
+ATTACK = nb.AttackSettings(
+    lighting=nb.StepSettings("linf", 0.1, "sign", 0.025), max_steps=10, margin=1e5, batch_size=16
+)
+# Estimates by light and quantity.
+Scores = dict[str, Mapping[str, Estimate]]
+
+
+def views_in_maps(folder: str) -> Iterator[Views]:
+    """Yield a view of each object of a class folder in each map."""
+    objects = [load_object(nb.ObjectSettings(mesh=name, label=folder)) for name in OBJECTS[folder]]
+    for number, name in enumerate(MAPS):
+        yield Views(objects, len(objects), SEED + number, torch.device("cpu"), name)
+
+
+def natural_light(views: Views) -> Tensor:
+    """Return the light of the map for each view."""
+    return nb.load_light(views.light).expand(views.count, -1, -1)
+
+
+def random_light(views: Views) -> Tensor:
+    """Draw a random light around that of the map for each view, as the audit does."""
+    draws = generator(views.seed, "lights")
+    lights = perturb(nb.load_light(views.light), views.count, AMPLITUDE, None, draws)
+    return HARMONICS.project_nonnegative(lights)
+
+
+def attacked_light(network: Classifier, views: Views) -> Tensor:
+    """Return the light of each view after an attack on the network."""
+    scene = views.scene(network.size)
+    result = nb.attack(network, scene, settings=ATTACK, seed=views.seed, force=True)
+    examples = torch.arange(views.count)
+    return result.problem.conditions(result.minimum.values, examples).light.detach()
+
+
+def render(folder: str, light_of: Callable[[Views], Tensor]) -> UInt8[Tensor, "N 3 H W"]:
+    """Render all views of the objects of a class folder."""
+    images = []
+    for views in views_in_maps(folder):
+        conditions = Conditions(light_of(views))
+        with torch.no_grad():
+            images.append(views.scene(SIZE).render(conditions, torch.arange(views.count))[:, 0])
+    return to_bytes(torch.cat(images))
+
+
+def write_images(folder: Path, images: Mapping[str, Tensor]) -> None:
+    """Write the images of each class folder, and the table that names their objects."""
+    rows = [["path", "source_tag", "mesh"]]
+    for name, of_class in images.items():
+        (folder / name).mkdir(parents=True)
+        for index, image in enumerate(of_class):
+            path = f"{name}/{index:03d}.png"
+            write_image(folder / path, image.permute(1, 2, 0).numpy())
+            # Each map has one view of each object.
+            rows.append([path, "", OBJECTS[name][index % len(OBJECTS[name])]])
+    write_csv(folder / TABLE, rows)
+
+
+def write_renders(folder: Path) -> None:
+    """Render the objects in all lights that do not depend on a network."""
+    images = {
+        NATURAL: {name: render(name, natural_light) for name in OBJECTS},
+        RANDOM: {name: render(name, random_light) for name in OBJECTS},
+    }
+    for title, light in RELIT.items():
+        relight = partial(nb.relight_photographs, seed=SEED, lights=[light])
+        images[title] = {name: relight(each) for name, each in images[NATURAL].items()}
+    for title, of_light in images.items():
+        write_images(folder / title, of_light)
+
+
+def score_renders(network: Classifier, renders: Path) -> Scores:
+    """Score a network in all simulated lights, with intervals over objects."""
+    folders = {title: renders / title for title in (NATURAL, RANDOM, *RELIT)}
+    if max(height_and_width(network.size)) <= MAX_PATH_TRACED_SIZE:
+        folders[PATH_TRACED] = published_folder(Path("pretrained/laboratory"))
+    predictor = Predictor(network, network.classes, network.size)
+    scores: Scores = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        folders[ADVERSARIAL] = Path(temporary)
+        attacked = render(LABEL, partial(attacked_light, network))
+        # The light of the other objects is not attacked.
+        write_images(folders[ADVERSARIAL], {LABEL: attacked, OTHERS: render(OTHERS, natural_light)})
+        for title, folder in folders.items():
+            found = score(predictor.predict(folder, LABEL)).overall
+            values = (found.auc, found.recall_at["0.05"], found.recall, found.false_positive_rate)
+            scores[title] = dict(zip(QUANTITIES, values, strict=True))
+    return scores
+
+
+def score_photographs(
+    network: Classifier, path: Path, label: str, lights: Mapping[str, str], has_crops: bool
+) -> Scores:
+    """Score a network on real photographs in some lights, with intervals over photographs."""
+    found = find_photographs(path, network.classes, label)
+    folder = real_light.Folder(path, found, has_crops)
+    predictions = real_light.predict(network, folder, [label])
+    counts, units = folder.draw(label), folder.units(label)
+    scores: Scores = {}
+    words = [f"{title}={light}" for title, light in lights.items()]
+    for title, rows in real_light.choose_lights(folder, words).items():
+        draws = real_light.measure(predictions, folder.objects, counts, rows)
+        estimates = [real_light.estimate(each, len({*units[rows]})) for each in draws]
+        scores[title] = dict(zip(real_light.METRICS, estimates, strict=True))
+    return scores
+
+
+def score_network(name: str, renders: Path, real: Path | None) -> Scores:
+    """Score a network in all lights. Only networks of ImageNet name all projected objects."""
+    network = real_light.load(name)
+    scores = score_renders(network, renders)
+    if real:
+        scores |= score_photographs(network, real / "low_light", LABEL, REAL, True)
+        projected = real / "projector"
+        objects = [path.name for path in projected.iterdir() if path.is_dir()]
+        if {*objects} <= {*network.classes}:
+            lights = {PROJECTED: STRIPES}
+            found = score_photographs(network, projected, objects[0], lights, False)
+            scores[PROJECTED] = {TOP1: found[PROJECTED][TOP1]}
+    return scores
+
+
+def read(path: Path) -> dict[str, list[list[str]]]:
+    """Read the rows of each network from a file of scores."""
+    rows: dict[str, list[list[str]]] = {}
+    with path.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            rows.setdefault(row["network"], []).append([row[name] for name in HEADER])
+    return rows
+
+
+def rows_of(name: str, scores: Scores) -> list[list[str]]:
+    """Return the rows of a network, whose scores have four digits."""
+    commit = current_commit()
+    rows = []
+    for light in LIGHTS:
+        for quantity, found in scores.get(light, {}).items():
+            ends = ("" if end is None else f"{end:.4f}" for end in (found.low, found.high))
+            if found.value is not None:
+                rows.append([name, light, quantity, f"{found.value:.4f}", *ends, commit])
+    return rows
+
+
+def ranked_scores(rows: Mapping[str, Sequence[Sequence[str]]], light: str) -> dict[str, Estimate]:
+    """Return the estimate by which each network is ranked in a light."""
+    ranked_by = TOP1 if light == PROJECTED else QUANTITIES[0]
+    estimates = {}
+    for row in (row for of_network in rows.values() for row in of_network):
+        if row[1:3] == [light, ranked_by]:
+            estimates[row[0]] = Estimate(*map(float, row[3:6]))
+    return estimates
+
+
+def rank(scores: Mapping[str, Estimate]) -> dict[str, tuple[int, int, int]]:
+    """Return the rank of each network, and the first and the last rank that intervals allow.
+
+    Networks with equal values share the first of their ranks. The limits count the networks whose
+    intervals lie completely above, or below.
+    """
+    ranks = {}
+    for name, one in scores.items():
+        others = [*scores.values()]
+        above = sum(other.value > one.value for other in others)
+        surely_above = sum(other.low > one.high for other in others)
+        surely_below = sum(other.high < one.low for other in others)
+        ranks[name] = (1 + above, 1 + surely_above, len(others) - surely_below)
+    return ranks
+
+
+def add(options: argparse.Namespace) -> None:
+    """Score networks, write a file with their rows, and print their ranks."""
+    rows = read(options.scores)
+    with tempfile.TemporaryDirectory() as temporary:
+        renders = options.renders or Path(temporary) / "renders"
+        if not renders.exists():
+            write_renders(renders)
+        for name in options.networks:
+            rows[name] = rows_of(name, score_network(name, renders, options.real))
+            # The scores of a network are kept if a later network cannot be scored.
+            write_csv(options.out, [HEADER, *(row for each in rows.values() for row in each)])
+    for name in options.networks:
+        lines = []
+        for light in LIGHTS:
+            scores = ranked_scores(rows, light)
+            if name in scores:
+                position, first, last = rank(scores)[name]
+                of_all = f"{position} of {len(scores)}"
+                lines.append([light, format_interval(scores[name]), of_all, f"{first} to {last}"])
+        print(Table(name, ["light", "score", "rank", "ranks within the intervals"], lines))
+
+
+def table(options: argparse.Namespace) -> None:
+    """Print the table of the page: the rank and the score of each network in each light."""
+    print("\n".join(table_lines(read(options.scores))))
+
+
+def table_lines(rows: Mapping[str, Sequence[Sequence[str]]]) -> list[str]:
+    """Return the lines of a Markdown table of ranks and scores."""
+    columns = {light: scores for light in LIGHTS if (scores := ranked_scores(rows, light))}
+    ranks = {light: rank(scores) for light, scores in columns.items()}
+    lines = [["network", *columns], ["-"] * (1 + len(columns))]
+    for name in rows:
+        line = [f"`{name}`"]
+        for light, scores in columns.items():
+            cell = ""
+            if found := scores.get(name):
+                interval = f"[{found.low:.2f}, {found.high:.2f}]"
+                cell = f"**{ranks[light][name][0]}**: {found.value:.2f} {interval}"
+            line.append(cell)
+        lines.append(line)
+    return [f"|{'|'.join(line)}|" for line in lines]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(required=True)
+    adding = commands.add_parser("add", help="score networks, and rank them among those of a file")
+    adding.set_defaults(body=add)
+    adding.add_argument("networks", nargs="+", metavar="NETWORK")
+    adding.add_argument("--out", type=Path, default=Path("ranking.csv"), help="file to write")
+    adding.add_argument("--real", type=Path, help="folder of photographs")
+    adding.add_argument("--renders", type=Path, help="folder in which to keep the renders")
+    printing = commands.add_parser("table", help="print the table of the page")
+    printing.set_defaults(body=table)
+    for command in (adding, printing):
+        command.add_argument("--scores", type=Path, default=SCORES, help="file of other networks")
+    options = parser.parse_args(arguments)
+    options.body(options)
+
+
+if __name__ == "__main__":
+    main()
