@@ -14,11 +14,13 @@ prints the table of docs/ranking.md.
 
 import argparse
 import csv
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import UInt8
 from torch import Tensor
@@ -68,6 +70,8 @@ LIGHTS = (NATURAL, RANDOM, ADVERSARIAL, *RELIT, PATH_TRACED, *REAL, PROJECTED)
 ATTACK = nb.AttackSettings(
     lighting=nb.StepSettings("linf", 0.1, "sign", 0.025), max_steps=10, margin=1e5, batch_size=16
 )
+# Rows of a file without their header.
+Rows = list[list[str]]
 # Estimates by light and quantity.
 Scores = dict[str, Mapping[str, Estimate]]
 
@@ -110,15 +114,16 @@ def render(folder: str, light_of: Callable[[Views], Tensor]) -> UInt8[Tensor, "N
 
 
 def write_images(folder: Path, images: Mapping[str, Tensor]) -> None:
-    """Write the images of each class folder, and the table that names their objects."""
-    rows = [["path", "source_tag", "mesh"]]
+    """Write the images of class folders, and the table that names the objects of all."""
     for name, of_class in images.items():
-        (folder / name).mkdir(parents=True)
+        (folder / name).mkdir(parents=True, exist_ok=True)
         for index, image in enumerate(of_class):
-            path = f"{name}/{index:03d}.png"
-            write_image(folder / path, image.permute(1, 2, 0).numpy())
-            # Each map has one view of each object.
-            rows.append([path, "", OBJECTS[name][index % len(OBJECTS[name])]])
+            write_image(folder / name / f"{index:03d}.png", image.permute(1, 2, 0).numpy())
+    rows = [["path", "source_tag", "mesh"]]
+    for name, objects in OBJECTS.items():
+        # Each map has one view of each object.
+        meshes = enumerate(objects * len(MAPS))
+        rows += [[f"{name}/{index:03d}.png", "", mesh] for index, mesh in meshes]
     write_csv(folder / TABLE, rows)
 
 
@@ -146,7 +151,8 @@ def score_renders(network: Classifier, renders: Path) -> Scores:
         folders[ADVERSARIAL] = Path(temporary)
         attacked = render(LABEL, partial(attacked_light, network))
         # The light of the other objects is not attacked.
-        write_images(folders[ADVERSARIAL], {LABEL: attacked, OTHERS: render(OTHERS, natural_light)})
+        shutil.copytree(renders / NATURAL / OTHERS, folders[ADVERSARIAL] / OTHERS)
+        write_images(folders[ADVERSARIAL], {LABEL: attacked})
         for title, folder in folders.items():
             found = score(predictor.predict(folder, LABEL)).overall
             values = (found.auc, found.recall_at["0.05"], found.recall, found.false_positive_rate)
@@ -172,30 +178,32 @@ def score_photographs(
 
 
 def score_network(name: str, renders: Path, real: Path | None) -> Scores:
-    """Score a network in all lights. Only networks of ImageNet name all projected objects."""
+    """Score a network in all lights. Projected objects count if it has all of their classes."""
     network = real_light.load(name)
+    if not isinstance(network, Classifier):
+        raise SystemExit(f"{name} is no classifier: only classifiers are ranked")
     scores = score_renders(network, renders)
-    if real:
-        scores |= score_photographs(network, real / "low_light", LABEL, REAL, True)
-        projected = real / "projector"
-        objects = [path.name for path in projected.iterdir() if path.is_dir()]
-        if {*objects} <= {*network.classes}:
-            lights = {PROJECTED: STRIPES}
-            found = score_photographs(network, projected, objects[0], lights, False)
+    folders = {path.name: path for path in real.iterdir()} if real else {}
+    if path := folders.get("low_light"):
+        scores |= score_photographs(network, path, LABEL, REAL, True)
+    if path := folders.get("projector"):
+        shown = [each.name for each in path.iterdir() if each.is_dir()]
+        if {*shown} <= {*network.classes}:
+            found = score_photographs(network, path, shown[0], {PROJECTED: STRIPES}, False)
             scores[PROJECTED] = {TOP1: found[PROJECTED][TOP1]}
     return scores
 
 
-def read(path: Path) -> dict[str, list[list[str]]]:
+def read(path: Path) -> dict[str, Rows]:
     """Read the rows of each network from a file of scores."""
-    rows: dict[str, list[list[str]]] = {}
+    rows: dict[str, Rows] = {}
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             rows.setdefault(row["network"], []).append([row[name] for name in HEADER])
     return rows
 
 
-def rows_of(name: str, scores: Scores) -> list[list[str]]:
+def rows_of(name: str, scores: Scores) -> Rows:
     """Return the rows of a network, whose scores have four digits."""
     commit = current_commit()
     rows = []
@@ -207,29 +215,26 @@ def rows_of(name: str, scores: Scores) -> list[list[str]]:
     return rows
 
 
-def ranked_scores(rows: Mapping[str, Sequence[Sequence[str]]], light: str) -> dict[str, Estimate]:
-    """Return the estimate by which each network is ranked in a light."""
-    ranked_by = TOP1 if light == PROJECTED else QUANTITIES[0]
-    estimates = {}
-    for row in (row for of_network in rows.values() for row in of_network):
-        if row[1:3] == [light, ranked_by]:
-            estimates[row[0]] = Estimate(*map(float, row[3:6]))
-    return estimates
+def ranked_scores(rows: Mapping[str, Rows], light: str) -> dict[str, list[float]]:
+    """Return the value by which each network is ranked in a light, and the ends of its interval."""
+    ranked_by = [light, TOP1 if light == PROJECTED else QUANTITIES[0]]
+    found = (row for of_network in rows.values() for row in of_network if row[1:3] == ranked_by)
+    return {row[0]: [float(cell or "nan") for cell in row[3:6]] for row in found}
 
 
-def rank(scores: Mapping[str, Estimate]) -> dict[str, tuple[int, int, int]]:
+def rank(scores: Mapping[str, Sequence[float]]) -> dict[str, tuple[int, int, int]]:
     """Return the rank of each network, and the first and the last rank that intervals allow.
 
     Networks with equal values share the first of their ranks. The limits count the networks whose
     intervals lie completely above, or below.
     """
     ranks = {}
-    for name, one in scores.items():
-        others = [*scores.values()]
-        above = sum(other.value > one.value for other in others)
-        surely_above = sum(other.low > one.high for other in others)
-        surely_below = sum(other.high < one.low for other in others)
-        ranks[name] = (1 + above, 1 + surely_above, len(others) - surely_below)
+    values, lows, highs = np.array([*scores.values()]).T
+    for name, (value, low, high) in scores.items():
+        above, surely_above, surely_below = map(
+            int, ((values > value).sum(), (lows > high).sum(), (highs < low).sum())
+        )
+        ranks[name] = (1 + above, 1 + surely_above, len(scores) - surely_below)
     return ranks
 
 
@@ -238,7 +243,8 @@ def add(options: argparse.Namespace) -> None:
     rows = read(options.scores)
     with tempfile.TemporaryDirectory() as temporary:
         renders = options.renders or Path(temporary) / "renders"
-        if not renders.exists():
+        # The table of the last light is written last.
+        if not (renders / [*RELIT][-1] / TABLE).exists():
             write_renders(renders)
         for name in options.networks:
             rows[name] = rows_of(name, score_network(name, renders, options.real))
@@ -249,32 +255,28 @@ def add(options: argparse.Namespace) -> None:
         for light in LIGHTS:
             scores = ranked_scores(rows, light)
             if name in scores:
+                interval = format_interval(Estimate(*scores[name]))
                 position, first, last = rank(scores)[name]
-                of_all = f"{position} of {len(scores)}"
-                lines.append([light, format_interval(scores[name]), of_all, f"{first} to {last}"])
-        print(Table(name, ["light", "score", "rank", "ranks within the intervals"], lines))
+                of_all = f"{position} of {len(scores)}, {first} to {last} within the intervals"
+                lines.append([light, interval, of_all])
+        print(Table(name, ["light", "score", "rank"], lines))
 
 
 def table(options: argparse.Namespace) -> None:
     """Print the table of the page: the rank and the score of each network in each light."""
-    print("\n".join(table_lines(read(options.scores))))
-
-
-def table_lines(rows: Mapping[str, Sequence[Sequence[str]]]) -> list[str]:
-    """Return the lines of a Markdown table of ranks and scores."""
-    columns = {light: scores for light in LIGHTS if (scores := ranked_scores(rows, light))}
-    ranks = {light: rank(scores) for light, scores in columns.items()}
-    lines = [["network", *columns], ["-"] * (1 + len(columns))]
+    rows = read(options.scores)
+    columns = {light: ranked_scores(rows, light) for light in LIGHTS}
+    print("|".join(["", "network", *columns, ""]))
+    print("|-" * (1 + len(columns)) + "|")
     for name in rows:
-        line = [f"`{name}`"]
-        for light, scores in columns.items():
+        line = ["", f"`{name}`"]
+        for scores in columns.values():
             cell = ""
-            if found := scores.get(name):
-                interval = f"[{found.low:.2f}, {found.high:.2f}]"
-                cell = f"**{ranks[light][name][0]}**: {found.value:.2f} {interval}"
+            if name in scores:
+                value, low, high = scores[name]
+                cell = f"**{rank(scores)[name][0]}**: {value:.2f} [{low:.2f}, {high:.2f}]"
             line.append(cell)
-        lines.append(line)
-    return [f"|{'|'.join(line)}|" for line in lines]
+        print("|".join([*line, ""]))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,0 +1,89 @@
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import rankdata
+
+from benchmarks import networks
+from tests.helpers import darker_than
+
+
+def rows_in(path):
+    with path.open(newline="") as file:
+        return {tuple(row[:3]): [float(cell or "nan") for cell in row[3:6]] for row in rows(file)}
+
+
+def rows(file):
+    reader = csv.reader(file)
+    assert next(reader) == networks.HEADER
+    return reader
+
+
+@pytest.fixture
+def add(tmp_path, monkeypatch):
+    """Add networks to a copy of the published file, in few renders of few pixels."""
+    kinds = {networks.LABEL: ["orange"], networks.OTHERS: ["apple", "pear"]}
+    objects = {
+        folder: [f"solid:{name}:{seed}" for name in names for seed in (1, 2)]
+        for folder, names in kinds.items()
+    }
+    monkeypatch.setattr(networks, "OBJECTS", objects)
+    monkeypatch.setattr(networks, "MAPS", ("grace", "st_peters"))
+    monkeypatch.setattr(networks, "SIZE", 32)
+    known = {"half": darker_than(0.5, size=16, scale=10)}
+    monkeypatch.setattr(networks.real_light, "load", known.__getitem__)
+    renders = tmp_path / "renders"
+
+    def run(scores, out):
+        words = [str(out), "--scores", str(scores), "--renders", str(renders)]
+        networks.main(["add", "half", "--out", *words])
+        return rows_in(out)
+
+    return run
+
+
+def test_ranks_are_those_of_scipy():
+    values = np.array([0.5, 0.9, 0.5, 0.1, 0.9, 0.7])
+    exact = networks.rank({name: (x, x, x) for name, x in enumerate(values)})
+    lowest, highest = (rankdata(-values, method) for method in ("min", "max"))
+    # Networks whose intervals are points may change their order only if they are equal.
+    expected = np.stack([lowest, lowest, highest], axis=1)
+    assert np.array_equal([*exact.values()], expected)
+    unknown = networks.rank({name: (x, 0.0, 1.0) for name, x in enumerate(values)})
+    assert {each[1:] for each in unknown.values()} == {(1, len(values))}
+
+
+def test_a_network_that_is_added_again_has_the_same_scores(add, tmp_path):
+    before = rows_in(networks.SCORES)
+    once = add(networks.SCORES, tmp_path / "once.csv")
+    shutil.rmtree(tmp_path / "renders")
+    again = add(tmp_path / "once.csv", tmp_path / "again.csv")
+    assert again == once
+    assert {key: once[key] for key in before} == before
+    own = {key[1] for key in once.keys() - before.keys()}
+    assert own == {light for light in networks.LIGHTS if not light.endswith("real")}
+
+
+def test_an_attack_lowers_the_auc_of_the_attacked_network(add, tmp_path):
+    scores = add(networks.SCORES, tmp_path / "scores.csv")
+    natural, attacked = (scores["half", light, "AUC"][0] for light in ("natural", "adversarial"))
+    assert attacked < natural
+
+
+def test_the_page_shows_the_table_of_the_file(capsys):
+    networks.main(["table"])
+    page = networks.SCORES.with_suffix(".md").read_text()
+    assert capsys.readouterr().out in page
+
+
+@pytest.mark.slow
+def test_a_published_network_that_is_added_again_has_its_published_scores(tmp_path):
+    name, out = "pretrained/none", Path(tmp_path / "scores.csv")
+    networks.main(["add", name, "--out", str(out)])
+    published, measured = rows_in(networks.SCORES), rows_in(out)
+    for key, (value, *_) in published.items():
+        # One of 60 images of an orange is 0.017.
+        if key[0] == name and key in measured:
+            assert measured[key][0] == pytest.approx(value, abs=0.02), key
