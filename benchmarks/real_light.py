@@ -36,7 +36,7 @@ from scipy.stats import spearmanr
 import norm_balls as nb
 from augment.classifier import Classifier
 from renderer.io.images import write_image
-from train.checkpoints import is_classifier, load_network, load_run
+from train.checkpoints import RUN, is_classifier, load_network, load_run
 from train.data.photo import Photograph
 from train.data.photographs import find_photographs, load_photographs
 from train.results.intervals import auc_and_recalls, class_means, weighted_means
@@ -66,7 +66,7 @@ def load(name: str) -> Classifier:
     """Load a network by its name on the command line."""
     if name.startswith(NORMALIZED):
         return load(name.removeprefix(NORMALIZED)).normalizing_light()
-    return load_network(name) if is_classifier(name) else load_run(name)
+    return load_network(name) if is_classifier(name) else load_run(name.removeprefix(RUN))
 
 
 def light_of(photograph: Photograph) -> str:

@@ -3,6 +3,7 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from benchmarks import real_light
@@ -50,6 +51,11 @@ def test_each_light_has_its_scores(folder, monkeypatch):
     assert values["half", "plain"] == ["1.000", "1.000", "0.000", "1.000"]
     assert values["half", "low_light"] == ["1.000", "0.000", "0.250", "0.750"]
     assert values["never", "plain"][0] == "0.000"
+
+
+def test_a_run_is_loaded_as_network_spells_it():
+    one, other = (real_light.load(f"{prefix}pretrained/none") for prefix in ("", "run:"))
+    assert all(map(torch.equal, one.state_dict().values(), other.state_dict().values()))
 
 
 def test_crops_of_a_photograph_are_drawn_together(folder, monkeypatch):
