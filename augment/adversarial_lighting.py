@@ -130,12 +130,18 @@ class AdversarialLighting:
             image_of_row, criterion = self._criterion(network, unit, targets)
             if not len(image_of_row):
                 return lights
+            rows = image_of_row.tolist()
             # The last light needs no gradient, because no step follows.
             for step in range(self.steps + 1):
                 with torch.set_grad_enabled(step < self.steps):
                     # The numbers of these lights are leaves of the graph, which get gradients.
                     leaves = [light and _leaf(light) for light in lights]
-                    cost = self._cost(network, unit, leaves, image_of_row, criterion)
+                    outputs = network(self.lighting.apply(unit, {"lights": leaves}))
+                    is_list = isinstance(outputs, list)
+                    chosen = [outputs[row] for row in rows] if is_list else outputs[rows]
+                    # The cost of an image is the sum of the costs of its objects.
+                    costs = criterion.cost(chosen)
+                    cost = costs.new_zeros(len(unit)).index_add(0, image_of_row, costs)
                     if step < self.steps:
                         cost.sum().backward()
                 is_lower = (cost < lowest).tolist()
@@ -193,22 +199,6 @@ class AdversarialLighting:
         # The class is the last axis of `one_hot`, but the first axis of the outputs of an image.
         outputs = F.one_hot(targets.where(has_class, count), count + 1).movedim(-1, 1)
         return outputs.float(), [*self.classes, BACKGROUND]
-
-    def _cost(
-        self,
-        network: CheckedNetwork,
-        unit: Float[Tensor, "N 3 H W"],
-        lights: list[Light | None],
-        image_of_row: Int[Tensor, " E"],
-        criterion: Criterion,
-    ) -> Float[Tensor, " N"]:
-        """Sum up the cost of the objects in each image, in some lights."""
-        outputs = network(self.lighting.apply(unit, {"lights": lights}))
-        rows = image_of_row.tolist()
-        chosen = [outputs[row] for row in rows] if isinstance(outputs, list) else outputs[rows]
-        # Costs of objects, of which the sum over each image is returned.
-        costs = criterion.cost(chosen)
-        return costs.new_zeros(len(unit)).index_add(0, image_of_row, costs)
 
     def _stepped(self, light: Light) -> Light:
         """Move the numbers of a light along the sign of their gradient, within [0, 1]."""

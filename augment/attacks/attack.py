@@ -207,7 +207,10 @@ def _attack(
     # A detector that finds nothing may have constant scores, but a cost with a gradient.
     has_gradient = settings.uses_gradients and not minimum.zero_gradient.all()
     may_be_constant = not has_gradient and torch.equal(evidence, evidence_before)
-    if may_be_constant and _ignores_images(objective, images, evidence):
+    black_and_white = (torch.full_like(images, shade) for shade in (0.0, 1.0))
+    if may_be_constant and all(
+        torch.equal(objective.evidence(shown), evidence) for shown in black_and_white
+    ):
         advice = "an attack finds no direction in constant scores"
         reason = "scores black and white images exactly like the renders"
         warnings.warn(f"{classifier.title} {reason}: {advice}", stacklevel=3)
@@ -235,14 +238,6 @@ def _attack(
         queries=queries,
         seconds=phases.take(),
     )
-
-
-def _ignores_images(
-    objective: Objective, images: Float[Tensor, "E V 3 H W"], evidence: Float[Tensor, "E V K"]
-) -> bool:
-    """Tell whether a network scores black and white images exactly like the attacked ones."""
-    black_and_white = (torch.full_like(images, shade) for shade in (0.0, 1.0))
-    return all(torch.equal(objective.evidence(shown), evidence) for shown in black_and_white)
 
 
 def require_clean_correct(

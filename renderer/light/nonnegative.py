@@ -331,9 +331,15 @@ class _QuadraticProgram:
             derivatives = [_differentiate(*channel) for channel in arrays]
             velocities, multipliers, rates = zip(*derivatives, strict=True)
             velocity = np.stack(velocities)
-            # r² - |x - c|² = (r - |x - c|) (r + |x - c|).
+            # The change s of t with |x - c + s velocity| = r solves the quadratic equation
+            # s² |velocity|² + 2 s slope = r² - |x - c|² = (r - |x - c|) (r + |x - c|).
             missing_squared = missing * (self._radius + distance)
-            step = self._step_to_sphere(velocity, displacement, missing_squared)
+            squared_speed = float((velocity * velocity).sum())
+            slope = float((velocity * displacement).sum())
+            root = math.sqrt(max(slope**2 + squared_speed * missing_squared, 0))
+            step = (root - slope) / max(squared_speed, _TINY)
+            # Keep t in its range.
+            step = min(max(step, self._min_t - self._t), 1 - self._t)
             self._t += step
             # A constraint stays active if its multiplier does not become negative.
             if (np.concatenate(multipliers) + step * np.concatenate(rates) >= 0).all():
@@ -344,21 +350,6 @@ class _QuadraticProgram:
         # Rounding may leave the solution slightly outside of the ball.
         scale = min(1, self._radius / max(float(np.linalg.norm(displacement)), _TINY))
         self.nearest = self._center + displacement * scale
-
-    def _step_to_sphere(
-        self, velocity: Array, displacement: Array, missing_squared: float
-    ) -> float:
-        """Find the change s of t with |displacement + s velocity| = r, which keeps t in its range.
-
-        `velocity` is the derivative of x with respect to t, `displacement` is x - c, and
-        `missing_squared` is r² - |x - c|².
-        """
-        # s solves the quadratic equation s² |velocity|² + 2 s slope = missing_squared.
-        squared_speed = float((velocity * velocity).sum())
-        slope = float((velocity * displacement).sum())
-        root = math.sqrt(max(slope**2 + squared_speed * missing_squared, 0))
-        step = (root - slope) / max(squared_speed, _TINY)
-        return min(max(step, self._min_t - self._t), 1 - self._t)
 
 
 def _differentiate(offset: Array, correction: Array, active_rows: Array) -> tuple[Array, ...]:

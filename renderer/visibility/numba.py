@@ -15,10 +15,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from renderer.errors import import_package
-from renderer.visibility.numpy import FAR, SUBSAMPLE_BITS, to_fixed_point
+from renderer.visibility.numpy import FAR, SUBSAMPLE_BITS, FaceIds, Faces, Views, to_fixed_point
 
 # numba also raises ImportError for an unsupported NumPy.
 numba = import_package("numba", "numba, or choose the rasterizer numpy")
@@ -31,12 +30,7 @@ TYPES = (
 )
 
 
-def rasterize(
-    points: Float[np.ndarray, "N V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    shape: tuple[int, int],
-    closed: bool,
-) -> Int[np.ndarray, "N R C"]:
+def rasterize(points: Views, faces: Faces, shape: tuple[int, int], closed: bool) -> FaceIds:
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility` defines the

@@ -48,13 +48,13 @@ FACES_PER_BLOCK = 2**14
 # processor.
 ENTRIES_PER_BLOCK = 2**13
 
+# Projected points of N views, the faces of a mesh, and the face at each sample of each view.
+Views = Float[np.ndarray, "N V 3"]
+Faces = Int[np.ndarray, "F 3"]
+FaceIds = Int[np.ndarray, "N R C"]
 
-def rasterize(
-    points: Float[np.ndarray, "N V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    shape: tuple[int, int],
-    closed: bool,
-) -> Int[np.ndarray, "N R C"]:
+
+def rasterize(points: Views, faces: Faces, shape: tuple[int, int], closed: bool) -> FaceIds:
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility` defines the

@@ -25,9 +25,9 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from renderer.errors import InputError, explained
+from renderer.visibility.numpy import FaceIds, Faces, Views
 
 if TYPE_CHECKING:
     import moderngl
@@ -56,12 +56,7 @@ void main() {
 FLOAT_BYTES = 4
 
 
-def rasterize(
-    points: Float[np.ndarray, "N V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    shape: tuple[int, int],
-    closed: bool,
-) -> Int[np.ndarray, "N R C"]:
+def rasterize(points: Views, faces: Faces, shape: tuple[int, int], closed: bool) -> FaceIds:
     """Find the nearest face at each sample of each view.
 
     The docstring of the package `renderer.visibility` defines the
@@ -125,12 +120,8 @@ def _check(context: moderngl.Context) -> None:
 
 
 def _draw(
-    context: moderngl.Context,
-    points: Float[np.ndarray, "N V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    shape: tuple[int, int],
-    closed: bool,
-) -> Int[np.ndarray, "N R C"]:
+    context: moderngl.Context, points: Views, faces: Faces, shape: tuple[int, int], closed: bool
+) -> FaceIds:
     """Draw N views and read the face ids."""
     import moderngl
 

@@ -45,27 +45,19 @@ class Marked:
     is_crowd: Bool[np.ndarray, " M"]
 
 
-def box_overlaps(
-    found: Float[np.ndarray, "N 4"],
-    boxes: Float[np.ndarray, "M 4"],
-    is_crowd: Bool[np.ndarray, " M"],
-) -> Float[np.ndarray, "N M"]:
-    """Compute intersection over union or, of crowds, over the area of the detection."""
-    low = np.maximum(found[:, None, :2], boxes[None, :, :2])
-    high = np.minimum(found[:, None, 2:], boxes[None, :, 2:])
-    shared = (high - low).clip(0).prod(-1)
-    areas, others = ((item[:, 2:] - item[:, :2]).prod(-1) for item in (found, boxes))
-    whole = np.where(is_crowd, areas[:, None], areas[:, None] + others - shared)
-    return np.divide(shared, whole, out=np.zeros_like(shared), where=whole > 0)
-
-
 def match(found: Found, marked: Marked, iou: float) -> Int[np.ndarray, " N"]:
     """Return the index of the object of each detection, NO_OBJECT or CROWD.
 
     The detections choose in descending order of their scores. Each takes the object of its class
     with the largest overlap, of those that no other has taken and whose overlap is at least `iou`.
     """
-    overlaps = box_overlaps(found.boxes, marked.boxes, marked.is_crowd)
+    low = np.maximum(found.boxes[:, None, :2], marked.boxes[None, :, :2])
+    high = np.minimum(found.boxes[:, None, 2:], marked.boxes[None, :, 2:])
+    shared = (high - low).clip(0).prod(-1)
+    areas, others = ((of.boxes[:, 2:] - of.boxes[:, :2]).prod(-1) for of in (found, marked))
+    # An overlap is intersection over union or, of crowds, over the area of the detection.
+    whole = np.where(marked.is_crowd, areas[:, None], areas[:, None] + others - shared)
+    overlaps = np.divide(shared, whole, out=np.zeros_like(shared), where=whole > 0)
     # Whether each detection (row) may take each object (column).
     is_free = (overlaps >= iou) & (found.labels[:, None] == marked.labels)
     objects = np.full(len(found.scores), NO_OBJECT)

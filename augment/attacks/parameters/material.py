@@ -110,39 +110,24 @@ class Material(Parameter):
         material = values * self._unit
         objects = self._object_of[examples]
         # Columns `GLOSS` are the three factors, and column `HUE` is the rotation.
+        # One row for each example, one column for each face: 1 for faces of the object itself, and
+        # 0 for faces of props and table.
+        object_mask = self._object_mask[objects]
         if self._changes_gloss:
-            conditions = self._with_gloss(conditions, material[:, GLOSS], objects)
+            # Change of the averages of each example, shape (A, 3), and of its faces, (A, F, 3).
+            change = material[:, GLOSS] - self._average_gloss[objects]
+            face_change = change[:, None] * object_mask[..., None]
+            gloss = (self._face_gloss[objects] + face_change).clamp(0, 1)
+            conditions = replace(conditions, gloss=gloss)
         if self._changes_hue:
-            conditions = self._with_hue(conditions, material[:, HUE], objects)
+            # Rotation in degrees.
+            hue = (material[:, HUE] * object_mask).expand(-1, self._face_count)
+            albedo_offset = conditions.albedo
+            if albedo_offset is None:
+                # The renderer rotates hues only where it adds a color to the albedo, so add 0.
+                albedo_offset = hue.new_zeros(*hue.shape, 3)
+            conditions = replace(conditions, hue=hue, albedo=albedo_offset)
         return conditions
-
-    def _with_gloss(
-        self,
-        conditions: Conditions,
-        average_gloss: Float[Tensor, "A 3"],
-        objects: Int[Tensor, " A"],
-    ) -> Conditions:
-        """Return a copy of the conditions with another average gloss of the objects."""
-        # Change of the averages of each example, shape (A, 3).
-        change = average_gloss - self._average_gloss[objects]
-        # The mask is 1 for faces of the object itself and 0 for faces of props and table. One
-        # row for each example, one column for each face, shape (A, F, 3).
-        face_change = change[:, None] * self._object_mask[objects][..., None]
-        return replace(conditions, gloss=(self._face_gloss[objects] + face_change).clamp(0, 1))
-
-    def _with_hue(
-        self, conditions: Conditions, angle: Float[Tensor, "A 1"], objects: Int[Tensor, " A"]
-    ) -> Conditions:
-        """Return a copy of the conditions in which the hue of the objects is rotated.
-
-        Angles are in degrees. `objects` has the index of the object of each example.
-        """
-        hue = (angle * self._object_mask[objects]).expand(-1, self._face_count)
-        albedo_offset = conditions.albedo
-        if albedo_offset is None:
-            # The renderer rotates hues only where it adds a color to the albedo, so add 0.
-            albedo_offset = angle.new_zeros(len(angle), self._face_count, 3)
-        return replace(conditions, hue=hue, albedo=albedo_offset)
 
     def project_feasible(
         self, values: Float[Tensor, "A 4"], within: Ball | None = None
