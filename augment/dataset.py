@@ -25,7 +25,7 @@ from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT
 from augment.service import AugmentationService
 from renderer import errors
-from renderer.camera import Camera, PerspectiveCamera
+from renderer.camera import Camera
 from renderer.errors import InputError
 from renderer.image import to_bytes
 from renderer.settings import Size, height_and_width
@@ -202,10 +202,7 @@ def _show_all(camera: Camera, item: SceneObject, size: Size) -> Camera:
     # Vertices of all objects, without the table, and half of their largest extent.
     points = item.mesh.vertices[np.unique(item.mesh.faces[: item.ends[-1]])]
     span = float(np.ptp(points, axis=0).max()) / 2 if item.others else 1.0
-    scaled = {"width": camera.width * aspect * span}
-    if isinstance(camera, PerspectiveCamera):
-        scaled["distance"] = camera.distance * aspect * span
-    camera = replace(camera, **scaled)
+    camera = camera.widened(aspect).widened(span)
     if not item.others:
         return camera
     # Positions in the image in units of half its width. Shift the camera to their center.

@@ -130,11 +130,16 @@ class Camera(ABC):
         at the origin grows with the distance. An orthographic camera has no distance, and
         only its width changes.
         """
-        factor = log_distance.exp()
-        moved: dict[str, Any] = {"polar": self.polar + polar, "azimuth": self.azimuth + azimuth}
-        for name in ("width", "distance") if self.has_perspective else ("width",):
-            moved[name] = getattr(self, name) * factor
-        return replace(self, **moved)
+        scaled = self.widened(log_distance.exp())
+        return replace(scaled, polar=self.polar + polar, azimuth=self.azimuth + azimuth)
+
+    def widened(self, factor: Any) -> Self:
+        """Return a camera that sees `factor` times the width, at the same field of view.
+
+        Only a perspective camera has a distance, which is multiplied by the factor, too.
+        """
+        names = ("width", "distance") if self.has_perspective else ("width",)
+        return replace(self, **{name: getattr(self, name) * factor for name in names})
 
     def normalized(self, center: np.ndarray, scale: float) -> Self:
         """Return a camera whose image stays the same if the mesh is moved and scaled.

@@ -32,7 +32,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
-from renderer.camera import Camera, PerspectiveCamera, orbit_cameras
+from renderer.camera import Camera, orbit_cameras
 from renderer.errors import InputError, as_tensor, require_shape
 from renderer.image import decode
 from renderer.light.basis import COEFFICIENTS, DEGREE
@@ -364,18 +364,13 @@ class _Target(NamedTuple):
 
         def camera_of(parameters: Float[np.ndarray, " 5"]) -> Camera:
             polar, azimuth, relative_width, right, up = parameters.tolist()
-            moved = replace(
-                first,
+            return replace(
+                first.widened(relative_width),
                 polar=math.degrees(polar),
                 azimuth=math.degrees(azimuth),
-                width=first.width * relative_width,
                 right=first.width * right,
                 up=first.width * up,
             )
-            # The distance changes with the width, so that the field of view stays the same.
-            if isinstance(moved, PerspectiveCamera):
-                moved = replace(moved, distance=moved.distance * relative_width)
-            return moved
 
         def residuals(parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, " N"]:
             return self.fit_light(camera_of(parameters))[0].numpy()
@@ -517,11 +512,9 @@ def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Cam
     mask_high = np.array([2 * (columns.max() + 1) / size - 1, 1 - 2 * rows.min() / size])
     # A camera that is wider by this factor shows the mesh smaller by this factor.
     factor = math.sqrt(np.prod(mesh_high - mesh_low) / np.prod(mask_high - mask_low))
-    width = camera.width * factor
+    wider = camera.widened(factor)
     mask_center = (mask_low + mask_high) / 2
     # Offset of the center of the box from its place in the image of the wider camera.
     shift = mask_center - (mesh_low + mesh_high) / 2 / factor
-    framed = replace(camera, width=width, right=shift[0] * width / 2, up=shift[1] * width / 2)
-    if isinstance(framed, PerspectiveCamera):
-        framed = replace(framed, distance=framed.distance * factor)
-    return framed
+    right, up = shift * wider.width / 2
+    return replace(wider, right=right, up=up)
