@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from PIL import Image
 
 from renderer import errors
@@ -186,14 +185,45 @@ def export_mesh(
     require_mesh("mesh", mesh)
     path = errors.as_path("path", path)
     cameras = errors.as_list("cameras", cameras, Camera, "a list of cameras")
-    if first is not None:
-        errors.require_whole("first", first, 0, len(mesh.faces))
+    first = len(mesh.faces) if first is None else first
+    errors.require_whole("first", first, 0, len(mesh.faces))
     unit_normals = mesh.written_normals(normals)
     if path.suffix.lower() != ".glb":
         raise InputError(f"{path} cannot be written as a mesh: choose a name that ends in .glb")
-    content = _glb(mesh, unit_normals, cameras, len(mesh.faces) if first is None else first, aspect)
+    tree = _Tree()
+    is_later = np.arange(len(mesh.faces)) >= first
+    # A row vector times this matrix is rotated in the opposite direction: from z up to y up.
+    rotation = Y_UP_TO_Z_UP[:3, :3]
+    primitives = []
+    for is_written, texture_id, gloss in by_material(mesh, is_later):
+        # Corners with the same values become one vertex: the index of the vertex (1), color (3),
+        # texture coordinates (2) and normal (3). float64 does not round the index.
+        columns = (mesh.faces[..., None], mesh.corner_colors, mesh.corner_uvs, unit_normals)
+        corner_values = np.concatenate([column[is_written] for column in columns], axis=-1)
+        values, corners = np.unique(corner_values.reshape(-1, 9), axis=0, return_inverse=True)
+        attributes = {
+            "POSITION": mesh.vertices[values[:, 0].astype(np.int64)] @ rotation,
+            # v points down in glTF.
+            "TEXCOORD_0": values[:, 4:6] * [1, -1] + [0, 1],
+            "COLOR_0": decode(torch.from_numpy(values[:, 1:4]), "srgb").numpy(),
+            "NORMAL": values[:, 6:] @ rotation,
+        }
+        primitive = {
+            "attributes": {n: tree.add_array(a.astype(np.float32)) for n, a in attributes.items()},
+            "indices": tree.add_array(corners.astype(np.uint32).ravel()),
+            "material": _add_material(tree, mesh, texture_id, gloss),
+        }
+        primitives.append(primitive)
+    tree.add("nodes", {"mesh": tree.add("meshes", {"primitives": primitives})})
+    for index, camera in enumerate(cameras):
+        # The axes of a camera in glTF are the same as ours: right, up and back. glTF stores
+        # matrices column by column.
+        matrix = (Y_UP_TO_Z_UP.T @ camera.pose()).T.ravel().tolist()
+        lens = tree.add("cameras", _gltf_camera(camera, aspect))
+        tree.add("nodes", {"camera": lens, "name": f"view {index}", "matrix": matrix})
+    tree["scene"] = tree.add("scenes", {"nodes": list(range(len(tree["nodes"])))})
     path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, content)
+    atomic_write(path, tree.content())
 
 
 class _Tree(dict[str, Any]):
@@ -246,49 +276,6 @@ class _Tree(dict[str, Any]):
         chunks = struct.pack("<I4s", len(text), b"JSON") + text
         chunks += struct.pack("<I4s", len(self.buffer), b"BIN\0") + self.buffer
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
-def _glb(
-    mesh: Mesh,
-    normals: Float[np.ndarray, "F 3 3"],
-    cameras: Sequence[Camera],
-    first_count: int,
-    aspect: float,
-) -> bytes:
-    """Create the content of a .glb file, with y up and linear colors."""
-    tree = _Tree()
-    is_later = np.arange(len(mesh.faces)) >= first_count
-    # A row vector times this matrix is rotated in the opposite direction: from z up to y up.
-    rotation = Y_UP_TO_Z_UP[:3, :3]
-    primitives = []
-    for is_written, texture_id, gloss in by_material(mesh, is_later):
-        # Corners with the same values become one vertex: the index of the vertex (1), color (3),
-        # texture coordinates (2) and normal (3). float64 does not round the index.
-        columns = (mesh.faces[..., None], mesh.corner_colors, mesh.corner_uvs, normals)
-        corner_values = np.concatenate([column[is_written] for column in columns], axis=-1)
-        values, corners = np.unique(corner_values.reshape(-1, 9), axis=0, return_inverse=True)
-        attributes = {
-            "POSITION": mesh.vertices[values[:, 0].astype(np.int64)] @ rotation,
-            # v points down in glTF.
-            "TEXCOORD_0": values[:, 4:6] * [1, -1] + [0, 1],
-            "COLOR_0": decode(torch.from_numpy(values[:, 1:4]), "srgb").numpy(),
-            "NORMAL": values[:, 6:] @ rotation,
-        }
-        primitive = {
-            "attributes": {n: tree.add_array(a.astype(np.float32)) for n, a in attributes.items()},
-            "indices": tree.add_array(corners.astype(np.uint32).ravel()),
-            "material": _add_material(tree, mesh, texture_id, gloss),
-        }
-        primitives.append(primitive)
-    tree.add("nodes", {"mesh": tree.add("meshes", {"primitives": primitives})})
-    for index, camera in enumerate(cameras):
-        # The axes of a camera in glTF are the same as ours: right, up and back. glTF stores
-        # matrices column by column.
-        matrix = (Y_UP_TO_Z_UP.T @ camera.pose()).T.ravel().tolist()
-        lens = tree.add("cameras", _gltf_camera(camera, aspect))
-        tree.add("nodes", {"camera": lens, "name": f"view {index}", "matrix": matrix})
-    tree["scene"] = tree.add("scenes", {"nodes": list(range(len(tree["nodes"])))})
-    return tree.content()
 
 
 def _add_material(tree: _Tree, mesh: Mesh, texture_id: int, gloss: list[float]) -> int:

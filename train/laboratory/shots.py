@@ -8,7 +8,7 @@ is white in the image.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -117,11 +117,46 @@ def draw_shots(
         position = (index + rng.uniform()) / shots_per_lighting
         brightness = dimmest * (brightest / dimmest) ** position
         pattern = PLAIN_PATTERN if lighting in environments else lighting
-        shot = _draw_shot(pattern, brightness, settings, slides, rng, extra_rng)
+        first_pattern, *other_patterns = pattern.split("+")
+        # The first pattern and its generator, and further projectors with another generator, so
+        # that they do not change the other draws of the shot.
+        sources = [(first_pattern, rng), *((name, extra_rng) for name in other_patterns)]
+        azimuth = rng.uniform(0, 360)
+        half_width = rng.uniform(*HALF_WIDTHS)
+        scale = rng.uniform(*SCALES)
+        center = np.array([0, 0, CENTER_HEIGHT * scale])
+        aim = center + rng.uniform(-MAX_AIM_OFFSET, MAX_AIM_OFFSET, 3)
+        roughness = _between(settings.roughness, extra_rng)
+        patterns = [draw_lab_pattern(name, draws, slides) for name, draws in sources]
+        ambient = _between(settings.ambient, rng) * draw_lab_color(rng)
+        table = _between(settings.albedo, rng) * draw_lab_color(rng)
+        projectors = []
+        for _, draws in sources:
+            projector_azimuth = azimuth + _between(settings.azimuth, draws)
+            elevation = _between(settings.elevation, draws)
+            distance = draws.uniform(*PROJECTOR_DISTANCES)
+            projectors.append(center + _from_angles(projector_azimuth, elevation, distance))
+        # At this distance, the image shows `half_width` to each side of its center.
+        camera_distance = half_width / math.tan(math.radians(FOV / 2))
+        camera = aim + _from_angles(azimuth, rng.uniform(*CAMERA_ELEVATIONS), camera_distance)
+        angles = rng.uniform(0, MAX_EULER_ANGLES)
+        rotation = Rotation.from_euler("ZXZ", angles, degrees=True).as_matrix()
+        # The wall stands behind the object, as seen from the camera. `to_wall` leads from the
+        # center of the object to the nearest point of the wall.
+        wall_azimuth = azimuth + 180 + extra_rng.uniform(-MAX_WALL_TURN, MAX_WALL_TURN)
+        to_wall = _from_angles(wall_azimuth, 0, extra_rng.uniform(*WALL_DISTANCES))
+        wants_wall = extra_rng.uniform() < settings.walls and lighting not in environments
+        # `to_wall` is normal to the wall, so its dot product with a vector is larger than
+        # its squared length only if the vector ends behind the wall.
+        is_behind_wall = [(place - center) @ to_wall >= to_wall @ to_wall for place in projectors]
+        # A wall between a projector and the object would block the light.
+        wall = center + to_wall if wants_wall and not any(is_behind_wall) else None
+        radiance = None
         if lighting in environments:
             radiance = _scale_environment(environments[lighting], brightness, rng)
-            shot = replace(shot, lighting=lighting, environment=radiance, wall=None)
-        yield shot
+        values: tuple[Any, ...] = (patterns, ambient, table, projectors, camera, center)
+        values += (aim, rotation, scale, roughness, wall, radiance)
+        yield Shot(lighting, brightness, *values)
 
 
 def _scale_environment(
@@ -140,57 +175,6 @@ def _scale_environment(
     # A map whose columns are shifted is rotated about the vertical axis.
     rotated = np.roll(radiance, rng.integers(radiance.shape[1]), axis=1)
     return (brightness / white_radiance * rotated).astype(np.float32)
-
-
-def _draw_shot(
-    pattern_names: str,
-    brightness: float,
-    settings: LabSettings,
-    slides: Sequence[np.ndarray],
-    rng: np.random.Generator,
-    extra_rng: np.random.Generator,
-) -> Shot:
-    """Draw a random shot of an object in the light of projectors.
-
-    `brightness` is the radiance of a white surface that faces all projectors.
-    """
-    first_pattern, *other_patterns = pattern_names.split("+")
-    # The first pattern and its generator, and further projectors with another generator, so that
-    # they do not change the other draws of the shot.
-    sources = [(first_pattern, rng), *((name, extra_rng) for name in other_patterns)]
-    azimuth = rng.uniform(0, 360)
-    half_width = rng.uniform(*HALF_WIDTHS)
-    scale = rng.uniform(*SCALES)
-    center = np.array([0, 0, CENTER_HEIGHT * scale])
-    aim = center + rng.uniform(-MAX_AIM_OFFSET, MAX_AIM_OFFSET, 3)
-    roughness = _between(settings.roughness, extra_rng)
-    patterns = [draw_lab_pattern(name, draws, slides) for name, draws in sources]
-    ambient = _between(settings.ambient, rng) * draw_lab_color(rng)
-    table = _between(settings.albedo, rng) * draw_lab_color(rng)
-    projectors = []
-    for _, draws in sources:
-        projector_azimuth = azimuth + _between(settings.azimuth, draws)
-        elevation = _between(settings.elevation, draws)
-        distance = draws.uniform(*PROJECTOR_DISTANCES)
-        projectors.append(center + _from_angles(projector_azimuth, elevation, distance))
-    # At this distance, the image shows `half_width` to each side of its center.
-    camera_distance = half_width / math.tan(math.radians(FOV / 2))
-    camera = aim + _from_angles(azimuth, rng.uniform(*CAMERA_ELEVATIONS), camera_distance)
-    angles = rng.uniform(0, MAX_EULER_ANGLES)
-    rotation = Rotation.from_euler("ZXZ", angles, degrees=True).as_matrix()
-    # The wall stands behind the object, as seen from the camera. `to_wall` leads from the center
-    # of the object to the nearest point of the wall.
-    wall_azimuth = azimuth + 180 + extra_rng.uniform(-MAX_WALL_TURN, MAX_WALL_TURN)
-    to_wall = _from_angles(wall_azimuth, 0, extra_rng.uniform(*WALL_DISTANCES))
-    wants_wall = extra_rng.uniform() < settings.walls
-    # `to_wall` is normal to the wall, so its dot product with a vector is larger than
-    # its squared length only if the vector ends behind the wall.
-    is_behind_wall = [(position - center) @ to_wall >= to_wall @ to_wall for position in projectors]
-    # A wall between a projector and the object would block the light.
-    wall = center + to_wall if wants_wall and not any(is_behind_wall) else None
-    values: tuple[Any, ...] = (patterns, ambient, table, projectors, camera, center)
-    values += (aim, rotation, scale, roughness, wall)
-    return Shot(pattern_names, brightness, *values)
 
 
 def _between(limits: Sequence[float], rng: np.random.Generator) -> float:
