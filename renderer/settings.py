@@ -174,8 +174,11 @@ class Settings:
         """Check the type, the range and the choices of each field."""
         for name, hint, facts in _checked_fields(type(self)):  # type: ignore[arg-type]  # types are hashable
             value = getattr(self, name)
-            if facts.checks_type:
-                _check_type(name, value, hint)
+            if facts.checks_type and not _fits(value, hint):
+                # `formatannotation` puts the module before the name of a class.
+                expected = re.sub(r"\b[\w.]+\.", "", formatannotation(hint))
+                given = describe(value)
+                raise InputError(f"{name} is {given}: give a value of type {expected}", name)
             if value is not None:
                 _check_value(name, value, facts)
 
@@ -260,14 +263,6 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
         if not all(holds(item, end) for _, _, holds, end in limits):
             range_in_words = " and ".join(f"{words} {end:g}" for words, _, _, end in limits)
             raise InputError(f"{name}={item} must be {range_in_words}", name)
-
-
-def _check_type(name: str, value: Any, hint: Any) -> None:
-    """Check that a value has the annotated type of its field."""
-    if not _fits(value, hint):
-        # `formatannotation` puts the module before the name of a class.
-        expected = re.sub(r"\b[\w.]+\.", "", formatannotation(hint))
-        raise InputError(f"{name} is {describe(value)}: give a value of type {expected}", name)
 
 
 # Functions that tell whether a value is accepted for a

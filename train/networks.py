@@ -69,7 +69,12 @@ class WideResNet(nn.Module):
         The depth is 10, 16, 22 and so on. `mean` and `std` are of RGB images in [0, 1].
         """
         super().__init__()
-        _require_shape(depth, width)
+        # Each group has (depth - 4) / 6 blocks. A block has two 3 × 3 convolutions, whose weights
+        # are most of the parameters. The groups have 16, 32 and 64 times `width` channels.
+        parameter_count = (depth - 4) // 6 * 2 * 3 * 3 * (16**2 + 32**2 + 64**2) * width**2
+        if depth < 10 or (depth - 4) % 6 or width < 1 or parameter_count > MAX_PARAMETER_COUNT:
+            advice = f"set depth to 10, 16 ..., and at most {MAX_PARAMETER_COUNT:.0g} parameters"
+            raise InputError(f"depth={depth}, width={width}: {advice}", "depth")
         self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
         self.stem = nn.Conv2d(3, 16, 3, padding=1, bias=False)
@@ -91,16 +96,6 @@ class WideResNet(nn.Module):
         """Classify RGB images in [0, 1]."""
         features = self.groups(self.stem((images - self.mean) / self.std))
         return self.head(F.relu(self.norm(features)).mean((2, 3)))
-
-
-def _require_shape(depth: int, width: int) -> None:
-    """Check the depth of a WideResNet, and the size that depth and width give it."""
-    # Each group has (depth - 4) / 6 blocks. A block has two 3 × 3 convolutions, whose weights are
-    # most of the parameters of the network. The groups have 16, 32 and 64 times `width` channels.
-    parameter_count = (depth - 4) // 6 * 2 * 3 * 3 * (16**2 + 32**2 + 64**2) * width**2
-    if depth < 10 or (depth - 4) % 6 or width < 1 or parameter_count > MAX_PARAMETER_COUNT:
-        advice = f"set depth to 10, 16 ..., and at most {MAX_PARAMETER_COUNT:.0g} parameters"
-        raise InputError(f"depth={depth}, width={width}: {advice}", "depth")
 
 
 class _Block(nn.Module):

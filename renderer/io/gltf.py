@@ -190,13 +190,19 @@ def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.n
 
 def _place(part: _Primitive, pose: Float[np.ndarray, "4 4"]) -> list[Part]:
     """Return a part without its holes, with its matrix in the scene, or none if no face is left."""
-    values, faces = _visible(part.material, part.surface)
+    material, visible = part.material, part.surface
+    if material.mode != "OPAQUE":
+        # The alpha of a material decides what is visible (3.9.6).
+        cutoff = ALMOST_ONE if material.mode == "BLEND" else material.cutoff
+        visible = _cut_out(part.surface, material.alpha, cutoff)
+    if material.mode == "BLEND" and visible is not part.surface:
+        raise ValueError("its surface is transparent (alphaMode BLEND): use OPAQUE or MASK")
+    values, faces = visible
     if not len(faces):
         return []
     vertices = values[:, POSITION]
     # Axes: face, corner, column of the values.
     corners = values[faces]
-    material = part.material
     mesh = colored_mesh(
         vertices,
         faces,
@@ -212,17 +218,6 @@ def _place(part: _Primitive, pose: Float[np.ndarray, "4 4"]) -> list[Part]:
     # Normals of 0 mean that the file has none.
     normals = corners[..., NORMAL] if corners[..., NORMAL].any() else None
     return [Part(mesh, normals, pose)]
-
-
-def _visible(material: Material, surface: _Surface) -> _Surface:
-    """Return the visible part of a surface (3.9.6)."""
-    if material.mode == "OPAQUE":
-        return surface
-    cutoff = ALMOST_ONE if material.mode == "BLEND" else material.cutoff
-    visible = _cut_out(surface, material.alpha, cutoff)
-    if material.mode == "BLEND" and visible is not surface:
-        raise ValueError("its surface is transparent (alphaMode BLEND): use OPAQUE or MASK")
-    return visible
 
 
 # Largest alpha of a texel.

@@ -111,8 +111,11 @@ def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
     require_file(path, "give the path of an .npy, .hdr or .exr file")
     with reading(path, "cannot be read as an environment map", "export it again"):
         if path.suffix.lower() == ".npy":
-            texels, names = _read_array(path)
-            chromaticities: Sequence[float] = REC_709
+            texels, chromaticities = read_numbers(path), REC_709
+            channel_count = texels.shape[-1] if texels.ndim == 3 else 0
+            names = _CHANNEL_NAMES_BY_COUNT.get(channel_count)
+            if names is None:
+                raise InputError(f"the array has the shape {texels.shape}: save (height, width, 3)")
         else:
             texels, names, chromaticities = _read_image(path)
         radiance = _in_rec709(texels[..., _color_channels(names)], chromaticities)
@@ -177,15 +180,6 @@ def _write_image(path: Path, texels: Float[Tensor, "H W 3"], file_format: str) -
         # The data type "unknown" keeps the float32 values of the image.
         if not image.write(str(temporary), "unknown", file_format):
             raise OSError(errno.EIO, " ".join(image.geterror().split()), str(path))
-
-
-def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
-    """Read the texels of an environment map and the names of its channels from an .npy file."""
-    array = read_numbers(path)
-    names = _CHANNEL_NAMES_BY_COUNT.get(array.shape[-1]) if array.ndim == 3 else None
-    if names is None:
-        raise InputError(f"the array has the shape {array.shape}: save (height, width, 3)")
-    return array, names
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]:

@@ -369,11 +369,9 @@ class _Silhouettes:
         end = self.places[:, self.ends[1]]
         # Places (cuts) where edges cross rows of samples for the axis X, or columns for Y.
         across_and_along = [1 - axis, axis]
-        edge, line, fraction, next_sample = _cut_edges(
-            start[across_and_along],
-            end[across_and_along],
-            (rows, columns) if axis == X else (columns, rows),
-        )
+        shape = (rows, columns) if axis == X else (columns, rows)
+        places = start[across_and_along], end[across_and_along]
+        edge, line, fraction, next_sample = _cut_edges(*places, shape)
         # Row-major indices of the first sample after each cut, and of the sample before.
         if axis == X:
             after = line * columns + next_sample

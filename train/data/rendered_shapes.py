@@ -83,7 +83,13 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: Path | None 
         key = content_hash([CODE, CLASSES, images_per_class, seed, split_name, settings])
         images = read_cached(cache, key) if cache else None
         if images is None:
-            images = _render(split_name, images_per_class, seed, settings)
+            solids_per_class = math.ceil(images_per_class / (CAMERAS * BACKGROUNDS))
+            draws = generator(seed, split_name)
+            of_classes = []
+            for name in progress(CLASSES, f"{split_name} images"):
+                of_class = [_render_solid(name, settings, draws) for _ in range(solids_per_class)]
+                of_classes.append(torch.cat(of_class)[:images_per_class])
+            images = torch.cat(of_classes)
             if cache:
                 write_cached(cache, key, images)
         # The images are in the order of their classes.
@@ -124,19 +130,6 @@ def soft_front_light(to_camera: Float[Tensor, " 3"], draws: Generator) -> Float[
     tint = 1 + 0.05 * torch.randn(3, generator=draws)
     strength = 0.9 + 0.2 * torch.rand(1, generator=draws)
     return ambient(0.2 * strength * tint) + directional(direction, 0.45 * strength * tint)
-
-
-def _render(
-    split_name: str, images_per_class: int, seed: int, settings: ImageSettings
-) -> UInt8[Tensor, "_ 3 size size"]:
-    """Render the images of all classes for one split of the data set. They are sorted by class."""
-    solids_per_class = math.ceil(images_per_class / (CAMERAS * BACKGROUNDS))
-    draws = generator(seed, split_name)
-    images = []
-    for name in progress(CLASSES, f"{split_name} images"):
-        images_of_class = [_render_solid(name, settings, draws) for _ in range(solids_per_class)]
-        images.append(torch.cat(images_of_class)[:images_per_class])
-    return torch.cat(images)
 
 
 def _render_solid(name: str, settings: ImageSettings, draws: Generator) -> UInt8[Tensor, "_ 3 S S"]:
