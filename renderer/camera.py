@@ -130,8 +130,8 @@ class Camera(ABC):
         at the origin grows with the distance. An orthographic camera has no distance, and
         only its width changes.
         """
-        scaled = self.widened(log_distance.exp())
-        return replace(scaled, polar=self.polar + polar, azimuth=self.azimuth + azimuth)
+        turned: dict[str, Any] = {"polar": self.polar + polar, "azimuth": self.azimuth + azimuth}
+        return replace(self.widened(log_distance.exp()), **turned)
 
     def widened(self, factor: Any) -> Self:
         """Return a camera that sees `factor` times the width, at the same field of view.

@@ -110,11 +110,12 @@ def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
     path = Path(path)
     require_file(path, "give the path of an .npy, .hdr or .exr file")
     with reading(path, "cannot be read as an environment map", "export it again"):
+        chromaticities: Sequence[float] = REC_709
         if path.suffix.lower() == ".npy":
-            texels, chromaticities = read_numbers(path), REC_709
+            texels = read_numbers(path)
             channel_count = texels.shape[-1] if texels.ndim == 3 else 0
-            names = _CHANNEL_NAMES_BY_COUNT.get(channel_count)
-            if names is None:
+            names: Sequence[str] = _CHANNEL_NAMES_BY_COUNT.get(channel_count, "")
+            if not names:
                 raise InputError(f"the array has the shape {texels.shape}: save (height, width, 3)")
         else:
             texels, names, chromaticities = _read_image(path)

@@ -347,8 +347,7 @@ def build_fragments(
         points = points.double() if points.is_cuda else points.cpu().double().numpy()
     # Axes: camera, coordinate, vertex. In this order, each coordinate is contiguous in
     # memory.
-    coordinates = torch.stack([torch.as_tensor(c.project(points)).T for c in cameras])
-    projected = coordinates.mT
+    projected = torch.stack([torch.as_tensor(c.project(points)).T for c in cameras]).mT
     # The third coordinate is the depth. It is less than -1 in front of the near plane,
     # which would cut the mesh open.
     is_uncut = bool((projected[..., 2] >= -1).all())
