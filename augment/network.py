@@ -34,10 +34,9 @@ ROUNDED = 1e-3
 MAX_DEVIATION = 0.01
 # Smallest sRGB value above black in an image of 8 bits. Below it, the gamma curve is a line.
 DARKEST_ENCODED = 1 / 255
-# Linear value of this sRGB value. Images are brightened as if their brightness were at least this,
-# so that black images stay black.
+# Its linear value, the lowest brightness from which images are brightened: black stays black.
 DARKEST = DARKEST_ENCODED / 12.92
-# Who states a fact about the images of a network, besides the library that published it.
+# Who states a fact about the images, besides the library that published the network.
 YOU, FILE, NETWORK, DATA = "you", "the file", "the network", "the training images"
 # Names of the mean of the channels in networks that normalize images themselves. That of the
 # standard deviation ends with "std" instead.
@@ -200,7 +199,7 @@ class LightNormalization(nn.Module):
         return normalize_light(images, self.settings)
 
     def extra_repr(self) -> str:
-        """Write the settings, so that stored logits of different networks have different keys."""
+        """Write the settings, on which the keys of stored logits depend."""
         return str(self.settings)
 
 
@@ -250,8 +249,8 @@ def normalize_light(images: Float[Tensor, "N 3 H W"], settings: NormalizedLightS
 
     1. White balance: each channel is multiplied by (m / m_c)^`white_balance`. Here, m_c is the
        mean of the channel, and m is the mean of all channels.
-    2. Exposure: the image is multiplied by a factor that maps the given percentile of all pixels
-       and channels to `level`. Values above 1 are clipped.
+    2. Exposure: a factor maps the given percentile of all values to `level`. Those above 1 are
+       clipped.
     3. Encoding: the sRGB curve, and then the exponent `gamma`.
 
     The result is differentiable almost everywhere.
@@ -262,18 +261,19 @@ def normalize_light(images: Float[Tensor, "N 3 H W"], settings: NormalizedLightS
     ratio = mean.clamp(min=DARKEST) / channel_means.clamp(min=DARKEST)
     balanced = linear * ratio**settings.white_balance
 
-    values = balanced.flatten(1)
-    # The percentile is the value with this rank among the sorted values. Ranks start at 1.
-    rank = math.ceil(settings.percentile / 100 * values.shape[1])
-    bright = values.kthvalue(rank, dim=1).values
-    factors = settings.level / bright.clamp(min=DARKEST)
+    factors = settings.level / percentiles(balanced, settings.percentile).clamp(min=DARKEST)
     encoded = encode(clamp(balanced * factors.view(-1, 1, 1, 1)), "srgb")
 
     if settings.gamma == 1:
         return encoded
-    # x^gamma is x · x^(gamma - 1). The second factor is constant below `DARKEST_ENCODED`, because
-    # it would be infinite at 0 if gamma is less than 1.
+    # x^gamma is x · x^(gamma - 1). The second factor would be infinite at 0 if gamma is below 1.
     return encoded * encoded.clamp(min=DARKEST_ENCODED) ** (settings.gamma - 1)
+
+
+def percentiles(images: Float[Tensor, "N 3 H W"], percentile: float) -> Float[Tensor, " N"]:
+    """Return the value of each image with the rank ⌈percentile / 100 · number of values⌉."""
+    values = images.flatten(1)
+    return values.kthvalue(math.ceil(percentile / 100 * values.shape[1]), dim=1).values
 
 
 class Function(nn.Module):

@@ -34,6 +34,8 @@ from train.settings import NetworkSettings, TaskSettings, published_folder
 
 # A name of a classifier that begins with this text names the folder of a training run.
 RUN = "run:"
+# A name that begins with this text names a network, and one for dim images after a "+".
+DIM = "dim:"
 # Entries in the file of a published network, in addition to the weights.
 PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point")
 # Entries in the description of a network that are no arguments of `build_network`.
@@ -135,6 +137,14 @@ def load_network(
     its own weights and its own `facts`, such as classes and size, so these must then be None.
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
+    if name.startswith(DIM):
+        plain, plus, dim = name.removeprefix(DIM).rpartition("+")
+        if not plus:
+            raise InputError(f"name={name} names one network: give {DIM}NETWORK+DIM_NETWORK")
+        network = load_network(plain, weights, trust_code=trust_code, **facts)
+        # The light of plain images is not normalized.
+        options = {"normalize_light": normalize_light, "trust_code": trust_code}
+        return network.with_dim(load_network(dim, **options))
     path = Path(name)
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path

@@ -1,0 +1,105 @@
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from oracles import srgb_of
+from torch import Tensor
+
+import norm_balls as nb
+from augment.dim import DimSwitch
+from renderer import InputError
+
+SIZE = 8
+NAMES = ["red", "green", "blue"]
+BELOW = 0.25
+
+
+def brightness(linear: float) -> Tensor:
+    """Return a gray image (1, 3, SIZE, SIZE) of a linear value."""
+    return torch.from_numpy(srgb_of(np.full((1, 3, SIZE, SIZE), linear)))
+
+
+class Constant(torch.nn.Module):
+    """Network that returns the mean of each channel and a number of its own."""
+
+    def __init__(self, number: float, kind: str):
+        super().__init__()
+        self.number, self.kind = number, kind
+
+    def forward(self, images: Tensor) -> Any:
+        means = images.mean((2, 3)) + self.number
+        if self.kind == "tensor":
+            return means
+        if self.kind == "mapping":
+            return {"out": means, "loss": None}
+        return [{"scores": row} for row in means]
+
+
+def rows(outputs: Any) -> np.ndarray:
+    """Return the numbers (N, 3) in outputs of any kind."""
+    if isinstance(outputs, list):
+        return torch.stack([item["scores"] for item in outputs]).numpy()
+    return (outputs["out"] if isinstance(outputs, dict) else outputs).numpy()
+
+
+@pytest.mark.parametrize("kind", ["tensor", "mapping", "list"])
+@pytest.mark.parametrize("levels", [(0.1, 0.9, 0.2, 0.4, 0.24), (0.1, 0.2), (0.3, 0.9)])
+def test_each_image_gets_the_outputs_of_the_network_for_its_brightness(kind, levels):
+    images = torch.cat([brightness(level) for level in levels])
+    network = DimSwitch(Constant(0.0, kind), Constant(10.0, kind), BELOW)
+    added = np.where(np.array(levels) < BELOW, 10, 0)[:, None]
+    expected = images.mean((2, 3)).numpy() + added
+    np.testing.assert_array_equal(rows(network(images)), expected)
+
+
+@pytest.mark.parametrize(("fraction", "is_dim"), [(0.01, True), (0.03, False)])
+def test_an_image_with_more_than_two_percent_of_bright_values_is_not_dim(fraction, is_dim):
+    image = brightness(0.05).float()[..., :1, :].repeat(1, 1, 100, 1)
+    values = image.flatten()
+    values[: round(fraction * len(values))] = 1.0
+    network = DimSwitch(Constant(0.0, "tensor"), Constant(10.0, "tensor"), BELOW)
+    assert (network(values.view_as(image)) > 5).all() == is_dim
+
+
+def test_gradients_pass_through_the_network_that_an_image_gets():
+    images = torch.cat([brightness(0.1), brightness(0.9)]).requires_grad_()
+    network = DimSwitch(torch.nn.Identity(), torch.nn.Conv2d(3, 3, 1, bias=False), BELOW).double()
+    network(images).sum().backward()
+    weights = network.dim.weight.detach().sum((0, 2, 3))
+    expected = torch.stack([weights, torch.ones(3)])[..., None, None].expand_as(images)
+    torch.testing.assert_close(images.grad, expected.double())
+
+
+def test_a_name_of_two_networks_is_the_first_with_the_second_for_dim_images():
+    from train.checkpoints import load_network
+
+    plain, dim = nb.load("none"), nb.load("best")
+    switched = load_network("dim:run:pretrained/none+run:pretrained/best")
+    images = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    dark = images * 0.1
+    torch.testing.assert_close(
+        switched(torch.cat([images, dark])), torch.cat([plain(images), dim(dark)])
+    )
+
+
+def test_the_candidates_of_a_detector_are_those_of_the_network_that_an_image_gets():
+    plain = nb.load("detector")
+    dim = plain.normalizing_light()
+    shown = torch.rand(3, 3, plain.size, plain.size, generator=torch.Generator().manual_seed(0))
+    shown[1] *= 0.1
+    found = plain.with_dim(dim)(shown)
+    expected = [plain(shown[:1])[0], dim(shown[1:2])[0], plain(shown[2:])[0]]
+    for item, own in zip(found, expected, strict=True):
+        for key in own:
+            torch.testing.assert_close(item[key], own[key], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("size", "names", "said"), [(9, NAMES, "size"), (SIZE, [*NAMES[:2], "black"], "classes")]
+)
+def test_networks_of_other_images_or_classes_are_an_error(size, names, said):
+    plain = nb.Classifier(Constant(0.0, "tensor").eval(), SIZE, NAMES)
+    other = nb.Classifier(Constant(0.0, "tensor").eval(), size, names)
+    with pytest.raises(InputError, match=f"another {said} than"):
+        plain.with_dim(other)
