@@ -15,7 +15,8 @@ from train.cli import as_override, quoted
 from train.settings import OTHER, ExperimentSettings, TrainingSceneSettings
 
 OTHER_DATA = ["data=npz", "data.path=a.npz", "out=here"]
-EXPERIMENTS = ["best", "classifier", "cpu", "demo", "fast", "harden", "paper", "photographs"]
+EXPERIMENTS = ["best", "classifier", "cpu", "demo", "dim", "fast", "harden", "low_light", "paper"]
+EXPERIMENTS += ["photographs"]
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)

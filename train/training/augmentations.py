@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.attack_settings import AttackSettings, RelightingSettings, StepSettings
 from augment.attacks.loop import minimize_from
-from augment.attacks.objective import Objective
+from augment.attacks.objective import Objective, as_jpeg
 from augment.attacks.optimizers import Gradient, NormBalls
 from augment.photographs import RelitPhotographs
 from augment.random_streams import generator, stream_seed
@@ -41,22 +41,30 @@ LIT = {
 
 
 def darken(images: Images, seed: int) -> Images:
-    """Show images in low light of any color, as a camera shows them that smooths its noise.
+    """Show images in low light of any color from one side, as the camera of a phone shows them.
 
-    At 224 pixels, the standard deviation of the smoothing is up to 2.5 pixels.
+    It smooths the noise, raises the contrast, and writes JPEG. At 224 pixels, the standard
+    deviation of the smoothing is up to 2.5 pixels.
     """
     # These imports take a second, and most runs need no light.
     from torchvision.transforms import v2
 
     from augment.lighting import relight_photographs
 
-    colored = relight_photographs(images, stream_seed(seed, "color"), lights=["color_temperature"])
-    dark = relight_photographs(colored, seed, lights=["low_light"])
+    for light in ("color_temperature", "linear", "low_light"):
+        images = relight_photographs(images, stream_seed(seed, light), lights=[light])
     widest = max(images.shape[2:]) / 90
     smooth = v2.GaussianBlur(2 * round(1.6 * widest) + 1, (0.04 * widest, widest))
+    camera = v2.Compose([smooth, v2.ColorJitter(contrast=(1.0, 1.6))])
     with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
         torch.manual_seed(seed)
-        return torch.stack([smooth(image) for image in dark])
+        # Only a CPU writes JPEG.
+        developed = [to_unit(camera(image)) for image in images.cpu()]
+        qualities = torch.randint(60, 98, (len(images),)).tolist()
+    shown = [
+        as_jpeg(image[None], quality) for image, quality in zip(developed, qualities, strict=True)
+    ]
+    return to_bytes(torch.cat(shown)).to(images.device)
 
 
 def relit(images: Images, seed: int, augmentation: str) -> Images:

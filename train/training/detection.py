@@ -33,6 +33,9 @@ from train.settings import TrainSettings
 
 # Number of photographs in a pass of the validation.
 BATCH = 32
+# In other light, a network is less sure, and its scores fall below the threshold. So the scores
+# that its teacher gives count twice there.
+FAVOR = 2.0
 # A pixel of a map has the class of its object + MAX_CLASSES · the index of the object.
 MAX_CLASSES = 2**16
 # What a detector takes in training: "boxes", "labels" and "masks" of the objects of an image.
@@ -115,28 +118,32 @@ class DetectionLoss:
         correct predictions, NaN: a detector in training mode predicts nothing.
         """
         is_photograph = ~rendered
-        # Weight, images, and what they are compared with: targets or the teacher's detections.
-        terms: list[tuple[float, Tensor, Any]] = []
+        # Weight, images, what they are compared with (targets or the teacher's detections), and
+        # how much more a score counts that the teacher gives than one that it does not.
+        terms: list[tuple[float, Tensor, Any, float]] = []
         if rendered.any():
-            terms.append((1.0, images[rendered], [*map(target_of, labels[rendered])]))
+            terms.append((1.0, images[rendered], [*map(target_of, labels[rendered])], 1.0))
         if self.teacher is not None and is_photograph.any():
             find = detected if self.task.decode is None else candidates
             with torch.no_grad(), eval_mode(self.teacher):
                 found = find(self.teacher, images[is_photograph], self.task)
-            terms.append((self.settings.distillation_weight, images[is_photograph], found))
+            terms.append((self.settings.distillation_weight, images[is_photograph], found, 1.0))
             if augmented is not None:
-                terms.append((self.settings.consistency_weight, augmented[is_photograph], found))
+                shown = augmented[is_photograph]
+                terms.append((self.settings.consistency_weight, shown, found, FAVOR))
         loss = images.new_zeros((), dtype=torch.float32)
-        for weight, shown, found in terms:
+        for weight, shown, found, favor in terms:
             if weight:
                 # Each term counts in proportion to its share of the images of the batch.
-                loss = loss + weight * len(shown) / len(images) * self._loss(shown, found)
+                loss = loss + weight * len(shown) / len(images) * self._loss(shown, found, favor)
         return loss, torch.full_like(loss, torch.nan).detach()
 
-    def _loss(self, images: UInt8[Tensor, "N 3 H W"], targets: Any) -> Float[Tensor, ""]:
+    def _loss(
+        self, images: UInt8[Tensor, "N 3 H W"], targets: Any, favor: float
+    ) -> Float[Tensor, ""]:
         if self.task.decode is None:
             return losses_of(self.model, to_unit(images), targets)
-        return candidate_loss(candidates(self.model, images, self.task), targets)
+        return candidate_loss(candidates(self.model, images, self.task), targets, favor)
 
 
 # Boxes and scores of the K candidates of each image.
@@ -152,11 +159,14 @@ def candidates(network: nn.Module, images: UInt8[Tensor, "N 3 H W"], task: Detec
     return [(item[detection.CANDIDATE_BOXES], item[detection.CANDIDATE_SCORES]) for item in outputs]
 
 
-def candidate_loss(found: Candidates, expected: Candidates) -> Float[Tensor, ""]:
+def candidate_loss(
+    found: Candidates, expected: Candidates, favor: float = 1.0
+) -> Float[Tensor, ""]:
     """Return the mean over images of the change of the candidates since the teacher.
 
-    The change of a score is the Kullback-Leibler divergence of its Bernoulli distribution. The
-    change of a box is 1 - GIoU, and counts as often as the best score of the teacher says.
+    The change of a score is the Kullback-Leibler divergence of its Bernoulli distribution, whose
+    positive part counts `favor` times. The change of a box is 1 - GIoU, and counts as often as the
+    best score of the teacher says.
     """
     from torchvision.ops import generalized_box_iou_loss  # torchvision takes half a second.
 
@@ -167,8 +177,12 @@ def candidate_loss(found: Candidates, expected: Candidates) -> Float[Tensor, ""]
             raise InputError(f"{reason}: return all candidates, whose number is always the same")
         # The entropy of the teacher is subtracted, so that equal scores have the loss 0.
         old = old_scores.clamp(SMALLEST_SCORE, 1 - SMALLEST_SCORE)
-        entropy = binary_cross_entropy(old, old, reduction="sum")
-        changes.append(binary_cross_entropy(scores, old, reduction="sum") - entropy)
+        # The loss has its minimum where the odds are `favor` times those of the teacher.
+        weights = 1 + (favor - 1) * old
+        target = favor * old / weights
+        options = {"weight": weights, "reduction": "sum"}
+        entropy = binary_cross_entropy(target, target, **options)
+        changes.append(binary_cross_entropy(scores, target, **options) - entropy)
         # The best score of each candidate over the classes is the weight of its box.
         changes.append((old_scores.amax(1) * generalized_box_iou_loss(boxes, old_boxes)).sum())
     return torch.stack(changes).sum() / len(found)

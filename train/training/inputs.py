@@ -284,7 +284,8 @@ def relabel(
     network, the network has the classes of the data.
     """
     if not data.labeled:
-        if not (initial and settings.train.distillation_weight):
+        recipe = settings.train
+        if not (initial and (recipe.distillation_weight or recipe.consistency_weight)):
             raise InputError("data=unlabeled: set network and train.distillation_weight")
         return replace(data, classes=initial.classes)
     if initial and (data.rendered or initial.is_classifier):

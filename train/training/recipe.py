@@ -243,7 +243,10 @@ class TrainingLoss:
         correct predictions.
         """
         settings = self.settings
-        logits = self.model(to_unit(images))
+        # Without labels, renders and distillation, only the augmented photographs are learned.
+        learns_unchanged = self.labeled or self.positive_classes or settings.distillation_weight
+        is_augmented_only = augmented is not None and not learns_unchanged
+        logits = self.model(to_unit(augmented if is_augmented_only else images))
         teacher_logits = None
         if self.teacher is not None:
             with torch.no_grad():
@@ -272,7 +275,8 @@ class TrainingLoss:
             loss = loss + settings.distillation_weight * divergences.mean()
         if teacher_logits is not None and augmented is not None:
             # Also augmented photographs should get the predictions for the originals.
-            divergences = kl_divergence(self.model(to_unit(augmented)), teacher_logits) * ~rendered
+            shown = logits if is_augmented_only else self.model(to_unit(augmented))
+            divergences = kl_divergence(shown, teacher_logits) * ~rendered
             loss = loss + settings.consistency_weight * divergences.mean()
         if self.positive_classes and settings.ranking_weight:
             loss_sum = sum(ranking_loss(logits, labels, label) for label in self.positive_classes)

@@ -165,6 +165,15 @@ def test_the_loss_of_candidates_is_the_divergence_of_scores_and_the_overlap_of_b
     assert candidate_loss([(moved, new)], [(boxes, old)]).item() == pytest.approx(float(expected))
 
 
+def test_favor_multiplies_the_odds_with_the_lowest_loss():
+    boxes, old = torch.tensor([[0.0, 0.0, 2.0, 2.0]]), torch.tensor([[0.2]])
+    scores = torch.linspace(0.01, 0.99, 99)[:, None, None]
+    losses = [float(candidate_loss([(boxes, one)], [(boxes, old)], favor=3.0)) for one in scores]
+    # Odds of 1 / 4 times 3 are 3 / 4, a score of 3 / 7.
+    assert float(scores[np.argmin(losses)]) == pytest.approx(3 / 7, abs=0.01)
+    assert min(losses) == pytest.approx(0, abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("meshes", "decode", "reason"),
     [

@@ -144,12 +144,13 @@ def test_weights_are_interpolated_by_predictions_in_the_light_of_the_training():
     assert brightness("low_light") < 0.6 * 180 / 255 < brightness("relight")
 
 
-def test_the_loss_compares_relit_and_unchanged_images_with_the_teacher():
+@pytest.mark.parametrize("weight", [2.0, 0.0])
+def test_the_loss_compares_relit_and_unchanged_images_with_the_teacher(weight):
     torch.manual_seed(0)
     flat = torch.nn.Flatten()
     model = torch.nn.Sequential(flat, torch.nn.Linear(12, 3))
     teacher = torch.nn.Sequential(flat, torch.nn.Linear(12, 3))
-    settings = TrainSettings(distillation_weight=2.0, consistency_weight=0.5)
+    settings = TrainSettings(distillation_weight=weight, consistency_weight=0.5)
     unchanged = torch.randint(0, 256, (4, 3, 2, 2), dtype=torch.uint8)
     relit = torch.randint(0, 256, (4, 3, 2, 2), dtype=torch.uint8)
     loss = TrainingLoss(model, settings, (), teacher, labeled=False)
@@ -164,7 +165,7 @@ def test_the_loss_compares_relit_and_unchanged_images_with_the_teacher():
     for images in (unchanged, relit):
         found = probabilities(model, images)
         divergences.append((wanted * np.log(wanted / found)).sum(1).mean())
-    assert value.item() == pytest.approx(2.0 * divergences[0] + 0.5 * divergences[1], rel=1e-5)
+    assert value.item() == pytest.approx(weight * divergences[0] + 0.5 * divergences[1], rel=1e-5)
 
 
 def test_gradient_steps_lower_the_confidence_of_relit_batches():
