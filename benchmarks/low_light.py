@@ -7,7 +7,8 @@ Run it as a module in the root of the repository, after `pip install ".[ecosyste
 DATA has weights/ (fastestdet_coco.onnx, coco.names), photographs of anything for the training
 (imagenet_samples/ and photos/), and for the scores alone real_light/low_light_detection/ with boxes
 in a COCO file. Of imagenet_samples, every tenth photograph is held out: the network should find
-there what the original finds.
+there what the original finds. Half of the training images come from the folder --objects, whose
+photographs show the objects in ordinary light. The trained network sees dim images alone.
 """
 
 import argparse
@@ -21,8 +22,8 @@ from PIL import Image
 from torch import nn
 
 import norm_balls as nb
+from augment.dim import DIM, DimSwitch
 from augment.network import with_normalized_light
-from augment.settings import NormalizeLight
 from benchmarks.common import machine
 from benchmarks.detectors import SIZE, FastestDet, decode
 from renderer.io.images import crop_center, read_rgb
@@ -32,10 +33,6 @@ from train.results.tables import format_interval
 from train.training.detection import validate
 
 TASK = nb.Detection(decode=decode)
-# The exposure maps the 98th percentile of the linear light to 0.8.
-NORMALIZED = {"percentile": 98.0, "level": 0.8, "gamma": 1.0}
-# Normalization of light of a network in training, by the name of its weights.
-VARIANTS: dict[str, NormalizeLight] = {"hardened": None, "hardened_normalized": NORMALIZED}
 LIGHTS = ("plain", "low_light", "motion_blur")
 CLASSES = ("apple", "banana", "orange")
 # Single photographs mostly show one large object, so there are also mosaics of 2 × 2.
@@ -57,67 +54,78 @@ def split(data: Path) -> tuple[list[Path], list[Path]]:
     return sorted({*samples, *photos} - {*held_out}), held_out
 
 
-def write_photographs(paths: Sequence[Path], folder: Path) -> None:
-    """Write the training images: all photographs, and mosaics of random ones."""
+def write_photographs(others: Sequence[Path], objects: Sequence[Path], folder: Path) -> None:
+    """Write the training images: all photographs, and mosaics of random ones.
+
+    Every second tile of a mosaic shows an object.
+    """
     folder.mkdir(parents=True)
-    for index, path in enumerate(paths):
+    for index, path in enumerate([*others, *objects]):
         Image.fromarray(square(path, SIZE)).save(folder / f"photograph_{index:04}.png")
     draws = np.random.default_rng(0)
     for index in range(MOSAICS):
-        tiles = [square(paths[one], SIZE // 2) for one in draws.integers(len(paths), size=4)]
-        mosaic = np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])])
+        sources = [list(objects) or others, others] * 2
+        tiles = [square(paths[draws.integers(len(paths))], SIZE // 2) for paths in sources]
+        mosaic = np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[3:1:-1])])
         Image.fromarray(mosaic).save(folder / f"mosaic_{index:04}.png")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train the variants that have no weights yet, and write the table of all networks."""
+    """Train the networks that have no weights yet, and write the table of all networks."""
     parser = argparse.ArgumentParser(description=__doc__)
     add = parser.add_argument
     add("--data", type=Path, required=True, help="folder of the data")
+    add("--objects", type=Path, help="folder of photographs of the objects")
     add("--out", type=Path, required=True, help="folder of the weights and of table.md")
-    add("--epochs", type=int, default=40, help="epochs of 400 images")
-    add("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
+    add("--epochs", type=int, default=20, help="epochs of 400 images")
+    add("--seeds", type=int, nargs="*", default=[0])
     options = parser.parse_args(arguments)
     weights = options.data / "weights"
     names = (weights / "coco.names").read_text().splitlines()
     given = {"classes": names, "size": SIZE, "task": TASK}
     original = FastestDet(weights / "fastestdet_coco.onnx").eval()
-    training, held_out = split(options.data)
+    others, held_out = split(options.data)
+    objects = sorted(options.objects.glob("*.*")) if options.objects else []
     photographs = options.out / "photographs"
     if not photographs.exists():
-        write_photographs(training, photographs)
-    networks: dict[str, tuple[nn.Module, NormalizeLight]] = {"original": (original, None)}
-    networks["normalized light"] = original, NORMALIZED
-    for name in options.variants:
-        light, path = VARIANTS[name], options.out / f"{name}.pt"
+        write_photographs(others, objects, photographs)
+
+    def for_dim(network: nn.Module) -> nn.Module:
+        return DimSwitch(original, with_normalized_light(network, True), DIM)
+
+    networks = {"original": original, "normalized light": with_normalized_light(original, True)}
+    networks["normalized light, dim images alone"] = for_dim(original)
+    for seed in options.seeds:
+        path = options.out / f"{seed}.pt"
         network: nn.Module = FastestDet(weights / "fastestdet_coco.onnx").eval()
         if path.exists():
             network.load_state_dict(torch.load(path))
         else:
             train = {"epochs": options.epochs, "augmentation": "low_light", "resume": True}
+            train["distillation_weight"] = 0.0
             start = resource.getrusage(resource.RUSAGE_SELF).ru_utime
-            run = {"train": train, "data": {"workers": 0}, "out": options.out / name}
-            network = nb.harden(network, [], photographs, normalize_light=light, **given, **run)
+            run = {"train": train, "data": {"workers": 0}, "seed": seed}
+            run |= {"out": options.out / f"run{seed}", "normalize_light": True}
+            network = nb.harden(network, [], photographs, **given, **run)
             seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - start
-            print(f"{name}: {seconds / 60:.0f} minutes of one core")
+            print(f"seed {seed}: {seconds / 60:.0f} minutes of one core")
             torch.save(network.state_dict(), path)
-        networks[name.replace("_", ", ")] = network, light
+        networks[f"trained for dim images, seed {seed}"] = for_dim(network)
     images = np.stack([square(path, SIZE) for path in held_out])
     kept = Split(torch.tensor(images).permute(0, 3, 1, 2), torch.zeros(len(images)).long())
     columns = [f"{name}, {light}" for light in LIGHTS for name in (*CLASSES, "false")]
     lines = [f"|network|{'|'.join(columns)}|kept|", "|-|" + "-|" * (len(columns) + 1)]
-    for name, (network, light) in networks.items():
+    for name, network in networks.items():
         photos = options.data / "real_light" / "low_light_detection"
-        scores = nb.evaluate(network, photos, normalize_light=light, fit="stretch", **given)
+        scores = nb.evaluate(network, photos, fit="stretch", **given)
         assert isinstance(scores, DetectionScores)
         cells = []
         for kind in LIGHTS:
             of_light = scores.by_source[kind]
             cells += [format_interval(of_light[label].recall) for label in CLASSES]
             cells.append(format_interval(of_light["all"].false_per_image))
-        shown = with_normalized_light(network, light)
         with torch.no_grad():
-            agreement = validate(shown, original, TASK, kept, torch.arange(len(images)))
+            agreement = validate(network, original, TASK, kept, torch.arange(len(images)))
         lines.append(f"|{name}|{'|'.join(cells)}|{agreement['accuracy']:.3f}|")
         print(lines[-1], flush=True)
     (options.out / "table.md").write_text("\n".join(lines) + f"\n\n{machine()}\n")

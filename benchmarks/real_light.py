@@ -31,12 +31,17 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy.stats import spearmanr
 
 import norm_balls as nb
 from augment.classifier import Classifier
-from renderer.io.images import write_image
-from train.checkpoints import RUN, is_classifier, load_network, load_run
+from augment.dim import DIM as BELOW
+from augment.dim import DIM_PERCENTILE
+from augment.network import percentiles
+from renderer.image import decode, to_unit
+from renderer.io.images import crop_center, read_rgb, write_image
+from train.checkpoints import DIM, RUN, is_classifier, load_network, load_run
 from train.data.photo import Photograph
 from train.data.photographs import find_photographs, load_photographs
 from train.results.intervals import auc_and_recalls, class_means, weighted_means
@@ -66,7 +71,8 @@ def load(name: str) -> Classifier:
     """Load a network by its name on the command line."""
     if name.startswith(NORMALIZED):
         return load(name.removeprefix(NORMALIZED)).normalizing_light()
-    return load_network(name) if is_classifier(name) else load_run(name.removeprefix(RUN))
+    is_known = is_classifier(name) or name.startswith(DIM)
+    return load_network(name) if is_known else load_run(name.removeprefix(RUN))
 
 
 def light_of(photograph: Photograph) -> str:
@@ -365,6 +371,19 @@ def rank(options: argparse.Namespace) -> None:
     print(Table("Spearman's rank correlation, 95% intervals over networks", header, pairs))
 
 
+def count_dim(options: argparse.Namespace) -> None:
+    """Count the photographs of folders that `Classifier.with_dim` shows to the network for them."""
+    paths = sorted(path for folder in options.folders for path in folder.rglob("*.*"))
+    counts = [0, 0]
+    for path in paths:
+        if path.suffix.lower() in {".jpg", ".jpeg", ".png"}:
+            square = crop_center(read_rgb(path, options.size), options.size)
+            linear = decode(to_unit(torch.tensor(np.array(square))).permute(2, 0, 1), "srgb")
+            counts[0] += bool(percentiles(linear[None], DIM_PERCENTILE) < BELOW)
+            counts[1] += 1
+    print(f"{counts[0]} of {counts[1]} photographs are dim")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command."""
     parser = argparse.ArgumentParser(
@@ -393,6 +412,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ranking.add_argument("scores", nargs="+", help="TITLE=FILE of score --out")
     ranking.add_argument("--label", required=True, help="positive class")
     ranking.add_argument("--metric", default="recall at 5% FPR", choices=METRICS)
+    counting = commands.add_parser("dim", help="count the dim photographs of folders")
+    counting.set_defaults(body=count_dim)
+    counting.add_argument("folders", nargs="+", type=Path)
+    counting.add_argument("--size", type=int, default=224, help="pixels per side")
     options = parser.parse_args(arguments)
     options.body(options)
 
