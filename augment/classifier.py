@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from augment import network as wrappers
-from augment.dim import DIM, DimSwitch
+from augment.dim import DIM, DIM_NAME, DimSwitch
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
 from augment.tasks import recognized_task
 from augment.tasks.classification import Classification
@@ -42,8 +42,7 @@ Label = str | Sequence[str]
 Normalization = str | tuple[Sequence[float], Sequence[float]] | None
 # Image values may exceed the range [0, 1] by at most this much, because of interpolation and noise.
 OVERSHOOT = 0.1
-# Pixel value of the gray image with which a function is called to find out whether it has
-# gradients.
+# Value of the gray image with which a function is called to find out whether it has gradients.
 GRAY = 0.5
 # Number of images of a scene with which a function of another task is called for that.
 MAX_PROBED = 8
@@ -217,9 +216,7 @@ class TaskNetwork(CheckedNetwork):
         return self.with_network(self.network, normalize_light)
 
     def with_dim(self, dim: Self, below: float = DIM) -> Self:
-        """Return a network that shows dim images to another network.
-
-        All other images keep their outputs.
+        """Return a network that shows dim images alone to another network.
 
         Args:
             dim: Network for dim images, with the same task, size and classes.
@@ -244,12 +241,15 @@ class TaskNetwork(CheckedNetwork):
             if getattr(dim, name) != getattr(self, name):
                 reason = f"dim has another {name} than {self.title}"
                 raise InputError(f"{reason}: give a network of the same task, size and classes")
-        return self.with_network(DimSwitch(self, dim, below))
+        name = f"{DIM_NAME}{self.name}+{dim.name}"
+        return self.with_network(DimSwitch(self, dim, below), name=name)
 
-    def with_network(self, network: nn.Module, normalize_light: NormalizeLight = None) -> Self:
+    def with_network(
+        self, network: nn.Module, normalize_light: NormalizeLight = None, name: str | None = None
+    ) -> Self:
         """Return a copy with another network of the same images, and without operating points."""
         options: dict[str, Any] = {} if isinstance(self, Classifier) else {"task": self.task}
-        given = self.size, self.classes, self.name, normalize_light
+        given = self.size, self.classes, name or self.name, normalize_light
         made = type(self)(network, *given, **options)
         made.inputs = self.inputs
         return made

@@ -16,6 +16,10 @@ DIM_PERCENTILE = 98.0
 DIM = 0.25
 
 
+# A name that begins with this text names a network, and one for dim images after a "+".
+DIM_NAME = "dim:"
+
+
 class DimSwitch(nn.Module):
     """Network that shows dim images to another network.
 

@@ -36,12 +36,11 @@ from scipy.stats import spearmanr
 
 import norm_balls as nb
 from augment.classifier import Classifier
-from augment.dim import DIM as BELOW
-from augment.dim import DIM_PERCENTILE
+from augment.dim import DIM, DIM_NAME, DIM_PERCENTILE
 from augment.network import percentiles
 from renderer.image import decode, to_unit
 from renderer.io.images import crop_center, read_rgb, write_image
-from train.checkpoints import DIM, RUN, is_classifier, load_network, load_run
+from train.checkpoints import RUN, is_classifier, load_network, load_run
 from train.data.photo import Photograph
 from train.data.photographs import find_photographs, load_photographs
 from train.results.intervals import auc_and_recalls, class_means, weighted_means
@@ -71,7 +70,7 @@ def load(name: str) -> Classifier:
     """Load a network by its name on the command line."""
     if name.startswith(NORMALIZED):
         return load(name.removeprefix(NORMALIZED)).normalizing_light()
-    is_known = is_classifier(name) or name.startswith(DIM)
+    is_known = is_classifier(name) or name.startswith(DIM_NAME)
     return load_network(name) if is_known else load_run(name.removeprefix(RUN))
 
 
@@ -379,7 +378,7 @@ def count_dim(options: argparse.Namespace) -> None:
         if path.suffix.lower() in {".jpg", ".jpeg", ".png"}:
             square = crop_center(read_rgb(path, options.size), options.size)
             linear = decode(to_unit(torch.tensor(np.array(square))).permute(2, 0, 1), "srgb")
-            counts[0] += bool(percentiles(linear[None], DIM_PERCENTILE) < BELOW)
+            counts[0] += bool(percentiles(linear[None], DIM_PERCENTILE) < DIM)
             counts[1] += 1
     print(f"{counts[0]} of {counts[1]} photographs are dim")
 

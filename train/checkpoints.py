@@ -21,8 +21,9 @@ from safetensors import safe_open
 from torch import Tensor, cuda
 
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
+from augment.dim import DIM, DIM_NAME
 from augment.files import as_facts, is_network_file, require_no_facts
-from augment.network import FROM_FILE, Inputs, say_inputs, with_normalized_light
+from augment.network import FROM_FILE, Inputs, say_inputs, say_once, with_normalized_light
 from augment.settings import PYTHON, NormalizeLight
 from augment.sources import SOURCES, import_function, load_classifier
 from augment.tasks.detection import Detection
@@ -34,8 +35,6 @@ from train.settings import NetworkSettings, TaskSettings, published_folder
 
 # A name of a classifier that begins with this text names the folder of a training run.
 RUN = "run:"
-# A name that begins with this text names a network, and one for dim images after a "+".
-DIM = "dim:"
 # Entries in the file of a published network, in addition to the weights.
 PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point")
 # Entries in the description of a network that are no arguments of `build_network`.
@@ -137,20 +136,23 @@ def load_network(
     its own weights and its own `facts`, such as classes and size, so these must then be None.
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
-    if name.startswith(DIM):
-        plain, plus, dim = name.removeprefix(DIM).rpartition("+")
+    options: dict[str, Any] = {"normalize_light": normalize_light, "trust_code": trust_code}
+    if name.startswith(DIM_NAME):
+        plain, plus, dim = name.removeprefix(DIM_NAME).rpartition("+")
         if not plus:
-            raise InputError(f"name={name} names one network: give {DIM}NETWORK+DIM_NETWORK")
+            reason = f"name={name} names one network: give {DIM_NAME}NETWORK+DIM_NETWORK"
+            raise InputError(reason, "name")
         network = load_network(plain, weights, trust_code=trust_code, **facts)
+        if not dim.startswith(RUN):
+            options |= {"weights": weights, **facts}
+        say_once(f"{dim} gets the images whose 98th percentile of linear values is below {DIM}")
         # The light of plain images is not normalized.
-        options = {"normalize_light": normalize_light, "trust_code": trust_code}
         return network.with_dim(load_network(dim, **options))
     path = Path(name)
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path
     if (folder / BEST).is_file():
         raise InputError(f"name={name} is a training run: give name={RUN}{folder} instead", "name")
-    options: dict[str, Any] = {"normalize_light": normalize_light, "trust_code": trust_code}
     if not name.startswith(RUN):
         return load_classifier(name, weights, **options, **facts)
     require_no_facts(name, as_facts(**facts))
