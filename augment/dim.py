@@ -15,7 +15,6 @@ DIM_PERCENTILE = 98.0
 # Images are dim if this percentile is below this value.
 DIM = 0.25
 
-
 # A name that begins with this text names a network, and one for dim images after a "+".
 DIM_NAME = "dim:"
 
