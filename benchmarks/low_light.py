@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--data", type=Path, required=True, help="folder of the data")
     add("--objects", type=Path, help="folder of photographs of the objects")
     add("--out", type=Path, required=True, help="folder of the weights and of table.md")
-    add("--epochs", type=int, default=20, help="epochs of 400 images")
+    add("--epochs", type=int, default=24, help="epochs of 400 images")
     add("--seeds", type=int, nargs="*", default=[0])
     options = parser.parse_args(arguments)
     weights = options.data / "weights"
