@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from numbers import Integral
+from operator import itemgetter
 from typing import Any, TypeVar
 
 import torch
@@ -167,7 +168,7 @@ def _attack(
     problem = build_problem(settings, scene)
     warn_of_changed_light(scene, problem.scene, stacklevel=4)
     images_before = problem.images(problem.start)
-    warn_of_exposure(problem.scene)
+    warn_of_exposure(problem.scene, images_before)
 
     has_gradients = classifier.is_differentiable(lambda: images_before.flatten(0, 1))
     if settings.optimizer is None and not has_gradients:
@@ -300,23 +301,16 @@ def find_scene(
     The search tries several cameras. Each is tried in the light of the scene, in the built-in
     environments and in uniform light, with several exposures, and also in front of a light gray
     background. It ends when the classifier gives the true class a probability of at least
-    `CONFIDENCE_TO_STOP` in all images. The given settings are returned if the classifier is right
-    in all their images, or if no other scene is recognized.
+    `CONFIDENCE_TO_STOP` in all images. The given settings are returned if no scene is recognized.
     """
-    # The confidence is 0 if an image is misclassified.
-    scene = build(settings)
-    if _confidences(scene, attack_settings, classifier).any():
-        return settings, scene
-    highest, best_settings = 0.0, settings
+    # Confidence and settings. The confidence is 0 if an image is misclassified.
+    best = 0.0, settings
     for candidate in progress(_candidates(settings, cameras, draws), "search for a scene"):
-        # The first candidate is the given scene, whose shadows are computed already.
-        tried = scene if candidate is settings else build(candidate)
-        confidence, lit = _best_light(tried, candidate, attack_settings, classifier)
-        if confidence > highest:
-            highest, best_settings = confidence, lit
-        if highest >= CONFIDENCE_TO_STOP:
+        found = _best_light(build(candidate), candidate, attack_settings, classifier)
+        best = max(best, found, key=itemgetter(0))
+        if best[0] >= CONFIDENCE_TO_STOP:
             break
-    return best_settings, build(best_settings)
+    return best[1], build(best[1])
 
 
 def _candidates(settings: Settings, cameras: int, draws: Generator) -> Iterator[Settings]:
@@ -374,7 +368,7 @@ def _best_light(
 
 @torch.no_grad()
 def _confidences(
-    scene: Scene, attack_settings: AttackSettings, classifier: Classifier, groups: int = 1
+    scene: Scene, attack_settings: AttackSettings, classifier: Classifier, groups: int
 ) -> Float[Tensor, " groups"]:
     """Compute the confidence in each group of E / groups successive examples before an attack.
 

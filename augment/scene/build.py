@@ -523,16 +523,19 @@ def _linear_values(scene: Scene, rows: list[int]) -> Float[Tensor, "N 3"]:
 
 
 @torch.no_grad()
-def warn_of_exposure(scene: Scene) -> None:
-    """Warn of objects that are almost black or white in their first example."""
+def warn_of_exposure(scene: Scene, images: Float[Tensor, "E V 3 H W"] | None = None) -> None:
+    """Warn of objects that are almost black or white in their first example.
+
+    Without the images of all examples, that example is rendered.
+    """
     # First example of each object.
     seen: dict[int, int] = {}
     for row, example in enumerate(scene.examples):
         seen.setdefault(example.object, row)
     rows = torch.tensor([*seen.values()][:PROBED], device=scene.lights.device)
-    images = scene.render(scene.conditions(rows), rows)
+    shown = scene.render(scene.conditions(rows), rows) if images is None else images[rows]
     masks = scene.truth(unlabeled, rows).masks[:, :, 0]
-    for index, image, mask in zip(seen, images, masks, strict=False):
+    for index, image, mask in zip(seen, shown, masks, strict=False):
         mean = float(image.movedim(1, 0)[:, mask].mean()) if mask.any() else MEAN
         if not DARK <= mean <= BRIGHT:
             kind = "dark" if mean < DARK else "bright"

@@ -216,14 +216,18 @@ def attacks(
         mesh.label = class_of_meshes([item], classifier.classes, key, label)
         build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
         chosen = settings.scene
-        # `search` is the number of cameras that the search for a recognized view tries.
-        if chosen.search and not settings.attack.force:
+        try:
+            result = start(build(chosen), settings.attack.force)
+        except InputError as error:
+            # The attack has rendered the scene, and found the mesh misclassified in it. `search` is
+            # the number of cameras that the search for a recognized view tries.
+            if error.argument != "attack.force" or not chosen.search:
+                raise
             draws = generator(settings.seed, mesh.mesh, "search")
             arguments = classifier, chosen, settings.attack, build, chosen.search, draws
             chosen, scene = find_scene(*arguments)
-        else:
-            scene = build(chosen)
-        yield mesh.mesh, chosen, start(scene, settings.attack.force)
+            result = start(scene, force=False)
+        yield mesh.mesh, chosen, result
 
 
 def build_attacked(

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from augment.attacks.result import AttackResult
 from augment.classifier import Classifier
+from augment.scene.scene import Scene
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.files import probe
@@ -61,6 +62,17 @@ def test_a_class_whose_name_is_a_number_is_a_target():
     classifier = by_color(("orange", "7", "8"))
     result = attacked("target=7", "attack.max_steps=1", classifier=classifier)
     assert result.criterion.target.tolist() == [[1]]
+
+
+def test_a_scene_that_is_classified_correctly_is_attacked_as_it_is_and_rendered_once(monkeypatch):
+    render = Mock(side_effect=Scene.render)
+    monkeypatch.setattr(Scene, "render", lambda *given: render(*given))
+    settings = configured("attack.max_steps=0")
+    ((_, scene, result),) = attacks(settings, by_color(), torch.device("cpu"))
+    assert result.clean_correct.all()
+    assert scene == settings.scene
+    # Images before the attack, and the initial values of the search.
+    assert render.call_count == 2
 
 
 @pytest.mark.slow
