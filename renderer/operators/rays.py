@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from renderer.errors import import_package
@@ -199,7 +199,7 @@ class Rays:
         for the next block of pixels.
         """
         fragments = surface.fragments
-        pixels = self._pixels_to_cast(surface)
+        pixels, may_hit = self._pixels_to_cast(surface)
         if not len(pixels):
             return
         plane_normals = surface.planes
@@ -222,8 +222,9 @@ class Rays:
             cosine = dot(surface.normals[sample_of_ray], directions).clamp(min=0)
             height = dot(plane_normals[sample_of_ray], directions)
             # Pairs of a pixel and a direction that need a ray: the direction is above the
-            # face, and in front of the shading normal.
-            cast = torch.nonzero((cosine > 0) & (height > 0), as_tuple=True)
+            # face, and in front of the shading normal, and the ray may hit another face.
+            is_above = (height > 0) & may_hit[sample_of_ray]
+            cast = torch.nonzero((cosine > 0) & is_above, as_tuple=True)
             start_sample = sample_of_ray[cast]
             origins = surface.points[start_sample] + self.offset * plane_normals[start_sample]
             hit_face = self.first_hit(origins, directions[cast[1]])
@@ -255,21 +256,22 @@ class Rays:
             vertices = vertices[ConvexHull(vertices).vertices]
         return torch.from_numpy(vertices).double()
 
-    def _pixels_to_cast(self, surface: Surface) -> Tensor:
-        """Find the pixels for which the mesh may block light.
+    def _pixels_to_cast(self, surface: Surface) -> tuple[Int[Tensor, " B"], Bool[Tensor, " S"]]:
+        """Find the pixels for which the mesh may block light, and the samples whose rays may hit.
 
         A pixel is returned if one of its samples fulfills one of two conditions. First, a vertex of
         the mesh lies above the plane of the face on which the sample lies. Second, the shading
         normal differs from the normal of the face by an angle a, so that the plane of the face
         blocks the fraction (1 - cos a) / 2 of uniform light, and this exceeds `MAX_IGNORED_LIGHT`.
-        All pixels are returned if the test would need more than `MAX_COMPARISONS` comparisons and
-        would take longer than the rays.
+        A ray from a sample can only hit another face under the first condition. All are returned
+        if the test would need more than `MAX_COMPARISONS` comparisons and would take longer than
+        the rays.
         """
         fragments = surface.fragments
         plane_normals = surface.face_planes
         hull_vertices = self._outermost
         if len(plane_normals) * len(hull_vertices) > MAX_COMPARISONS:
-            return torch.arange(len(fragments.pixels))
+            return torch.arange(len(fragments.pixels)), fragments.sample_to_pixel >= 0
         # The normals are processed in blocks to limit the memory.
         blocks = plane_normals.split(max(1, 8 * BLOCK // len(hull_vertices)))
         # Largest coordinate of a hull vertex along the normal of each seen face.
@@ -277,11 +279,10 @@ class Rays:
         first_corner = surface.vertices[fragments.corners[:, 0]]
         # Height of the face itself along its normal.
         height_of_face = (plane_normals * first_corner).sum(1)
-        is_below_a_vertex = highest - height_of_face > self.offset
         cosine_of_normals = (surface.normals * surface.planes).sum(1)
         blocks_light = cosine_of_normals < 1 - 2 * MAX_IGNORED_LIGHT
-        casts_rays = is_below_a_vertex[fragments.sample_to_seen_face] | blocks_light
-        return fragments.sample_to_pixel[casts_rays].unique()
+        may_hit = (highest - height_of_face > self.offset)[fragments.sample_to_seen_face]
+        return fragments.sample_to_pixel[may_hit | blocks_light].unique(), may_hit
 
     def first_hit(
         self,
