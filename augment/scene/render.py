@@ -193,6 +193,10 @@ KEPT_SAMPLES = 2**24
 NEAR = 0.001
 
 
+# Largest number of samples along one side of a pixel in a draft of moved vertices.
+DRAFT_SAMPLES = 2
+
+
 # What shadows and bounces add to one view of a mesh: the radiance of each channel and pixel, for
 # each of the K harmonic coefficients of the light, and the sum of the albedo of the samples of
 # each pixel with which it was computed.
@@ -336,7 +340,8 @@ class DirectRenderer:
                 self._views.clear()
             mesh = self.objects[object_index].mesh
             vertices = torch.as_tensor(mesh.vertices, device=self.like.device)
-            self._views[key] = self._rasterize(object_index, camera, vertices)
+            shown = (object_index, camera, vertices, self.settings.samples)
+            self._views[key] = self._rasterize(*shown)
         return self._views[key]
 
     def local_view(self, object_index: int, camera: Camera) -> LocalLightView:
@@ -349,7 +354,7 @@ class DirectRenderer:
             fragments, _ = self.view(object_index, camera)
             mesh = self.objects[object_index].mesh
             surface = Surface(mesh, fragments.to("cpu"), self.settings)
-            self._local_views[key] = LocalLightView(self._rays_among(object_index), surface)
+            self._local_views[key] = LocalLightView(self._rays_of(object_index), surface)
         return self._local_views[key]
 
     def masks(
@@ -425,7 +430,7 @@ class DirectRenderer:
         mesh = self.objects[object_index].mesh
         if vertices is None:
             return mesh, self.view(object_index, camera)[0].to("cpu")
-        fragments, _ = self._rasterize(object_index, camera, vertices)
+        fragments, _ = self._rasterize(object_index, camera, vertices, self.settings.samples)
         return _moved(mesh, vertices), fragments.to("cpu")
 
     def radiance(
@@ -442,18 +447,21 @@ class DirectRenderer:
 
         The result is differentiable in the light and in all changes. With
         `settings.silhouettes`, it is also differentiable in fields of the
-        camera that are tensors. A draft approximates the shadows and bounces of moved vertices.
+        camera that are tensors. A draft of moved vertices with shadows or bounces has fewer samples
+        and rays.
         """
         item = self.objects[object_index]
         fixed_camera = camera.fixed()
         moved = changed.vertices
-        if moved is None:
-            fragments, albedo = self.view(object_index, fixed_camera)
-        else:
-            fragments, albedo = self._rasterize(object_index, fixed_camera, moved)
-        rasterized = fragments, albedo
+        # Without shadows, the images of a search are not rendered again, so they are no drafts.
+        has_draft = is_draft and moved is not None and self.settings.global_illumination
+        samples = min(self.settings.samples, DRAFT_SAMPLES) if has_draft else self.settings.samples
+        settings = replace(self.settings, samples=samples)
+        seen = object_index, fixed_camera
+        rasterized = self.view(*seen) if moved is None else self._rasterize(*seen, moved, samples)
+        fragments, albedo = rasterized
         if changed.albedo is not None:
-            of_view = (item.mesh, fragments, self.settings.encoding, item.albedo_scale)
+            of_view = (item.mesh, fragments, settings.encoding, item.albedo_scale)
             albedo = paint_faces(*of_view, changed.albedo, changed.hue)
         gloss = None
         if changed.gloss is not None:
@@ -465,23 +473,20 @@ class DirectRenderer:
         if split.local_lights and moved is None and gloss is None:
             lamp_view = self.local_view(object_index, fixed_camera)
         elif split.local_lights:
-            rays = (
-                self._rays_among(object_index) if moved is None else Rays(_moved(item.mesh, moved))
-            )
-            surface = Surface(item.mesh, fragments.to("cpu"), self.settings, moved, gloss)
+            rays = self._rays_of(object_index) if moved is None else Rays(_moved(item.mesh, moved))
+            surface = Surface(item.mesh, fragments.to("cpu"), settings, moved, gloss)
             lamp_view = LocalLightView(rays, surface)
 
         def indirect(albedo: Float[Tensor, "S 3"], light: Float[Tensor, "K 3"]) -> Tensor:
             """Compute the radiance that shadows and bounces of environment light add."""
             positions = _moved(item.mesh, moved).vertices
             frozen = self._transport(example, object_index, positions)
-            has_draft = is_draft and moved is not None
             view = (example if self.one_light else None, fixed_camera, has_draft)
             if view not in frozen.views:
                 shown = rasterized
                 if not np.array_equal(frozen.mesh.vertices, positions):
                     vertices = torch.as_tensor(frozen.mesh.vertices, device=self.like.device)
-                    shown = self._rasterize(object_index, fixed_camera, vertices)
+                    shown = self._rasterize(object_index, fixed_camera, vertices, samples)
                 frozen.add(view, *shown, light if self.one_light else None)
             added = frozen.radiance(view, fragments, albedo, light)
             # A camera whose fields are tensors is attacked, so it differs in each call. Its views
@@ -493,19 +498,19 @@ class DirectRenderer:
         shown = ShadedView(
             mesh=item.mesh,
             fragments=fragments,
-            settings=self.settings,
+            settings=settings,
             vertices=self.vertices[object_index] if moved is None else moved,
             albedo=albedo,
             light=split,
             is_moved=moved is not None,
             gloss=gloss,
             lamp_view=lamp_view,
-            indirect=indirect if self.settings.global_illumination else None,
+            indirect=indirect if settings.global_illumination else None,
             lamp_positions=changed.positions,
         )
         return shown.pixel_radiance(camera, background)
 
-    def _rays_among(self, object_index: int) -> Rays:
+    def _rays_of(self, object_index: int) -> Rays:
         """Return the ray tracer of an unmoved object with the given index. It is built once."""
         if object_index not in self._rays:
             self._rays[object_index] = Rays(self.objects[object_index].mesh)
@@ -534,14 +539,15 @@ class DirectRenderer:
         return frozen
 
     def _rasterize(
-        self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"]
+        self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"], samples: int
     ) -> tuple[Fragments, Tensor]:
         """Find the samples that show an object with given vertices, and their albedo (S, 3)."""
+        settings = replace(self.settings, samples=samples)
         item = self.objects[object_index]
-        shown = (vertices, item.mesh.faces, [camera], self.settings, self.rasterizer)
+        shown = (vertices, item.mesh.faces, [camera], settings, self.rasterizer)
         [fragments] = build_fragments(*shown, closed=item.mesh.closed)
         fragments = fragments.to(self.like.device)
-        albedo = surface_albedo(item.mesh, fragments, self.settings.encoding)
+        albedo = surface_albedo(item.mesh, fragments, settings.encoding)
         return fragments, (albedo * item.albedo_scale).to(self.like)
 
 

@@ -344,7 +344,8 @@ class Scene:
             conditions: Light, shape and colors of each of A examples.
             examples: Index of each of the A examples, which are objects with their views, in the
                 scene, shape (A,).
-            is_draft: Whether fewer rays may find the shadows and bounces of moved vertices.
+            is_draft: Whether images of moved vertices with shadows or bounces may have fewer
+                samples and rays.
 
         Returns:
             Images with values in [0, 1], shape (A, V, 3, height, width).

@@ -346,6 +346,17 @@ def test_drafts_of_moved_vertices_have_nearly_the_shadows_of_all_directions():
         assert least <= float((images - expected).square().mean().sqrt()) < most
 
 
+def test_drafts_of_moved_vertices_have_at_most_two_samples_along_a_side_of_a_pixel():
+    vertices = 1.1 * built("cup").vertices
+    drafts = []
+    for samples in (2, 8):
+        scene = built("cup", shadows=True, samples=samples)
+        rows = torch.arange(len(scene))
+        of_rows = vertices.expand(len(scene), -1, -1)
+        drafts.append(scene.render(Conditions(scene.lights, of_rows), rows, is_draft=True))
+    assert torch.equal(*drafts)
+
+
 def images_of_moved(scene, mesh, vertices, lights) -> torch.Tensor:
     images = []
     for row, example in enumerate(scene.examples):
