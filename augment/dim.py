@@ -1,6 +1,6 @@
 """A network for dim images beside the network for all others."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -46,7 +46,7 @@ class DimSwitch(nn.Module):
         return f"below={self.below}"
 
 
-def _joined(outputs: Sequence[Any], places: Int[Tensor, " N"]) -> Any:
+def _joined(outputs: list[Any], places: Int[Tensor, " N"]) -> Any:
     """Join outputs of several batches of images, and put them in another order."""
     first = outputs[0]
     if isinstance(first, Tensor):

@@ -180,7 +180,7 @@ def candidate_loss(
         # The loss has its minimum where the odds are `favor` times those of the teacher.
         weights = 1 + (favor - 1) * old
         target = favor * old / weights
-        options = {"weight": weights, "reduction": "sum"}
+        options: dict[str, Any] = {"weight": weights, "reduction": "sum"}
         entropy = binary_cross_entropy(target, target, **options)
         changes.append(binary_cross_entropy(scores, target, **options) - entropy)
         # The best score of each candidate over the classes is the weight of its box.

@@ -245,8 +245,8 @@ class TrainingLoss:
         settings = self.settings
         # Without labels, renders and distillation, only the augmented photographs are learned.
         learns_unchanged = self.labeled or self.positive_classes or settings.distillation_weight
-        is_augmented_only = augmented is not None and not learns_unchanged
-        logits = self.model(to_unit(augmented if is_augmented_only else images))
+        shown = images if augmented is None or learns_unchanged else augmented
+        logits = self.model(to_unit(shown))
         teacher_logits = None
         if self.teacher is not None:
             with torch.no_grad():
@@ -275,8 +275,8 @@ class TrainingLoss:
             loss = loss + settings.distillation_weight * divergences.mean()
         if teacher_logits is not None and augmented is not None:
             # Also augmented photographs should get the predictions for the originals.
-            shown = logits if is_augmented_only else self.model(to_unit(augmented))
-            divergences = kl_divergence(shown, teacher_logits) * ~rendered
+            relit = logits if shown is augmented else self.model(to_unit(augmented))
+            divergences = kl_divergence(relit, teacher_logits) * ~rendered
             loss = loss + settings.consistency_weight * divergences.mean()
         if self.positive_classes and settings.ranking_weight:
             loss_sum = sum(ranking_loss(logits, labels, label) for label in self.positive_classes)
