@@ -20,9 +20,9 @@ def test_no_candidate_leaves_the_ball_or_has_negative_light(attacked, monkeypatc
     rendered = []
     render = SceneProblem.render
 
-    def record(problem, values, examples):
+    def record(problem, values, *arguments, **options):
         rendered.append(values)
-        return render(problem, values, examples)
+        return render(problem, values, *arguments, **options)
 
     monkeypatch.setattr(SceneProblem, "render", record)
     result = attacked(
