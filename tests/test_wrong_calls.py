@@ -68,10 +68,6 @@ def small_service(label: Any = 0, **options: Any) -> augment.AugmentationService
     return augment.AugmentationService.from_meshes([(MESH, label)], SIZE, **given)
 
 
-def small_service_with(settings: Any) -> augment.AugmentationService:
-    return augment.AugmentationService.from_meshes([(MESH, 0)], SIZE, settings)
-
-
 def shown_examples(examples: Any) -> Tensor:
     return small_scene().render(small_scene().conditions(torch.arange(2)), examples)
 
@@ -148,10 +144,11 @@ RENDERING = [
     *by_name(render, albedo_scale=[-1.0], gloss=[0.3, (0.3, 0, 1)], normals=["Smooth"]),
     *by_name(render, shadows=["no"], bounces=[-1, 101], silhouettes=["yes"], rasterizer=["gpu"]),
     *by_name(operators, mesh=["orange.glb"], cameras=[None], size=[0], gloss=[0.3]),
-    *calls_of("lights", lambda x: operator().image(x), "grace", LIGHT.T, LIGHT * NAN),
+    *calls_of("lights", lambda x: operator().image(x), "grace", LIGHT.T, LIGHT * NAN, LIGHT * 1e30),
     *calls_of("lights", lambda x: operator().radiance(x), LIGHT[:9]),
     *calls_of("background", lambda x: operator().image(LIGHT, x), 2.0, torch.rand(3, 4, 4)),
     *calls_of("radiance_gradient", lambda x: operator().light_gradient(x), "x", 1.0),
+    *calls_of("radiance_gradient", lambda x: operator().light_gradient(x), NAN * torch.ones(3, 13)),
     *calls_of("device", lambda x: operator().to(x), "gpu", 3.5),
 ]
 
@@ -187,9 +184,10 @@ LIGHTS = [
     *calls_of("degree", lambda x: harmonics.basis(torch.ones(2, 3), x), -1, 41),
     *calls_of("light", harmonics.degree_of, "grace", torch.ones(49)),
     *calls_of("radiance", lambda x: harmonics.project(x, 2), "sky", torch.ones(4, 8, 3) * NAN),
+    *calls_of("radiance", lambda x: harmonics.project(lambda _: x, 2), torch.ones(28, 3) * NAN),
     *calls_of("degree", lambda x: harmonics.project(torch.ones(4, 8, 3), x), -1, 2.5),
-    *calls_of("coefficients", lambda x: harmonics.rotate(x, torch.eye(3)), "x", torch.ones(8, 3)),
-    *calls_of("rotation", lambda x: harmonics.rotate(LIGHT, x), "x", torch.eye(2)),
+    *calls_of("coefficients", lambda x: harmonics.rotate(x, torch.eye(3)), LIGHT[:8], LIGHT * NAN),
+    *calls_of("rotation", lambda x: harmonics.rotate(LIGHT, x), torch.eye(2), torch.eye(3) * NAN),
     *calls_of("zenith", lambda x: skylight.coefficients(x, 0.0, 3.0), "noon", 91.0, -0.1),
     *calls_of("azimuth", lambda x: skylight.coefficients(0.5, x, 3.0), "south", NAN),
     *calls_of("turbidity", lambda x: skylight.coefficients(0.5, 0.0, x), "clear", 1.0),
@@ -226,7 +224,7 @@ MESHES = [
     *by_name(mesh_of, normal_ids=[MESH.faces - 1, MESH.faces * 1.0, MESH.faces[1:]]),
     *by_name(mesh_of, texture_ids=[None, np.zeros(4, int), [0, 0]]),
     *by_name(mesh_of, textures=["a.png", [np.ones((4, 4, 3))], 3]),
-    *by_name(rendered_with, corner_colors=[MESH.corner_colors * 255]),
+    *by_name(rendered_with, corner_colors=[MESH.corner_colors * 255, MESH.corner_colors * NAN]),
     *by_name(rendered_with, gloss=[0.3, np.full((4, 3), 2.0), renderer.Gloss(0.3)]),
     *by_name(partial(plain_mesh, MESH.faces), crease=[-1]),
     *calls_of("roughness", lambda x: renderer.Gloss(x).on(MESH), "smooth", 2.0),
@@ -239,14 +237,14 @@ object_of_cup = partial(augment.ObjectSettings, "solid:cup", "cup")
 SCENES = [
     *calls_of("meshes", scene, "solid:orange", [], [("solid:orange",)], ["solid:orange"], 3),
     *calls_of("meshes", scene, [(MESH, None)], [(TRIMESH, "orange")], {"orange": MESH}, [()]),
-    *by_name(scene, size=[16.5, 0], views=[0, 2.5], shared=["yes"], samples=[0]),
+    *by_name(scene, size=[16.5, 0, (8,), (8, True), None], views=[0, 2.5], samples=[0]),
     *by_name(scene, scene=[{"views": 3}, 3], renderer=[{"samples": 3}], device=["gpu", 3.5]),
     *by_name(scene, widht=[2.0], backgrounds=[0.5, [], [255], [True], ["missing.png"]]),
     *by_name(scene, light=[None, "sunset", LIGHT.T, LIGHT * NAN], degree=[2.5, -1, 41]),
     *by_name(scene, exposure=[-1], width=[0, NAN], polar=[200.0], azimuth=["east"], fov=[200.0]),
     *by_name(scene, vertices=[2.5, -1, None], ground=[[1, 2, 3], "wood", 0.5, [0.5, 0.5]]),
     *by_name(scene, projector=[Projector(), 16], lamps=[LAMP], rasterizer=["gpu"]),
-    *by_name(scene, cameras=[[], ["above"]], normalize=[False, "no"]),
+    *by_name(scene, cameras=[[], ["above"]], normalize=[False, "no"], shared=["yes"]),
     *by_name(partial(scene, cameras=renderer.orbit_cameras(3, 2.0)), views=[2]),
     *calls_of(
         "solid:orange",
@@ -258,7 +256,8 @@ SCENES = [
     *calls_of("start", lambda x: scene(lamps=augment.LampsSettings(start=x)), [1, 2], None),
     *calls_of("mesh", lambda x: augment.ObjectSettings(x, "orange"), None, ""),
     *calls_of("label", lambda x: scene([augment.ObjectSettings("solid:orange", x)]), None, 0.5),
-    *by_name(object_of_cup, albedo_scale=[0], color=[0.5, [255, 0, 0], [0, 0]], gloss=["shiny"]),
+    *by_name(object_of_cup, albedo_scale=[0], color=[0.5, [255, 0, 0], [0, 0]]),
+    *by_name(object_of_cup, gloss=["shiny", [], [0.5, 2.0], [-0.1], [0.1] * 4]),
     *by_name(object_of_cup, others=[["solid:cup"], 3], at=[3, [1], [NAN, 0]], scale=[0]),
     *by_name(augment.VariationSettings, shift=[2.0], scale=[2.0, [2, 1]], fov=[30.0, [50, 60]]),
     *by_name(augment.VariationSettings, environments=["grace"], instances=["yes"]),
@@ -388,7 +387,9 @@ SERVICES = [
     *calls_of("amplitude", RandomLightSettings, 0),
     *by_name(service_of, scene=[3, MESH], labels=["orange", [0]], positive_classes=["orange"]),
     *by_name(service_of, seed=[None, 0.5]),
-    *calls_of("examples", small_service_with, augment.AugmentationSettings(examples=0)),
+    *calls_of(
+        "examples", lambda x: small_service(settings=x), augment.AugmentationSettings(examples=0)
+    ),
     *calls_of("meshes", lambda x: of_meshes(x, SIZE), [(MESH,)], [MESH], 3),
     *calls_of("label", small_service, "orange", 1.5, None),
     *calls_of("size", lambda x: of_meshes([(MESH, 0)], x), 16.5, 0),
@@ -478,11 +479,6 @@ def test_a_wrong_call_is_refused_by_a_sentence_naming_the_argument(folder, monke
         call()
     sentence = str(refused.value)
     assert name in sentence and "\n" not in sentence, sentence
-
-
-@pytest.mark.parametrize("size", [SIZE, np.int64(SIZE), np.uint8(SIZE)])
-def test_whole_numbers_of_numpy_are_sizes(size):
-    assert torch.equal(render(size=size), render())
 
 
 def test_numbers_of_any_kind_are_factors_and_fields_of_cameras():

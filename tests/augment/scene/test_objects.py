@@ -32,12 +32,6 @@ def test_a_mesh_without_colors_takes_the_given_one_which_a_metal_needs(plain_mes
         load_object(ObjectSettings(plain_mesh, "orange", gloss=metal))
 
 
-@pytest.mark.parametrize("gloss", [[], [0.5, 2.0], [-0.1], [0.1] * 4, "matte"])
-def test_a_gloss_that_no_surface_has_is_refused(gloss):
-    with pytest.raises(InputError, match="gloss"):
-        ObjectSettings("solid:orange", "orange", gloss=gloss)
-
-
 def test_props_stand_on_the_objects_ground_shifted_and_turned():
     """A quarter turn takes x to y, and y to -x."""
     prop = ObjectSettings("solid:cup:1", at=[0.9, -0.2], scale=0.5, azimuth=90)

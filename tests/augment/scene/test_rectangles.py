@@ -172,16 +172,11 @@ def logits(images):
     return torch.stack([mean, 0.3 + 0 * mean], dim=1)
 
 
-def attacked(shape, **settings):
-    scene = nb.build_scene([("solid:cup", "0")], shape, rasterizer="numpy", samples=1)
-    return nb.attack(logits, scene, settings=nb.AttackSettings(max_steps=2, **settings))
-
-
 def test_an_attack_is_saved_and_read_again(tmp_path):
     shape = SHAPES[1]
-    result = attacked(
-        shape, lighting=nb.StepSettings(step_size=0.5), pixels=nb.StepSettings(step_size=0.1)
-    )
+    scene = nb.build_scene([("solid:cup", "0")], shape, rasterizer="numpy", samples=1)
+    steps = {"lighting": nb.StepSettings(step_size=0.5), "pixels": nb.StepSettings(step_size=0.1)}
+    result = nb.attack(logits, scene, settings=nb.AttackSettings(max_steps=2, **steps))
     assert result.images.shape == (1, 3, *shape)
     save(result, tmp_path)
     adversary = nb.reload(tmp_path / "example_000")
@@ -196,9 +191,3 @@ def test_a_classifier_of_rectangles_refuses_other_images():
     assert classifier(torch.zeros(2, 3, 8, 12)).shape == (2, 2)
     with pytest.raises(nb.InputError, match=r"\(2, 3, 12, 8\): give \(N, 3, 8, 12\)"):
         classifier(torch.zeros(2, 3, 12, 8))
-
-
-@pytest.mark.parametrize("size", [0, 2.5, (8,), (8, True), None])
-def test_another_size_is_refused_in_one_sentence(size):
-    with pytest.raises(nb.InputError, match=r"^size is .*: give a whole number from 1 to"):
-        nb.build_scene([("solid:cup", "0")], size)
