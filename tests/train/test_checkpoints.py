@@ -1,4 +1,3 @@
-import errno
 import os
 import re
 from pathlib import Path
@@ -19,26 +18,6 @@ STATE |= {"history": [{"epoch": 1, "train/loss": 0.25}], "random": [torch.arange
 class Harmful:
     def __reduce__(self):
         return os.mkdir, ("harm",)
-
-
-@pytest.mark.parametrize("function", ["fsync", "replace"])
-def test_a_full_disk_leaves_the_old_checkpoint_and_names_the_new(tmp_path, monkeypatch, function):
-    save(tmp_path / LAST, STATE)
-    before = (tmp_path / LAST).read_bytes()
-
-    def fail(*arguments):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(f"renderer.io.files.os.{function}", fail)
-        with pytest.raises(OSError, match="No space left on device") as full:
-            save(tmp_path / LAST, STATE | {"epoch": 4}, tmp_path / PREVIOUS)
-    assert full.value.errno == errno.ENOSPC
-    assert full.value.filename == str(tmp_path / LAST)
-    assert os.listdir(tmp_path) == [LAST]
-    assert (tmp_path / LAST).read_bytes() == before
-    save(tmp_path / LAST, STATE)
-    assert content_hash(load(tmp_path / LAST)) == content_hash(STATE)
 
 
 NAN = {"model": {"weight": torch.tensor(torch.nan)}}

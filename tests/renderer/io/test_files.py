@@ -38,7 +38,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "mesh.glb": lambda path: renderer.export_mesh(renderer.solid("orange"), path),
     "image.png": lambda path: write_image(path, Image.fromarray(PIXELS)),
     "numbers.npy": lambda path: write_numbers(path, np.ones(4096)),
-    "last.pt": lambda path: checkpoints.save(path, {"model": {"weight": torch.rand(4096)}}),
+    "last.pt": lambda path: checkpoints.save(path, {"model": torch.rand(4096)}, path.parent / "b"),
 }
 
 

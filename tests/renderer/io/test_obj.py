@@ -194,14 +194,6 @@ def test_images_are_sought_in_the_folder_of_the_library_then_in_that_of_the_mesh
     assert found == [[255, 0, 0], [0, 255, 0], [0, 0, 255]]
 
 
-def test_a_texture_that_does_not_fit_into_memory_is_refused(tmp_path, monkeypatch):
-    (tmp_path / "red.png").write_bytes(png_of(255, 0, 0))
-    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nmtllib m.mtl\nusemtl m\nf 1/1 2/1 3/1\n"
-    monkeypatch.setattr("renderer.errors.free_memory", lambda device: 10)
-    with pytest.raises(InputError, match="memory"):
-        load(tmp_path, text, m="newmtl m\nmap_Kd red.png\n")
-
-
 def test_concave_faces_keep_their_shape_and_their_texture_coordinates(tmp_path):
     (tmp_path / "red.png").write_bytes(png_of(255, 0, 0))
     points = [(2, 1), (1, 1), (1, 2), (0, 2), (0, 0), (2, 0)]
