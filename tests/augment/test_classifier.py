@@ -20,7 +20,6 @@ MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
 SIZE = 8
 CLASSES = ("orange", "lemon", "apple")
-COLORS = ("red", "green", "blue")
 EPS = torch.finfo(torch.float64).eps
 SHIFT = (0.1, 0.4, 0.6)
 SCALE = (0.2, 0.5, 3.0)
@@ -33,10 +32,6 @@ class SimpleLogits:
 
 def random_images(size: int = 8) -> Tensor:
     return torch.rand(2, 3, size, size, generator=torch.Generator().manual_seed(0))
-
-
-def mean_color(images: Tensor) -> Tensor:
-    return images.mean((2, 3))
 
 
 @pytest.mark.parametrize(("bgr", "order"), [(False, [0, 1, 2]), (True, [2, 1, 0])])
@@ -54,17 +49,6 @@ def test_a_linear_network_gets_normalized_images_in_its_order_of_channels(bgr, o
     expected = (images * weight[order]).sum((1, 2, 3)) + offset
     # Each logit is a sum of 75 products.
     torch.testing.assert_close(logits, expected, rtol=0, atol=75 * 16 * EPS)
-
-
-def test_a_callable_is_a_classifier_of_the_images_as_they_are():
-    classifier = Classifier(mean_color, 8, COLORS, name="color")
-    images = random_images().requires_grad_()
-    assert torch.equal(classifier(images), images.mean((2, 3)))
-    (gradient,) = torch.autograd.grad(classifier(images)[:, 1].sum(), images)
-    expected = torch.zeros_like(images)
-    expected[:, 1] = 1 / 64
-    assert torch.equal(gradient, expected)
-    assert [classifier.label(name) for name in COLORS] == [0, 1, 2]
 
 
 def test_a_classifier_is_frozen_and_stays_in_eval_mode():

@@ -49,12 +49,6 @@ def test_a_cast_on_gray_keeps_a_part_of_its_logarithm(degree, left):
     np.testing.assert_allclose(np.log(means / means[1]), expected, atol=1e-9)
 
 
-def test_an_image_in_normalized_light_stays_as_it_is(radiance):
-    once = normalized(radiance, white_balance=1.0, level=0.5, percentile=100)
-    twice = normalized(once, white_balance=1.0, level=0.5, percentile=100)
-    np.testing.assert_allclose(twice, once, rtol=1e-9)
-
-
 def test_gamma_is_the_exponent_of_the_encoded_image(radiance):
     plain = srgb_of(normalized(radiance))
     powered = srgb_of(normalized(radiance, gamma=0.7))

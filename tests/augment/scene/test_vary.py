@@ -420,11 +420,6 @@ def linear_light(images: Tensor) -> Tensor:
     return decode(images, "srgb")
 
 
-def test_without_effects_the_render_is_unchanged():
-    # The draws are in single precision.
-    torch.testing.assert_close(photographed(), IMAGES, rtol=0, atol=1e-6)
-
-
 def test_a_pattern_multiplies_the_light_of_object_and_background():
     patterned = photographed(pattern_fraction=0.5, pattern_fill=[0.2, 0.2])
     ratio = linear_light(patterned) / linear_light(IMAGES)

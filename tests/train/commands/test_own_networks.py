@@ -84,19 +84,6 @@ def here(tmp_path) -> Path:
     return tmp_path
 
 
-def normalized_logits(network: nn.Module, images: Tensor) -> Tensor:
-    with torch.no_grad():
-        return network.eval()((images - MEAN) / STD)
-
-
-def test_a_state_dict_of_ten_classes_gives_the_networks_own_logits(here):
-    images = renders()[:4]
-    loaded = augment.load_classifier(f"torchvision:{NAME}", here / "mine.pth", list(CLASSES), SIZE)
-    expected = normalized_logits(trained_network(), images)
-    torch.testing.assert_close(loaded(images), expected, **ROUNDING)
-    assert (loaded.classes, loaded.size) == (CLASSES, SIZE)
-
-
 @pytest.mark.parametrize(
     "wrap",
     [

@@ -22,7 +22,7 @@ from augment.scene.scene import Scene
 from augment.tasks.classification import ClassCriterion
 from renderer.camera import orbit_cameras
 from renderer.light.environment import to_map
-from renderer.light.files import directional, mean_luminance
+from renderer.light.files import mean_luminance
 from renderer.light.harmonics import irradiance_error
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.skylight import ZENITH, coefficients
@@ -196,37 +196,8 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
     assert is_changed.double().mean() > 0.4
 
 
-def in_sunlight(scene: Scene) -> Scene:
-    """Light the scene by a sun, which degree 6 cuts off, so that it is negative in places."""
-    direction = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-    color = torch.full((3,), 0.3, dtype=torch.float64)
-    return scene.changed(lights=directional(direction, color))
-
-
 def norms(offsets: Tensor, norm: str) -> Tensor:
     return offsets.norm(dim=1) if norm == "l2" else offsets.abs().amax(1)
-
-
-@pytest.mark.parametrize(("norm", "radius"), [("linf", 0.05), ("l2", 0.4)])
-def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm, radius):
-    """The point q nearest to v has (v - q)·(p - q) ≤ 0 for all points p of the convex set."""
-    scene = in_sunlight(make_scene())
-    draws = torch.Generator().manual_seed(3)
-    light = make_parameter("lighting", scene, StepSettings(norm, radius), nonnegative=True)
-    assert not torch.equal(light.start, scene.lights.flatten(1))
-    values = light.start + 0.1 * float64_noise(3, 147, draws=draws)
-    nearest = light.project(values, EVERY)
-    offset = nearest - light.start
-    assert (norms(offset, norm) <= radius * (1 + 1e-9)).all()
-    torch.testing.assert_close(light.project_feasible(nearest), nearest, rtol=0, atol=TOLERANCE)
-
-    distance = (light.start - values).norm(dim=1)
-    others = [light.sample(draws), light.start, light.start + offset / 2]
-    for other in others:
-        product = ((values - nearest) * (other - nearest)).sum(1)
-        assert (product <= 1e-3 * distance * (other - nearest).norm(dim=1)).all()
-    again = light.project(nearest, EVERY)
-    torch.testing.assert_close(again, nearest, rtol=0, atol=10 * TOLERANCE)
 
 
 SKY_STARTS = st.tuples(st.floats(*ZENITH), st.floats(-400, 400), st.floats(*TURBIDITY))
