@@ -43,10 +43,6 @@ def rendered(shown: Scene, conditions: Conditions | None = None) -> Tensor:
     return shown.render(conditions or shown.conditions(BOTH), BOTH)
 
 
-def by_mean_color() -> augment.Classifier:
-    return augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
-
-
 @pytest.mark.parametrize("kind", LOCAL_LIGHTS.values())
 def test_each_kind_of_local_light_is_read_back_from_its_file(kind, tmp_path):
     basis, _ = build_local_light(LOCAL_LIGHT_SETTINGS[kind.name]())
@@ -108,7 +104,8 @@ def joint_attack(request, tmp_path_factory) -> tuple[augment.AttackResult, Adver
     steps["albedo"] = StepSettings("linf", 0.1, "sign", 0.05)
     settings = augment.AttackSettings(**steps, max_steps=3, backtracking=True)
     shown = scene(exposure=0.3, lamps=replace(LAMPS, radius=request.param))
-    done = augment.attack(by_mean_color(), shown, settings=settings, force=True)
+    by_mean_color = augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
+    done = augment.attack(by_mean_color, shown, settings=settings, force=True)
     before = done.images_in_views_before[0]
     written = Adversary.of(done.problem.scene, 0, done.conditions, before, done.images_in_views[0])
     folder = tmp_path_factory.mktemp("joint")

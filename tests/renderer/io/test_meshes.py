@@ -68,10 +68,6 @@ def write_ply(folder: Path) -> Path:
     return write(folder / "mesh.ply", PLY)
 
 
-def textured_material() -> PBRMaterial:
-    return PBRMaterial(baseColorTexture=Image.fromarray(TEXTURE))
-
-
 def write_gltf(folder: Path, image: dict[str, Any] | None = None) -> Path:
     """Write a textured square as .gltf that contains its buffers, by default beside peel.png."""
     gltf = Gltf()
@@ -105,7 +101,8 @@ UVS_OF_FRUIT = np.random.default_rng(2).random((8, 2))
 
 def fruit_and_leaf() -> trimesh.Scene:
     fruit = trimesh.creation.box()
-    fruit.visual = TextureVisuals(uv=UVS_OF_FRUIT, material=textured_material())
+    material = PBRMaterial(baseColorTexture=Image.fromarray(TEXTURE))
+    fruit.visual = TextureVisuals(uv=UVS_OF_FRUIT, material=material)
     leaf = trimesh.creation.box((0.2, 0.4, 0.6))
     leaf.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=COLOR_BYTES))
     mirrored = np.diag([-2.0, 1, 1, 1])

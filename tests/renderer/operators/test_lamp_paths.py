@@ -180,16 +180,12 @@ def irradiance_of_lamp(position, radius, points, normals) -> Tensor:
     return total.index_add(0, paths.point, paths.irradiance)
 
 
-def random_surfaces() -> tuple[Tensor, Tensor]:
-    return draw(500, 3), torch.nn.functional.normalize(draw(500, 3, seed=1))
-
-
 POSITION = [0.5, -0.3, 0.8]
 
 
 def test_a_small_disc_is_a_point_times_the_cosine_to_its_axis_and_dark_behind():
     """A disc faces the origin."""
-    points, normals = random_surfaces()
+    points, normals = draw(500, 3), torch.nn.functional.normalize(draw(500, 3, seed=1))
     position = torch.tensor(POSITION, dtype=torch.float64)
     to_lamp = position - points
     axis = position / position.norm()

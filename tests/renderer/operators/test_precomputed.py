@@ -89,11 +89,6 @@ def test_a_convex_mesh_has_the_operator_of_direct_light_to_the_bit(name, bounces
     assert torch.equal(shadowed.nonzero, nonzero_coefficients(6))
 
 
-def octahedron() -> Mesh:
-    hull = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)]))
-    return Mesh.plain(hull.vertices, hull.faces, crease=180)
-
-
 def points_on_octahedron(operator: TransferOperator, camera: OrthographicCamera) -> np.ndarray:
     size = operator.settings.size
     row, column = np.divmod(operator.pixels.numpy(), size)
@@ -109,7 +104,9 @@ def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive
     """The normal at a point p is p / |p|. Of a uniform sky, the face leaves (1 + cos) / 2."""
     monkeypatch.setattr(rays, "DIRECTIONS", 2**14)
     camera = OrthographicCamera(0, 0, 2.1)
-    operator = operator_of(octahedron(), camera, size=8, normals="smooth", bounces=2)
+    hull = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)]))
+    octahedron = Mesh.plain(hull.vertices, hull.faces, crease=180)
+    operator = operator_of(octahedron, camera, size=8, normals="smooth", bounces=2)
     points = points_on_octahedron(operator, camera)
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     face_normals = np.sign(points) / math.sqrt(3)

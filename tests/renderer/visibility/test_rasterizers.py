@@ -136,16 +136,13 @@ def depths() -> st.SearchStrategy[float]:
     return st.one_of(quarter, st.floats(-1.1, 1.1), FAR_AWAY)
 
 
-def nearly_equal_depths() -> st.SearchStrategy[float]:
-    return st.integers(-8, 8).map(lambda steps: steps / FAR / 4)
-
-
 @st.composite
 def small_images(draw) -> tuple[Scene, int]:
     """Draw faces that share edges, occur twice, have no area, are thin, tiny, huge or outside."""
     resolution = draw(st.sampled_from([1, 2, 7, 21]))
     coordinate = coordinates(resolution)
-    depth = draw(st.sampled_from([depths(), nearly_equal_depths()]))
+    nearly_equal = st.integers(-8, 8).map(lambda steps: steps / FAR / 4)
+    depth = draw(st.sampled_from([depths(), nearly_equal]))
     point = st.tuples(coordinate, coordinate, depth)
     points = draw(st.lists(point, min_size=3, max_size=9))
     corner = st.integers(0, len(points) - 1)

@@ -252,10 +252,6 @@ def start_sweep(folder: Path, *overrides: str) -> subprocess.Popen:
         return subprocess.Popen(command, **options)
 
 
-def child_of(process_id: int) -> int:
-    return int(Path(f"/proc/{process_id}/task/{process_id}/children").read_text())
-
-
 @pytest.mark.slow
 def test_a_preempted_job_of_submitit_queues_itself_again_and_ends_with_the_same_weights(
     run_sweep, folder_of, tiny_npz, tmp_path
@@ -271,7 +267,8 @@ def test_a_preempted_job_of_submitit_queues_itself_again_and_ends_with_the_same_
         time.sleep(0.05)
         log = next(tmp_path.glob("jobs/.submitit/*/*_log.out"), log)
     controller, _, _ = log.name.partition("_")
-    os.kill(child_of(int(controller)), signal.SIGUSR2)
+    child = Path(f"/proc/{controller}/task/{controller}/children").read_text()
+    os.kill(int(child), signal.SIGUSR2)
     assert process.wait(300) == 0
     assert "Requeued job" in log.read_text()
     assert "resumed" in log.read_text()

@@ -188,11 +188,9 @@ def test_a_large_jpeg_decoded_small_equals_one_decoded_in_full(tmp_path):
 @pytest.mark.parametrize(
     ("name", "image", "options", "expected"),
     [
-        ("gray.png", Image.new("L", (40, 40), 100), {}, (100, 100, 100)),
         ("color-key.png", plain((10, 20, 30)), {"transparency": (10, 20, 30)}, (255, 255, 255)),
         ("alpha.png", Image.new("RGBA", (40, 40), (255, 0, 0, 51)), {}, (255, 204, 204)),
         ("cmyk.jpg", Image.new("CMYK", (40, 40), (0, 255, 255, 0)), {"quality": 100}, (255, 0, 0)),
-        ("sixteen.png", Image.fromarray(np.full((40, 40), 0x80C0, np.uint16)), {}, (128, 128, 128)),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
