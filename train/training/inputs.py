@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from augment import distributed
 from augment.classifier import TaskNetwork, class_index
+from augment.dim import DIM_NAME
 from augment.files import as_facts, is_network_file, name_from_anywhere, require_no_facts
 from augment.network import FROM_FILE, YOU, Inputs, without_normalized_light
 from augment.progress import Phases
@@ -103,6 +104,8 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     name = settings.network
     if not name:
         return None
+    if name.startswith(DIM_NAME):
+        raise InputError(f"network={name} has two networks: train one of them", "network")
     # A classifier comes from a library or a file. Any other name is the folder of a training run.
     if checkpoints.is_classifier(name):
         return _load_classifier(settings, name)
