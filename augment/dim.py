@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from augment.network import percentiles
@@ -19,11 +19,14 @@ DIM = 0.25
 DIM_NAME = "dim:"
 
 
-class DimSwitch(nn.Module):
-    """Network that shows dim images to another network.
+def are_dim(images: Float[Tensor, "N 3 H W"], below: float = DIM) -> Bool[Tensor, " N"]:
+    """Return whether the 98th percentile of the linear values of each image is below a limit."""
+    linear = decode(clamp(images.detach()), "srgb")
+    return percentiles(linear, DIM_PERCENTILE) < below
 
-    An image is dim if the 98th percentile of its linear values is below `below`.
-    """
+
+class DimSwitch(nn.Module):
+    """Network that shows dim images to another network."""
 
     def __init__(self, network: nn.Module, dim: nn.Module, below: float):
         super().__init__()
@@ -31,8 +34,7 @@ class DimSwitch(nn.Module):
         self.training = network.training
 
     def forward(self, images: Tensor) -> Any:
-        linear = decode(clamp(images.detach()), "srgb")
-        is_dim = percentiles(linear, DIM_PERCENTILE) < self.below
+        is_dim = are_dim(images, self.below)
         if not is_dim.any():
             return self.network(images)
         if is_dim.all():
@@ -42,7 +44,7 @@ class DimSwitch(nn.Module):
         return _joined([self.network(images[~is_dim]), self.dim(images[is_dim])], places)
 
     def extra_repr(self) -> str:
-        """Write the limit, so that stored logits of different networks have different keys."""
+        """Write the limit, on which the keys of stored logits depend."""
         return f"below={self.below}"
 
 

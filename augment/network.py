@@ -34,7 +34,7 @@ ROUNDED = 1e-3
 MAX_DEVIATION = 0.01
 # Smallest sRGB value above black in an image of 8 bits. Below it, the gamma curve is a line.
 DARKEST_ENCODED = 1 / 255
-# Its linear value, the lowest brightness from which images are brightened: black stays black.
+# Linear value of this sRGB value. Images are brightened as if they were at least this bright.
 DARKEST = DARKEST_ENCODED / 12.92
 # Who states a fact about the images, besides the library that published the network.
 YOU, FILE, NETWORK, DATA = "you", "the file", "the network", "the training images"
@@ -249,7 +249,7 @@ def normalize_light(images: Float[Tensor, "N 3 H W"], settings: NormalizedLightS
 
     1. White balance: each channel is multiplied by (m / m_c)^`white_balance`. Here, m_c is the
        mean of the channel, and m is the mean of all channels.
-    2. Exposure: a factor maps the given percentile of all values to `level`. Those above 1 are
+    2. Exposure: a factor maps the given percentile of all values to `level`. Values above 1 are
        clipped.
     3. Encoding: the sRGB curve, and then the exponent `gamma`.
 

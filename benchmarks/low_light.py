@@ -7,8 +7,8 @@ Run it as a module in the root of the repository, after `pip install ".[ecosyste
 DATA has weights/ (fastestdet_coco.onnx, coco.names), photographs of anything for the training
 (imagenet_samples/ and photos/), and for the scores alone real_light/low_light_detection/ with boxes
 in a COCO file. Of imagenet_samples, every tenth photograph is held out: the network should find
-there what the original finds. Half of the training images come from the folder --objects, whose
-photographs show the objects in ordinary light. The trained network sees dim images alone.
+there what the original finds. The folder --objects has further photographs for the training, which
+show the objects in ordinary light. The trained network sees dim images alone.
 """
 
 import argparse

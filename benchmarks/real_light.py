@@ -36,10 +36,9 @@ from scipy.stats import spearmanr
 
 import norm_balls as nb
 from augment.classifier import Classifier
-from augment.dim import DIM, DIM_NAME, DIM_PERCENTILE
-from augment.network import percentiles
-from renderer.image import decode, to_unit
-from renderer.io.images import crop_center, read_rgb, write_image
+from augment.dim import DIM_NAME, are_dim
+from renderer.image import to_unit
+from renderer.io.images import SUFFIXES, crop_center, read_rgb, write_image
 from train.checkpoints import RUN, is_classifier, load_network, load_run
 from train.data.photo import Photograph
 from train.data.photographs import find_photographs, load_photographs
@@ -375,10 +374,11 @@ def count_dim(options: argparse.Namespace) -> None:
     paths = sorted(path for folder in options.folders for path in folder.rglob("*.*"))
     counts = [0, 0]
     for path in paths:
-        if path.suffix.lower() in {".jpg", ".jpeg", ".png"}:
+        if path.suffix.lower() in SUFFIXES:
             square = crop_center(read_rgb(path, options.size), options.size)
-            linear = decode(to_unit(torch.tensor(np.array(square))).permute(2, 0, 1), "srgb")
-            counts[0] += bool(percentiles(linear[None], DIM_PERCENTILE) < DIM)
+            counts[0] += bool(
+                are_dim(to_unit(torch.tensor(np.array(square))).permute(2, 0, 1)[None])
+            )
             counts[1] += 1
     print(f"{counts[0]} of {counts[1]} photographs are dim")
 

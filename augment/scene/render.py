@@ -340,7 +340,7 @@ class DirectRenderer:
                 self._views.clear()
             mesh = self.objects[object_index].mesh
             vertices = torch.as_tensor(mesh.vertices, device=self.like.device)
-            shown = (object_index, camera, vertices, self.settings.samples)
+            shown = (object_index, camera, vertices, self.settings)
             self._views[key] = self._rasterize(*shown)
         return self._views[key]
 
@@ -430,7 +430,7 @@ class DirectRenderer:
         mesh = self.objects[object_index].mesh
         if vertices is None:
             return mesh, self.view(object_index, camera)[0].to("cpu")
-        fragments, _ = self._rasterize(object_index, camera, vertices, self.settings.samples)
+        fragments, _ = self._rasterize(object_index, camera, vertices, self.settings)
         return _moved(mesh, vertices), fragments.to("cpu")
 
     def radiance(
@@ -455,10 +455,11 @@ class DirectRenderer:
         moved = changed.vertices
         # Without shadows, the images of a search are not rendered again, so they are no drafts.
         has_draft = is_draft and moved is not None and self.settings.global_illumination
-        samples = min(self.settings.samples, DRAFT_SAMPLES) if has_draft else self.settings.samples
-        settings = replace(self.settings, samples=samples)
+        settings = self.settings
+        if has_draft:
+            settings = replace(settings, samples=min(settings.samples, DRAFT_SAMPLES))
         seen = object_index, fixed_camera
-        rasterized = self.view(*seen) if moved is None else self._rasterize(*seen, moved, samples)
+        rasterized = self.view(*seen) if moved is None else self._rasterize(*seen, moved, settings)
         fragments, albedo = rasterized
         if changed.albedo is not None:
             of_view = (item.mesh, fragments, settings.encoding, item.albedo_scale)
@@ -486,7 +487,7 @@ class DirectRenderer:
                 shown = rasterized
                 if not np.array_equal(frozen.mesh.vertices, positions):
                     vertices = torch.as_tensor(frozen.mesh.vertices, device=self.like.device)
-                    shown = self._rasterize(object_index, fixed_camera, vertices, samples)
+                    shown = self._rasterize(object_index, fixed_camera, vertices, settings)
                 frozen.add(view, *shown, light if self.one_light else None)
             added = frozen.radiance(view, fragments, albedo, light)
             # A camera whose fields are tensors is attacked, so it differs in each call. Its views
@@ -539,10 +540,13 @@ class DirectRenderer:
         return frozen
 
     def _rasterize(
-        self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"], samples: int
+        self,
+        object_index: int,
+        camera: Camera,
+        vertices: Float[Tensor, "V 3"],
+        settings: ImageSettings,
     ) -> tuple[Fragments, Tensor]:
         """Find the samples that show an object with given vertices, and their albedo (S, 3)."""
-        settings = replace(self.settings, samples=samples)
         item = self.objects[object_index]
         shown = (vertices, item.mesh.faces, [camera], settings, self.rasterizer)
         [fragments] = build_fragments(*shown, closed=item.mesh.closed)

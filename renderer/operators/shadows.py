@@ -201,8 +201,11 @@ class Transport:
         # consist.
         self._patches = Patches.from_mesh(mesh) if settings.bounces else None
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
-        self._ray_count = max(rays.DIRECTIONS, rays.DIRECTIONS_PER_SAMPLE * settings.samples**2)
-        self._basis = basis
+        ray_count = max(rays.DIRECTIONS, rays.DIRECTIONS_PER_SAMPLE * settings.samples**2)
+        # Ray directions of an exact image, and of a draft.
+        self._directions = [rays.sphere(count) for count in (ray_count, rays.DRAFT_DIRECTIONS)]
+        # Radiance of the sky: one row for each ray direction, one column for each SH coefficient.
+        self._skies = [basis.radiance(directions) for directions in self._directions]
         self.has_colored_light = False
         if self._patches:
             # Radiance that the patches send, with the axes: patch, SH coefficient, color. The
@@ -232,7 +235,7 @@ class Transport:
             return radiance if light is None else radiance @ light[:, channel, None]
 
         change = None
-        directions = rays.sphere(rays.DRAFT_DIRECTIONS if is_draft else self._ray_count)
+        directions, sky = self._directions[is_draft], self._skies[is_draft]
         fragments = surface.fragments
         gloss = surface.gloss
         # Albedo divided by the number of samples of a pixel: one row for each channel, one
@@ -243,8 +246,6 @@ class Transport:
             diffuse_factor = gloss.diffuse_factor(surface.normals, surface.toward)
             diffuse_albedo = albedo_by_channel * diffuse_factor
         channels = range(len(albedo_by_channel))
-        # Radiance of the sky: one row for each ray direction, one column for each SH coefficient.
-        sky = self._basis.radiance(directions)
         skies = [in_light(sky, channel) for channel in channels]
         if self._patches:
             colors = self._sent.expand(-1, -1, len(channels)).unbind(2)
