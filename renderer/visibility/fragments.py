@@ -347,54 +347,67 @@ def build_fragments(
         points = points.double() if points.is_cuda else points.cpu().double().numpy()
     # Axes: camera, coordinate, vertex. In this order, each coordinate is contiguous in
     # memory.
-    projected = torch.stack([torch.as_tensor(c.project(points)).T for c in cameras]).mT
+    coordinates = torch.stack([torch.as_tensor(c.project(points)).T for c in cameras])
+    projected = coordinates.mT
     # The third coordinate is the depth. It is less than -1 in front of the near plane,
     # which would cut the mesh open.
     is_uncut = bool((projected[..., 2] >= -1).all())
     shape = tuple(side * settings.samples for side in settings.shape)
     face_ids = rasterizer.rasterize(projected, faces, shape, closed and is_uncut)
     all_faces = torch.as_tensor(faces, device=projected.device)
-    # Order in which the samples of a pixel follow each other.
-    order = _samples_by_pixel(settings.shape, settings.samples, face_ids.device)
     views = []
     for camera, view_points, view_ids in zip(cameras, projected, face_ids, strict=True):
         depths = camera.depths(points)
-        ids_by_pixel = view_ids.flatten().index_select(0, order)
-        is_covered = ids_by_pixel >= 0
-        covered = is_covered.nonzero().squeeze(1)
-        # Number of covered samples of each pixel.
-        counts_of_all_pixels = is_covered.view(-1, settings.samples**2).sum(1)
-        pixels = counts_of_all_pixels.nonzero().squeeze(1)
-        sample_count = counts_of_all_pixels.index_select(0, pixels)
-        shown = ids_by_pixel.index_select(0, covered).long()
-        is_seen = torch.zeros(len(all_faces), dtype=torch.bool, device=all_faces.device)
-        is_seen.index_fill_(0, shown, True)
-        # One row for each corner, one column for each seen face. Rows are contiguous in
-        # memory, because later code reads all first corners together.
-        seen_faces = is_seen.nonzero().squeeze(1)
-        corners = all_faces.index_select(0, seen_faces).T.contiguous()
-        # Axes: coordinates x and y, corner, seen face.
-        outlines = view_points.T[:2].index_select(1, corners.flatten()).unflatten(1, (3, -1))
-        (ax, bx, cx), (ay, by, cy) = outlines
-        # A face is seen from behind if its corners are clockwise in the image.
-        is_seen_from_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
-        view = Fragments(
-            shape=settings.shape,
-            samples=settings.samples,
-            pixels=pixels,
-            coverage=sample_count.double() / settings.samples**2,
-            faces=seen_faces,
-            corners=corners.T,
-            facing=torch.where(is_seen_from_behind, -1.0, 1.0).double()[:, None],
-            outlines=outlines.permute(2, 1, 0),
-            sample_to_pixel=torch.repeat_interleave(sample_count, output_size=len(covered)),
-            sample_to_seen_face=(is_seen.cumsum(0) - 1).index_select(0, shown),
-            sample_numbers=order.index_select(0, covered),
-            depths=None if depths is None else torch.as_tensor(depths)[corners].T,
-            camera=camera,
-        )
-        views.append(view)
+        depths = None if depths is None else torch.as_tensor(depths)
+        views.append(_fragments_of_view(camera, view_points, depths, view_ids, all_faces, settings))
     return views
+
+
+def _fragments_of_view(
+    camera: Camera,
+    projected: Float[Tensor, "V 3"],
+    depths: Float[Tensor, " V"] | None,
+    face_ids: Int[Tensor, "_ _"],
+    faces: Int[Tensor, "F 3"],
+    settings: ImageSettings,
+) -> Fragments:
+    """Create fragments from face indices (-1: no face) and depths (None: no perspective)."""
+    # Order in which the samples of a pixel follow each other.
+    order = _samples_by_pixel(settings.shape, settings.samples, face_ids.device)
+    ids_by_pixel = face_ids.flatten().index_select(0, order)
+    is_covered = ids_by_pixel >= 0
+    covered = is_covered.nonzero().squeeze(1)
+    # Number of covered samples of each pixel.
+    counts_of_all_pixels = is_covered.view(-1, settings.samples**2).sum(1)
+    pixels = counts_of_all_pixels.nonzero().squeeze(1)
+    sample_count = counts_of_all_pixels.index_select(0, pixels)
+    shown = ids_by_pixel.index_select(0, covered).long()
+    is_seen = torch.zeros(len(faces), dtype=torch.bool, device=faces.device)
+    is_seen.index_fill_(0, shown, True)
+    # One row for each corner, one column for each seen face. Rows are contiguous in
+    # memory, because later code reads all first corners together.
+    seen_faces = is_seen.nonzero().squeeze(1)
+    corners = faces.index_select(0, seen_faces).T.contiguous()
+    # Axes: coordinates x and y, corner, seen face.
+    outlines = projected.T[:2].index_select(1, corners.flatten()).unflatten(1, (3, -1))
+    (ax, bx, cx), (ay, by, cy) = outlines
+    # A face is seen from behind if its corners are clockwise in the image.
+    is_seen_from_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
+    return Fragments(
+        shape=settings.shape,
+        samples=settings.samples,
+        pixels=pixels,
+        coverage=sample_count.double() / settings.samples**2,
+        faces=seen_faces,
+        corners=corners.T,
+        facing=torch.where(is_seen_from_behind, -1.0, 1.0).double()[:, None],
+        outlines=outlines.permute(2, 1, 0),
+        sample_to_pixel=torch.repeat_interleave(sample_count, output_size=len(covered)),
+        sample_to_seen_face=(is_seen.cumsum(0) - 1).index_select(0, shown),
+        sample_numbers=order.index_select(0, covered),
+        depths=None if depths is None else depths[corners].T,
+        camera=camera,
+    )
 
 
 @lru_cache(maxsize=2)
