@@ -28,7 +28,7 @@ Row = dict[str, Any]
 # A call that takes fewer seconds is repeated until the repeats take this long
 # together, because a single short call drowns in the noise of the clock.
 MIN_TIMED_SECONDS = 2e-3
-# A comparison stops after this many seconds, but not before MIN_ROUNDS.
+# A comparison stops by default after this many seconds, but not before MIN_ROUNDS.
 MAX_COMPARISON_SECONDS = 20.0
 MIN_ROUNDS = 3
 
@@ -69,12 +69,15 @@ def medians(
 
 
 def times_in_turn(
-    calls: Mapping[Key, Callable[[], object]], rounds: int, device: str = "cpu"
+    calls: Mapping[Key, Callable[[], object]],
+    rounds: int,
+    device: str = "cpu",
+    seconds: float = MAX_COMPARISON_SECONDS,
 ) -> dict[Key, list[float]]:
     """Measure every call once per round, on one thread.
 
     The calls take turns, so that noise affects all of them alike. A comparison
-    that takes more than 20 seconds ends before its last round.
+    ends before its last round if it takes too long.
 
     Args:
         calls: Calls to measure, by name.
@@ -83,6 +86,8 @@ def times_in_turn(
             clock is the time of this process, which leaves out other processes
             on a shared machine. On a GPU, it is the wall time after
             synchronization.
+        seconds: Time after which no further round begins, except of the first
+            MIN_ROUNDS.
 
     Returns:
         Time of each call in each round in milliseconds.
@@ -93,7 +98,7 @@ def times_in_turn(
     start = now()
     times: dict[Key, list[float]] = {key: [] for key in calls}
     for finished_rounds in range(rounds):
-        if finished_rounds >= MIN_ROUNDS and now() - start > MAX_COMPARISON_SECONDS:
+        if finished_rounds >= MIN_ROUNDS and now() - start > seconds:
             break
         for key, timer in timers.items():
             # Each measurement begins with calls that warm up and do not count.
@@ -136,10 +141,14 @@ def quartiles_of_ratio(
         First quartile, median and third quartile of `times / reference_times`.
     """
     pairs = zip(times, reference_times, strict=True)
-    ratios = [time / reference for time, reference in pairs]
-    if len(ratios) == 1:
-        return ratios[0], ratios[0], ratios[0]
-    low, middle, high = statistics.quantiles(ratios, n=4, method="inclusive")
+    return quartiles([time / reference for time, reference in pairs])
+
+
+def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+    """Compute the first quartile, the median and the third quartile of at least one value."""
+    if len(values) == 1:
+        return values[0], values[0], values[0]
+    low, middle, high = statistics.quantiles(values, n=4, method="inclusive")
     return low, middle, high
 
 

@@ -40,8 +40,10 @@ from torch import Tensor
 
 from benchmarks import common
 from benchmarks.common import Row, quartiles_of_ratio, record, relative_error, times_in_turn
+from benchmarks.scene import Contender, View, coefficients
+from benchmarks.steps import LightStep
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
-from renderer.light.basis import HARMONICS, Basis
+from renderer.light.basis import DEGREE, HARMONICS, Basis
 from renderer.light.environment import write_map
 from renderer.light.files import load_light
 from renderer.light.lamps import Lamps, Projector
@@ -88,6 +90,13 @@ LOCAL_LIGHT_SAMPLES = Samples(measured=2, converged=64)
 # Samples per side of a pixel in the table of errors by the number of samples.
 SAMPLES = (2, 4, 8, 16)
 CONVERGED_SAMPLES = 32
+
+# Ray directions of a pixel that `shadow_builds` compares, and the most of them for each sample.
+DIRECTIONS = (128, 512, 2048, 8192)
+MAX_DIRECTIONS_PER_SAMPLE = 128
+# Most samples per side of an image, and ray directions of a pixel, of their reference.
+CONVERGED_RESOLUTION = 4096
+CONVERGED_DIRECTIONS = 2**15
 
 
 @dataclass(frozen=True)
@@ -326,6 +335,30 @@ def gradient_by_light(operator: TransferOperator, light: Tensor) -> Tensor:
     generator = torch.Generator().manual_seed(0)
     weights = torch.randn(3, operator.settings.size**2, generator=generator)
     return operator.light_gradient(weights[:, operator.pixels])
+
+
+def shadow_builds(view: View) -> Iterator[Contender]:
+    """Yield the building of an operator of a cup with shadows, by samples and ray directions."""
+    view = replace(view, mesh=subdivide(normalize(solid("cup", 0)), 4000))
+    light = coefficients(DEGREE, torch.float32, view.device)
+    samples = min(CONVERGED_SAMPLES, CONVERGED_RESOLUTION // view.size)
+    exact = LightStep(view, build_shadows(view, samples, CONVERGED_DIRECTIONS), light)()
+    pixels = torch.arange(view.size**2)
+    exact = replace(exact, pixels=pixels, radiance=exact.image(len(pixels)))
+    for samples, directions in product((1, *SAMPLES), DIRECTIONS):
+        if not 1 <= directions / samples**2 <= MAX_DIRECTIONS_PER_SAMPLE:
+            continue
+        if 2 * samples * view.size > CONVERGED_RESOLUTION:
+            continue
+        build = partial(build_shadows, view, samples, directions)
+        step = LightStep(view, build(), light)
+        yield Contender(f"{directions:,} directions", samples, DEGREE, step, build, exact)
+
+
+def build_shadows(view: View, samples: int, directions: int) -> TransferOperator:
+    """Build an operator with shadows whose samples divide some ray directions of each pixel."""
+    with patch.multiple(rays, DIRECTIONS=directions, DIRECTIONS_PER_SAMPLE=1):
+        return view.operator(samples, shadows=True)
 
 
 # ---------------------------------------------------------------------------- Mitsuba

@@ -12,6 +12,15 @@ the difference, divided by the root mean square of the reference. They are
 measured on the radiance before clamping, and on the gradient of
 Σ image × normal random numbers, with visibility fixed.
 
+The panel "rasterizing" times each rasterizer. The panel "shadows" times the
+building of operators of a cup with shadows (`benchmarks.lights`), and its
+reference has more samples and ray directions. The panel "random light" times
+`nb.RandomLighting` for one image (`benchmarks.transforms`), and its reference is
+the same formula in float64. These panels alone, with all other rows kept, take
+some minutes:
+
+    python -m benchmarks.renderer --panels rasterizing shadows "random light" --seconds 60
+
 Whole light steps (an image with background and clamp, a loss, and the loss's
 gradient by the light) are timed beside autograd code that keeps all it can
 (`benchmarks.peer`) and beside the operator's step written out by hand, for two
@@ -23,11 +32,13 @@ takes a few minutes:
 """
 
 import argparse
+import csv
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, product
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -36,13 +47,15 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks import common, scene
-from benchmarks.common import Row, machine, medians, write_csv
+from benchmarks.common import Row, machine, quartiles, times_in_turn, write_csv
+from benchmarks.lights import shadow_builds
 from benchmarks.peer import Peer
 from benchmarks.savings import measure_savings
 from benchmarks.scene import (
     BACKGROUND,
     CAMERA,
     SAMPLES,
+    Contender,
     Converged,
     MitsubaStep,
     Result,
@@ -51,7 +64,9 @@ from benchmarks.scene import (
     coefficients,
 )
 from benchmarks.steps import ANALYTIC, SHADINGS, LightStep, VertexStep, shade_by_face
+from benchmarks.transforms import random_lights
 from benchmarks.whole_steps import measure_many_views, measure_whole_steps
+from renderer.errors import InputError
 from renderer.light.basis import DEGREE
 from renderer.mesh import Mesh
 from renderer.settings import RASTERIZERS
@@ -70,34 +85,11 @@ MAX_AUTOGRAD_SAMPLES = 2
 PANELS_PER_ROW = 4
 
 
-@dataclass(frozen=True)
-class Contender:
-    """A method that renders the image and computes the gradient.
-
-    Attributes:
-        setting: Name of the method with its settings.
-        samples: Samples per side of a pixel.
-        degree: Degree of the light's harmonics.
-        step: Step whose errors are measured.
-        call: Call whose time is measured.
-    """
-
-    setting: str
-    samples: int
-    degree: int
-    step: Step
-    call: Callable[[], object]
-
-
 # ---------------------------------------------------------------------------- contenders
 
 
 def light_steps(view: View) -> Iterator[Contender]:
-    """Yield a step of an attack on the light for each degree and type of the operator.
-
-    Args:
-        view: View to render.
-    """
+    """Yield a step of an attack on the light for each degree and type of the operator."""
     for degree, (name, dtype) in product(DEGREES, DTYPES.items()):
         light_dtype = torch.promote_types(dtype, torch.float32)
         light = coefficients(degree, light_dtype, view.device)
@@ -108,11 +100,7 @@ def light_steps(view: View) -> Iterator[Contender]:
 
 
 def builds(view: View) -> Iterator[Contender]:
-    """Yield the building of an operator for each number of samples and degree.
-
-    Args:
-        view: View to render.
-    """
+    """Yield the building of an operator for each number of samples and degree."""
     for samples, degree in product(SAMPLES_PER_SIDE, DEGREES):
         build = partial(view.operator, samples, degree)
         light = coefficients(degree, torch.float32, view.device)
@@ -130,9 +118,6 @@ def light_gradients(view: View) -> Iterator[Contender]:
 
     The first is the operator. The others are plain autograd, which computes
     more and more once and keeps it.
-
-    Args:
-        view: View to render.
     """
     step: Step = OperatorGradient(view)
     yield Contender("operator", SAMPLES, DEGREE, step, step)
@@ -143,11 +128,7 @@ def light_gradients(view: View) -> Iterator[Contender]:
 
 
 class OperatorGradient:
-    """Radiance, and the gradient of the loss by the light from the operator itself.
-
-    Args:
-        view: View to render.
-    """
+    """Radiance, and the gradient of the loss by the light from the operator itself."""
 
     def __init__(self, view: View):
         self.operator = view.operator()
@@ -256,9 +237,6 @@ def vertex_gradients(view: View) -> Iterator[Contender]:
 
     Their gradients are analytic or from plain autograd. The mesh is rasterized
     in every step or, with one sample per pixel, also once for all steps.
-
-    Args:
-        view: View to render.
     """
     light = coefficients(DEGREE, torch.float32, view.device)
     for samples, (name, shade) in product(SAMPLES_PER_SIDE, SHADINGS.items()):
@@ -273,6 +251,27 @@ def vertex_gradients(view: View) -> Iterator[Contender]:
             yield Contender(f"{name}, visibility cached", samples, DEGREE, step, step)
 
 
+def rasterizers(view: View) -> Iterator[Contender]:
+    """Yield each rasterizer that works here, with each number of samples.
+
+    Points are on the device of the view, so the time on a GPU includes copies to the CPU.
+    """
+    points = torch.from_numpy(CAMERA.project(view.mesh.vertices))[None].to(view.device)
+    light = coefficients(DEGREE, torch.float32, view.device)
+    found = []
+    for name in RASTERIZERS:
+        with suppress(InputError):
+            found += [choose(name)] if name != "auto" else []
+    for rasterizer, samples in product(found, SAMPLES_PER_SIDE):
+        operator = replace(view, rasterizer=rasterizer).operator(samples)
+        resolution = view.size * samples
+        call = partial(
+            rasterizer.rasterize, points, view.mesh.faces, resolution, closed=view.mesh.closed
+        )
+        step = LightStep(view, operator, light)
+        yield Contender(rasterizer.name, samples, DEGREE, step, call)
+
+
 # ---------------------------------------------------------------------------- panels
 
 
@@ -283,17 +282,19 @@ class Panel:
     Attributes:
         contenders: Function that yields the contenders for a view.
         irradiance: Irradiance of the converged reference: a function from unit
-            normals (N, 3) to irradiance (N, 3).
+            normals (N, 3) to irradiance (N, 3). None if contenders have references.
         is_by_vertices: Whether the gradient is by the vertices, and not by the
             light.
         mitsuba_parameter: Mitsuba's name of what the gradient is by. None if
             the panel has no row of Mitsuba.
+        has_front: Whether all contenders do the same work.
     """
 
     contenders: Callable[[View], Iterator[Contender]]
-    irradiance: Callable[[Tensor], Tensor]
+    irradiance: Callable[[Tensor], Tensor] | None = None
     is_by_vertices: bool = False
     mitsuba_parameter: str | None = None
+    has_front: bool = True
 
 
 PANELS = {
@@ -308,6 +309,9 @@ PANELS = {
         is_by_vertices=True,
         mitsuba_parameter="mesh.vertex_positions",
     ),
+    "rasterizing": Panel(rasterizers, scene.cut_irradiance),
+    "shadows": Panel(shadow_builds),
+    "random light": Panel(random_lights, has_front=False),
 }
 
 # Names of the contenders that pnb-train uses by default, with SAMPLES per side
@@ -317,10 +321,12 @@ TRAINING_SETTINGS = {
     f"degree {DEGREE}, float32",
     f"{ANALYTIC}, rasterized in every step",
     f"{SAMPLES}² samples, degree {DEGREE}",
+    "numba",
+    "2,048 directions",
 }
 
 
-def measure(title: str, view: View, rounds: int, with_mitsuba: bool) -> list[Row]:
+def measure(title: str, view: View, rounds: int, with_mitsuba: bool, seconds: float) -> list[Row]:
     """Measure the time and the errors of all contenders of a panel.
 
     Args:
@@ -328,13 +334,18 @@ def measure(title: str, view: View, rounds: int, with_mitsuba: bool) -> list[Row
         view: View to render.
         rounds: Number of rounds.
         with_mitsuba: Whether Mitsuba 3 is a contender, too.
+        seconds: Time after which no further round begins.
 
     Returns:
-        A row for each contender, with the column "front" of `mark_front`.
+        A row for each contender, with the column "front" of `mark_front`, and the quartiles of
+        the time.
     """
     panel = PANELS[title]
-    exact = Converged(view, panel.irradiance)
-    exact_gradient = exact.by_vertices if panel.is_by_vertices else exact.by_light
+    exact = None
+    if panel.irradiance is not None:
+        converged = Converged(view, panel.irradiance)
+        gradient = converged.by_vertices if panel.is_by_vertices else converged.by_light
+        exact = Result(torch.arange(view.size**2), converged.image, gradient)
     contenders = list(panel.contenders(view))
     if with_mitsuba and panel.mitsuba_parameter is not None:
         step = MitsubaStep(view, panel.mitsuba_parameter)
@@ -342,11 +353,13 @@ def measure(title: str, view: View, rounds: int, with_mitsuba: bool) -> list[Row
     rows: list[Row] = []
     for contender in contenders:
         row = describe_contender(contender, f"{title}, {view.size}²", view.size)
-        rows.append(row | exact.errors(contender.step, exact_gradient))
+        rows.append(row | contender.step().errors(contender.exact or exact))
     calls = {index: contender.call for index, contender in enumerate(contenders)}
-    for index, milliseconds in medians(calls, rounds, view.device).items():
-        rows[index]["time_ms"] = milliseconds
-    mark_front(rows)
+    for index, times in times_in_turn(calls, rounds, view.device, seconds).items():
+        low, middle, high = quartiles(times)
+        rows[index] |= {"time_ms": middle, "time_ms_low": low, "time_ms_high": high}
+    if panel.has_front:
+        mark_front(rows)
     print(f"{title}, {view.size}²: {len(rows)} settings", flush=True)
     return rows
 
@@ -366,7 +379,7 @@ def describe_contender(contender: Contender, panel: str, size: int) -> Row:
         # None keeps the place of the column until the time is measured.
         "time_ms": None,
         "degree": contender.degree,
-        "samples": contender.samples**2,
+        "samples": contender.samples and contender.samples**2,
         "size": size,
         "pnb-train": of_training,
     }
@@ -377,9 +390,6 @@ def mark_front(rows: Sequence[Row]) -> None:
 
     Another contender beats it with a smaller time and no larger error, or with a
     smaller error and no larger time.
-
-    Args:
-        rows: Rows with their times and errors, which are changed.
     """
     points = [(row["time_ms"], error_of(row)) for row in rows]
     for row, point in zip(rows, points, strict=True):
@@ -393,7 +403,7 @@ def error_of(row: Row) -> float:
 
     The reference is not accurate enough for more digits.
     """
-    largest = max(row["image_error"], row["gradient_error"])
+    largest = max(row["image_error"], row.get("gradient_error", 0.0))
     return float(f"{largest:.3g}")
 
 
@@ -419,43 +429,72 @@ STYLES = {"front": Style("k-", 5, 3), "pnb-train": Style("r*", 14, 3)}
 OTHER_STYLE = Style("o", 5, 2)
 
 
-def draw(path: Path, panels: Sequence[Sequence[Row]]) -> None:
-    """Draw the time and the error of all settings, with axes for each panel.
+def read_rows(path: Path) -> list[Row]:
+    """Read rows of measurements as text, without the columns that they lack."""
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return [{name: text for name, text in row.items() if text} for row in rows]
 
-    Args:
-        path: File to write.
-        panels: Rows of each panel.
-    """
+
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    """Draw the time and the error of all settings, with axes for each panel and size."""
+    panels: list[list[Row]] = []
+    for title in PANELS:
+        of_title = [row for row in rows if row["panel"].rpartition(", ")[0] == title]
+        for size in dict.fromkeys(row["panel"] for row in of_title):
+            panels.append([parse_row(row) for row in of_title if row["panel"] == size])
     row_count = -(-len(panels) // PANELS_PER_ROW)
-    figure = Figure(figsize=(24, 6 * row_count), layout="constrained")
+    figure = Figure(figsize=(20, 5 * row_count), layout="constrained")
     all_axes = figure.subplots(row_count, PANELS_PER_ROW, squeeze=False)
-    for axes, rows in zip(all_axes.flat, panels, strict=False):
-        draw_panel(axes, rows)
-    figure.savefig(path, dpi=100)
+    for axes in all_axes.flat[len(panels) :]:
+        axes.set_axis_off()
+    for axes, panel in zip(all_axes.flat, panels, strict=False):
+        draw_panel(axes, panel)
+    figure.savefig(path, dpi=120)
+
+
+def parse_row(row: Row) -> Row:
+    """Convert the columns that are drawn from text."""
+    numbers = ("time_ms", "image_error", "gradient_error")
+    marks = ("front", "pnb-train")
+    return (
+        row
+        | {name: float(row[name]) for name in numbers if name in row}
+        | {name: row.get(name) == "True" for name in marks}
+    )
 
 
 def draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
     """Draw the points of a panel by setting or, if the degrees differ, by degree.
 
-    Args:
-        axes: Axes to draw on.
-        rows: Rows of the panel.
+    Settings that differ in the type in parentheses are one group. References, whose error is 0,
+    have no point.
     """
-    has_degrees = len({row["degree"] for row in rows}) > 1
+    has_degrees = len({row.get("degree") for row in rows}) > 1
+    shown = [row for row in rows if error_of(row) > 0]
     # The front and the settings of pnb-train come first in the legend.
     points: dict[str, list[tuple[float, float]]] = {"front": [], "pnb-train": []}
-    for row in sorted(rows, key=lambda row: row["time_ms"]):
-        groups = [f"degree {row['degree']}" if has_degrees else row["setting"]]
-        groups += [mark for mark in ("front", "pnb-train") if row[mark]]
-        for group in groups:
-            points.setdefault(group, []).append((row["time_ms"], error_of(row)))
+    for row in shown:
+        row["group"] = row["setting"].partition(" (")[0]
+        if has_degrees:
+            row["group"] = f"degree {row['degree']}"
+        points.setdefault(row["group"], [])
+    for row in sorted(shown, key=lambda row: row["time_ms"]):
+        marks = [mark for mark in ("front", "pnb-train") if row[mark]]
+        for group in [row["group"], *marks]:
+            points[group].append((row["time_ms"], error_of(row)))
     for group, group_points in points.items():
+        if not group_points:
+            continue
         style = STYLES.get(group, OTHER_STYLE)
         times, errors = zip(*group_points, strict=True)
         axes.loglog(
             times, errors, style.line, label=group, ms=style.marker_size, zorder=style.layer
         )
     axes.set(title=rows[0]["panel"], xlabel="milliseconds", ylabel="relative error")
+    axes.tick_params(which="minor", labelsize=6)
     axes.legend(fontsize=7)
 
 
@@ -484,22 +523,20 @@ def make_parser() -> argparse.ArgumentParser:
         "--coarse", type=int, default=3, help="subdivisions of the second mesh of whole light steps"
     )
     add("--whole-steps-only", action="store_true", help="write whole_steps.csv alone")
+    add("--panels", nargs="+", choices=PANELS, help="measure these panels, and keep other rows")
+    add(
+        "--seconds",
+        type=float,
+        default=common.MAX_COMPARISON_SECONDS,
+        help="time of a panel after which no further round begins",
+    )
     return parser
 
 
 def measure_steps_of_meshes(
     meshes: Sequence[Mesh], rasterizer: Rasterizer, options: argparse.Namespace
 ) -> list[Row]:
-    """Measure whole light steps of one view and of many views.
-
-    Args:
-        meshes: Meshes to render.
-        rasterizer: Rasterizer of all views.
-        options: Parsed command line.
-
-    Returns:
-        Rows of all meshes, sizes and numbers of samples.
-    """
+    """Measure whole light steps of one view and of many views."""
     rows = []
     for mesh in meshes:
         for size, samples in product(options.step_sizes, WHOLE_STEP_SAMPLES):
@@ -522,21 +559,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(machine(options.device))
     rasterizer = choose(options.rasterizer)
     mesh = scene.ellipsoid(options.subdivisions)
-    coarse_mesh = scene.ellipsoid(options.coarse)
-    step_rows = measure_steps_of_meshes([coarse_mesh, mesh], rasterizer, options)
+    step_rows = []
+    if not options.panels:
+        meshes = [scene.ellipsoid(options.coarse), mesh]
+        step_rows = measure_steps_of_meshes(meshes, rasterizer, options)
     if options.whole_steps_only:
         write_csv(options.out / "whole_steps.csv", step_rows)
         return
-    panels = []
+    measured = []
     saving_rows = []
     for size in options.sizes:
         view = View(mesh, size, rasterizer, options.device)
-        for title in PANELS:
-            panels.append(measure(title, view, options.rounds, options.mitsuba))
-        saving_rows += measure_savings(view, options.rounds)
-    rows = [*chain.from_iterable(panels), *saving_rows, *step_rows]
-    write_csv(options.out / "renderer_pareto.csv", rows)
-    draw(options.out / "renderer_pareto.png", panels)
+        for title in options.panels or PANELS:
+            measured += measure(title, view, options.rounds, options.mitsuba, options.seconds)
+        if not options.panels:
+            saving_rows += measure_savings(view, options.rounds)
+    path = options.out / "renderer_pareto.csv"
+    kept = []
+    if options.panels:
+        replaced = {row["panel"] for row in measured}
+        kept = [row for row in read_rows(path) if row["panel"] not in replaced]
+    write_csv(path, [*kept, *measured, *saving_rows, *step_rows])
+    draw(path.with_suffix(".png"), read_rows(path))
 
 
 if __name__ == "__main__":

@@ -77,8 +77,47 @@ class Result:
     radiance: Tensor
     gradient: Tensor
 
+    def image(self, pixel_count: int) -> Tensor:
+        """Return the radiance of all pixels before black, shape (3, pixel_count)."""
+        black = self.radiance.new_zeros(3, pixel_count)
+        return black.index_copy(1, self.pixels, self.radiance)
+
+    def errors(self, exact: "Result") -> Row:
+        """Compute the relative errors to a result for all pixels.
+
+        The gradient of the exact result may have more rows, and none leaves out
+        the error of the gradient.
+        """
+        count = exact.radiance.shape[1]
+        errors = {"image_error": relative_error(self.image(count), exact.radiance)}
+        if len(exact.gradient):
+            same_rows = exact.gradient[: len(self.gradient)]
+            errors["gradient_error"] = relative_error(self.gradient, same_rows)
+        return errors
+
 
 Step = Callable[[], Result]
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method that renders the image and computes the gradient.
+
+    Attributes:
+        setting: Name of the method with its settings.
+        samples: Samples per side of a pixel. None for photographs.
+        degree: Degree of the light's harmonics. None for photographs.
+        step: Step whose errors are measured.
+        call: Call whose time is measured.
+        exact: Reference of the errors. None for that of the panel.
+    """
+
+    setting: str
+    samples: int | None
+    degree: int | None
+    step: Step
+    call: Callable[[], object]
+    exact: Result | None = None
 
 
 def ellipsoid(subdivisions: int) -> Mesh:
@@ -166,7 +205,11 @@ class View:
     device: str = "cpu"
 
     def operator(
-        self, samples: int = SAMPLES, degree: int = DEGREE, dtype: torch.dtype = torch.float32
+        self,
+        samples: int = SAMPLES,
+        degree: int = DEGREE,
+        dtype: torch.dtype = torch.float32,
+        shadows: bool = False,
     ) -> TransferOperator:
         """Build the transfer operator of the view.
 
@@ -174,6 +217,7 @@ class View:
             samples: Samples per side of a pixel.
             degree: Degree of the light's harmonics.
             dtype: Type of the operator.
+            shadows: Whether the mesh casts shadows on itself.
 
         Returns:
             Operator from the light to the image.
@@ -181,7 +225,7 @@ class View:
         [operator] = build_operators(
             self.mesh,
             [CAMERA],
-            ImageSettings(self.size, samples),
+            ImageSettings(self.size, samples, shadows=shadows),
             self.rasterizer,
             basis=Harmonics(degree),
             dtype=dtype,
@@ -283,14 +327,7 @@ class Converged:
         Returns:
             Row with "image_error" and "gradient_error".
         """
-        result = step()
-        image = result.radiance.new_zeros(self.image.shape)
-        image = image.index_copy(1, result.pixels, result.radiance)
-        same_rows = gradient[: len(result.gradient)]
-        return {
-            "image_error": relative_error(image, self.image),
-            "gradient_error": relative_error(result.gradient, same_rows),
-        }
+        return step().errors(Result(torch.arange(self.image.shape[1]), self.image, gradient))
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,19 @@ import argparse
 import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.util import find_spec
+from unittest.mock import patch
 
 import torch
+from torch import Tensor
 
 import norm_balls as nb
 from augment.lighting import RandomLighting
+from augment.scene import lights
 from augment.scene.lights import MODELS
+from benchmarks.scene import Contender, Result, View
 
 # Our models that have a counterpart in the other libraries, and its names there.
 COUNTERPARTS = {
@@ -28,6 +32,8 @@ COUNTERPARTS = {
     "linear": ("Illumination", "RandomLinearIllumination"),
     "fractal": ("PlasmaShadow", "RandomPlasmaShadow"),
 }
+# Images, each in a light of its own, over which the errors of random light are computed.
+LIT_IMAGES = 16
 
 
 def measure(call: Callable[[], object], repeats: int) -> float:
@@ -71,6 +77,39 @@ def transforms(size: int) -> dict[str, Callable[[], object]]:
             module = getattr(kornia.augmentation, name)(p=1.0)
             calls[f"Kornia {name}"] = partial(module, unit)
     return calls
+
+
+def random_lights(view: View) -> Iterator[Contender]:
+    """Yield each model of random light on images of each type of numbers, of the view's size."""
+    generator = torch.Generator().manual_seed(0)
+    shape = LIT_IMAGES, 3, view.size, view.size
+    images = torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator).to(view.device)
+    typed = {"uint8": images, "float32": images.float() / 255, "float64": images.double() / 255}
+    for name in MODELS:
+        transform = RandomLighting(name)
+        exact = light_images(transform, typed["float64"])
+        for dtype, batch in typed.items():
+            step = partial(light_images, transform, batch)
+            call = partial(transform, batch[0])
+            yield Contender(f"{name} ({dtype})", None, None, step, call, exact)
+
+
+def light_images(transform: RandomLighting, images: Tensor) -> Result:
+    """Light images (N, 3, H, W), and return all their pixels, each in the same light every time."""
+
+    def normal_noise(like: Tensor, seeds: Sequence[int]) -> Tensor:
+        """Draw the same noise for numbers of 64 bits as for those of 32."""
+        return float_noise(like.float(), seeds).to(like)
+
+    float_noise = lights.normal_noise
+    torch.manual_seed(0)
+    drawn = transform.make_params([images])
+    with patch.object(lights, "normal_noise", normal_noise):
+        lit = transform.apply(images, drawn)
+    values = lit / 255 if lit.dtype == torch.uint8 else lit
+    radiance = values.transpose(0, 1).flatten(1)
+    pixels = torch.arange(radiance.shape[1], device=radiance.device)
+    return Result(pixels, radiance, gradient=torch.empty(0))
 
 
 def main() -> None:
