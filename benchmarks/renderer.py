@@ -17,7 +17,7 @@ building of operators of a cup with shadows (`benchmarks.lights`), and its
 reference has more samples and ray directions. The panel "random light" times
 `nb.RandomLighting` for one image (`benchmarks.transforms`), and its reference is
 the same formula in float64. These panels alone, with all other rows kept, take
-some minutes:
+about 15 minutes of processor time:
 
     python -m benchmarks.renderer --panels rasterizing shadows "random light" --seconds 60
 
