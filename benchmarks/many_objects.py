@@ -1,31 +1,47 @@
 """Scores networks that are hardened for several classes, by top-1 accuracy among all classes.
 
-The objects are scans and models of nine classes of ImageNet, in plain light,
-under projected patterns, under hard patterns and in environment maps. A hard
-pattern has a saturated color, its complementary color and black.
+The objects are scans and models of classes of ImageNet, in plain light, under
+projected patterns, under hard patterns and in environment maps. A hard pattern
+has a saturated color, its complementary color and black.
 
 The objects are in three groups: the objects of the training in new light and
-pose, other objects of the trained classes, and classes that are not trained on.
+pose, other objects of the 15 trained classes, and classes that are not trained on.
 The validation split has other lights than the test split, and other objects in
 the last two groups.
 
 pip download --no-deps -d packages robosuite pybullet
-python -m benchmarks.many_objects make --data DATA --packages packages --out OBJECTS
+for name in REPOSITORIES; do git -C MESHES clone --depth 1 https://github.com/$name; done
+python -m benchmarks.many_objects make --data DATA --packages packages --meshes MESHES --out OBJECTS
 python -m benchmarks.many_objects score efficientnet_lite0 RUNS/hardened --objects OBJECTS
 
-RUNS/hardened/0,RUNS/hardened/1 is one column with the mean over two seeds. Scores
-on the test split require --table NAME, which docs/test_evaluations.csv records.
-DATA has meshes/ and hdri/. docs/results.md has the commands of the training.
+REPOSITORIES, with the first letters of the commits and the licenses of the meshes:
+
+elpis-lab/YCB_Dataset b7d8884: scans of the YCB object set, CC BY 4.0
+Lifelong-Robot-Learning/LIBERO 8f1084e: pan from Google Scanned Objects and bottle, CC BY 4.0
+RobotLocomotion/models 4723170: sofa from Poly Haven, CC0, and bell pepper, BSD 3-clause
+objktt/objktt-web f9ba80f: "Wine Bottle" by Reeeeeece, Sketchfab, CC BY 4.0
+rohitnv09/football-landing b88f723: "FootBall" by kdilipramprasath, Sketchfab, CC BY 4.0
+Mjamesss/cuisining.v1 7f220b5: kitchen models without a license, for measuring only
+meigangwen/react-three-fiber faba861: hammer and drill without a license, for measuring only
+samazevedo/banana-three-landing-page bfc3a7d: banana without a license, for measuring only
+
+DATA has meshes/ and hdri/. `make` also writes OBJECTS/meshes.txt, the objects of
+the training as a setting of pnb-train. RUNS/hardened/0,RUNS/hardened/1 is one
+column with the mean over two seeds. Scores on the test split require --table NAME,
+which docs/test_evaluations.csv records. docs/results.md has the commands of the
+training.
 """
 
 import argparse
 import colorsys
 import csv
+import json
 import zipfile
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -58,14 +74,34 @@ PACKAGED = (
     *(f"objects/meshes/{name}.mtl" for name in ("lemon", "bread", "cereal")),
     *(f"textures/{name}.png" for name in ("lemon", "bread", "cereal")),
 )
-# Meshes of training with their classes. The training also shows solids of oranges and lemons.
+# Paths in the folder of repositories.
+SCANS = "YCB_Dataset/ycb"
+KITCHEN = "cuisining.v1/frontend/public"
+LIBERO = "LIBERO/libero/libero/assets"
+# Meshes of training with their classes.
 TRAINED = (
     {"mesh": "banana.glb", "label": "banana"},
     {"mesh": "golf_ball.glb", "label": "golf ball"},
     {"mesh": "soccerball.obj", "label": "soccer ball"},
     {"mesh": "orange_studio.glb", "label": "orange"},
     {"mesh": "orange_sketchfab.glb", "label": "orange", "albedo_scale": 3.0},
+    {"mesh": f"{SCANS}/lemon/textured.obj", "label": "lemon"},
+    {"mesh": f"{SCANS}/strawberry/textured.obj", "label": "strawberry"},
+    {"mesh": f"{SCANS}/tennis_ball/textured.obj", "label": "tennis ball"},
+    {"mesh": f"{SCANS}/baseball/textured.obj", "label": "baseball"},
+    {"mesh": f"{SCANS}/mug/textured.obj", "label": "coffee mug"},
+    {"mesh": f"{SCANS}/bowl/textured.obj", "label": "mixing bowl"},
+    {"mesh": f"{SCANS}/hammer/textured.obj", "label": "hammer"},
+    {"mesh": f"{SCANS}/power_drill/textured.obj", "label": "power drill"},
+    {"mesh": f"{SCANS}/flat_screwdriver/textured.obj", "label": "screwdriver"},
+    {
+        "mesh": f"{LIBERO}/stable_scanned_objects/chefmate_8_frypan/chefmate_8_frypan.obj",
+        "label": "frying pan",
+    },
+    {"mesh": "objktt-web/public/models/wine-bottle.glb", "label": "wine bottle"},
 )
+# Each view of the training shows another instance of them.
+GENERATED = ({"mesh": "solid:orange", "label": "orange"}, {"mesh": "solid:lemon", "label": "lemon"})
 OBJECTS = {
     "validation": {
         SAME: TRAINED,
@@ -74,12 +110,13 @@ OBJECTS = {
             {"mesh": "solid:orange:3002", "label": "orange"},
             {"mesh": "solid:lemon:3001", "label": "lemon"},
             {"mesh": "solid:lemon:3002", "label": "lemon"},
-        ),
-        UNTRAINED: (
             {"mesh": "solid:cup:3001", "label": "coffee mug"},
             {"mesh": "solid:cup:3002", "label": "coffee mug"},
+        ),
+        UNTRAINED: (
             {"mesh": "solid:lamp:3001", "label": "table lamp"},
             {"mesh": "solid:lamp:3002", "label": "table lamp"},
+            {"mesh": f"{KITCHEN}/dutchoven.glb", "label": "Dutch oven"},
         ),
     },
     TEST: {
@@ -87,18 +124,46 @@ OBJECTS = {
         OTHERS: (
             {"mesh": "orange_scan.glb", "label": "orange"},
             {"mesh": "orange_leaf.glb", "label": "orange"},
+            {"mesh": f"{SCANS}/orange/textured.obj", "label": "orange"},
             {"mesh": "lemon.obj", "label": "lemon"},
             {"mesh": "solid:lemon:2001", "label": "lemon"},
             {"mesh": "solid:lemon:2002", "label": "lemon"},
+            {"mesh": "mug.obj", "label": "coffee mug"},
+            {"mesh": "solid:cup:2001", "label": "coffee mug"},
+            {"mesh": "solid:cup:2002", "label": "coffee mug"},
+            {"mesh": f"{KITCHEN}/banana.glb", "label": "banana"},
+            {"mesh": "banana-three-landing-page/public/banana.glb", "label": "banana"},
+            {"mesh": f"{SCANS}/mini_soccer_ball/textured.obj", "label": "soccer ball"},
+            {"mesh": "football-landing/public/models/football.glb", "label": "soccer ball"},
+            {"mesh": f"{KITCHEN}/stainelessbowl.glb", "label": "mixing bowl"},
+            {"mesh": f"{KITCHEN}/plasticbowl.glb", "label": "mixing bowl"},
+            {"mesh": f"{KITCHEN}/strawberry.glb", "label": "strawberry"},
+            {"mesh": f"{KITCHEN}/castironskillet.glb", "label": "frying pan"},
+            {"mesh": "react-three-fiber/public/models/hammer.glb", "label": "hammer"},
+            {"mesh": "react-three-fiber/public/models/drill.glb", "label": "power drill"},
+            {"mesh": f"{SCANS}/phillips_screwdriver/textured.obj", "label": "screwdriver"},
+            {
+                "mesh": f"{LIBERO}/turbosquid_objects/wine_bottle/wine_bottle_red_main.obj",
+                "label": "wine bottle",
+            },
         ),
         UNTRAINED: (
             # ImageNet has no other class of apples.
             {"mesh": "apple_scan.glb", "label": "Granny Smith"},
             {"mesh": "bread.obj", "label": "French loaf"},
-            {"mesh": "mug.obj", "label": "coffee mug"},
-            {"mesh": "solid:cup:2001", "label": "coffee mug"},
             {"mesh": "solid:lamp:2001", "label": "table lamp"},
             {"mesh": "solid:lamp:2002", "label": "table lamp"},
+            {"mesh": f"{SCANS}/padlock/textured.obj", "label": "padlock"},
+            {"mesh": f"{SCANS}/spatula/textured.obj", "label": "spatula"},
+            {"mesh": f"{SCANS}/pitcher_base/textured.obj", "label": "pitcher"},
+            {"mesh": f"{SCANS}/chain/textured.obj", "label": "chain"},
+            {
+                "mesh": "models/veggies/assets/yellow_bell_pepper_no_stem_low.gltf",
+                "label": "bell pepper",
+            },
+            {"mesh": "models/tutorials/models/assets/sofa_03_1k.gltf", "label": "studio couch"},
+            {"mesh": f"{KITCHEN}/pineapple.glb", "label": "pineapple"},
+            {"mesh": f"{KITCHEN}/Refrigerator.glb", "label": "refrigerator"},
         ),
     },
 }
@@ -106,9 +171,8 @@ OBJECTS = {
 PATTERNS = {"validation": ["rings", "colors"], TEST: ["window", "leaves", "text"]}
 MAPS = {"validation": ["city", "studio"], TEST: ["forest", "night"]}
 SEEDS = {"validation": 11, TEST: 12}
-# Renders of each class in each light. A group with fewer classes has more.
-RENDERS = 18
-FACTORS = {SAME: 1, OTHERS: 2, UNTRAINED: 1}
+# Renders of each class in each light.
+RENDERS = 12
 # Directions, surroundings and materials that are drawn for each render.
 SURROUNDINGS = {
     "ambient": [0.1, 0.25],
@@ -210,20 +274,39 @@ def with_file(item: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, An
 
     Args:
         item: Fields of `ObjectSettings`.
-        files: Path of each mesh by its file name.
+        files: Path of each mesh by its name.
     """
     return {**item, "mesh": files.get(item["mesh"], item["mesh"])}
 
 
-def mesh_files(data: Path, objects: Path) -> dict[str, str]:
-    """Return the path of each mesh by its file name.
+def mesh_files(options: argparse.Namespace) -> dict[str, str]:
+    """Return the path of each mesh by its file name, or by its path in the folder of repositories.
 
     Args:
-        data: Folder with meshes/.
-        objects: Folder with the unpacked packages.
+        options: Parsed command line.
     """
-    paths = [*(data / "meshes").iterdir(), *(objects / "packages").rglob("*.obj")]
-    return {path.name: str(path.resolve()) for path in paths}
+    packaged = (options.out / "packages").rglob("*.obj")
+    paths = [*(options.data / "meshes").iterdir(), *packaged]
+    files = {path.name: str(path.resolve()) for path in paths}
+    for item in chain(TRAINED, *(chain(*groups.values()) for groups in OBJECTS.values())):
+        path = options.meshes / item["mesh"]
+        if path.exists():
+            files[item["mesh"]] = str(path.resolve())
+    return files
+
+
+def write_setting(files: Mapping[str, str], path: Path) -> None:
+    """Write the objects of the training as a setting of pnb-train.
+
+    Args:
+        files: Path of each mesh by its name.
+        path: File to write.
+    """
+    items = []
+    for item in (*TRAINED, *GENERATED):
+        fields = with_file(item, files).items()
+        items.append(", ".join(f"{name}: {json.dumps(value)}" for name, value in fields))
+    path.write_text(f"meshes=[{', '.join(f'{{{item}}}' for item in items)}]\n")
 
 
 def make(options: argparse.Namespace) -> None:
@@ -235,7 +318,8 @@ def make(options: argparse.Namespace) -> None:
     extra = options.out / "packages"
     if not extra.exists():
         unpack(options.packages, extra)
-    files = mesh_files(options.data, options.out)
+    files = mesh_files(options)
+    write_setting(files, options.out / "meshes.txt")
     for split in options.splits:
         slides = write_slides(options.out / "slides" / split, SEEDS[split])
         kinds = lights(split, slides, options.data / "hdri")
@@ -246,7 +330,7 @@ def make(options: argparse.Namespace) -> None:
                     out=str(options.out / split / group / kind),
                     label=list(dict.fromkeys(item["label"] for item in items)),
                     meshes=meshes,
-                    setups=options.renders * FACTORS[group],
+                    setups=options.renders,
                     size=options.size,
                     spp=options.spp,
                     bounces=3,
@@ -546,11 +630,12 @@ def make_parser() -> argparse.ArgumentParser:
     making.set_defaults(body=make)
     making.add_argument("--data", type=Path, required=True)
     making.add_argument("--packages", type=Path, required=True, help="folder of the wheels")
+    making.add_argument("--meshes", type=Path, required=True, help="folder of the repositories")
     making.add_argument("--out", type=Path, required=True)
     making.add_argument("--splits", nargs="+", choices=[*OBJECTS], default=[*OBJECTS])
     making.add_argument("--renders", type=int, default=RENDERS, help="of each class and light")
     making.add_argument("--size", type=int, default=SIZE, help="pixels per side")
-    making.add_argument("--spp", type=int, default=32, help="paths per pixel and light")
+    making.add_argument("--spp", type=int, default=16, help="paths per pixel and light")
     scoring = commands.add_parser("score", help="score networks; the first one is the original")
     scoring.set_defaults(body=score)
     scoring.add_argument("networks", nargs="+", help="a classifier, and folders of runs")

@@ -263,12 +263,19 @@ def adapt_texture_or_material(path: Path) -> None:
 
     A texture (.png) is resized to 1024 × 1024 pixels. A material (.mtl) loses the
     gray factor 0.8 of its texture. With this factor, the loader would paint a
-    new texture. Other files stay as they are.
+    new texture. The textures of robosuite move to its meshes, because a mesh is
+    loaded only with files below its folder. Other files stay as they are.
     """
     if path.suffix == ".png":
-        Image.open(path).convert("RGB").resize((1024, 1024)).save(path)
+        image = Image.open(path).convert("RGB").resize((1024, 1024))
+        path.unlink()
+        if path.parent.name == "textures":
+            path = path.parents[1] / "objects" / "meshes" / path.name
+            path.parent.mkdir(parents=True, exist_ok=True)
+        image.save(path)
     elif path.suffix == ".mtl":
-        path.write_text(path.read_text().replace("0.800000", "1.000000"))
+        text = path.read_text().replace("0.800000", "1.000000")
+        path.write_text(text.replace("../../textures/", ""))
 
 
 def unpack_maps(package: tarfile.TarFile, folder: Path) -> None:
