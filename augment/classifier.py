@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from augment import network as wrappers
-from augment.dim import DIM, DIM_NAME, DimSwitch
+from augment.exposure import DIM, DIM_NAME, DimSwitch, light_settings, with_normalized_light
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
 from augment.tasks import recognized_task
 from augment.tasks.classification import Classification
@@ -141,7 +141,7 @@ class TaskNetwork(CheckedNetwork):
         super().__init__(network, f"{kind} {name}", task, len(names))
         own = wrappers.NETWORK if wrappers.normalization_of(self.network) else None
         self.inputs = wrappers.Inputs(wrappers.YOU, own, None)
-        self.network = wrappers.with_normalized_light(self.network, normalize_light)
+        self.network = with_normalized_light(self.network, normalize_light)
         self.size = as_size(f"{kind} {name}: size", size, MAX_SIZE)
         self.classes = names
         self.name = name
@@ -185,7 +185,7 @@ class TaskNetwork(CheckedNetwork):
     @property
     def normalized_light(self) -> NormalizedLightSettings | None:
         """Settings with which the light of images is normalized. None if it is not normalized."""
-        return wrappers.light_settings(self.network)
+        return light_settings(self.network)
 
     def normalizing_light(self, normalize_light: NormalizeLight = True) -> Self:
         """Return a classifier that first normalizes the light of images.

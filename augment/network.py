@@ -5,7 +5,6 @@ network returns. What an output means, such as logits, is known where a task use
 """
 
 import logging
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,9 +20,8 @@ from torch.nn.modules.module import register_module_forward_pre_hook
 
 from augment.distributed import rank
 from augment.progress import progress
-from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
 from renderer.errors import InputError, is_out_of_memory
-from renderer.image import clamp, decode, encode, to_bytes, to_unit
+from renderer.image import to_bytes, to_unit
 from renderer.settings import Size, height_and_width
 
 # Number of images that a network sees at a time if nothing else is said.
@@ -32,10 +30,6 @@ BATCH = 256
 ROUNDED = 1e-3
 # The sum of many rounded probabilities may differ from 1 by at most this much.
 MAX_DEVIATION = 0.01
-# Smallest sRGB value above black in an image of 8 bits. Below it, the gamma curve is a line.
-DARKEST_ENCODED = 1 / 255
-# Linear value of this sRGB value. Images are brightened as if they were at least this bright.
-DARKEST = DARKEST_ENCODED / 12.92
 # Who states a fact about the images, besides the library that published the network.
 YOU, FILE, NETWORK, DATA = "you", "the file", "the network", "the training images"
 # Names of the mean of the channels in networks that normalize images themselves. That of the
@@ -188,21 +182,6 @@ class ChannelNormalization(nn.Module):
         return normalized.contiguous(memory_format=torch.channels_last)
 
 
-class LightNormalization(nn.Module):
-    """Transform images by `normalize_light`."""
-
-    def __init__(self, settings: NormalizedLightSettings):
-        super().__init__()
-        self.settings = settings
-
-    def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N 3 H W"]:
-        return normalize_light(images, self.settings)
-
-    def extra_repr(self) -> str:
-        """Write the settings, on which the keys of stored logits depend."""
-        return str(self.settings)
-
-
 class Quantization(nn.Module):
     """Transform images by rounding to 8 bits per channel, with the gradient of the identity."""
 
@@ -216,64 +195,6 @@ def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tens
     detached = images.detach()
     difference = change(detached) - detached
     return images + difference
-
-
-def with_normalized_light(network: nn.Module, value: NormalizeLight) -> nn.Module:
-    """Return a network that normalizes the light of images and then calls a given network."""
-    settings = read_normalized_light(value)
-    if settings is None:
-        return network
-    if light_settings(network) is not None:
-        reason = "normalize_light is set, but the network normalizes light already"
-        raise InputError(f"{reason}: remove normalize_light", "normalize_light")
-    return Network(network, [LightNormalization(settings)])
-
-
-def light_settings(network: object) -> NormalizedLightSettings | None:
-    """Return the settings with which a network normalizes light. None if it does not."""
-    for transform in network.transforms if isinstance(network, Network) else ():
-        if isinstance(transform, LightNormalization):
-            return transform.settings
-    return None
-
-
-def without_normalized_light(network: Any) -> Any:
-    """Remove the normalization of light, if there is one, from in front of a network."""
-    return network if light_settings(network) is None else network.network
-
-
-def normalize_light(images: Float[Tensor, "N 3 H W"], settings: NormalizedLightSettings) -> Tensor:
-    """Normalize color and brightness of the light of each image.
-
-    Each image is treated by itself, in linear light:
-
-    1. White balance: each channel is multiplied by (m / m_c)^`white_balance`. Here, m_c is the
-       mean of the channel, and m is the mean of all channels.
-    2. Exposure: a factor maps the given percentile of all values to `level`. Values above 1 are
-       clipped.
-    3. Encoding: the sRGB curve, and then the exponent `gamma`.
-
-    The result is differentiable almost everywhere.
-    """
-    linear = decode(clamp(images), "srgb")
-    channel_means = linear.mean((2, 3), keepdim=True)
-    mean = channel_means.mean(1, keepdim=True)
-    ratio = mean.clamp(min=DARKEST) / channel_means.clamp(min=DARKEST)
-    balanced = linear * ratio**settings.white_balance
-
-    factors = settings.level / percentiles(balanced, settings.percentile).clamp(min=DARKEST)
-    encoded = encode(clamp(balanced * factors.view(-1, 1, 1, 1)), "srgb")
-
-    if settings.gamma == 1:
-        return encoded
-    # x^gamma is x · x^(gamma - 1). The second factor would be infinite at 0 if gamma is below 1.
-    return encoded * encoded.clamp(min=DARKEST_ENCODED) ** (settings.gamma - 1)
-
-
-def percentiles(images: Float[Tensor, "N 3 H W"], percentile: float) -> Float[Tensor, " N"]:
-    """Return the value of each image with the rank ⌈percentile / 100 · number of values⌉."""
-    values = images.flatten(1)
-    return values.kthvalue(math.ceil(percentile / 100 * values.shape[1]), dim=1).values
 
 
 class Function(nn.Module):

@@ -547,13 +547,11 @@ def _describe_scene(scene: Scene) -> list[object]:
     for item in scene.objects:
         counts = (len(item.mesh.vertices), len(item.mesh.faces))
         extent = _rounded(item.mesh.vertices.std(axis=0))
-        scale = f"{item.albedo_scale:.3g}"
-        objects.append((str(item.label), item.name, counts, extent, scale))
+        objects.append((str(item.label), item.name, counts, extent, f"{item.albedo_scale:.3g}"))
     examples = []
     for example in scene.examples:
         cameras = [_rounded(vars(camera.fixed()).values()) for camera in example.cameras]
-        exposure = f"{example.exposure:.3g}"
-        examples.append((example.object, example.background, exposure, cameras))
+        examples.append((example.object, example.background, f"{example.exposure:.3g}", cameras))
     # Lights and backgrounds are described by their sums, norms and means, which identify them.
     lights = scene.lights.flatten(1).unique(dim=0).double()
     sizes = [*lights.sum(1).tolist(), *lights.norm(dim=1).tolist()]

@@ -22,8 +22,7 @@ from PIL import Image
 from torch import nn
 
 import norm_balls as nb
-from augment.dim import DIM, DimSwitch
-from augment.network import with_normalized_light
+from augment.exposure import DIM, DimSwitch, with_normalized_light
 from benchmarks.common import machine
 from benchmarks.detectors import SIZE, FastestDet, decode
 from renderer.io.images import crop_center, read_rgb

@@ -8,8 +8,9 @@ FOLDER has a folder of photographs for each class, named LIGHT__NAME.jpg, and ma
 with the columns path, source_tag and mesh (the object). A folder other_CLASS stands for a CLASS
 that some networks lack. With --crops, LIGHT__NAME_K.jpg is crop K of a photograph NAME, which may
 have crops in several folders. A network is a published name, the folder of a run, or a name that
-`pnb-evaluate` takes as network=. After "normalized:" it sees normalized light. TITLE=A,B,C is a
-training with three seeds. The first network and the first light are what others are compared with.
+`pnb-evaluate` takes as network=. After "normalized:" it sees normalized light, and after "mean:"
+its probabilities for dim images are means of those for two exposures. TITLE=A,B,C is a training
+with three seeds. The first network and the first light are what others are compared with.
 
     python -m benchmarks.real_light simulate PHOTOS FOLDER --lights low_light --classes orange apple
 
@@ -36,7 +37,7 @@ from scipy.stats import spearmanr
 
 import norm_balls as nb
 from augment.classifier import Classifier
-from augment.dim import DIM_NAME, are_dim
+from augment.exposure import DIM_NAME, are_dim
 from renderer.image import to_unit
 from renderer.io.images import SUFFIXES, crop_center, read_rgb, write_image
 from train.checkpoints import RUN, is_classifier, load_network, load_run
@@ -60,6 +61,8 @@ DRAWS = 2000
 METRICS = ("top-1", "recall", "recall at 5% FPR", "FPR", "AUC")
 HEADER = ["network", "light", *METRICS]
 NORMALIZED = "normalized:"
+MEAN = "mean:"
+MEAN_OF_LIGHTS = {"percentile": 98.0, "level": 0.1, "gamma": 1.0, "average": True}
 PLAIN = "plain"
 # Statistics of a network in a light, shape (5, 1 + DRAWS): of all photographs, then of each draw.
 Statistics = np.ndarray
@@ -69,6 +72,8 @@ def load(name: str) -> Classifier:
     """Load a network by its name on the command line."""
     if name.startswith(NORMALIZED):
         return load(name.removeprefix(NORMALIZED)).normalizing_light()
+    if name.startswith(MEAN):
+        return load(name.removeprefix(MEAN)).normalizing_light(MEAN_OF_LIGHTS)
     is_known = is_classifier(name) or name.startswith(DIM_NAME)
     return load_network(name) if is_known else load_run(name.removeprefix(RUN))
 

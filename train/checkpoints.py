@@ -21,9 +21,9 @@ from safetensors import safe_open
 from torch import Tensor, cuda
 
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
-from augment.dim import DIM, DIM_NAME
+from augment.exposure import DIM, DIM_NAME, with_normalized_light
 from augment.files import as_facts, is_network_file, require_no_facts
-from augment.network import FROM_FILE, Inputs, say_inputs, say_once, with_normalized_light
+from augment.network import FROM_FILE, Inputs, say_inputs, say_once
 from augment.settings import PYTHON, NormalizeLight
 from augment.sources import SOURCES, import_function, load_classifier
 from augment.tasks.detection import Detection

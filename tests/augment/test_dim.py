@@ -7,7 +7,7 @@ from oracles import srgb_of
 from torch import Tensor
 
 import norm_balls as nb
-from augment.dim import DimSwitch
+from augment.exposure import DimSwitch
 from renderer import InputError
 
 SIZE = 8

@@ -1,11 +1,14 @@
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from oracles import linear_of, srgb_of
+from scipy.special import softmax
 from torch import Tensor, nn
 
 from augment.classifier import Classifier, as_network
-from augment.network import normalize_light
+from augment.exposure import MeanOfLights, normalize_light
 from augment.settings import NormalizedLightSettings
 from renderer import InputError
 
@@ -122,3 +125,17 @@ def test_light_is_not_normalized_twice():
     classifier = Classifier(Spy(), SIZE, ["red", "green", "blue"], normalize_light=True)
     with pytest.raises(InputError, match="normalize_light"):
         classifier.normalizing_light()
+
+
+def test_probabilities_are_averaged_over_both_lights_of_dim_images_alone(radiance):
+    def probabilities(linear: np.ndarray, **given: Any) -> np.ndarray:
+        network = as_network(Spy().eval(), SIZE, classes=list("rgb"), normalize_light=given or None)
+        return softmax(network(torch.from_numpy(srgb_of(linear))).numpy(), axis=1)
+
+    dim, bright = radiance / 9, radiance + 0.3
+    mean = (probabilities(dim) + probabilities(dim, level=0.1)) / 2
+    np.testing.assert_allclose(probabilities(dim, level=0.1, average=True), mean, rtol=1e-6)
+    averaged = probabilities(bright, level=0.1, average=True)
+    np.testing.assert_allclose(averaged, probabilities(bright), rtol=1e-6)
+    with pytest.raises(InputError, match="classifiers"):
+        MeanOfLights(lambda images: [{"boxes": images}])(torch.zeros(1, 3, SIZE, SIZE))

@@ -89,7 +89,9 @@ class Jackknife:
         # The logit of 0 or 1 is infinite, so 0.5 stands for such a value until the last line.
         is_inner = (value > 0) & (value < 1)
         inner = np.where(is_inner, value, 0.5)
-        errors = [_keep_errors(item, inner[..., None]) for item in self.without]
+        # Each value keeps MIN_RATIO of the distance of the mean from 0 and from 1.
+        lowest, highest = MIN_RATIO * inner[..., None], 1 - MIN_RATIO * (1 - inner[..., None])
+        errors = [item.clip(lowest, highest) for item in self.without]
         spread = _Spread.of([np.where(is_inner[..., None], _logit(item), 0.0) for item in errors])
         half_width = spread.quantile * spread.variance**0.5
         # The logistic function turns logit(value) ∓ half width back into fractions.
@@ -273,11 +275,6 @@ class _Spread(NamedTuple):
         # Harmonic mean of the degrees, weighted by variance. Without variance, the smallest.
         freedom = np.where(total > 0, total / np.where(total > 0, terms, 1), degrees.min())
         return cls(total, stdtrit(freedom, 0.975))
-
-
-def _keep_errors(values: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Move values (..., k) so that each keeps MIN_RATIO of the distance of `value` from 0 and 1."""
-    return values.clip(MIN_RATIO * value, 1 - MIN_RATIO * (1 - value))
 
 
 def _logit(values: np.ndarray) -> np.ndarray:

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from augment import distributed
 from augment.classifier import TaskNetwork, class_index
-from augment.dim import DIM_NAME
+from augment.exposure import DIM_NAME, without_normalized_light
 from augment.files import as_facts, is_network_file, name_from_anywhere, require_no_facts
-from augment.network import FROM_FILE, YOU, Inputs, without_normalized_light
+from augment.network import FROM_FILE, YOU, Inputs
 from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene

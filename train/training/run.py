@@ -11,7 +11,7 @@ from jaxtyping import Int
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from augment import distributed
+from augment import distributed, exposure
 from augment import network as wrappers
 from augment.random_streams import stream_seed
 from augment.tasks.classification import Classification
@@ -133,7 +133,7 @@ class Run:
             light = light or initial.architecture.get(checkpoints.NORMALIZE_LIGHT)
         if light is not None:
             facts[checkpoints.NORMALIZE_LIGHT] = light
-            network = wrappers.with_normalized_light(network, light)
+            network = exposure.with_normalized_light(network, light)
         if recipe.freeze:
             with keyed(stage="train.freeze"):
                 freeze(wrappers.unwrapped(network), recipe.freeze, data.size)
@@ -147,7 +147,7 @@ class Run:
             console.info("learning rate %.3g, by the norm of the features of the network", rate)
             recipe = replace(recipe, learning_rate=rate)
         # The checkpoint describes the network without the wrapper, and the wrapper by its settings.
-        inner = wrappers.without_normalized_light(network)
+        inner = exposure.without_normalized_light(network)
         description = describe(inner, **facts, validation=validation)
         task = initial.task if initial else Classification()
         service = inputs.build_service(settings, data, device, task)
@@ -221,7 +221,7 @@ class Run:
         checkpoints.save(path, {name: value.cpu() for name, value in weights.items()})
         console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
         # Settings of the wrapper that normalizes the light of images. None without one.
-        light = wrappers.light_settings(self.trainer.selected.network)
+        light = exposure.light_settings(self.trainer.selected.network)
         if light is not None:
             given = json.dumps(asdict(light))
             console.info("it needs images with normalized light: normalize_light=%s", given)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torchvision.models import get_model
 
-from augment.network import normalize_light
+from augment.exposure import normalize_light
 from augment.settings import NormalizedLightSettings
 from augment.sources import load_classifier
 from renderer.errors import InputError

@@ -1,0 +1,151 @@
+"""Exposure of images: normalized light, and a network for dim images beside another network."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from augment.network import Network, plain_outputs
+from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
+from renderer.errors import InputError
+from renderer.image import clamp, decode, encode
+
+# Smallest sRGB value above black in an image of 8 bits. Below it, the gamma curve is a line.
+DARKEST_ENCODED = 1 / 255
+# Linear value of this sRGB value. Images are brightened as if they were at least this bright.
+DARKEST = DARKEST_ENCODED / 12.92
+# Percentile of the linear values of an image that tells whether it is dim.
+DIM_PERCENTILE = 98.0
+# Images are dim if this percentile is below this value.
+DIM = 0.25
+
+# A name that begins with this text names a network, and one for dim images after a "+".
+DIM_NAME = "dim:"
+
+
+class LightNormalization(nn.Module):
+    """Transform images by `normalize_light`."""
+
+    def __init__(self, settings: NormalizedLightSettings):
+        super().__init__()
+        self.settings = settings
+
+    def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N 3 H W"]:
+        return normalize_light(images, self.settings)
+
+    def extra_repr(self) -> str:
+        """Write the settings, on which the keys of stored logits depend."""
+        return str(self.settings)
+
+
+class MeanOfLights(Network):
+    """Classifier whose probabilities for dim images are means of those with normalized light."""
+
+    def forward(self, images: Tensor, *targets: Any) -> Any:
+        both = [self.network(images, *targets), super().forward(images, *targets)]
+        if not isinstance(plain_outputs(both[0]), Tensor) or plain_outputs(both[0]).ndim != 2:
+            raise InputError("normalize_light.average is for classifiers alone: set it to false")
+        unchanged, normalized = (plain_outputs(one).log_softmax(1) for one in both)
+        mean = torch.logaddexp(unchanged, normalized) - math.log(2)
+        return torch.where(are_dim(images)[:, None], mean, unchanged)
+
+
+def with_normalized_light(network: nn.Module, value: NormalizeLight) -> nn.Module:
+    """Return a network that normalizes the light of images and then calls a given network."""
+    settings = read_normalized_light(value)
+    if settings is None:
+        return network
+    if light_settings(network) is not None:
+        raise InputError("normalize_light: the network has this already", "normalize_light")
+    return (MeanOfLights if settings.average else Network)(network, [LightNormalization(settings)])
+
+
+def light_settings(network: object) -> NormalizedLightSettings | None:
+    """Return the settings with which a network normalizes light. None if it does not."""
+    transforms = network.transforms if isinstance(network, Network) else ()
+    return next((one.settings for one in transforms if isinstance(one, LightNormalization)), None)
+
+
+def without_normalized_light(network: Any) -> Any:
+    """Remove the normalization of light, if there is one, from in front of a network."""
+    return network if light_settings(network) is None else network.network
+
+
+def normalize_light(images: Float[Tensor, "N 3 H W"], settings: NormalizedLightSettings) -> Tensor:
+    """Normalize color and brightness of the light of each image.
+
+    Each image is treated by itself, in linear light:
+
+    1. White balance: each channel is multiplied by (m / m_c)^`white_balance`. Here, m_c is the
+       mean of the channel, and m is the mean of all channels.
+    2. Exposure: a factor maps the given percentile of all values to `level`. Values above 1 are
+       clipped.
+    3. Encoding: the sRGB curve, and then the exponent `gamma`.
+
+    The result is differentiable almost everywhere.
+    """
+    linear = decode(clamp(images), "srgb")
+    channel_means = linear.mean((2, 3), keepdim=True)
+    mean = channel_means.mean(1, keepdim=True)
+    ratio = mean.clamp(min=DARKEST) / channel_means.clamp(min=DARKEST)
+    balanced = linear * ratio**settings.white_balance
+
+    factors = settings.level / percentiles(balanced, settings.percentile).clamp(min=DARKEST)
+    encoded = encode(clamp(balanced * factors.view(-1, 1, 1, 1)), "srgb")
+
+    if settings.gamma == 1:
+        return encoded
+    # x^gamma is x · x^(gamma - 1). The second factor would be infinite at 0 if gamma is below 1.
+    return encoded * encoded.clamp(min=DARKEST_ENCODED) ** (settings.gamma - 1)
+
+
+def percentiles(images: Float[Tensor, "N 3 H W"], percentile: float) -> Float[Tensor, " N"]:
+    """Return the value of each image with the rank ⌈percentile / 100 · number of values⌉."""
+    values = images.flatten(1)
+    return values.kthvalue(math.ceil(percentile / 100 * values.shape[1]), dim=1).values
+
+
+def are_dim(images: Float[Tensor, "N 3 H W"], below: float = DIM) -> Bool[Tensor, " N"]:
+    """Return whether the 98th percentile of the linear values of each image is below a limit."""
+    linear = decode(clamp(images.detach()), "srgb")
+    return percentiles(linear, DIM_PERCENTILE) < below
+
+
+class DimSwitch(nn.Module):
+    """Network that shows dim images to another network."""
+
+    def __init__(self, network: nn.Module, dim: nn.Module, below: float):
+        super().__init__()
+        self.network, self.dim, self.below = network, dim, below
+        self.training = network.training
+
+    def forward(self, images: Tensor) -> Any:
+        is_dim = are_dim(images, self.below)
+        if not is_dim.any():
+            return self.network(images)
+        if is_dim.all():
+            return self.dim(images)
+        # Place of each image among the outputs of both networks.
+        places = torch.cat([(~is_dim).nonzero(), is_dim.nonzero()])[:, 0].argsort()
+        return _joined([self.network(images[~is_dim]), self.dim(images[is_dim])], places)
+
+    def extra_repr(self) -> str:
+        """Write the limit, on which the keys of stored logits depend."""
+        return f"below={self.below}"
+
+
+def _joined(outputs: list[Any], places: Int[Tensor, " N"]) -> Any:
+    """Join outputs of several batches of images, and put them in another order."""
+    first = outputs[0]
+    if isinstance(first, Tensor):
+        return torch.cat(outputs)[places]
+    if isinstance(first, Mapping):
+        # Outputs of transformers have keys without values.
+        given = [key for key, value in first.items() if value is not None]
+        parts = {key: [item[key] for item in outputs] for key in given}
+        return type(first)(**{key: _joined(values, places) for key, values in parts.items()})
+    rows = [row for item in outputs for row in item]
+    return [rows[place] for place in places.tolist()]
