@@ -271,8 +271,9 @@ def import_function(name: str) -> Callable[..., Any]:
     """Import "package.module:function" of the user, also from the current folder."""
     separator = ":" if ":" in name else "."
     module_name, _, function_name = name.rpartition(separator)
+    # Behind what is installed, such as this library in a folder that also has a clone of it.
     if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
+        sys.path.append(str(Path.cwd()))
     module = importlib.import_module(module_name)
     if not hasattr(module, function_name):
         advice = f"did you mean {nearest(function_name, [*vars(module)])}?"

@@ -62,15 +62,6 @@ def test_an_image_with_more_than_two_percent_of_bright_values_is_not_dim(fractio
     assert (network(values.view_as(image)) > 5).all() == is_dim
 
 
-def test_gradients_pass_through_the_network_that_an_image_gets():
-    images = torch.cat([brightness(0.1), brightness(0.9)]).requires_grad_()
-    network = DimSwitch(torch.nn.Identity(), torch.nn.Conv2d(3, 3, 1, bias=False), BELOW).double()
-    network(images).sum().backward()
-    weights = network.dim.weight.detach().sum((0, 2, 3))
-    expected = torch.stack([weights, torch.ones(3)])[..., None, None].expand_as(images)
-    torch.testing.assert_close(images.grad, expected.double())
-
-
 def test_a_name_of_two_networks_is_the_first_with_the_second_for_dim_images():
     from train.checkpoints import load_network
 

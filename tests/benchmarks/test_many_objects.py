@@ -65,9 +65,8 @@ def test_intervals_contain_the_mean_over_all_objects_if_most_are_never_or_always
     for _ in range(100):
         of_objects, of_setups = 3 * rng.normal(size=16), 0.5 * rng.normal(size=12)
         effects = of_objects[objects] + of_setups[setups] - 1.5
-        found = mean_of(
-            one_group((effects > rng.normal(size=16 * 12)).astype(float), setups, objects)
-        )
+        hits = (effects > rng.normal(size=16 * 12)).astype(float)
+        found = mean_of(one_group(hits, setups, objects))
         contained.append(found.low <= mean <= found.high)
     assert np.mean(contained) >= 0.93
 
