@@ -42,13 +42,16 @@ class LightNormalization(nn.Module):
 
 
 class MeanOfLights(Network):
-    """Classifier whose probabilities for dim images are means of those with normalized light."""
+    """Classifier that averages probabilities of a dim image over unchanged and normalized light.
 
-    def forward(self, images: Tensor, *targets: Any) -> Any:
-        both = [self.network(images, *targets), super().forward(images, *targets)]
-        if not isinstance(plain_outputs(both[0]), Tensor) or plain_outputs(both[0]).ndim != 2:
+    Both are computed for all images, because CUDA graphs need fixed shapes.
+    """
+
+    def forward(self, images: Tensor, *_: Any) -> Tensor:
+        unchanged, normalized = map(plain_outputs, (self.network(images), super().forward(images)))
+        if not isinstance(unchanged, Tensor) or unchanged.ndim != 2:
             raise InputError("normalize_light.average is for classifiers alone: set it to false")
-        unchanged, normalized = (plain_outputs(one).log_softmax(1) for one in both)
+        unchanged, normalized = unchanged.log_softmax(1), normalized.log_softmax(1)
         mean = torch.logaddexp(unchanged, normalized) - math.log(2)
         return torch.where(are_dim(images)[:, None], mean, unchanged)
 
@@ -59,7 +62,8 @@ def with_normalized_light(network: nn.Module, value: NormalizeLight) -> nn.Modul
     if settings is None:
         return network
     if light_settings(network) is not None:
-        raise InputError("normalize_light: the network has this already", "normalize_light")
+        reason = "normalize_light is set, but the network normalizes light already"
+        raise InputError(f"{reason}: remove normalize_light", "normalize_light")
     return (MeanOfLights if settings.average else Network)(network, [LightNormalization(settings)])
 
 

@@ -237,7 +237,7 @@ class NormalizedLightSettings(Settings):
     level: float = setting(1.0, "Linear value of this percentile.", above=0, maximum=1)
     white_balance: float = setting(0.0, "Balance. 0: none. 1: equal channel means.", within=(0, 1))
     gamma: float = setting(1.25, "Exponent of encoded values. Below 1: brighter.", within=(0.1, 10))
-    average: bool = setting(False, "Average the probabilities with those for unchanged light.")
+    average: bool = setting(False, "Average the probabilities of dim images over both lights.")
 
 
 # Type of the argument `normalize_light` of several functions.

@@ -271,7 +271,7 @@ def import_function(name: str) -> Callable[..., Any]:
     """Import "package.module:function" of the user, also from the current folder."""
     separator = ":" if ":" in name else "."
     module_name, _, function_name = name.rpartition(separator)
-    # Behind what is installed, such as this library in a folder that also has a clone of it.
+    # Installed packages come first. The current folder may be a clone of this library.
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
     module = importlib.import_module(module_name)

@@ -345,7 +345,7 @@ def measure(title: str, view: View, rounds: int, with_mitsuba: bool, seconds: fl
     if panel.irradiance is not None:
         converged = Converged(view, panel.irradiance)
         gradient = converged.by_vertices if panel.is_by_vertices else converged.by_light
-        exact = Result(torch.arange(view.size**2), converged.image, gradient)
+        exact = converged.result(gradient)
     contenders = list(panel.contenders(view))
     if with_mitsuba and panel.mitsuba_parameter is not None:
         step = MitsubaStep(view, panel.mitsuba_parameter)

@@ -316,18 +316,9 @@ class Converged:
         image = fractions.draw(reference.irradiance(normals.detach(), light))
         [self.by_light] = torch.autograd.grad((image * image_gradient).sum(), light)
 
-    def errors(self, step: Step, gradient: Tensor) -> Row:
-        """Compute the relative errors of a step.
-
-        Args:
-            step: Step to take once.
-            gradient: `by_light` or `by_vertices`. Rows beyond those of the
-                step's gradient are left out.
-
-        Returns:
-            Row with "image_error" and "gradient_error".
-        """
-        return step().errors(Result(torch.arange(self.image.shape[1]), self.image, gradient))
+    def result(self, gradient: Tensor) -> Result:
+        """Return the image with its gradient `by_light` or `by_vertices`."""
+        return Result(torch.arange(self.image.shape[1]), self.image, gradient)
 
 
 @dataclass(frozen=True)

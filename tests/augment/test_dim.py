@@ -68,10 +68,11 @@ def test_a_name_of_two_networks_is_the_first_with_the_second_for_dim_images():
     plain, dim = nb.load("none"), nb.load("best")
     switched = load_network("dim:run:pretrained/none+run:pretrained/best")
     images = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
-    dark = images * 0.1
-    torch.testing.assert_close(
-        switched(torch.cat([images, dark])), torch.cat([plain(images), dim(dark)])
-    )
+    shown = torch.cat([images, images * 0.1]).requires_grad_()
+    outputs = switched(shown), torch.cat([plain(shown[:2]), dim(shown[2:])])
+    torch.testing.assert_close(*outputs)
+    gradients = [torch.autograd.grad(each.square().sum(), shown)[0] for each in outputs]
+    torch.testing.assert_close(*gradients)
 
 
 def test_the_candidates_of_a_detector_are_those_of_the_network_that_an_image_gets():

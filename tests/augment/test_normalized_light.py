@@ -1,5 +1,3 @@
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -128,7 +126,7 @@ def test_light_is_not_normalized_twice():
 
 
 def test_probabilities_are_averaged_over_both_lights_of_dim_images_alone(radiance):
-    def probabilities(linear: np.ndarray, **given: Any) -> np.ndarray:
+    def probabilities(linear: np.ndarray, **given) -> np.ndarray:
         network = as_network(Spy().eval(), SIZE, classes=list("rgb"), normalize_light=given or None)
         return softmax(network(torch.from_numpy(srgb_of(linear))).numpy(), axis=1)
 

@@ -72,12 +72,13 @@ def view() -> scene.View:
 def test_the_benchmarks_reference_is_what_more_samples_converge_to(view):
     # Even random samples would reduce the error to a quarter, with four times as many of
     # them per side.
-    exact = scene.Converged(view)
+    converged = scene.Converged(view)
+    exact = converged.result(converged.by_light)
     light = scene.coefficients(6).float()
     gradient_errors = []
     for samples in (2, 8, 32):
         step = steps.LightStep(view, view.operator(samples), light)
-        gradient_errors.append(exact.errors(step, exact.by_light)["gradient_error"])
+        gradient_errors.append(step().errors(exact)["gradient_error"])
     coarse, middle, fine = gradient_errors
     assert middle < coarse / 4
     assert fine < middle / 4

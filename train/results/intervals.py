@@ -89,7 +89,7 @@ class Jackknife:
         # The logit of 0 or 1 is infinite, so 0.5 stands for such a value until the last line.
         is_inner = (value > 0) & (value < 1)
         inner = np.where(is_inner, value, 0.5)
-        # Each value keeps MIN_RATIO of the distance of the mean from 0 and from 1.
+        # Without a unit, a value keeps at least MIN_RATIO of its distance from 0 and from 1.
         lowest, highest = MIN_RATIO * inner[..., None], 1 - MIN_RATIO * (1 - inner[..., None])
         errors = [item.clip(lowest, highest) for item in self.without]
         spread = _Spread.of([np.where(is_inner[..., None], _logit(item), 0.0) for item in errors])
