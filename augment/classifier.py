@@ -496,7 +496,7 @@ def as_network(
     if task is None:
         task = recognized_task(outputs, argument)
         if not isinstance(task, Classification):
-            wrappers.say_once(f"network {name}: its outputs are of {task}")
+            wrappers.say_once(f"network {name}: its outputs are of {task.name}")
     count = task.output_count(network, task.reader(argument)(outputs, images))
     if names is not None and count not in (None, len(names)):
         reason = f"classes has {len(names)} names, but the network returns {count} outputs"

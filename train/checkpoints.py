@@ -204,6 +204,7 @@ def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
     changed = TaskNetwork(*options, task=replace(own, **given))
     # It stays the same who stated the facts about the images.
     changed.inputs = network.inputs
+    say_once(f"network {network.name}: its task is {changed.task}")
     return changed
 
 

@@ -183,8 +183,12 @@ class AttackResult(ShortRepr):
 
     @property
     def success_before(self) -> Tensor:
-        """Return a mask of the examples that met the criterion before the attack, shape (E,)."""
-        return self.criterion.reached(self.criterion.predicted(self.evidence_in_views_before))
+        """Return a mask of the examples that cannot succeed, shape (E,).
+
+        They met the criterion before the attack, or a view did not find their object.
+        """
+        reached = self.criterion.reached(self.criterion.predicted(self.evidence_in_views_before))
+        return reached | ~self.clean_correct if self.criterion.needs_truth else reached
 
     @property
     def clean_correct(self) -> Tensor:

@@ -82,9 +82,6 @@ class Classification(Task):
         """Return the criterion of an attack on the class of each image."""
         return torch.arange(len(outputs)), ClassCriterion(outputs.argmax(1, keepdim=True))
 
-    def require_target(self, target: Any) -> None:
-        """Accept every target."""
-
     def confidences(self, evidence: Float[Tensor, "... C"]) -> Float[Tensor, "... C"]:
         """Return the probability of each class."""
         return evidence.softmax(-1)

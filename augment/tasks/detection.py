@@ -52,6 +52,8 @@ CANDIDATES_OF = CANDIDATE_BOXES, CANDIDATE_SCORES, CANDIDATE_LABELS
 FINAL = "boxes", "scores", "labels"
 # Candidates of a detector of torchvision are so many boxes with the highest scores above this one.
 MAX_CANDIDATES, CANDIDATE_SCORE = 5000, 1e-4
+# Number of classes of the detectors of torchvision for COCO, with background and gaps.
+COCO_COUNT = 91
 # Boxes of one image: "boxes" (n, 4) in pixels, "labels" (n,) and "scores" (n,), and candidates.
 Detections = dict[str, Tensor]
 
@@ -127,13 +129,11 @@ class Detection(Task):
     def class_names(self, network: Any, count: int | None) -> Sequence[str] | None:
         """Return the names of COCO for torchvision, or those that transformers stores."""
         names = stored_names(unwrapped(network))
-        if not names and _torchvision_count(network):
+        if not names and _torchvision_count(network) == COCO_COUNT:
             from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights as Weights
 
             # The names of COCO by the numbers that torchvision's detectors return.
             names = Weights.COCO_V1.meta["categories"]
-            if len(names) != _torchvision_count(network):
-                return None
         return unique_names(names) or None
 
     def output_count(self, network: Any, outputs: Any) -> int | None:
@@ -221,8 +221,7 @@ class Detection(Task):
         """Check that boxes of another class are the goal of the attack."""
         if self.goal != MISLABEL or target == "least_likely":
             advice = "leave it out, or set goal='mislabel' and name a class"
-            given = errors.describe(target)
-            raise InputError(f"target is {given}, and {self} hides objects: {advice}")
+            raise InputError(f"target is {errors.describe(target)} for {self}: {advice}")
 
     def draw(self, image: Tensor, output: Detections, classes: Sequence[str]) -> Tensor:
         """Draw the boxes whose scores reach the threshold, with their classes and scores."""
@@ -355,7 +354,7 @@ class _Reader:
             given, title = outputs, f"decode of {title}"
             with errors.explained(f"{title} fails on {errors.describe(given)}"):
                 outputs = task.decode(given)
-        elif _is_transformer(outputs):
+        elif _is_transformer(outputs) or _is_rt_detr(outputs):
             outputs = _of_transformer(outputs, images, title, self.class_count)
         if _is_ultralytics(outputs):
             outputs, is_raw = _of_ultralytics(outputs[0]), True
@@ -420,7 +419,7 @@ class _Reader:
         last = (class_count or int(NO_LIMIT)) - 1
         if len(labels) and not (labels.min() >= 0 and labels.max() <= last):
             span = f"from {int(labels.min())} to {int(labels.max())}"
-            advice = f"give indices of the {class_count} classes, from 0 to {last}"
+            advice = "give indices of classes, from 0" + f" to {last}" * bool(class_count)
             raise InputError(f"{title} returned labels {span}: {advice}")
         return found | {keys[2]: labels.detach().long()}
 
@@ -469,8 +468,12 @@ def _of_transformer(
     Otherwise, logits of classes are independent, and the best pairs of box and class are returned.
     A single logit is that of a class.
     """
-    given = outputs if isinstance(outputs, Mapping) else vars(outputs)
-    logits, fractions = given["logits"], given["pred_boxes"]
+    if isinstance(outputs, tuple):
+        # RT-DETR of Ultralytics returns those of each layer of its decoder.
+        fractions, logits = (layers[-1] for layers in outputs[1][:2])
+    else:
+        given = outputs if isinstance(outputs, Mapping) else vars(outputs)
+        logits, fractions = given["logits"], given["pred_boxes"]
     # Number of classes, maybe with "no object".
     columns = logits.shape[-1]
     if class_count not in (None, columns, columns - 1):
@@ -499,16 +502,19 @@ def _is_ultralytics(outputs: Any) -> bool:
     return is_pair and isinstance(outputs[0], Tensor) and outputs[0].ndim == 3
 
 
+def _is_rt_detr(outputs: Any) -> bool:
+    """Return whether outputs are final boxes and five parts, as RT-DETR of Ultralytics returns."""
+    return _is_ultralytics(outputs) and isinstance(outputs[1], tuple) and len(outputs[1]) == 5
+
+
 def _of_ultralytics(outputs: Tensor) -> list[dict[str, Tensor]]:
     """Read rows (N, n, 6) of box, score and label, or columns (N, 4 + C, K) of box and scores.
 
     Rows begin with left, top, right and bottom, and columns with center and size, in pixels.
     """
     if outputs.shape[2] == 6:
-        return [
-            {"boxes": rows[:, :4], "scores": rows[:, 4], "labels": rows[:, 5].detach()}
-            for rows in outputs
-        ]
+        columns = outputs[..., :4], outputs[..., 4], outputs[..., 5].detach()
+        return [dict(zip(FINAL, of_image, strict=True)) for of_image in zip(*columns, strict=True)]
     # The transpose has a row for each box, shape (N, K, 4 + C).
     center, size = outputs.mT[..., :2], outputs.mT[..., 2:4]
     boxes = torch.cat([center - size / 2, center + size / 2], dim=-1)

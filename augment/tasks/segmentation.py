@@ -94,7 +94,10 @@ class Segmentation(Task):
         if is_tensor and not is_full:
             # Segmenters of transformers return smaller logits, which its own reader enlarges.
             logits = F.interpolate(logits, images.shape[2:], mode="bilinear", align_corners=False)
-        count = class_count or (logits.shape[1] if is_tensor else "C")
+        if is_tensor and hasattr(outputs, "masks_queries_logits"):
+            logits = logits.clamp_min(torch.finfo(logits.dtype).tiny).log()
+        # The largest of a single logit would be at each pixel.
+        count = class_count or (max(2, logits.shape[1]) if is_tensor else "C")
         shape = (len(images), count, *images.shape[2:])
         if not is_tensor or logits.shape != shape:
             raise InputError(f"{title} returned {describe(logits)}: it must return logits {shape}")
@@ -183,12 +186,11 @@ def _logits(outputs: Any) -> Any:
     """Return the logits (N, C, H, W) of the pixels, which torchvision names "out".
 
     Mask2Former and similar networks return a mask and class probabilities for each of Q queries.
-    Their result is log Σ_q P(class of q) · P(pixel in the mask of q).
+    Their result is not a logit but Σ_q P(class of q) · P(pixel in the mask of q).
     """
     if hasattr(outputs, "masks_queries_logits"):
         # The last class of a query is "no object", which no pixel shows.
         classes = outputs.class_queries_logits.softmax(-1)[..., :-1]
-        scores = torch.einsum("nqc,nqhw->nchw", classes, outputs.masks_queries_logits.sigmoid())
-        return scores.clamp_min(torch.finfo(scores.dtype).tiny).log()
-    has_out = isinstance(outputs, Mapping) and "out" in outputs
-    return outputs["out"] if has_out else plain_outputs(outputs)
+        return torch.einsum("nqc,nqhw->nchw", classes, outputs.masks_queries_logits.sigmoid())
+    out = outputs.get("out") if isinstance(outputs, Mapping) else getattr(outputs, "out", None)
+    return plain_outputs(outputs) if out is None else out

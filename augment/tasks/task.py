@@ -204,8 +204,7 @@ class Task(ABC):
         What it finds in unchanged images is the truth for the same images in other light.
         """
 
-    @abstractmethod
-    def require_target(self, target: Any) -> None:
+    def require_target(self, target: Any) -> None:  # noqa: B027 (Some tasks accept every target.)
         """Check that an attack of this task can have a target class."""
 
     def confidences(self, evidence: Float[Tensor, "... K"]) -> Float[Tensor, "... C"]:

@@ -199,6 +199,7 @@ def red_or_not():
     network = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(3, 2))
     return network, 16, ["red", "other"]
 
+def wide(): return red_or_not()[0], (8, 16), ["red", "other"]
 def no_size(): return nn.Identity(), "16", ["red"]
 def huge(): return nn.Identity(), 10**9, ["red"]
 def leaves(): raise SystemExit(0)
@@ -214,12 +215,13 @@ def own_networks(tmp_path, monkeypatch) -> None:
     monkeypatch.delitem(sys.modules, "own_networks", raising=False)
 
 
-def test_a_function_in_the_current_folder_makes_a_classifier(own_networks):
-    classifier = load_classifier("python:own_networks:red_or_not")
-    assert classifier.size == 16
+@pytest.mark.parametrize(("name", "size", "height"), [("red_or_not", 16, 16), ("wide", (8, 16), 8)])
+def test_a_function_in_the_current_folder_makes_a_classifier(own_networks, name, size, height):
+    classifier = load_classifier(f"python:own_networks:{name}")
+    assert classifier.size == size
     assert classifier.classes == ("red", "other")
     assert not classifier.training
-    assert classifier(torch.rand(2, 3, 16, 16)).shape == (2, 2)
+    assert classifier(torch.rand(2, 3, height, 16)).shape == (2, 2)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 import pytest
 import torch
-from torch.utils.data import DataLoader
 from torchvision.ops import masks_to_boxes
 
 import norm_balls as nb
@@ -11,7 +10,7 @@ from augment.service import AugmentationService
 from augment.tasks.detection import Detection
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from tests.detectors import BrightBox, small_detector
+from tests.detectors import BrightBox
 
 SIZE = 32
 CLASSES = ("background", "cup", "bottle")
@@ -19,7 +18,7 @@ CLASSES = ("background", "cup", "bottle")
 MESHES = [("solid:bottle", 2), ("solid:ball", -1), ("solid:cup", 1)]
 
 
-def serve(meshes=MESHES, task=None, classes=CLASSES, camera=None, **options) -> AugmentationService:
+def serve(task=None, classes=CLASSES, camera=None, **options) -> AugmentationService:
     scene = {"samples": 1, "backgrounds": [0.5], "rasterizer": "numpy"}
     scene |= {"cameras": [camera]} if camera else {"views": 2}
     given = AugmentationSettings(**options)
@@ -43,14 +42,6 @@ def test_targets_are_the_pixels_that_differ_from_the_background(renders):
         assert target["labels"].tolist() == [int(label)] * count
         assert (target["boxes"].shape, target["boxes"].dtype) == ((count, 4), torch.float32)
         assert (target["labels"].dtype, target["masks"].dtype) == (torch.int64, torch.uint8)
-
-
-def test_a_detector_of_torchvision_learns_from_batches_of_renders(renders):
-    loader = DataLoader(renders, batch_size=4, collate_fn=lambda batch: [*zip(*batch, strict=True)])
-    detector = small_detector(len(CLASSES), SIZE).train()
-    for images, targets in loader:
-        losses = detector(images, targets)
-        assert all(loss.isfinite() for loss in losses.values())
 
 
 def test_an_attack_hides_objects_and_draws_random_light_for_images_without_a_class():

@@ -4,7 +4,6 @@ from torchvision.ops import box_iou
 
 import norm_balls as nb
 from augment import dataset
-from train.checkpoints import load_run
 
 LABELED = ("orange", "sweet_pepper", "mushroom", "cup", "bottle")
 LOOKS = {"width": 3.2, "encoding": "srgb"}
@@ -19,6 +18,7 @@ def test_the_published_detector_finds_more_than_half_of_other_solids(detector):
     objects = [(f"solid:{kind}:{seed}", kind) for kind in LABELED for seed in (2001, 2002)]
     scene = nb.build_scene(objects, detector.size, **LOOKS)
     rows = torch.arange(len(scene))
+    assert detector.classes == ("background", *LABELED)
     truth = scene.truth(detector.label)
     outputs = detector(scene.render(scene.conditions(rows), rows)[:, 0])
     labels = truth.labels[:, 0, 0]
@@ -38,10 +38,3 @@ def test_renders_are_attacked_for_a_detector_that_reads_its_outputs_itself(detec
         patch.setattr(dataset, "BLOCK", 1)
         [render] = nb.render_dataset(meshes, detector.size, 1, **options)
     assert render.labels == ["orange"]
-
-
-def test_a_run_of_the_published_detector_is_the_same_network(detector):
-    other = load_run("pretrained/detector")
-    assert other.classes == detector.classes == ("background", *LABELED)
-    weights = zip(detector.state_dict().values(), other.state_dict().values(), strict=True)
-    assert all(torch.equal(own, others) for own, others in weights)

@@ -188,13 +188,12 @@ def evaluate(
         with sole_writer("out", target) if target else nullcontext():
             if not isinstance(made, Classifier):
                 found: AnnotatedScores
+                options = fit, skip_unreadable, device
                 if isinstance(made.task, Detection):
                     chosen = None if label is None else label_names(label)
-                    found = evaluate_detector(
-                        made, annotations, chosen, fit, skip_unreadable, device
-                    )
+                    found = evaluate_detector(made, annotations, chosen, *options)
                 else:
-                    found = evaluate_segmenter(made, folder, fit, skip_unreadable, device)
+                    found = evaluate_segmenter(made, folder, *options)
                 if target:
                     annotated_scores.write(found, target)
                 return found

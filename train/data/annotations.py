@@ -206,11 +206,8 @@ def _read_coco(file: Path) -> Annotations:
         for item in images.values():
             item["file_name"] = str(item["file_name"]).replace("\\", "/")
         names_of_images = [item["file_name"] for item in images.values()]
-        for key, found in (
-            ("images", images),
-            ("images", {*names_of_images}),
-            ("categories", names),
-        ):
+        unique = ("images", images), ("images", {*names_of_images}), ("categories", names)
+        for key, found in unique:
             if len(found) < len(content[key]):
                 raise ValueError(f"two of the {key} have the same id or file_name")
         # For each image id, the rows that `_annotated` takes: label, four sides and `is_crowd`.
@@ -227,14 +224,13 @@ def _read_coco(file: Path) -> Annotations:
             corners = (*box[:2], *(box[:2] + box[2:]))
             rows[item["image_id"]].append((label, *corners, bool(item.get("iscrowd"))))
         paths = _find_images(file, names_of_images)
-        photographs, missing = [], []
+        missing = [name for name in names_of_images if name not in paths]
+        photographs = []
         for key, image in images.items():
             name = image["file_name"]
             size = (image["width"], image["height"]) if image.get("width") else None
             if name in paths:
                 photographs.append(_annotated(paths[name], name, size, rows[key]))
-            else:
-                missing.append(name)
     if not photographs:
         first = f", such as {missing[0]}" if missing else ""
         raise InputError(f"{file} names no image that exists{first}: move the images beside it")

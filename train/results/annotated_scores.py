@@ -21,7 +21,7 @@ from renderer.io.files import atomic_write
 from renderer.io.images import draw_grid, tiles_of, write_image
 from renderer.settings import height_and_width
 from train import console
-from train.class_names import class_of_name
+from train.class_names import class_name, class_of_name
 from train.data.annotations import (
     FITS,
     Annotated,
@@ -236,9 +236,8 @@ def evaluate_detector(
             console.warning("%s: a box without an area in the photograph is left out", item.name)
     all_matches = [matched for of_source in matches.values() for matched in of_source]
     by_label = _score(all_matches, label_of_class, task)
-    by_source = {}
-    for source in sorted(matches) if len(matches) > 1 else ():
-        by_source[source] = _score(matches[source], label_of_class, task)
+    sources = sorted(matches) if len(matches) > 1 else ()
+    by_source = {source: _score(matches[source], label_of_class, task) for source in sources}
     overall = by_label.pop(ALL)
     missing = f" ({len(annotations.missing)} files are missing)" if annotations.missing else ""
     return DetectionScores(
@@ -263,7 +262,12 @@ def _choose_labels(
     """Return the index in the network of each scored class, by its name in the annotations."""
     # None for a class that the network lacks.
     known = {name: class_of_name(name, classes) for name in annotations.classes}
-    chosen = [*known] if labels is None else [*labels]
+    # A class is named as in the annotations, as in the network, or by its index in the network.
+    marked = {own: name for name, own in known.items()}
+    chosen = [
+        name if name in known else marked.get(class_name(classes, name, "label"), name)
+        for name in (known if labels is None else labels)
+    ]
     unmarked = [name for name in chosen if name not in known]
     if unmarked:
         names = ", ".join(annotations.classes[:10])

@@ -81,18 +81,6 @@ def test_an_object_that_leaves_the_view_is_no_success():
     assert rule.predicted(rule.evidence([empty])) == 0
 
 
-@pytest.mark.parametrize("goal", ["hide", "mislabel"])
-def test_the_gradient_of_the_cost_is_that_of_finite_differences(goal):
-    item = {name: value.double() for name, value in drawn_boxes(3).items()}
-    item["labels"] = item["labels"].long()
-    rule = criterion(goal=goal, box=TRUE_BOX.double())
-
-    def cost(scores: Tensor) -> Tensor:
-        return rule.cost([item | {"scores": scores}])
-
-    assert torch.autograd.gradcheck(cost, item["scores"].clone().requires_grad_())
-
-
 def test_the_cost_is_the_log_sum_of_the_odds_of_candidates_near_the_object():
     item = drawn_boxes(1)
     is_near = box_iou(item["boxes"], TRUE_BOX[None])[:, 0] >= 0.25
@@ -132,15 +120,22 @@ SETTINGS = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.2), max_steps=
 def test_a_list_of_boxes_is_recognized_and_said(caplog):
     adapted = as_network(brightness_detector, SIZE, CLASSES, name="boxes of one")
     assert adapted.task == nb.Detection()
-    assert "boxes of one: its outputs are of Detection(" in caplog.text
+    assert "boxes of one: its outputs are of detection" in caplog.text
 
 
-def test_an_object_that_is_not_found_before_is_reported_and_no_success():
-    scene, task = ball_scene(), nb.Detection(threshold=0.9)
+@pytest.mark.parametrize("goal", ["hide", "mislabel"])
+def test_an_object_that_is_not_found_before_is_reported_and_no_success(goal):
+    def find(images: Tensor) -> list[dict[str, Tensor]]:
+        # To mislabel, the attack makes the ball so bright that it is detected as a cup.
+        label = torch.tensor([int(goal == "mislabel")])
+        return [item | {"labels": label} for item in brightness_detector(images)]
+
+    scene, task = ball_scene(), nb.Detection(threshold=0.8, goal=goal)
+    options = {"task": task, "settings": SETTINGS, "classes": CLASSES}
     with pytest.raises(nb.InputError, match="not found"):
-        nb.attack(brightness_detector, scene, task=task, settings=SETTINGS, classes=CLASSES)
-    options = {"task": task, "settings": SETTINGS, "classes": CLASSES, "force": True}
-    result = nb.attack(brightness_detector, scene, **options)
+        nb.attack(find, scene, **options)
+    result = nb.attack(find, scene, **options, force=True)
+    assert result.success_in_views.all()
     assert not result.clean_correct.any() and not result.success.any()
 
 

@@ -46,8 +46,8 @@ def of_torchvision(library, name: str, **options) -> nn.Module:
     return network.eval()
 
 
-def slopes(network, task, step: float = 1e-7) -> tuple[Tensor, Tensor]:
-    """Return the slope of the cost along its gradient in pixels, and that by finite differences.
+def require_slope(network, task, step: float = 1e-7, rtol: float = 1e-3) -> None:
+    """Compare the slope of the cost along its gradient in pixels with that by finite differences.
 
     The object is at a candidate of a detector, or in the center for a segmenter. Steps are small,
     because deep networks have many kinks.
@@ -72,7 +72,8 @@ def slopes(network, task, step: float = 1e-7) -> tuple[Tensor, Tensor]:
         ahead, behind = (
             rule.cost(adapted(images + sign * step * gradient / slope)) for sign in (1, -1)
         )
-    return slope, (ahead - behind).sum() / (2 * step)
+    assert slope > 1e-8
+    torch.testing.assert_close(slope, (ahead - behind).sum() / (2 * step), rtol=rtol, atol=0)
 
 
 @pytest.mark.slow
@@ -80,19 +81,14 @@ def slopes(network, task, step: float = 1e-7) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("name", DETECTORS)
 def test_the_gradient_of_a_detector_of_torchvision_is_that_of_finite_differences(name, goal):
     network = of_torchvision(detection, name, **DETECTORS[name])
-    found, expected = slopes(network, nb.Detection(goal=goal))
-    assert found > 1e-8
     # Detectors with proposals give no gradient to the positions of the proposals.
-    rtol = 0.1 if "rcnn" in name else 1e-3
-    torch.testing.assert_close(found, expected, rtol=rtol, atol=0)
+    require_slope(network, nb.Detection(goal=goal), rtol=0.1 if "rcnn" in name else 1e-3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SEGMENTERS)
 def test_the_gradient_of_a_segmenter_of_torchvision_is_that_of_finite_differences(name):
-    found, expected = slopes(of_torchvision(segmentation, name), nb.Segmentation())
-    assert found > 1e-8
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+    require_slope(of_torchvision(segmentation, name), nb.Segmentation())
 
 
 def test_candidates_of_torchvision_are_its_boxes_without_suppression_in_the_pixels_given():
@@ -114,9 +110,7 @@ def test_candidates_of_torchvision_are_its_boxes_without_suppression_in_the_pixe
 
 @pytest.mark.parametrize("goal", ["hide", "mislabel"])
 def test_the_gradient_in_the_pixels_is_that_of_finite_differences(goal):
-    found, expected = slopes(small_detector(len(CLASSES), SIZE), nb.Detection(goal=goal), step=1e-4)
-    assert found > 1e-8
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+    require_slope(small_detector(len(CLASSES), SIZE), nb.Detection(goal=goal), step=1e-4)
 
 
 def test_a_single_logit_of_a_detector_of_transformers_is_that_of_its_class():
@@ -128,6 +122,19 @@ def test_a_single_logit_of_a_detector_of_transformers_is_that_of_its_class():
     for item in as_network(find, SIZE, ["ball"])(images):
         torch.testing.assert_close(item["scores"], torch.tensor([0.25]).sigmoid())
         assert item["labels"].tolist() == [0]
+
+
+def test_boxes_of_rt_detr_are_those_of_the_last_layer_in_pixels():
+    # Center and size as fractions of the image, for each layer of the decoder.
+    boxes = torch.tensor([[1.0, 1.0, 1.0, 1.0], [0.5, 0.4, 0.2, 0.6]])[:, None, None]
+    logits = torch.tensor([[9.0, 9.0, 9.0], [-1.0, 2.0, -3.0]])[:, None, None]
+    final = torch.cat([boxes[1], logits[1].sigmoid().amax(2, True), torch.ones(1, 1, 1)], dim=2)
+    outputs = final, (boxes, logits, boxes[0], logits[0], None)
+    [item] = nb.Detection().reader("network", 3)(outputs, torch.zeros(1, 3, 50, 100))
+    torch.testing.assert_close(item["boxes"], torch.tensor([[40.0, 5.0, 60.0, 35.0]]))
+    assert item["labels"].tolist() == [1]
+    torch.testing.assert_close(item["scores"], torch.tensor([2.0]).sigmoid())
+    torch.testing.assert_close(item["candidate_scores"], logits[1, 0].sigmoid())
 
 
 class Raw(nn.Module):

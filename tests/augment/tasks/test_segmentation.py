@@ -1,5 +1,8 @@
+from types import SimpleNamespace
+
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 import norm_balls as nb
@@ -66,3 +69,21 @@ def test_logits_of_another_size_are_refused(shape):
     reader = nb.Segmentation().reader("network", 3)
     with pytest.raises(nb.InputError, match=r"must return logits \(1, 3, 12, 12\)"):
         reader(torch.zeros(shape), torch.zeros(1, 3, SIZE, SIZE))
+
+
+def test_a_single_logit_is_refused_because_its_class_would_be_everywhere():
+    with pytest.raises(nb.InputError, match=r"must return logits \(1, 2, 12, 12\)"):
+        nb.Segmentation().reader("network")(
+            torch.zeros(1, 1, SIZE, SIZE), torch.zeros(1, 3, 12, 12)
+        )
+
+
+def test_the_probabilities_of_queries_are_enlarged_and_not_their_logarithms():
+    draws = torch.Generator().manual_seed(0)
+    masks = 40 * torch.randn(1, 5, 3, 4, generator=draws)
+    classes = torch.randn(1, 5, 4, generator=draws)
+    outputs = SimpleNamespace(masks_queries_logits=masks, class_queries_logits=classes)
+    read = nb.Segmentation().reader("network")(outputs, torch.zeros(1, 3, SIZE, SIZE))
+    scores = classes.softmax(2)[0, :, :3].T @ masks.sigmoid()[0].flatten(1)
+    expected = F.interpolate(scores.view(1, 3, 3, 4), (SIZE, SIZE), mode="bilinear")
+    torch.testing.assert_close(read.exp(), expected)

@@ -55,7 +55,9 @@ def test_recall_and_false_detections_are_the_counted_ones_and_written(photograph
     assert scores.by_label["dog"].false_per_image.value == 0
     assert scores.by_label["Cow"].recall.value is None
     assert scores.by_label["Cow"].false_per_image.value == pytest.approx(1)
+    # Cows do not count, because no photograph shows one.
     assert scores.overall.recall == scores.by_label["dog"].recall
+    assert scores.overall.ap50 == scores.by_label["dog"].ap50
     recalls = {name: metrics["dog"].recall.value for name, metrics in scores.by_source.items()}
     assert recalls == {"dark": 0, "light": 1}
     summary = json.loads((out / "summary.json").read_text())
@@ -72,6 +74,9 @@ def test_a_class_that_the_network_lacks_is_not_scored(photographs):
     assert scores.labels == ["dog", "Cow"]
     only = nb.evaluate(_find_white, photographs, "dog", classes=CLASSES, size=120)
     assert only.labels == ["dog"]
+    # A class of the network, by name and by index, which the annotations write in another way.
+    for label in ("cow", 2):
+        assert nb.evaluate(_find_white, photographs, label, classes=CLASSES).labels == ["Cow"]
     with pytest.raises(InputError, match="no classes of the network"):
         nb.evaluate(_find_white, photographs, "yak", classes=CLASSES, size=120)
     with pytest.raises(InputError, match="marks no cat"):

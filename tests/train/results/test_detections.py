@@ -105,20 +105,6 @@ def test_an_object_has_at_most_one_detection_of_its_class(boxes, labels, scores,
     assert detections.match(found, marked, 0.5).tolist() == expected
 
 
-def test_numbers_of_two_images_are_the_counted_ones():
-    found = [_found([BOX, BOX + 50], [0, 0], [0.9, 0.5]), _found([BOX, BOX], [0, 1], [0.3, 0.6])]
-    marked = [_marked([BOX], [0]), _marked([BOX], [0])]
-    matches = _match(found, marked)
-    metrics = detections.score(matches, [0], threshold=0.4)
-    assert metrics.n == 2
-    assert metrics.recall.value == 0.5
-    assert metrics.false_per_image.value == pytest.approx(0.5)
-    both = detections.score(matches, [0, 1], threshold=0.4)
-    assert both.false_per_image.value == pytest.approx(1.0)
-    assert both.ap50.value == metrics.ap50.value
-    assert detections.score(matches, [1], 0.4).ap50.value is None
-
-
 def test_objects_of_the_same_photograph_add_nothing_to_its_interval():
     def recall(copies):
         shifts = 50 * np.arange(copies)[:, None]
