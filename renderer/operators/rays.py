@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -56,7 +57,7 @@ MAX_COMPARISONS = 2**30
 # The plane of a face may block light that would reach an interpolated normal (smooth
 # shading). This is ignored if at most this fraction of uniform environment light is blocked.
 MAX_IGNORED_LIGHT = 1 / 1024
-# Number of pairs of a pixel and a ray direction that `Rays.hits` processes at
+# Number of pairs of a pixel and a ray direction that `Rays.blocked` processes at
 # once. It limits the memory.
 BLOCK = 2**17
 # Stands for the index of the face that a ray hits if it hits no face.
@@ -130,6 +131,22 @@ class Surface:
         return unit(smooth_normals(self.fragments, corner_normals).T).T
 
     @cached_property
+    def samples_of_pixels(self) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+        """Number of samples of each of the P pixels, and index of the first of them."""
+        fragments = self.fragments
+        count = fragments.sample_to_pixel.bincount(minlength=len(fragments.pixels))
+        return count, count.cumsum(0) - count
+
+    def samples_of_rays(self, pixels: Int[Tensor, " B"], ray_count: int) -> Int[Tensor, "B D"]:
+        """Return the sample from which each of the first D rays of B pixels starts.
+
+        Adding the index of the pixel makes neighboring pixels use different samples for the same
+        direction.
+        """
+        count, first = (values[pixels, None] for values in self.samples_of_pixels)
+        return first + (torch.arange(ray_count) + pixels[:, None]) % count
+
+    @cached_property
     def points(self) -> Tensor:
         """Position in world axes of each of the S samples, shape (S, 3)."""
         return self.fragments.interpolate(self.vertices[self.fragments.corners])
@@ -149,28 +166,35 @@ class Surface:
         return toward_camera(self.fragments, self.vertices)
 
 
-class RayHits(NamedTuple):
-    """First faces that rays from B pixels of a view hit in D directions.
+class BlockedRays(NamedTuple):
+    """E rays from B pixels, in whose directions the mesh blocks the light of the sky.
 
     Attributes:
         pixels: Index of each pixel in `Fragments.pixels`, shape (B,).
-        sample_of_ray: Index of the sample from which each ray starts,
-            shape (B, D).
-        weight: Weight of the radiance from each direction in the irradiance that
-            the mesh blocks, shape (B, D). It is 0 if the sky is visible in the
-            direction. Otherwise, it is the solid angle of the direction, times the
-            cosine to the shading normal, times the number n of samples of the
-            pixel, because each sample casts only D / n of the rays.
-        face_of_ray: Index in the mesh of the first face that each ray hits, or
-            `NO_FACE`, shape (B, D). No ray is cast in directions below the plane
-            of the face on which the sample lies. They have `NO_FACE`, and a
-            positive weight if the angle to the shading normal is less than 90°.
+        row: Index in `pixels` of the pixel of each ray, shape (E,).
+        direction: Index of the direction of each ray, shape (E,).
+        sample: Index of the sample from which it starts, shape (E,).
+        weight: Weight of the radiance from its direction in the irradiance of its pixel,
+            shape (E,). It is the solid angle of the direction, times the cosine to the shading
+            normal, times the number n of samples of the pixel, because each sample has only
+            1 / n of the directions.
+        face: Index in the mesh of the first face that it hits, shape (E,). No ray is cast in
+            directions below the plane of the face on which the sample lies. They have `NO_FACE`.
     """
 
     pixels: Int[Tensor, " B"]
-    sample_of_ray: Int[Tensor, "B D"]
-    weight: Float[Tensor, "B D"]
-    face_of_ray: Int[Tensor, "B D"]
+    row: Int[Tensor, " E"]
+    direction: Int[Tensor, " E"]
+    sample: Int[Tensor, " E"]
+    weight: Float[Tensor, " E"]
+    face: Int[Tensor, " E"]
+
+    def add_light(
+        self, weights: Float[Tensor, " E"], sky: Float[Tensor, "D K"]
+    ) -> Float[Tensor, "B K"]:
+        """Add up the light from the directions of the rays of each pixel, times their weights."""
+        matrix = weights.new_zeros(len(self.pixels), len(sky))
+        return matrix.index_put_((self.row, self.direction), weights) @ sky
 
 
 class Rays:
@@ -190,49 +214,47 @@ class Rays:
         """Distance above the surface at which rays start, in world units."""
         return OFFSET * float(np.abs(self._mesh.vertices).max())
 
-    def hits(self, surface: Surface, directions: Float[Tensor, "D 3"]) -> Iterator[RayHits]:
-        """Cast rays in D directions from all pixels that may see another face of the mesh.
+    def blocked(self, surface: Surface, directions: Float[Tensor, "D 3"]) -> Iterator[BlockedRays]:
+        """Find which of D directions (`ray_directions`) the mesh blocks, for blocks of pixels.
 
-        Each ray starts at one sample of its pixel. The face of this sample
-        blocks all light from below its plane, as if the mesh were the surface of a
-        solid. The directions divide the sphere equally (see `sphere`), and each result is
-        for the next block of pixels.
+        The face of a sample blocks all light from below its plane, as if the mesh were the surface
+        of a solid. Pixels that can see no other surface are left out.
         """
-        fragments = surface.fragments
         pixels, may_hit = self._pixels_to_cast(surface)
-        if not len(pixels):
-            return
-        plane_normals = surface.planes
-        # Number of samples of each pixel. The samples of a pixel follow each other.
-        sample_count = fragments.sample_to_pixel.bincount(minlength=len(fragments.pixels))
-        first_sample = sample_count.cumsum(0) - sample_count
-        solid_angle = 4 * math.pi / len(directions)
-        pixels_per_block = max(1, BLOCK // len(directions))
-        for block in pixels.split(pixels_per_block):
-            # Number of samples of each pixel of the block, with an axis of size 1 for the ray
-            # directions.
-            samples_in_pixel = sample_count[block, None]
-            # Each ray of a pixel starts at one of its samples. Shuffled numbers spread the
-            # directions over the samples. Adding the index of the pixel makes neighboring
-            # pixels use different samples for the same direction.
-            rank_in_pixel = (_shuffled(len(directions)) + block[:, None]) % samples_in_pixel
-            sample_of_ray = first_sample[block, None] + rank_in_pixel
-            # Cosine of each direction to the shading normal, and height of the direction above
-            # the plane of the face, shape (pixels of the block, D).
-            cosine = dot(surface.normals[sample_of_ray], directions).clamp(min=0)
-            height = dot(plane_normals[sample_of_ray], directions)
-            # Pairs of a pixel and a direction that need a ray: the direction is above the
-            # face, and in front of the shading normal, and the ray may hit another face.
-            is_above = (height > 0) & may_hit[sample_of_ray]
-            cast = torch.nonzero((cosine > 0) & is_above, as_tuple=True)
-            start_sample = sample_of_ray[cast]
-            origins = surface.points[start_sample] + self.offset * plane_normals[start_sample]
-            hit_face = self.first_hit(origins, directions[cast[1]])
-            face_of_ray = torch.full_like(sample_of_ray, NO_FACE).index_put_(cast, hit_face)
-            # The sky is not visible in directions below the plane of the face (height < 0).
-            is_sky = (face_of_ray == NO_FACE) & (height >= 0)
-            weight = (cosine * samples_in_pixel * solid_angle).masked_fill(is_sky, 0)
-            yield RayHits(block, sample_of_ray, weight, face_of_ray)
+        normals, planes = surface.normals, surface.planes
+        starts = (surface.points + self.offset * planes).float()
+        sample_count, _ = surface.samples_of_pixels
+        for count in sample_count[pixels].unique().tolist():
+            # The directions form turns, in each of which a pixel goes once through its samples. So
+            # those in one place of all turns start at the same sample. The last turn is filled up
+            # with zeros, which are blocked nowhere.
+            places = min(count, len(directions))
+            turns = -(-len(directions) // places)
+            in_turns = F.pad(directions, (0, 0, 0, turns * places - len(directions)))
+            at_places = in_turns.view(turns, places, 3).transpose(0, 1)
+            float_directions = in_turns.float()
+            group = pixels[sample_count[pixels] == count]
+            for block in group.split(max(1, BLOCK // len(directions))):
+                sample = surface.samples_of_rays(block, places).T
+                # Cosine of each direction to the shading normal, and height of the direction above
+                # the plane of the face, shape (places, turns, pixels of the block).
+                cosine = at_places @ normals[sample].mT
+                height = cosine if normals is planes else at_places @ planes[sample].mT
+                is_in_front = cosine > 0
+                # A ray is only cast above the face, and if it may hit another face.
+                cast = torch.nonzero(is_in_front & (height > 0) & may_hit[sample][:, None])
+                place, turn, row = cast.T
+                origins = starts[sample[place, row]]
+                face = self.first_hit(origins, float_directions[turn * places + place])
+                is_hit = face != NO_FACE
+                below = torch.nonzero(is_in_front & (height < 0))
+                place, turn, row = torch.cat([cast[is_hit], below]).T
+                faces = F.pad(face[is_hit], (0, len(below)), value=NO_FACE)
+                weight = cosine[place, turn, row] * (count * 4 * math.pi / len(directions))
+                seen, row_of_ray = row.unique(return_inverse=True)
+                rays = row_of_ray, turn * places + place, sample[place, row], weight, faces
+                if len(seen):
+                    yield BlockedRays(block[seen], *rays)
 
     @cached_property
     def _scene(self) -> Any:
@@ -299,11 +321,6 @@ class Rays:
         return torch.from_numpy(self._scene.run(*rays)).long()
 
 
-def dot(vectors: Float[Tensor, "B D 3"], directions: Float[Tensor, "D 3"]) -> Float[Tensor, "B D"]:
-    """Compute scalar products of vectors, one for each pixel and direction, with directions."""
-    return torch.einsum("bdi,di->bd", vectors, directions)
-
-
 @cache_tensors
 def sphere(count: int) -> Float[Tensor, "count 3"]:
     """Compute directions that divide the sphere equally (spherical Fibonacci lattice)."""
@@ -316,13 +333,14 @@ def sphere(count: int) -> Float[Tensor, "count 3"]:
 
 
 @cache_tensors
-def _shuffled(count: int) -> Int[Tensor, " count"]:
-    """Return a random permutation of 0 to count - 1, which is the same in every call.
+def ray_directions(count: int) -> Float[Tensor, "count 3"]:
+    """Return the directions of `sphere` in a random order, which is the same in every call.
 
-    The directions of `sphere` are sorted by z. In this shuffled order, each sample of a pixel gets
-    ray directions from all over the sphere.
+    Those of `sphere` are sorted by z. In this order, each sample of a pixel gets directions from
+    all over the sphere.
     """
-    return torch.randperm(count, generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(0)).argsort()
+    return sphere(count)[order]
 
 
 def local_transfer(

@@ -40,7 +40,7 @@ from renderer.errors import InputError
 from renderer.light.basis import Basis, Harmonics
 from renderer.mesh import Mesh, refine
 from renderer.operators import rays
-from renderer.operators.rays import RayHits, Rays, Surface, sphere
+from renderer.operators.rays import BlockedRays, Rays, Surface, ray_directions
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo
 from renderer.surface.gloss import SampleGloss, at_samples
@@ -150,24 +150,22 @@ class Patches:
         patch_sums = values.new_zeros(len(self.view.pixels), values.shape[1])
         return patch_sums.index_add_(0, self.view.sample_to_pixel, values * self.fractions)
 
-    def weights_by_patch(
-        self, hits: RayHits, directions: Float[Tensor, "D 3"], weights: Float[Tensor, "B D"]
+    def sum_by_patch(
+        self, blocked: BlockedRays, directions: Float[Tensor, "D 3"], weights: Float[Tensor, " E"]
     ) -> csr_matrix:
         """Add up the weights of the rays from a pixel that hit the same patch.
 
         A patch is a group of pieces, the small faces of the mesh `pieces`. The result has
         one row for each pixel, and one column for each patch.
         """
-        is_hit = hits.face_of_ray != rays.NO_FACE
-        # Pixel and direction of each ray that hits a face and has a nonzero weight.
-        pixel, direction = torch.nonzero(weights * is_hit, as_tuple=True)
-        piece = hits.face_of_ray[pixel, direction]
+        is_hit = blocked.face != rays.NO_FACE
+        piece = blocked.face[is_hit]
         # A ray hits the back of a face if it goes in the direction of the outer normal.
-        is_back = (self._normals[piece] * directions[direction]).sum(1) > 0
+        is_back = (self._normals[piece] * directions[blocked.direction[is_hit]]).sum(1) > 0
         patch = self.patch_of_side[is_back.long(), piece]
         # `csr_matrix` adds up entries with the same pixel and patch.
-        entries = (weights[pixel, direction].numpy(), (pixel.numpy(), patch.numpy()))
-        return csr_matrix(entries, (len(weights), len(self.view.pixels)))
+        entries = (weights[is_hit].numpy(), (blocked.row[is_hit].numpy(), patch.numpy()))
+        return csr_matrix(entries, (len(blocked.pixels), len(self.view.pixels)))
 
     @cached_property
     def _normals(self) -> Tensor:
@@ -203,7 +201,7 @@ class Transport:
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
         ray_count = max(rays.DIRECTIONS, rays.DIRECTIONS_PER_SAMPLE * settings.samples**2)
         # Ray directions of an exact image, and of a draft.
-        self._directions = [rays.sphere(count) for count in (ray_count, rays.DRAFT_DIRECTIONS)]
+        self._directions = [ray_directions(count) for count in (ray_count, rays.DRAFT_DIRECTIONS)]
         # Radiance of the sky: one row for each ray direction, one column for each SH coefficient.
         self._skies = [basis.radiance(directions) for directions in self._directions]
         self.has_colored_light = False
@@ -243,44 +241,37 @@ class Transport:
         albedo_by_channel = albedo.T / fragments.samples**2
         diffuse_albedo = albedo_by_channel
         if gloss is not None:
-            diffuse_factor = gloss.diffuse_factor(surface.normals, surface.toward)
-            diffuse_albedo = albedo_by_channel * diffuse_factor
+            seen = surface.normals, surface.toward
+            diffuse_albedo = albedo_by_channel * gloss.diffuse_factor(*seen)
+            in_uniform_light = gloss.reflect_uniform_light(*seen)
         channels = range(len(albedo_by_channel))
         skies = [in_light(sky, channel) for channel in channels]
         if self._patches:
             colors = self._sent.expand(-1, -1, len(channels)).unbind(2)
             sent = [in_light(color, channel) for channel, color in enumerate(colors)]
-        for hits in self.rays.hits(surface, directions):
-            if not hits.weight.any():
-                continue
+        for blocked in self.rays.blocked(surface, directions):
             if change is None:
                 shape = (len(channels), skies[0].shape[1], len(fragments.pixels))
                 change = sky.new_zeros(shape)
-            sample_of_ray = hits.sample_of_ray
             if gloss is not None:
-                # Two specular reflectances along each ray: one that is later multiplied by
-                # the albedo, because metals color reflections, and one that is white. Axes
-                # of both: pixel, direction.
-                cosine = rays.dot(surface.normals[sample_of_ray], directions)
-                metallic, white = _reflect_rays(gloss, surface, sample_of_ray, directions, cosine)
-                # Fraction of the light that passes the coat to the diffuse layer below it.
-                transmittance = gloss.at(sample_of_ray).coat_transmittance(cosine)
+                shown = gloss, surface, in_uniform_light, blocked, directions
+                metallic, white, transmittance = _reflect_rays(*shown)
             for channel, channel_change in enumerate(change):
                 # Reflected radiance per irradiance, for light along each ray.
-                reflectance = diffuse_albedo[channel][sample_of_ray]
+                reflectance = diffuse_albedo[channel][blocked.sample]
                 if gloss is not None:
-                    colored = albedo_by_channel[channel][sample_of_ray] * metallic
-                    specular = colored + white / fragments.samples**2
-                    reflectance = reflectance * transmittance + specular
-                blocked = hits.weight * reflectance
+                    colored = albedo_by_channel[channel][blocked.sample] * metallic
+                    reflectance = reflectance * transmittance + colored
+                    reflectance = reflectance + white / fragments.samples**2
+                weights = blocked.weight * reflectance
                 # Subtract the light of the sky that the mesh blocks: one row for each column of
                 # the sky, one column for each pixel.
-                channel_change[:, hits.pixels] = -(blocked @ skies[channel]).T
+                channel_change[:, blocked.pixels] = -blocked.add_light(weights, skies[channel]).T
                 if self._patches:
                     # Add the light that the pixels receive from patches and reflect.
-                    weights = self._patches.weights_by_patch(hits, directions, blocked)
-                    added = torch.from_numpy(weights @ sent[channel].numpy())
-                    channel_change[:, hits.pixels] += added.T
+                    by_patch = self._patches.sum_by_patch(blocked, directions, weights)
+                    added = torch.from_numpy(by_patch @ sent[channel].numpy())
+                    channel_change[:, blocked.pixels] += added.T
         return change
 
     def radiance(
@@ -303,29 +294,33 @@ class Transport:
 def _reflect_rays(
     gloss: SampleGloss,
     surface: Surface,
-    sample_of_ray: Int[Tensor, "B D"],
+    in_uniform_light: Float[Tensor, " S"],
+    blocked: BlockedRays,
     directions: Float[Tensor, "D 3"],
-    cosine: Float[Tensor, "B D"],
-) -> tuple[Tensor, Tensor]:
-    """Compute the specular reflectance of B pixels for light along their rays.
+) -> tuple[Float[Tensor, " E"], Float[Tensor, " E"], Float[Tensor, " E"]]:
+    """Compute how a glossy surface reflects light from the directions of E rays.
+
+    The first two results are specular reflectances: one that is multiplied by the albedo, because
+    metals color reflections, and one that has the color of the light. The third is the fraction of
+    the light that passes the coat to the diffuse layer below it.
 
     The specular reflection may be narrower than the angle between two of the D ray directions.
     The reflectances of a pixel are therefore scaled so that their sum over the directions is
-    exact for uniform light. The first result is multiplied by the albedo, because metals color
-    reflections. The second has the color of the light. `cosine` is between ray and normal.
+    exact for uniform light (`SampleGloss.reflect_uniform_light`).
     """
-    to_camera = at_samples(surface.toward, sample_of_ray)
+    sample_of_ray = surface.samples_of_rays(blocked.pixels, len(directions))
     normals = surface.normals[sample_of_ray]
+    cosine = torch.einsum("bdi,di->bd", normals, directions)
+    to_camera = at_samples(surface.toward, sample_of_ray)
     colored, white = gloss.at(sample_of_ray).reflect_beams(normals, to_camera, directions)
     # Reflected radiance in uniform light of irradiance 1, that is, of radiance 1 / π. The
     # D directions have the solid angle 4π / D each. Sum · 4π / D · 1 / π is 4 · mean.
     sampled = ((colored + white) * cosine.clamp(min=0)).mean(1, keepdim=True) * 4
-    exact_colored, exact = gloss.reflect_uniform_light(surface.normals, surface.toward)
-    if exact_colored is not None:
-        exact = exact + exact_colored
     smallest = torch.finfo(sampled.dtype).tiny
-    scale = exact[sample_of_ray].mean(1, keepdim=True) / sampled.clamp(min=smallest)
-    return colored * scale, white * scale
+    scale = in_uniform_light[sample_of_ray].mean(1, keepdim=True) / sampled.clamp(min=smallest)
+    at_rays = blocked.row, blocked.direction
+    transmittance = gloss.at(blocked.sample).coat_transmittance(cosine[at_rays])
+    return (colored * scale)[at_rays], (white * scale)[at_rays], transmittance
 
 
 def build_transport(
@@ -391,15 +386,15 @@ def _link_patches(
     # whole sky. The loop below subtracts the directions that the mesh blocks.
     from_sky = surface.planes.new_zeros(patch_count, basis.size)
     from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))
-    directions = sphere(PATCH_DIRECTIONS)
+    directions = ray_directions(PATCH_DIRECTIONS)
     sky_radiance = basis.radiance(directions)
     receiving = [torch.arange(0)]
     factors = [csr_matrix((0, patch_count))]
-    for hits in rays.hits(surface, directions):
+    for blocked in rays.blocked(surface, directions):
         # A patch consists of several small faces (pieces). The weight of a ray contains
         # the area of the piece from which it starts, divided by the area of the patch.
-        weights = hits.weight * patches.fractions[hits.sample_of_ray, 0]
-        from_sky[hits.pixels] -= weights @ sky_radiance
-        receiving.append(hits.pixels)
-        factors.append(patches.weights_by_patch(hits, directions, weights))
+        weights = blocked.weight * patches.fractions[blocked.sample, 0]
+        from_sky[blocked.pixels] -= blocked.add_light(weights, sky_radiance)
+        receiving.append(blocked.pixels)
+        factors.append(patches.sum_by_patch(blocked, directions, weights))
     return from_sky[..., None], torch.cat(receiving), vstack(factors, format="csr")

@@ -187,16 +187,12 @@ class SampleGloss(NamedTuple):
 
     def reflect_uniform_light(
         self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "_ 3"]
-    ) -> tuple[Tensor | None, Tensor]:
-        """Compute the specular radiance of S samples under uniform light of irradiance 1.
-
-        The first result is multiplied by the albedo, and None if no sample is metallic. The
-        second has the color of the light.
-        """
+    ) -> Float[Tensor, " S"]:
+        """Compute the specular radiance of white samples under uniform light of irradiance 1."""
         cosine = (normals * toward).sum(1).clamp(0, 1)
         colored, white = self.lobes(cosine, degree=0)
-        colored_radiance = None if colored is None else colored[0] * _UNIFORM_COEFFICIENT
-        return colored_radiance, white[0] * _UNIFORM_COEFFICIENT
+        total = white if colored is None else white + colored
+        return total[0] * _UNIFORM_COEFFICIENT
 
     def coat_transmittance(self, cosine: Tensor) -> Tensor:
         """Compute the fraction of a light beam that passes the dielectric coat.

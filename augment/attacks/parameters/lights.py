@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from augment.attack_settings import SkylightSettings, StepSettings
+from augment.attacks.objective import Examples, Values
 from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
@@ -49,19 +50,15 @@ class LightParameter(Parameter):
             initial_light = basis.project_nonnegative(initial_light)
         super().__init__(settings, start=initial_light.flatten(1))
 
-    def apply(
-        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Tensor
-    ) -> Conditions:
+    def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with other coefficients of this light."""
         return replace_light(conditions, self._rows, values.unflatten(1, (-1, 3)))
 
-    def project_feasible(
-        self, values: Float[Tensor, "A D"], within: Ball | None = None
-    ) -> Float[Tensor, "A D"]:
+    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
         """Find the nearest coefficients whose radiance is not negative."""
         if not self._nonnegative:
             return super().project_feasible(values, within)
-        # RGB of each of the K coefficients, shape (A, K, 3).
+        # RGB of each of the K coefficients, shape (E, K, 3).
         coefficients = values.unflatten(1, (-1, 3))
         ball = None if within is None else within.unflatten(-1, 3)
         return self._basis.nearest_nonnegative(coefficients, ball).flatten(1)
@@ -74,7 +71,7 @@ def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
 
 
 def replace_light(
-    conditions: Conditions, rows: slice, coefficients: Float[Tensor, "A K 3"]
+    conditions: Conditions, rows: slice, coefficients: Float[Tensor, "E K 3"]
 ) -> Conditions:
     """Return a copy of the conditions with other coefficients for one light.
 
@@ -168,9 +165,7 @@ class Skylight(Parameter):
         start = torch.tensor(values, dtype=torch.float64).to(scene.lights)
         super().__init__(settings, start=start.expand(len(scene), -1))
 
-    def apply(
-        self, values: Float[Tensor, "A 3"], conditions: Conditions, examples: Int[Tensor, " A"]
-    ) -> Conditions:
+    def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with the sky in place of the environment lighting.
 
         The values are zenith angle, azimuth and turbidity, each divided by its unit.
@@ -178,7 +173,7 @@ class Skylight(Parameter):
         # Convert the angles to degrees in float64, so that rounding is negligible.
         zenith, azimuth = (values[:, :2].double() * self._sun).unbind(1)
         turbidity = values[:, 2] * TURBIDITY_UNIT
-        # RGB of the 49 harmonic coefficients of the sky model, shape (A, 49, 3).
+        # RGB of the 49 harmonic coefficients of the sky model, shape (E, 49, 3).
         sky = sky_coefficients(zenith, azimuth, turbidity)
         sky = sky * self._scale[examples, None, None]
         if self._window is not None:
@@ -188,9 +183,7 @@ class Skylight(Parameter):
         sky = F.pad(sky, (0, 0, 0, missing_count))
         return replace_light(conditions, self._rows, sky.to(conditions.light))
 
-    def project_feasible(
-        self, values: Float[Tensor, "A 3"], within: Ball | None = None
-    ) -> Float[Tensor, "A 3"]:
+    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
         """Find the nearest values for which the sky model is defined."""
         # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
         # The order of the values is zenith angle, azimuth, turbidity.
@@ -228,9 +221,7 @@ class Positions(Parameter):
         positions = light.basis.source_positions().to(scene.lights)
         super().__init__(settings, start=positions.flatten().expand(len(scene), -1))
 
-    def apply(
-        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Tensor
-    ) -> Conditions:
+    def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with moved lamps.
 
         The values are x, y and z of the L lamps in world units.

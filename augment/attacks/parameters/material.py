@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
-from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from augment.attack_settings import MaterialSettings
+from augment.attacks.objective import Examples, Values
 from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import METALLIC, Conditions, initial_materials
 from augment.scene.scene import Scene
@@ -96,9 +95,7 @@ class Material(Parameter):
         self._face_gloss = face_gloss.to(scene.lights)
         self._object_mask = object_mask.to(scene.lights)
 
-    def apply(
-        self, values: Float[Tensor, "A 4"], conditions: Conditions, examples: Int[Tensor, " A"]
-    ) -> Conditions:
+    def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with the given gloss and hue of the objects.
 
         The columns of the values are average roughness, metallic factor and specular factor, and
@@ -114,7 +111,7 @@ class Material(Parameter):
         # 0 for faces of props and table.
         object_mask = self._object_mask[objects]
         if self._changes_gloss:
-            # Change of the averages of each example, shape (A, 3), and of its faces, (A, F, 3).
+            # Change of the averages of each example, shape (E, 3), and of its faces, (E, F, 3).
             change = material[:, GLOSS] - self._average_gloss[objects]
             face_change = change[:, None] * object_mask[..., None]
             gloss = (self._face_gloss[objects] + face_change).clamp(0, 1)
@@ -129,8 +126,6 @@ class Material(Parameter):
             conditions = replace(conditions, hue=hue, albedo=albedo_offset)
         return conditions
 
-    def project_feasible(
-        self, values: Float[Tensor, "A 4"], within: Ball | None = None
-    ) -> Float[Tensor, "A 4"]:
+    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
         """Find the nearest values whose gloss the renderer can show."""
         return nearest_in_box(values, self._lowest_values, self._highest_values, within)

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from augment.attack_settings import StepSettings
+from augment.attacks.objective import Examples, Values
 from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
@@ -40,9 +41,7 @@ class MeshParameter(Parameter):
         start = scene.lights.new_zeros(used_mask.shape)
         super().__init__(settings, start=start, used_mask=used_mask)
 
-    def offsets(
-        self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A N 3"]:
+    def offsets(self, values: Values, examples: Examples) -> Float[Tensor, "E N 3"]:
         """Reshape the attack values to one vector for each vertex or face.
 
         The vectors of unused vertices or faces are zero.
@@ -73,14 +72,12 @@ class Geometry(MeshParameter):
         self._object_of = scene.object_of
         super().__init__(scene, settings, [item.own_vertices for item in scene.objects])
 
-    def apply(
-        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
-    ) -> Conditions:
+    def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with displaced vertices.
 
         The values are displacements of the N vertices of the largest mesh in world units.
         """
-        # Vertices before the attack, shape (A, N, 3).
+        # Vertices before the attack, shape (E, N, 3).
         vertices = self._vertices[self._object_of[examples]]
         return replace(conditions, vertices=vertices + self.offsets(values, examples))
 
@@ -101,12 +98,10 @@ class Albedo(MeshParameter):
     def __init__(self, scene: Scene, settings: StepSettings):
         super().__init__(scene, settings, [item.own_faces for item in scene.objects])
 
-    def apply(
-        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
-    ) -> Conditions:
+    def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with a color offset for each face.
 
-        The values of each of the A examples are D = 3 F numbers: linear RGB offsets of the F faces
+        The values of each of the E examples are D = 3 F numbers: linear RGB offsets of the F faces
         of the largest mesh.
         """
         return replace(conditions, albedo=self.offsets(values, examples))
@@ -134,9 +129,7 @@ class Pixels(Parameter):
         start = scene.lights.new_zeros(len(scene), math.prod(self._images_shape))
         super().__init__(settings, start)
 
-    def apply(
-        self, values: Float[Tensor, "A _"], conditions: Conditions, examples: Tensor
-    ) -> Conditions:
+    def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with an offset for each pixel value.
 
         The values are in the order (V, 3, height, width) of the images.

@@ -3,9 +3,7 @@
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
-from jaxtyping import Float, Int
-from torch import Tensor
-
+from augment.attacks.objective import Examples, Values
 from augment.attacks.optimizers import NormBalls
 from augment.scene.objects import Conditions
 
@@ -32,9 +30,7 @@ class Parameter(NormBalls, ABC):
     fits_other_views: ClassVar[bool] = True
 
     @abstractmethod
-    def apply(
-        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
-    ) -> Conditions:
+    def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions in which this quantity has the given values.
 
         Conditions are the light, shape and colors with which examples are rendered. Other

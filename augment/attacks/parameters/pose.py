@@ -8,11 +8,12 @@ from itertools import chain
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from augment.attack_settings import PoseSettings
+from augment.attacks.objective import Examples, Values
 from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
@@ -91,9 +92,7 @@ class Pose(Parameter):
         limit[[SCALE, DISTANCE]] = largest_log_factor / units
         return limit
 
-    def apply(
-        self, values: Float[Tensor, "A D"], conditions: Conditions, examples: Int[Tensor, " A"]
-    ) -> Conditions:
+    def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with moved objects and cameras.
 
         The values are the pose divided by the units of the settings. Vertices that another
@@ -112,9 +111,7 @@ class Pose(Parameter):
             vertices = torch.stack(moved_vertices)
         return replace(conditions, vertices=vertices, cameras=changes[:, CAMERA])
 
-    def project_feasible(
-        self, values: Float[Tensor, "A D"], within: Ball | None = None
-    ) -> Float[Tensor, "A D"]:
+    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
         """Find the nearest values at which object and camera do not meet."""
         return nearest_in_box(values, -self._limit, self._limit, within)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from renderer.camera import OrthographicCamera
 from renderer.light.files import load_light
 from renderer.mesh import Mesh, concatenate, normalize
-from renderer.operators.rays import DIRECTIONS, Rays, Surface, sphere
+from renderer.operators.rays import DIRECTIONS, Rays, Surface, ray_directions
 from renderer.rendering import render
 from renderer.settings import ImageSettings
 from renderer.solids import solid
@@ -26,19 +26,20 @@ def starts_of_rays(sample_count: int) -> Tensor:
     """Return the sample of its pixel (pixels, DIRECTIONS) from which each ray of a floor starts."""
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     faces = [[0, 1, 2], [0, 2, 3]]
-    floor = Mesh.plain(corners, faces)
     higher_square = Mesh.plain(corners + np.array([3, 0, 1]), faces)
-    mesh = concatenate([floor, higher_square])
+    mesh = concatenate([Mesh.plain(corners, faces), higher_square])
     settings = ImageSettings(SIZE, SAMPLES)
     [fragments] = build_fragments(mesh.vertices, mesh.faces, [ABOVE], settings, choose("numpy"))
     in_pixel = torch.arange(SAMPLES**2).repeat(SIZE**2)
     names = ("sample_to_pixel", "sample_to_seen_face", "sample_numbers")
     kept = {name: getattr(fragments, name)[in_pixel < sample_count] for name in names}
-    fragments = replace(fragments, **kept)
-    surface = Surface(mesh, fragments, settings)
-    [hits] = Rays(mesh).hits(surface, sphere(DIRECTIONS))
-    assert hits.pixels.tolist() == list(range(SIZE**2))
-    return hits.sample_of_ray - sample_count * hits.pixels[:, None]
+    surface = Surface(mesh, replace(fragments, **kept), settings)
+    pixels = torch.arange(SIZE**2)
+    starts = surface.samples_of_rays(pixels, DIRECTIONS)
+    [blocked] = Rays(mesh).blocked(surface, ray_directions(DIRECTIONS))
+    assert len(blocked.row) > 0
+    assert torch.equal(starts[blocked.pixels[blocked.row], blocked.direction], blocked.sample)
+    return starts - sample_count * pixels[:, None]
 
 
 @pytest.mark.parametrize("sample_count", [9, 16])
@@ -52,7 +53,7 @@ def test_neighboring_pixels_cast_a_direction_from_all_of_their_samples(sample_co
 def test_each_sample_casts_rays_in_directions_all_over_the_sphere():
     """The mean of every 55th direction of the lattice has a length of 0.75."""
     is_from_sample = starts_of_rays(55)[..., None] == torch.arange(55)
-    sums = torch.einsum("pds,di->psi", is_from_sample.double(), sphere(DIRECTIONS))
+    sums = torch.einsum("pds,di->psi", is_from_sample.double(), ray_directions(DIRECTIONS))
     means = sums / is_from_sample.sum(1)[..., None]
     assert means.norm(dim=-1).mean() < 0.4
 
