@@ -93,6 +93,7 @@ def _torchvision(
     from torchvision.models import get_model, get_model_weights
 
     require_architecture(model)
+    name = f"torchvision:{model}"
     sets = get_model_weights(model)
     # A set without names of classes has no last layer.
     named = [entry for entry in sets if entry.meta["categories"]]
@@ -109,9 +110,10 @@ def _torchvision(
             options |= {"transform_input": True, "init_weights": False}
         if model.startswith("vit_"):
             options["image_size"] = size
-        network = get_model(model, **options)
-        normalization = transforms.mean, transforms.std
-        return _classifier(network, f"torchvision:{model}", facts, size, classes, *normalization)
+        # A transformer takes squares that its patches fill.
+        with files.reading_network(name, "cannot be built", "give another size="):
+            network = get_model(model, **options)
+        return _classifier(network, name, facts, size, classes, transforms.mean, transforms.std)
 
     if is_random:
         return build(facts)
@@ -119,7 +121,7 @@ def _torchvision(
         state = files.read_weights(weights)
     else:
         advice = f"set weights=FILE to a copy of {published.url}"
-        with files.reading_network(f"torchvision:{model}", "cannot be downloaded", advice):
+        with files.reading_network(name, "cannot be downloaded", advice):
             state = published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
     if model.startswith("densenet"):
         # Published files have names of weights such as "norm.1". The network has "norm1" instead.

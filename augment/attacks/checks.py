@@ -397,11 +397,17 @@ def _classify(
     def truth_of(some: Sequence[Adversary]) -> Truth:
         return Truth.join([item.scene(rasterizer).truth(unlabeled) for item in some])
 
-    criterion = task.criterion(source, lambda: truth_of(changed[:count]), len(classifier.classes))
-    # `map` moves all tensors of the criterion to the device of the attack.
-    criterion = replace(criterion, target=target).map(lambda rows: rows.to(examples.device))
-    objective = Objective(classifier, criterion, result.settings, result.seed)
-    if len(examples):
+    # Without examples, these tensors are empty and have the right number of dimensions.
+    criterion = result.criterion.select(examples)
+    evidence_before = evidence = result.evidence_in_views[examples]
+    fooled_in_views = result.success_in_views[examples]
+    without_noise = result.success_without_noise[examples]
+    if count:
+        at_start = partial(truth_of, changed[:count])
+        criterion = task.criterion(source, at_start, len(classifier.classes))
+        # `map` moves all tensors of the criterion to the device of the attack.
+        criterion = replace(criterion, target=target).map(lambda rows: rows.to(examples.device))
+        objective = Objective(classifier, criterion, result.settings, result.seed)
         images = [item.render_views(rasterizer) for item in progress(changed, "transfer")]
         images_before, images_after = torch.stack(images).to(result.images_in_views).chunk(2)
         evidence_before = objective.evidence(images_before)
@@ -409,11 +415,6 @@ def _classify(
             # The attack may have moved the objects, so their boxes and masks are computed again.
             objective.criterion = criterion.at(truth_of(changed[count:]))
         evidence, fooled_in_views, without_noise = objective.judge(images_after, examples)
-    else:
-        # Without examples, these tensors are empty and have the right number of dimensions.
-        evidence_before = evidence = result.evidence_in_views[examples]
-        fooled_in_views = result.success_in_views[examples]
-        without_noise = result.success_without_noise[examples]
     predicted_before, predicted = map(criterion.predicted, (evidence_before, evidence))
     return {
         "clean_correct": (predicted_before == criterion.source).all(1).tolist(),

@@ -130,10 +130,8 @@ class ObjectCriterion(Criterion):
 def visible_boxes(truth: Truth) -> Float[Tensor, "E V 4"]:
     """Return the box of the first object of each example, which must be in each view."""
     boxes = truth.boxes[..., 0, :]
-    hidden = (~boxes.any(-1)).nonzero().tolist()
-    if hidden:
-        example, view = hidden[0]
-        reason = f"the object of example {example} is not in its view {view}"
+    for example, view in (~boxes.any(-1)).nonzero().tolist():
+        reason = f"the object of example {example} is not visible in its view {view}"
         raise InputError(f"{reason}: turn the camera to it, or remove the view")
     return boxes
 

@@ -192,6 +192,12 @@ def test_a_failed_download_asks_for_a_file(hub, monkeypatch, cached):
         load_classifier("torchvision:squeezenet1_1")
 
 
+def test_a_size_that_the_patches_of_a_transformer_do_not_fill_is_refused(tmp_path):
+    torch.save({"weight": torch.zeros(1)}, tmp_path / "a.pth")
+    with pytest.raises(InputError, match=r"vit_b_16 cannot be built .*size="):
+        load_classifier("torchvision:vit_b_16", tmp_path / "a.pth", size=100)
+
+
 SOURCE = """
 from torch import nn
 

@@ -125,16 +125,13 @@ def test_a_list_of_boxes_is_recognized_and_said(caplog):
 
 @pytest.mark.parametrize("goal", ["hide", "mislabel"])
 def test_an_object_that_is_not_found_before_is_reported_and_no_success(goal):
-    def find(images: Tensor) -> list[dict[str, Tensor]]:
-        # To mislabel, the attack makes the ball so bright that it is detected as a cup.
-        label = torch.tensor([int(goal == "mislabel")])
-        return [item | {"labels": label} for item in brightness_detector(images)]
-
+    # To mislabel, the attack makes the ball so bright that it is detected as a lamp.
+    classes = CLASSES if goal == "hide" else CLASSES[::-1]
     scene, task = ball_scene(), nb.Detection(threshold=0.8, goal=goal)
-    options = {"task": task, "settings": SETTINGS, "classes": CLASSES}
+    options = {"task": task, "settings": SETTINGS, "classes": classes}
     with pytest.raises(nb.InputError, match="not found"):
-        nb.attack(find, scene, **options)
-    result = nb.attack(find, scene, **options, force=True)
+        nb.attack(brightness_detector, scene, **options)
+    result = nb.attack(brightness_detector, scene, **options, force=True)
     assert result.success_in_views.all()
     assert not result.clean_correct.any() and not result.success.any()
 

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -62,6 +63,9 @@ def test_an_attack_darkens_an_object_until_its_segment_is_lost(wrap):
     kept = (result.images[0].mean(0) > 0.15) & mask
     assert result.clean_correct.all() and result.success.all()
     assert kept.sum() < 0.5 * mask.sum()
+    # Nothing is shown to another network if no class is found before the attack.
+    nothing = replace(result, evidence_in_views_before=-result.evidence_in_views_before)
+    assert nb.transfer(nothing, [result.classifier])[0]["success"] == []
 
 
 @pytest.mark.parametrize("shape", [(1, 2, SIZE, SIZE), (2, 3, SIZE, SIZE), (1, 3, 6, 12), (1, 3)])
@@ -79,9 +83,8 @@ def test_a_single_logit_is_refused_because_its_class_would_be_everywhere():
 
 
 def test_the_probabilities_of_queries_are_enlarged_and_not_their_logarithms():
-    draws = torch.Generator().manual_seed(0)
-    masks = 40 * torch.randn(1, 5, 3, 4, generator=draws)
-    classes = torch.randn(1, 5, 4, generator=draws)
+    masks = 60 * torch.arange(60.0).view(1, 5, 3, 4).sin()
+    classes = torch.arange(20.0).view(1, 5, 4).sin()
     outputs = SimpleNamespace(masks_queries_logits=masks, class_queries_logits=classes)
     read = nb.Segmentation().reader("network")(outputs, torch.zeros(1, 3, SIZE, SIZE))
     scores = classes.softmax(2)[0, :, :3].T @ masks.sigmoid()[0].flatten(1)

@@ -55,7 +55,6 @@ def test_recall_and_false_detections_are_the_counted_ones_and_written(photograph
     assert scores.by_label["dog"].false_per_image.value == 0
     assert scores.by_label["Cow"].recall.value is None
     assert scores.by_label["Cow"].false_per_image.value == pytest.approx(1)
-    # Cows do not count, because no photograph shows one.
     assert scores.overall.recall == scores.by_label["dog"].recall
     assert scores.overall.ap50 == scores.by_label["dog"].ap50
     recalls = {name: metrics["dog"].recall.value for name, metrics in scores.by_source.items()}
