@@ -17,7 +17,7 @@ from augment.network import frozen_eval_mode
 from augment.scene.lights import LightModel
 from augment.settings import NO_CLASS_PIXEL
 from augment.tasks.classification import Classification
-from augment.tasks.detection import Detection
+from augment.tasks.detection import FINAL, Detection
 from augment.tasks.segmentation import BACKGROUND, Segmentation
 from augment.tasks.task import Criterion, Task
 from renderer import errors
@@ -165,7 +165,9 @@ class AdversarialLighting:
             given = errors.as_list("targets", targets, Mapping, expected)
             if not all({"boxes", "labels"} <= item.keys() for item in given):
                 raise InputError(f"targets has no boxes or no labels: give {expected}")
-            outputs = [_as_found(item["boxes"], item["labels"], unit.device) for item in given]
+            reader = Detection().reader("targets: the data set", len(classes))
+            found = (_as_found(item["boxes"], item["labels"]) for item in given)
+            outputs = [reader.checked(FINAL, item, unit) for item in found]
         else:
             outputs, classes = self._as_outputs(targets, unit)
         if len(outputs) != len(unit):
@@ -212,12 +214,11 @@ class AdversarialLighting:
         return light._replace(values=values)
 
 
-def _as_found(boxes: Any, labels: Any, device: torch.device) -> dict[str, Tensor]:
+def _as_found(boxes: Any, labels: Any) -> dict[str, Tensor]:
     """Return the boxes and labels of an image as a detector that is sure of them does."""
-    boxes = torch.as_tensor(boxes, dtype=torch.float32, device=device).as_subclass(Tensor)
-    labels = errors.as_integers("labels", labels).to(device)
-    found = {"boxes": boxes.reshape(-1, 4), "labels": labels}
-    return found | {"scores": torch.ones(len(labels), device=device)}
+    boxes = torch.as_tensor(boxes, dtype=torch.float32).as_subclass(Tensor)
+    labels = errors.as_integers("labels", labels)
+    return {"boxes": boxes.reshape(-1, 4), "labels": labels, "scores": torch.ones(len(labels))}
 
 
 def _leaf(light: Light) -> Light:

@@ -422,6 +422,8 @@ SCORES = [
 
 DETECTOR = {"task": augment.Detection(), "classes": CLASSES}
 adversarial_light = partial(augment.AdversarialLighting, LINEAR)
+# A label that the classes lack, more boxes than labels, and a box of NaN.
+BOXES = ([[0, 0, 2, 2]], 99), ([[0, 0, 2, 2]] * 2, 0), ([[NAN] * 4], 0)
 RELIGHTING = [
     *by_name(augment.RandomLighting, strength=[NAN], p=[-0.1]),
     *by_name(augment.RandomLighting, lights=["sun", [], 3, {"linear": 0.0}]),
@@ -445,6 +447,7 @@ RELIGHTING = [
         "targets",
         lambda x: augment.AdversarialLighting(BrightBox((1, 1, 4, 4)), **DETECTOR)(IMAGES, x),
         *(3, {"boxes": []}, [{"boxes": []}]),
+        *([{"boxes": boxes, "labels": [label]}] * len(IMAGES) for boxes, label in BOXES),
     ),
 ]
 

@@ -408,7 +408,7 @@ class _Reader:
             raise InputError(f"{title} returned {shapes}: give boxes (n, 4), and {advice}")
         scores = scores.detach()
         if not scores.isfinite().all() or not boxes.isfinite().all():
-            raise InputError(f"{title} returned NaN or infinite scores or boxes: check its weights")
+            raise InputError(f"{title} returned NaN or infinite scores or boxes: check them")
         if scores.numel() and not (scores.min() >= 0 and scores.max() <= 1):
             span = f"from {float(scores.min()):g} to {float(scores.max()):g}"
             raise InputError(f"{title} returned scores {span}: give probabilities from 0 to 1")
