@@ -205,8 +205,10 @@ class AugmentationService:
                 class_index(classes, label, "meshes") if isinstance(label, str) else label
                 for label in names
             ]
-        else:
+        elif classes:
             names = [_index_of(label, classes) for label in names]
+        else:
+            raise InputError("classes is empty: name all classes of the network")
         labels = torch.tensor(names, device=scene.lights.device)
         settings = replace(settings, examples=len(scene))
         service = (settings, scene, labels, seed, Phases(labels.device))

@@ -422,7 +422,6 @@ SCORES = [
 
 DETECTOR = {"task": augment.Detection(), "classes": CLASSES}
 adversarial_light = partial(augment.AdversarialLighting, LINEAR)
-# A label that the classes lack, more boxes than labels, and a box of NaN.
 BOXES = ([[0, 0, 2, 2]], 99), ([[0, 0, 2, 2]] * 2, 0), ([[NAN] * 4], 0)
 RELIGHTING = [
     *by_name(augment.RandomLighting, strength=[NAN], p=[-0.1]),

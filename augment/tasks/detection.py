@@ -196,6 +196,8 @@ class Detection(Task):
 
     def criterion(self, source: Tensor, truth: GetTruth, class_count: int) -> DetectionCriterion:
         """Return the criterion of an untargeted attack on the first object of each example."""
+        if self.goal == MISLABEL and class_count < 2:
+            raise InputError("goal='mislabel' needs a second class: name it, or leave the goal out")
         boxes = visible_boxes(truth())
         return DetectionCriterion(source, task=self, class_count=class_count, boxes=boxes)
 

@@ -80,6 +80,7 @@ def test_images_without_an_object_have_an_empty_target(mode):
         assert target["masks"].shape == (0, SIZE, SIZE)
 
 
-def test_a_label_without_a_name_is_refused():
-    with pytest.raises(InputError, match="2"):
-        serve(classes=("background", "cup"))
+@pytest.mark.parametrize(("classes", "message"), [(("background", "cup"), "2"), ((), "classes")])
+def test_a_label_without_a_name_is_refused(classes, message):
+    with pytest.raises(InputError, match=message):
+        serve(classes=classes)

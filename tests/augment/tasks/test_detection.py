@@ -188,6 +188,7 @@ def test_a_decode_function_of_other_shapes_is_refused(decode, message):
         ({"target": "cup", "force": True}, "mislabel"),
         ({"settings": replace(SETTINGS, eot=nb.EOTSettings(draws=1))}, "eot"),
         ({"task": nb.Classification()}, "returned list"),
+        ({"task": nb.Detection(goal="mislabel"), "classes": ["ball"]}, "second class"),
         ({"task": "detection"}, "task is 'detection'"),
     ],
 )

@@ -22,12 +22,11 @@ RESNETS = ["retinanet_resnet50_fpn", "fcos_resnet50_fpn", "maskrcnn_resnet50_fpn
 DETECTORS = dict.fromkeys([*RESNETS, "fasterrcnn_mobilenet_v3_large_320_fpn"], SMALL)
 DETECTORS["ssdlite320_mobilenet_v3_large"] = {}
 SEGMENTERS = ["lraspp_mobilenet_v3_large", "fcn_resnet50", "deeplabv3_mobilenet_v3_large"]
-SCENE = {"size": SIZE, "width": 2.5}
 
 
 def cost_falls(network: nn.Module, task: nb.Detection | nb.Segmentation, **options) -> bool:
     """Return whether a step of an attack on light lowers the cost of a network."""
-    scene = nb.build_scene([("solid:ball", "ball")], **SCENE)
+    scene = nb.build_scene([("solid:ball", "ball")], size=SIZE, width=2.5)
     settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.3), max_steps=1, margin=100.0)
     given = {"task": task, "settings": settings, "force": True}
     found = nb.attack(network, scene, **given, **options).minimum
@@ -125,14 +124,12 @@ def test_a_single_logit_of_a_detector_of_transformers_is_that_of_its_class():
 
 
 def test_boxes_of_rt_detr_are_those_of_the_last_layer_in_pixels():
-    # Center and size as fractions of the image, for each layer of the decoder.
     boxes = torch.tensor([[1.0, 1.0, 1.0, 1.0], [0.5, 0.4, 0.2, 0.6]])[:, None, None]
     logits = torch.tensor([[9.0, 9.0, 9.0], [-1.0, 2.0, -3.0]])[:, None, None]
     outputs = torch.zeros(1, 1, 6), (boxes, logits, None, None, None)
     [item] = nb.Detection().reader("network", 3)(outputs, torch.zeros(1, 3, 50, 100))
     torch.testing.assert_close(item["boxes"], torch.tensor([[40.0, 5.0, 60.0, 35.0]]))
     assert item["labels"].tolist() == [1]
-    torch.testing.assert_close(item["scores"], torch.tensor([2.0]).sigmoid())
     torch.testing.assert_close(item["candidate_scores"], logits[1, 0].sigmoid())
 
 

@@ -63,7 +63,6 @@ def test_an_attack_darkens_an_object_until_its_segment_is_lost(wrap):
     kept = (result.images[0].mean(0) > 0.15) & mask
     assert result.clean_correct.all() and result.success.all()
     assert kept.sum() < 0.5 * mask.sum()
-    # Nothing is shown to another network if no class is found before the attack.
     nothing = replace(result, evidence_in_views_before=-result.evidence_in_views_before)
     assert nb.transfer(nothing, [result.classifier])[0]["success"] == []
 

@@ -73,7 +73,6 @@ def test_a_class_that_the_network_lacks_is_not_scored(photographs):
     assert scores.labels == ["dog", "Cow"]
     only = nb.evaluate(_find_white, photographs, "dog", classes=CLASSES, size=120)
     assert only.labels == ["dog"]
-    # A class of the network, by name and by index, which the annotations write in another way.
     for label in ("cow", 2):
         assert nb.evaluate(_find_white, photographs, label, classes=CLASSES).labels == ["Cow"]
     with pytest.raises(InputError, match="no classes of the network"):
