@@ -60,6 +60,8 @@ MAX_IGNORED_LIGHT = 1 / 1024
 # Number of pairs of a pixel and a ray direction that `Rays.blocked` processes at
 # once. It limits the memory.
 BLOCK = 2**17
+# Pixels with the same number of samples are a group of their own from this number of such pairs.
+SMALL_GROUP = 2**14
 # Stands for the index of the face that a ray hits if it hits no face.
 NO_FACE = -1
 
@@ -224,16 +226,19 @@ class Rays:
         normals, planes = surface.normals, surface.planes
         starts = (surface.points + self.offset * planes).float()
         sample_count, _ = surface.samples_of_pixels
-        for count in sample_count[pixels].unique().tolist():
-            # The directions form turns, in each of which a pixel goes once through its samples. So
-            # those in one place of all turns start at the same sample. The last turn is filled up
-            # with zeros, which are blocked nowhere.
-            places = min(count, len(directions))
+        # The directions form turns, in each of which a pixel goes once through its samples. So
+        # those in one place of all turns start at the same sample. Pixels with a rare number of
+        # samples form a group together, with all directions in a single turn.
+        places_of_pixel = sample_count[pixels].clamp(max=len(directions))
+        is_rare = places_of_pixel.bincount()[places_of_pixel] * len(directions) < SMALL_GROUP
+        places_of_pixel[is_rare] = len(directions)
+        for places in places_of_pixel.unique().tolist():
             turns = -(-len(directions) // places)
+            # The last turn is filled up with zeros, which are blocked nowhere.
             in_turns = F.pad(directions, (0, 0, 0, turns * places - len(directions)))
             at_places = in_turns.view(turns, places, 3).transpose(0, 1)
             float_directions = in_turns.float()
-            group = pixels[sample_count[pixels] == count]
+            group = pixels[places_of_pixel == places]
             for block in group.split(max(1, BLOCK // len(directions))):
                 sample = surface.samples_of_rays(block, places).T
                 # Cosine of each direction to the shading normal, and height of the direction above
@@ -250,7 +255,8 @@ class Rays:
                 below = torch.nonzero(is_in_front & (height < 0))
                 place, turn, row = torch.cat([cast[is_hit], below]).T
                 faces = F.pad(face[is_hit], (0, len(below)), value=NO_FACE)
-                weight = cosine[place, turn, row] * (count * 4 * math.pi / len(directions))
+                solid_angle = sample_count[block[row]].double() * 4 * math.pi / len(directions)
+                weight = cosine[place, turn, row] * solid_angle
                 seen, row_of_ray = row.unique(return_inverse=True)
                 rays = row_of_ray, turn * places + place, sample[place, row], weight, faces
                 if len(seen):
