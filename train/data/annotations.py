@@ -188,7 +188,7 @@ def read_annotations(photos: Path) -> Annotations:
         return _read_yolo(photos.parent) if is_list_of_images else _read_coco(photos)
     if not photos.is_dir():
         raise InputError(f"photos={photos} does not exist: give a COCO file, or a folder", "photos")
-    files = sorted(photos.glob("*.json"))
+    files = sorted([*photos.glob("*.json"), *photos.glob("annotations/*.json")])
     if len(files) > 1:
         raise InputError(f"photos={photos} has {len(files)} JSON files: give one of them", "photos")
     return _read_coco(files[0]) if files else _read_yolo(photos)

@@ -52,7 +52,7 @@ def test_images_of_coco_are_found_in_subfolders(tmp_path, file, image, name):
     _write_coco(tmp_path / file, [name])
     read = read_annotations(tmp_path / file)
     (photograph,) = read.photographs
-    assert photograph.path == tmp_path / image
+    assert photograph.path == read_annotations(tmp_path).photographs[0].path == tmp_path / image
     # The identifiers of the categories have gaps.
     assert (read.classes, photograph.labels.tolist()) == (("cat", "dog"), [1])
 
