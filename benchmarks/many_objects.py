@@ -483,14 +483,15 @@ def mean_with_interval(parts: Sequence[ScoredGroup], name: str, other: str | Non
         parts: Groups of images with objects and setups of their own. They have
             the same weight.
         name: Network whose hits are averaged.
-        other: Network whose hits are subtracted. None subtracts nothing. It has
-            one seed, or as many seeds as the first network.
+        other: Network whose hits are subtracted. None subtracts nothing. Both have
+            as many seeds, or one of them has one.
     """
     runs = [leave_out_units(parts, name, seed) for seed in range(len(parts[0].hits[name]))]
     if other is None:
         return average(runs).estimate
     others = [leave_out_units(parts, other, seed) for seed in range(len(parts[0].hits[other]))]
-    return change(runs, others * (len(runs) // len(others)))
+    count = max(len(runs), len(others))
+    return change(runs * (count // len(runs)), others * (count // len(others)))
 
 
 def leave_out_units(parts: Sequence[ScoredGroup], name: str, seed: int) -> Jackknife:
