@@ -60,7 +60,8 @@ MAX_IGNORED_LIGHT = 1 / 1024
 # Number of pairs of a pixel and a ray direction that `Rays.blocked` processes at
 # once. It limits the memory.
 BLOCK = 2**17
-# Pixels with the same number of samples are a group of their own from this number of such pairs.
+# Pixels with the same number of samples form a group of their own if they have at least this
+# number of such pairs.
 SMALL_GROUP = 2**14
 # Stands for the index of the face that a ray hits if it hits no face.
 NO_FACE = -1
@@ -135,8 +136,7 @@ class Surface:
     @cached_property
     def samples_of_pixels(self) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
         """Number of samples of each of the P pixels, and index of the first of them."""
-        fragments = self.fragments
-        count = fragments.sample_to_pixel.bincount(minlength=len(fragments.pixels))
+        count = self.fragments.sample_to_pixel.bincount(minlength=len(self.fragments.pixels))
         return count, count.cumsum(0) - count
 
     def samples_of_rays(self, pixels: Int[Tensor, " B"], ray_count: int) -> Int[Tensor, "B D"]:
@@ -217,12 +217,14 @@ class Rays:
         return OFFSET * float(np.abs(self._mesh.vertices).max())
 
     def blocked(self, surface: Surface, directions: Float[Tensor, "D 3"]) -> Iterator[BlockedRays]:
-        """Find which of D directions (`ray_directions`) the mesh blocks, for blocks of pixels.
+        """Find the rays that the mesh blocks, among those in D directions (`ray_directions`).
 
         The face of a sample blocks all light from below its plane, as if the mesh were the surface
-        of a solid. Pixels that can see no other surface are left out.
+        of a solid. Pixels that can see no other surface are left out. Each result has some pixels.
         """
         pixels, may_hit = self._pixels_to_cast(surface)
+        if not len(pixels):
+            return
         normals, planes = surface.normals, surface.planes
         starts = (surface.points + self.offset * planes).float()
         sample_count, _ = surface.samples_of_pixels

@@ -261,8 +261,8 @@ class Transport:
                 reflectance = diffuse_albedo[channel][blocked.sample]
                 if gloss is not None:
                     colored = albedo_by_channel[channel][blocked.sample] * metallic
-                    reflectance = reflectance * transmittance + colored
-                    reflectance = reflectance + white / fragments.samples**2
+                    specular = colored + white / fragments.samples**2
+                    reflectance = reflectance * transmittance + specular
                 weights = blocked.weight * reflectance
                 # Subtract the light of the sky that the mesh blocks: one row for each column of
                 # the sky, one column for each pixel.

@@ -76,9 +76,7 @@ def test_logits_of_another_size_are_refused(shape):
 
 def test_a_single_logit_is_refused_because_its_class_would_be_everywhere():
     with pytest.raises(nb.InputError, match=r"must return logits \(1, 2, 12, 12\)"):
-        nb.Segmentation().reader("network")(
-            torch.zeros(1, 1, SIZE, SIZE), torch.zeros(1, 3, 12, 12)
-        )
+        nb.Segmentation().reader("network")(torch.zeros(1, 1, 12, 12), torch.zeros(1, 3, 12, 12))
 
 
 def test_the_probabilities_of_queries_are_enlarged_and_not_their_logarithms():
