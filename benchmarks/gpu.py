@@ -359,7 +359,8 @@ def rates(device: str) -> Iterator[Row]:
         cameras = renderer.orbit_cameras(count if device != "cpu" else 4, 2.2)
         light = renderer.load_light("grace").to(device)
         lights = light.expand(LIGHTS_PER_VIEW if device != "cpu" else 4, -1, -1)
-        operators = renderer.precompute_transfer(mesh, cameras, size).to(device)
+        build = partial(renderer.precompute_transfer, mesh, cameras, size, device=device)
+        operators = build()
 
         def new_pose(
             needs_gradient: bool = False,
@@ -377,7 +378,7 @@ def rates(device: str) -> Iterator[Row]:
             "new light": (len(lights) * len(cameras), partial(operators.image, lights)),
             "new pose": (len(cameras), new_pose),
             "new pose with gradient": (len(cameras), partial(new_pose, True)),
-            "operators": (len(cameras), partial(renderer.precompute_transfer, mesh, cameras, size)),
+            "operators": (len(cameras), build),
         }
         for way, (image_count, call) in ways.items():
             yield rate(f"{size}²", way, image_count, call, device)

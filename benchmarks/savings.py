@@ -18,6 +18,8 @@ from renderer.mesh import Mesh
 from renderer.surface.gloss import Gloss
 
 Call = Callable[[], object]
+# Number of views of `many_view_savings`.
+VIEWS = 16
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ def savings(view: View) -> Iterator[Saving]:
     yield from product_savings(view)
     yield from light_step_savings(view)
     yield from vertex_step_savings(view)
+    yield from many_view_savings(view)
 
 
 class Products:
@@ -214,3 +217,21 @@ def vertex_step_savings(view: View) -> Iterator[Saving]:
             complete=step_with(silhouettes=True),
             needed=step_with(silhouettes=False),
         )
+
+
+def many_view_savings(view: View) -> Iterator[Saving]:
+    """Yield what images of many views share in one call."""
+    cameras = [replace(CAMERA, azimuth=20.0 * index) for index in range(VIEWS)]
+    light = coefficients(DEGREE, torch.float32, view.device)
+    of_mesh = partial(rendering.render, view.mesh, light=light, size=view.size)
+    yield Saving(
+        name=f"{VIEWS} views in one call of render",
+        complete=lambda: [of_mesh(camera) for camera in cameras],
+        needed=partial(of_mesh, cameras),
+    )
+    operators = partial(rendering.precompute_transfer, view.mesh, size=view.size)
+    yield Saving(
+        name=f"operators of {VIEWS} views in one call",
+        complete=lambda: [operators(camera) for camera in cameras],
+        needed=partial(operators, cameras),
+    )

@@ -449,6 +449,7 @@ def measure_moved(options: argparse.Namespace) -> Iterator[Row]:
     settings = train_command.read(
         [
             "experiment=best",
+            "label=orange",
             "network=-",
             "out=-",
             f"scene.views={options.views}",

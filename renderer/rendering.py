@@ -35,7 +35,7 @@ from renderer.solids import sphere
 from renderer.surface.albedo import face_albedo, surface_albedo
 from renderer.surface.gloss import Gloss
 from renderer.visibility import choose
-from renderer.visibility.fragments import Fragments, build_fragments
+from renderer.visibility.fragments import Fragments, build_fragments, views_at_once
 
 # Type of a local light for `render`: a `Lamps` or a `Projector` object, alone or in a pair with its
 # coefficients.
@@ -162,6 +162,13 @@ def render(
     # Rasterizing and ray tracing have no gradients, so they take a mesh and cameras with plain
     # numbers instead of tensors.
     moved_mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
+    backgrounds = as_background(background, size, like)
+    view_count = len(all_cameras)
+    if backgrounds.ndim > 3 and len(backgrounds) not in (1, view_count):
+        raise InputError(f"there are {len(backgrounds)} backgrounds: give 1 or {view_count}")
+    # Several views at once form a tall image. Rays and silhouettes need single views.
+    is_single = bool(local_lights) or settings.global_illumination or silhouettes
+    at_once = 1 if is_single else views_at_once(settings, vertices)
     views = build_fragments(
         vertices,
         mesh.faces,
@@ -169,11 +176,9 @@ def render(
         settings,
         _choose(rasterizer),
         closed=moved_mesh.closed if is_moved else mesh.closed,
+        at_once=at_once,
     )
-    backgrounds = as_background(background, size, like)
-    if backgrounds.ndim > 3 and len(backgrounds) not in (1, len(views)):
-        raise InputError(f"there are {len(backgrounds)} backgrounds: give 1 or {len(views)}")
-    backgrounds = backgrounds.expand(len(views), -1, -1, -1)
+    backgrounds_of_views = backgrounds.expand(view_count, -1, -1, -1).split(at_once)
     # Object that computes bounces and shadows of environment light. None without both.
     colored_mesh = moved_mesh
     if albedo is not None and bounces:
@@ -181,7 +186,8 @@ def render(
     transport = build_transport(colored_mesh, settings, albedo_scale, split.basis)
     rays = transport.rays if transport else Rays(moved_mesh)
     images = []
-    for camera, view, view_background in zip(all_cameras, views, backgrounds, strict=True):
+    cameras_of_views = all_cameras[::at_once]
+    for camera, view, behind in zip(cameras_of_views, views, backgrounds_of_views, strict=True):
         fragments = view.to(like.device)
         indirect = None
         if transport:
@@ -204,10 +210,11 @@ def render(
             gloss=gloss,
             indirect=indirect,
         )
-        seen = shaded_view.pixel_radiance(camera, view_background.flatten(1))
-        image = composite(seen.radiance, seen.coverage, seen.pixels, view_background, encoding)
-        images.append(image.to(image_dtype))
-    return images[0] if isinstance(cameras, Camera) else torch.stack(images)
+        tall = behind.transpose(0, 1).flatten(1, 2)
+        seen = shaded_view.pixel_radiance(camera, tall.flatten(1))
+        image = composite(seen.radiance, seen.coverage, seen.pixels, tall, encoding)
+        images.append(image.unflatten(1, (len(behind), -1)).transpose(0, 1).to(image_dtype))
+    return images[0][0] if isinstance(cameras, Camera) else torch.cat(images)
 
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
@@ -236,6 +243,7 @@ class TransferOptions(TypedDict, total=False):
     shadows: bool
     bounces: int
     rasterizer: str
+    device: torch.device | str
 
 
 @overload
@@ -263,6 +271,7 @@ def precompute_transfer(
     shadows: bool = False,
     bounces: int = 0,
     rasterizer: str = "auto",
+    device: torch.device | str = "cpu",
 ) -> TransferOperator | TransferOperators:
     """Compute a transfer operator for each camera.
 
@@ -286,13 +295,15 @@ def precompute_transfer(
             or more includes shadows.
         rasterizer: Program that finds the visible faces: "auto", "opengl", "numba",
             "numpy" or "torch".
+        device: Device of the operators, such as "cuda". A GPU computes those of matte
+            surfaces itself, many views at once, except for shadows and bounces.
 
     Returns:
         The operator for one camera, or the sequence of operators for a list of
         cameras. The method `image` of the sequence renders all views in one call.
 
     Raises:
-        InputError: If an argument is out of range, or if there is no camera.
+        InputError: If an argument is out of range, or if there is no camera or device.
 
     Example:
         >>> import torch
@@ -306,7 +317,13 @@ def precompute_transfer(
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     all_cameras = _checked_cameras(mesh, cameras, albedo_scale, gloss)
     operators = build_operators(
-        mesh, all_cameras, settings, _choose(rasterizer), albedo_scale, gloss=gloss
+        mesh,
+        all_cameras,
+        settings,
+        _choose(rasterizer),
+        albedo_scale,
+        gloss=gloss,
+        device=errors.as_device(device),
     )
     return operators[0] if isinstance(cameras, Camera) else TransferOperators(operators)
 

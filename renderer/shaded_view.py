@@ -22,6 +22,7 @@ from renderer.light.basis import SplitLight
 from renderer.mesh import Mesh
 from renderer.operators.rays import LocalLightView
 from renderer.settings import ImageSettings
+from renderer.surface.albedo import of_seen_faces
 from renderer.surface.gloss import Gloss, sample_gloss
 from renderer.surface.shading import glossy_radiance, normals_in_sight, radiance
 from renderer.visibility.fragments import Fragments
@@ -155,7 +156,7 @@ class ShadedView:
         """
         fragments = self.fragments
         # Each sample becomes a pixel of a finer image, so that it is shaded alone.
-        finer_fragments = replace(fragments.by_sample(), camera=camera)
+        finer_fragments = replace(fragments.by_sample(), cameras=(camera,))
         at_samples = self._sum(finer_fragments, has_indirect=False)
         zeros = at_samples.new_zeros(3, len(fragments.pixels))
         at_pixels = zeros.index_add(1, fragments.sample_to_pixel, at_samples)
@@ -204,7 +205,6 @@ class ShadedView:
             return None
         if not self.is_moved:
             # The mesh caches these normals, so all its views share them.
-            corner_normals = torch.from_numpy(self.mesh.corner_normals).to(self.vertices.device)
-            return corner_normals[self.fragments.faces]
+            return of_seen_faces(self.mesh.corner_normals, self.fragments)
         normal_ids = torch.from_numpy(self.mesh.normal_ids).to(self._faces)
         return normals_in_sight(self.fragments, self.vertices, self._faces, normal_ids)

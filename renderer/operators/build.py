@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -27,8 +28,10 @@ from renderer.settings import ImageSettings
 from renderer.surface.albedo import shared_albedo, surface_albedo
 from renderer.surface.gloss import Gloss, SampleGloss, at_samples
 from renderer.visibility import Rasterizer
-from renderer.visibility.fragments import build_fragments
+from renderer.visibility.fragments import build_fragments, views_at_once
 
+# Devices on which SciPy adds up samples. On a CPU, it takes a tenth of the time of torch.
+SCIPY_DEVICES = ("cpu",)
 # Number of pixels that `_box_filter` processes at once. Their values fit into the cache of
 # the processor.
 BLOCK = 2**12
@@ -51,17 +54,25 @@ def build_operators(
     basis: Basis = HARMONICS,
     dtype: torch.dtype = torch.float32,
     gloss: Gloss | None = None,
+    device: torch.device | str = "cpu",
 ) -> list[TransferOperator]:
     """Compute the transfer operators of a mesh for several cameras.
 
     Surfaces are shaded on the side that the camera sees. A `gloss` of None is that of the
-    mesh.
+    mesh. A GPU computes those of matte surfaces without rays, and many of them at once.
     """
-    views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, mesh.closed)
+    is_matte = mesh.gloss is None and gloss is None
+    casts_rays = settings.global_illumination or bool(basis.local_lights)
+    vertices: Any = mesh.vertices
+    if is_matte and not casts_rays and torch.device(device).type != "cpu":
+        vertices = torch.from_numpy(vertices).to(device)
+    shown = vertices, mesh.faces, cameras, settings, rasterizer, mesh.closed
+    views = build_fragments(*shown, 1 if casts_rays else views_at_once(settings, vertices))
     transport = build_transport(mesh, settings, albedo_scale, basis)
     rays = transport.rays if transport else Rays(mesh)
     surfaces = [Surface(mesh, fragments, settings, given_gloss=gloss) for fragments in views]
-    return [_build(surface, albedo_scale, basis, dtype, transport, rays) for surface in surfaces]
+    built = [_build(surface, albedo_scale, basis, dtype, transport, rays) for surface in surfaces]
+    return [operator.to(device) for operators in built for operator in operators]
 
 
 def _build(
@@ -71,8 +82,8 @@ def _build(
     dtype: torch.dtype,
     transport: Transport | None,
     rays: Rays,
-) -> TransferOperator:
-    """Compute the operator of one view. A transport of None has no shadows and bounces."""
+) -> list[TransferOperator]:
+    """Compute the operator of each view. A transport of None has no shadows and bounces."""
     fragments = surface.fragments
     pixel_count = len(fragments.pixels)
     is_glossy = surface.gloss is not None
@@ -122,16 +133,20 @@ def _build(
             )
         ]
     [(nonzero, transfer)] = dense
-    return TransferOperator(
-        transfer=transfer,
-        albedo=pixel_albedo.T.to(dtype).contiguous(),
-        coverage=fragments.coverage.to(dtype),
-        pixels=fragments.pixels,
-        nonzero=nonzero,
-        settings=surface.settings,
-        basis=basis,
-        sparse=concatenate_entries(sparse) if sparse else None,
-    )
+    parts = transfer, pixel_albedo.T.to(dtype), fragments.coverage.to(dtype)
+    return [
+        TransferOperator(
+            transfer=transfer,
+            albedo=albedo.contiguous(),
+            coverage=coverage,
+            pixels=pixels,
+            nonzero=nonzero.to(transfer.device),
+            settings=surface.settings,
+            basis=basis,
+            sparse=concatenate_entries(sparse) if sparse else None,
+        )
+        for pixels, transfer, albedo, coverage in fragments.of_views(*parts)
+    ]
 
 
 def _albedo(
@@ -147,7 +162,7 @@ def _albedo(
     mesh, fragments = surface.mesh, surface.fragments
     encoding = surface.settings.encoding
     pixel_count = len(fragments.pixels)
-    ones = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.sample_to_pixel), 1)
+    ones = fragments.coverage.new_ones(1, 1).expand(len(fragments.sample_to_pixel), 1)
     color = None if needs_channels else shared_albedo(mesh, fragments, encoding)
     if color is not None:
         return ones, (color * albedo_scale).expand(pixel_count, COLORS)
@@ -161,7 +176,7 @@ def _albedo(
         of_samples = pixel_albedo.gather(1, fragments.sample_to_pixel.expand(COLORS, -1))
         if ((albedo.T - of_samples).abs_() <= torch.finfo(dtype).eps * albedo.T).all():
             return ones, pixel_albedo.T
-    return albedo, torch.ones(pixel_count, COLORS)
+    return albedo, albedo.new_ones(pixel_count, COLORS)
 
 
 def _environment_rows(
@@ -216,9 +231,15 @@ def _box_filter(
     else:
         entry_to_pixel = fragments.sample_to_pixel
         weights = albedo / fragments.samples**2
+    entry_counts = torch.bincount(entry_to_pixel, minlength=pixel_count)
+    if fragments.pixels.device.type not in SCIPY_DEVICES:
+        values = face_values[entry_to_face] if is_flat else basis.irradiance(surface.normals)
+        # The entries of a pixel follow each other.
+        add_up = partial(torch.segment_reduce, reduce="sum", lengths=entry_counts, unsafe=True)
+        rows = torch.stack([add_up(values * weight[:, None]) for weight in weights.T])
+        return rows.mT.to(dtype)
     transfer = torch.empty(weights.shape[1], len(basis.nonzero), pixel_count, dtype=dtype)
     # Pixel i has the entries from `entry_starts[i]` to `entry_starts[i + 1]` - 1.
-    entry_counts = torch.bincount(entry_to_pixel, minlength=pixel_count)
     entry_starts = F.pad(entry_counts.cumsum(0), (1, 0))
     for first_pixel in range(0, pixel_count, BLOCK):
         starts = entry_starts[first_pixel : first_pixel + BLOCK + 1]

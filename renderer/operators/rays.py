@@ -35,6 +35,7 @@ from renderer.mesh import Mesh
 from renderer.normals import face_normals
 from renderer.operators.apply import SparseTransfer
 from renderer.settings import ImageSettings
+from renderer.surface.albedo import of_seen_faces
 from renderer.surface.gloss import Gloss, SampleGloss, at_samples, sample_gloss, toward_camera
 from renderer.surface.shading import normals_in_sight, smooth_normals
 from renderer.vectors import unit, unit_vectors
@@ -94,9 +95,8 @@ class Surface:
     @cached_property
     def vertices(self) -> Tensor:
         """Positions of the V vertices in world axes, float64, shape (V, 3)."""
-        if self.moved is None:
-            return torch.from_numpy(self.mesh.vertices)
-        return self.moved.cpu().double()
+        given = torch.from_numpy(self.mesh.vertices) if self.moved is None else self.moved
+        return given.to(self.fragments.coverage)
 
     @cached_property
     def planes(self) -> Tensor:
@@ -125,7 +125,7 @@ class Surface:
             return self.planes
         if self.moved is None:
             # The mesh caches these normals, so all its views share them.
-            corner_normals = torch.from_numpy(self.mesh.corner_normals)[self.fragments.faces]
+            corner_normals = of_seen_faces(self.mesh.corner_normals, self.fragments)
         else:
             faces = torch.from_numpy(self.mesh.faces)
             normal_ids = torch.from_numpy(self.mesh.normal_ids)

@@ -106,9 +106,9 @@ def _samples_of_textures(
     textures: Sequence[Texture], mesh: Mesh, fragments: Fragments
 ) -> Iterator[tuple[Texture, Int[Tensor, " N"], Float[Tensor, "2 N"]]]:
     """Yield each texture of a mesh, and the samples that show it with their texture coordinates."""
-    corner_uvs = _of_seen_faces(mesh.corner_uvs, fragments).to(fragments.coverage)
+    corner_uvs = of_seen_faces(mesh.corner_uvs, fragments).to(fragments.coverage)
     sample_uvs = fragments.interpolate(corner_uvs).T
-    texture_of_face = _of_seen_faces(mesh.texture_ids, fragments)
+    texture_of_face = of_seen_faces(mesh.texture_ids, fragments)
     texture_of_sample = texture_of_face.index_select(0, fragments.sample_to_seen_face)
     for texture_id, texture in enumerate(textures):
         samples = torch.nonzero(texture_of_sample == texture_id).squeeze(1)
@@ -279,15 +279,17 @@ def _corner_albedo(
     mesh: Mesh, fragments: Fragments, encoding: str, like: Tensor
 ) -> Float[Tensor, "G 3 3"]:
     """Decode the corner colors of the G faces that a view shows, in the dtype of `like`."""
-    corner_colors = _of_seen_faces(mesh.corner_colors, fragments).to(like)
+    corner_colors = of_seen_faces(mesh.corner_colors, fragments).to(like)
     require_bounded(corner_colors=corner_colors)
     return decode(corner_colors, encoding)
 
 
-def _of_seen_faces(rows: np.ndarray, fragments: Fragments) -> Tensor:
+def of_seen_faces(rows: np.ndarray, fragments: Fragments) -> Tensor:
     """Select the rows of the G faces that a view shows, on the device of the view."""
-    seen_rows = rows.take(fragments.faces.cpu().numpy(), axis=0)
-    return torch.from_numpy(seen_rows).to(fragments.coverage.device)
+    faces = fragments.faces
+    if faces.is_cuda:
+        return torch.from_numpy(rows).to(faces.device, non_blocking=True)[faces]
+    return torch.from_numpy(rows.take(faces.numpy(), axis=0))
 
 
 # Approximate limit for the number of texels of a new texture. If it would have more texels,

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Num
+from jaxtyping import Float, Int, Num, Shaped
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -26,7 +26,10 @@ from renderer.errors import require_finite
 from renderer.settings import ImageSettings
 from renderer.visibility import Rasterizer
 
-# Number of samples that are interpolated at once. Their values fit into the cache of the
+# Samples of the views that a GPU shades at once, and a CPU, whose cache they should fit.
+SAMPLES_ON_GPU = 2**21
+SAMPLES_ON_CPU = 2**16
+# Number of samples that are interpolated at once on a CPU. Their values fit into the cache of the
 # processor.
 BLOCK = 2**14
 
@@ -65,7 +68,7 @@ class Fragments:
             ascending, int64, shape (P,). Row 0 is the top of the image.
         coverage: Fraction of the samples of each pixel that show the mesh, in
             (0, 1], float64, shape (P,).
-        faces: Indices in the mesh of the G faces that samples show, ascending,
+        faces: Indices in the mesh of the G faces that samples show, ascending in each view,
             int64, shape (G,).
         corners: Indices of the three vertices of each seen face, int64,
             shape (G, 3).
@@ -82,7 +85,7 @@ class Fragments:
             covered or not, int64, shape (S,).
         depths: Depths of the corners of seen faces (see `Camera.depths`),
             float64, shape (G, 3). None without perspective.
-        camera: Camera of the view. None if the samples come from no camera.
+        cameras: Camera of each view. Empty if the samples come from no camera.
     """
 
     shape: tuple[int, int]
@@ -97,7 +100,7 @@ class Fragments:
     sample_to_seen_face: Int[Tensor, " S"]
     sample_numbers: Int[Tensor, " S"]
     depths: Float[Tensor, "G 3"] | None = None
-    camera: Camera | None = None
+    cameras: tuple[Camera, ...] = ()
 
     @property
     def sample_shape(self) -> tuple[int, int]:
@@ -105,13 +108,29 @@ class Fragments:
         return self.shape[0] * self.samples, self.shape[1] * self.samples
 
     @property
-    def eye(self) -> Tensor:
-        """Homogeneous position of the camera (x, y, z, w), shape (4,).
+    def eyes(self) -> Float[Tensor, "_ 4"]:
+        """Homogeneous position (x, y, z, w) of the camera of the only view, or of each sample.
 
         w is 1 for the position of a perspective camera, and 0 for the direction
         to an orthographic camera. Without a camera, all four numbers are 0.
         """
-        return torch.zeros(4) if self.camera is None else self.camera.differentiable_eye()
+        if not self.cameras:
+            return torch.zeros(1, 4)
+        eyes = torch.stack([camera.differentiable_eye() for camera in self.cameras])
+        if len(eyes) == 1:
+            return eyes
+        view = self.sample_numbers.div(math.prod(self.sample_shape), rounding_mode="floor")
+        return eyes.to(view.device).index_select(0, view)
+
+    def of_views(self, *values: Shaped[Tensor, "*axes P"]) -> list[tuple[Tensor, ...]]:
+        """Return the indices of the pixels of each view in its image, and values at them."""
+        if len(self.cameras) < 2:
+            return [(self.pixels, *values)]
+        size = math.prod(self.shape)
+        view = self.pixels.div(size, rounding_mode="floor")
+        sizes = view.bincount(minlength=len(self.cameras)).tolist()
+        split = [part.split(sizes, dim=-1) for part in (self.pixels % size, *values)]
+        return list(zip(*split, strict=True))
 
     @cached_property
     def barycentric(self) -> Tensor:
@@ -163,7 +182,7 @@ class Fragments:
         return weights.T
 
     def positions(self) -> Float[Tensor, "S 2"]:
-        """Compute the positions of the S covered samples in the image.
+        """Compute the positions of the S covered samples in the image of their view.
 
         x points to the right and y up, and the image is [-1, 1] in x.
         """
@@ -172,6 +191,8 @@ class Fragments:
         numbers = self.sample_numbers.double()
         row = (numbers / columns).floor()
         column = numbers - row * columns
+        if len(self.cameras) > 1:
+            row = row % rows
         # The image is divided into square cells of width 2 / columns. A sample is the center of
         # its cell.
         ends = torch.stack([2 * column + 1, 2 * (rows - row) - 1]).T / columns
@@ -326,6 +347,13 @@ def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
     return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
 
 
+def views_at_once(settings: ImageSettings, vertices: np.ndarray | Tensor) -> int:
+    """Return how many views are shaded together, since operations on few samples take as long."""
+    is_on_gpu = isinstance(vertices, Tensor) and vertices.is_cuda
+    samples = SAMPLES_ON_GPU if is_on_gpu else SAMPLES_ON_CPU
+    return max(1, samples // (settings.pixel_count * settings.samples**2))
+
+
 def build_fragments(
     vertices: Float[np.ndarray, "V 3"] | Float[Tensor, "V 3"],
     faces: Int[np.ndarray, "F 3"],
@@ -333,12 +361,14 @@ def build_fragments(
     settings: ImageSettings,
     rasterizer: Rasterizer,
     closed: bool = False,
+    at_once: int = 1,
 ) -> list[Fragments]:
     """Rasterize a mesh once for each camera to find the samples that show the mesh.
 
-    Vertices are in world axes. Those on a GPU give fragments there, and all others on the CPU. With
-    `closed` (see `Mesh.closed`), faces that are seen from behind are not drawn, except if the near
-    plane cuts the mesh open. A mesh that reaches a perspective camera raises `InputError`.
+    Each result has `at_once` successive views, or the rest of them. Vertices are in world axes.
+    Those on a GPU give fragments there, and all others on the CPU. With `closed` (see
+    `Mesh.closed`), faces that are seen from behind are not drawn, except if the near plane cuts the
+    mesh open. A mesh that reaches a perspective camera raises `InputError`.
     """
     require_finite(vertices=torch.as_tensor(vertices))
     points: Any = vertices
@@ -356,24 +386,32 @@ def build_fragments(
     face_ids = rasterizer.rasterize(projected, faces, shape, closed and is_uncut)
     all_faces = torch.as_tensor(faces, device=projected.device)
     views = []
-    for camera, view_points, view_ids in zip(cameras, projected, face_ids, strict=True):
-        depths = camera.depths(points)
-        depths = None if depths is None else torch.as_tensor(depths)
-        views.append(_fragments_of_view(camera, view_points, depths, view_ids, all_faces, settings))
+    for first in range(0, len(cameras), at_once):
+        some = slice(first, first + at_once)
+        depths = None
+        if any(camera.has_perspective for camera in cameras[some]):
+            # Depths that are all equal are as none.
+            given = [camera.depths(points) for camera in cameras[some]]
+            equal = projected.new_ones(projected.shape[1])
+            depths = torch.cat([equal if d is None else torch.as_tensor(d) for d in given])
+        shown = tuple(cameras[some]), projected[some], depths, face_ids[some], all_faces
+        views.append(_fragments_of_views(*shown, settings))
     return views
 
 
-def _fragments_of_view(
-    camera: Camera,
-    projected: Float[Tensor, "V 3"],
-    depths: Float[Tensor, " V"] | None,
-    face_ids: Int[Tensor, "_ _"],
+def _fragments_of_views(
+    cameras: tuple[Camera, ...],
+    projected: Float[Tensor, "N V 3"],
+    depths: Float[Tensor, " _"] | None,
+    face_ids: Int[Tensor, "N _ _"],
     faces: Int[Tensor, "F 3"],
     settings: ImageSettings,
 ) -> Fragments:
-    """Create fragments from face indices (-1: no face) and depths (None: no perspective)."""
+    """Create fragments of N views from face indices (-1: no face) and depths (perspective)."""
+    view_count, vertex_count, _ = projected.shape
+    height, width = settings.shape
     # Order in which the samples of a pixel follow each other.
-    order = _samples_by_pixel(settings.shape, settings.samples, face_ids.device)
+    order = _samples_by_pixel((view_count * height, width), settings.samples, face_ids.device)
     ids_by_pixel = face_ids.flatten().index_select(0, order)
     is_covered = ids_by_pixel >= 0
     covered = is_covered.nonzero().squeeze(1)
@@ -382,14 +420,21 @@ def _fragments_of_view(
     pixels = counts_of_all_pixels.nonzero().squeeze(1)
     sample_count = counts_of_all_pixels.index_select(0, pixels)
     shown = ids_by_pixel.index_select(0, covered).long()
-    is_seen = torch.zeros(len(faces), dtype=torch.bool, device=faces.device)
+    if view_count > 1:
+        # Faces are numbered view by view.
+        shown += len(faces) * covered.div(len(order) // view_count, rounding_mode="floor")
+    is_seen = torch.zeros(view_count * len(faces), dtype=torch.bool, device=faces.device)
     is_seen.index_fill_(0, shown, True)
+    seen = is_seen.nonzero().squeeze(1)
+    view_of_seen = seen.div(len(faces), rounding_mode="floor") if view_count > 1 else 0
+    seen_faces = seen - len(faces) * view_of_seen
     # One row for each corner, one column for each seen face. Rows are contiguous in
     # memory, because later code reads all first corners together.
-    seen_faces = is_seen.nonzero().squeeze(1)
     corners = faces.index_select(0, seen_faces).T.contiguous()
+    projected_corners = (corners + vertex_count * view_of_seen).flatten()
     # Axes: coordinates x and y, corner, seen face.
-    outlines = projected.T[:2].index_select(1, corners.flatten()).unflatten(1, (3, -1))
+    outlines = projected.flatten(0, 1).T[:2].index_select(1, projected_corners)
+    outlines = outlines.unflatten(1, (3, -1))
     (ax, bx, cx), (ay, by, cy) = outlines
     # A face is seen from behind if its corners are clockwise in the image.
     is_seen_from_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
@@ -405,8 +450,8 @@ def _fragments_of_view(
         sample_to_pixel=torch.repeat_interleave(sample_count, output_size=len(covered)),
         sample_to_seen_face=(is_seen.cumsum(0) - 1).index_select(0, shown),
         sample_numbers=order.index_select(0, covered),
-        depths=None if depths is None else depths[corners].T,
-        camera=camera,
+        depths=None if depths is None else depths[projected_corners].view_as(corners).T,
+        cameras=cameras,
     )
 
 

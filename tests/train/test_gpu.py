@@ -70,3 +70,13 @@ def test_moved_shapes_render_on_a_gpu_as_on_a_cpu():
         for device in ("cpu", "cuda")
     ]
     assert ((images[0] - images[1]).abs().amax(1) > 1e-4).float().mean() <= 1e-3
+
+
+@pytest.mark.parametrize("options", [{}, {"shadows": True}, {"gloss": nb.Gloss(0.5)}], ids=str)
+def test_operators_that_a_gpu_computes_are_those_of_a_cpu(options):
+    mesh, light, cameras = nb.solid("cup"), nb.load_light("grace"), nb.orbit_cameras(3, 2.2)
+    images = [
+        nb.precompute_transfer(mesh, cameras, 64, device=device, **options).image(light.to(device))
+        for device in ("cpu", "cuda")
+    ]
+    assert ((images[0] - images[1].cpu()).abs().amax(1) > 1e-4).float().mean() <= 1e-3
