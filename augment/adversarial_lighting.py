@@ -111,8 +111,7 @@ class AdversarialLighting:
             if is_inference:
                 # Autograd cannot save a tensor that inference mode made.
                 images, targets = tree_map_only(Tensor, Tensor.clone, (images, targets))
-            params = self.lighting.make_params([images])
-            worst = self._search(images, targets, params["lights"])
+            worst = self._search(images, targets, self.lighting.make_params([images])["lights"])
             return self.lighting.apply(images, {"lights": worst})
 
     def _search(

@@ -56,8 +56,7 @@ class ZeroShot(nn.Module):
         """Compute the logits of normalized images."""
         features = self.model.get_image_features(pixel_values=images)
         # The method returned the vectors themselves before version 5.
-        vectors = getattr(features, "pooler_output", features)
-        return self.text(F.normalize(vectors, dim=-1))
+        return self.text(F.normalize(getattr(features, "pooler_output", features), dim=-1))
 
 
 def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool) -> TaskNetwork:

@@ -435,8 +435,7 @@ def _relight(
     is_large = images.dtype.itemsize > 2 and images.dtype != torch.float32
     dtype = torch.float64 if is_large else torch.float32
     values = torch.stack([light.values for light in lights]).to(images.device, dtype)
-    seeds = [light.seed for light in lights]
-    drawn = model.draw(values, tuple(images.shape[-2:]), depth, seeds)
+    drawn = model.draw(values, tuple(images.shape[-2:]), depth, [light.seed for light in lights])
     light = model.illumination(drawn, strength)
     if colored == 1:
         # The light of a gray image is the luminance.

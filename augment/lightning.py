@@ -55,8 +55,7 @@ def lightning_callback(service: AugmentationService, network: nn.Module | None =
         >>> loader = DataLoader(data + callback.renders, 128, shuffle=True)  # doctest: +SKIP
         >>> Trainer(callbacks=[callback]).fit(module, loader)  # doctest: +SKIP
     """
-    expected = "nb.AugmentationService.from_meshes(...)"
-    require_kind("service", service, AugmentationService, expected)
+    require_kind("service", service, AugmentationService, "nb.AugmentationService.from_meshes(...)")
     require_kind("network", network, nn.Module | None, "a torch.nn.Module or None")
     # Lightning has two packages, of which a user has one.
     for name in ("lightning.pytorch", "pytorch_lightning"):

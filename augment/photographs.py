@@ -271,8 +271,7 @@ def attack_photographs(
     success_settings = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
     size = as_size("photographs", photographs.shape[-2:])
     with wrappers.gradient_flags_kept(network):
-        device = wrappers.device_of(network)
-        given = size, classes, normalization, value_range, device
+        given = size, classes, normalization, value_range, wrappers.device_of(network)
         classifier = as_network(network, *given, task=task, size_from="the photographs")
         if classifier.size != size:
             reason = f"photographs have the size {size} in pixels"

@@ -476,8 +476,7 @@ class AugmentationService:
             diagnostics["attack_success_without_noise"] = _mean(result.success)
         if self._finds_objects:
             # Render all examples, since the attack has images of the attacked ones only.
-            images = problem.images(values, problem.all_examples)[:, 0]
-            return _Made(values, images, diagnostics)
+            return _Made(values, problem.images(values, problem.all_examples)[:, 0], diagnostics)
         is_new_success = success & ~result.success_before
         return _Made(values, result.images[:, 0], diagnostics, is_new_success)
 

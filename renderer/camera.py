@@ -227,8 +227,7 @@ class Camera(ABC):
             Position of the camera (x, y, z, w), float64, shape (4,).
         """
         # Camera coordinates of the origin and of the unit vectors give the axes of the camera.
-        origin_and_units = torch.eye(4, 3, dtype=torch.float64).roll(1, 0)
-        coordinates = self._camera_coordinates(origin_and_units)
+        coordinates = self._camera_coordinates(torch.eye(4, 3, dtype=torch.float64).roll(1, 0))
         origin = coordinates[:, 0]
         axes = coordinates[:, 1:] - origin[:, None]
         if not self.has_perspective:

@@ -327,8 +327,7 @@ class _Target(NamedTuple):
         rendered_image = background.repeat(CHANNELS, 1).index_copy(1, pixels, rendered)
         differences = rendered_image.clamp(max=1) - self.image
         penalties = penalty.sqrt() * (light - expected_light).T
-        residuals = torch.cat([differences.flatten(), penalties.flatten()])
-        return residuals, light, coverage
+        return torch.cat([differences.flatten(), penalties.flatten()]), light, coverage
 
     def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
         """Sort cameras by the squared error of a render with their best light, smallest first."""

@@ -41,8 +41,7 @@ def tonemap(
     Backgrounds are encoded image values.
     """
     require_bounded(radiance=radiance)
-    linear = radiance + background_term(coverage, background, encoding)
-    return encode(clamp(linear), encoding)
+    return encode(clamp(radiance + background_term(coverage, background, encoding)), encoding)
 
 
 def composite(
@@ -57,8 +56,7 @@ def composite(
     The radiance is already multiplied by the coverage. `pixels` are row-major, and the
     background has encoded values.
     """
-    batch_shape = radiance.shape[:-2]
-    backgrounds = background.expand(*batch_shape, *background.shape[-3:])
+    backgrounds = background.expand(*radiance.shape[:-2], *background.shape[-3:])
     # The last axis is over the pixels of an image
     # in row-major order, shape (..., 3, height · width).
     background_pixels = backgrounds.flatten(-2)

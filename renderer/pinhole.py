@@ -185,8 +185,7 @@ class PinholeCamera(PerspectiveCamera):
 
     def normalized(self, center: np.ndarray, scale: float) -> Self:
         """Return a camera whose image stays the same, and that attacks turn about the origin."""
-        moved = super().normalized(center, scale)
-        return replace(moved, center_x=0.0, center_y=0.0, center_z=0.0)
+        return replace(super().normalized(center, scale), center_x=0.0, center_y=0.0, center_z=0.0)
 
     def _limits(self, depths: Any) -> tuple[float, float, float]:
         """Return the smallest allowed depth, and depths just around those of the points."""
@@ -238,8 +237,7 @@ def load_cameras(path: str | Path, whole: bool = False) -> dict[str, PinholeCame
     if path.is_dir() and (path / COLMAP_IMAGES).exists():
         cameras = _read_colmap(path, whole)
     else:
-        file = path / "transforms.json" if path.is_dir() else path
-        cameras = _read_transforms(file, whole)
+        cameras = _read_transforms(path / "transforms.json" if path.is_dir() else path, whole)
     if not cameras:
         raise InputError(f"{path} has no cameras: give files with at least one image")
     return cameras

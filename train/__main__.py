@@ -36,8 +36,7 @@ class TrainCommand(Command):
                 # Report mistakes in the settings before the import of the module
                 # train.commands.experiment, which takes seconds.
                 read_settings(self.kind, config)
-            train = import_function("train.commands.experiment:train")
-            train(config, list(job.overrides.task))
+            import_function("train.commands.experiment:train")(config, list(job.overrides.task))
 
 
 def name_model(words: list[str]) -> list[str]:

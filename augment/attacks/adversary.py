@@ -122,10 +122,9 @@ class Adversary(ShortRepr):
         before_attack = scene.examples[example]
         item = scene.objects[before_attack.object]
         # Cameras that an attack on the pose has moved, with numbers in place of tensors below.
-        cameras = scene.cameras_under(after, row, example)
         return Adversary(
             shown=_attacked_object(item, after.row(row, item.mesh), scene.settings.encoding),
-            cameras=tuple(camera.fixed() for camera in cameras),
+            cameras=tuple(camera.fixed() for camera in scene.cameras_under(after, row, example)),
             light=after.light[row].detach().cpu() * before_attack.exposure,
             basis=scene.basis_under(after, row),
             background=scene.backgrounds[before_attack.background].cpu(),
@@ -178,8 +177,7 @@ class Adversary(ShortRepr):
             rasterizer = choose(rasterizer or "auto")
         pixels = None if self.pixels is None else self.pixels[None]
         conditions = Conditions(self.light[None], pixels=pixels)
-        scene = self.scene(rasterizer).changed(one_light=True)
-        return scene.render(conditions, torch.arange(1))[0]
+        return self.scene(rasterizer).changed(one_light=True).render(conditions, torch.arange(1))[0]
 
 
 def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> SceneObject:

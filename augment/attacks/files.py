@@ -138,8 +138,7 @@ def _write_example(
     problem, scene = result.problem, result.problem.scene
     images = result.images_in_views_before[example], result.images_in_views[example]
     write_image(path.with_suffix(".png"), figure(result, example))
-    adversary = Adversary.of(scene, example, after, *images)
-    light_numbers = write_adversary(adversary, path)
+    light_numbers = write_adversary(Adversary.of(scene, example, after, *images), path)
     # The files of an adversary have the light after the attack. Add that before it.
     light_before, basis_before = result.light(problem.start, example)
     exposed = light_before.cpu() * scene.examples[example].exposure
@@ -148,8 +147,7 @@ def _write_example(
     classes = result.classifier.classes
     minimum = result.minimum
     # Change of each of the D attack values of this example, shape (1, D).
-    change = minimum.values[[example]] - problem.start[[example]]
-    parts = problem.split_by_parameter(change)
+    parts = problem.split_by_parameter(minimum.values[[example]] - problem.start[[example]])
     return {
         "example": example,
         **{name: getattr(result, name)[example].tolist() for name in NUMBERS},
@@ -170,7 +168,6 @@ def _numbers_of_version(result: AttackResult, images: Images) -> list[dict[str, 
     evidence, fooled_in_views, without_noise = judged
     # Examples that reach the criterion before the attack are no successes.
     is_counted = ~result.success_before
-    differences = (images - result.images_in_views).abs().flatten(1)
     return [
         {
             "success": bool((fooled_in_views.all(1) & is_counted)[example]),
@@ -179,7 +176,7 @@ def _numbers_of_version(result: AttackResult, images: Images) -> list[dict[str, 
             "largest_difference": float(difference.max()),
             "mean_difference": float(difference.mean()),
         }
-        for example, difference in enumerate(differences)
+        for example, difference in enumerate((images - result.images_in_views).abs().flatten(1))
     ]
 
 

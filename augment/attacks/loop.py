@@ -112,8 +112,7 @@ class Minimum(Rows, ShortRepr):
         """
         for name in ("steps", "queries", "backward_passes"):
             getattr(self, name)[rows] += getattr(restart, name)
-        found = {name: getattr(restart, name) for name in FOUND}
-        self.record(rows, found, restart.success)
+        self.record(rows, {name: getattr(restart, name) for name in FOUND}, restart.success)
 
 
 @torch.no_grad()

@@ -193,8 +193,7 @@ class NormBalls:
             distance = (reached - self.start).norm(dim=1, keepdim=True)
             offset = direction * distance / direction.norm(dim=1, keepdim=True)
             return self.project_feasible(self.start + offset)
-        drawn = sample(self.settings, self.start, draws, self.used_mask)
-        return self._project(drawn, self.start)
+        return self._project(sample(self.settings, self.start, draws, self.used_mask), self.start)
 
 
 @dataclass(frozen=True)

@@ -123,8 +123,7 @@ class SceneProblem:
 
     def split_by_parameter(self, values: Values) -> list[tuple[Parameter, Tensor]]:
         """Split the attack values of examples into the values of each parameter."""
-        parts = values.split(self._value_counts, dim=1)
-        return list(zip(self.parameters, parts, strict=True))
+        return list(zip(self.parameters, values.split(self._value_counts, dim=1), strict=True))
 
 
 def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
@@ -166,8 +165,7 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
     if error > MAX_IRRADIANCE_ERROR:
         reason = "the light has negative radiance, and after its removal the irradiance is off by"
         advice = "give a higher degree, or set allow_negative=True to keep the light as it is"
-        message = f"{reason} {error:.0%} (rms) in {basis}: {advice}"
-        warnings.warn(message, stacklevel=stacklevel)
+        warnings.warn(f"{reason} {error:.0%} (rms) in {basis}: {advice}", stacklevel=stacklevel)
 
 
 def source_labels(scene: Scene, device: torch.device, network: TaskNetwork) -> Int[Tensor, "E V"]:

@@ -393,8 +393,7 @@ class AttackResult(ShortRepr):
         """
         task = self.classifier.task
         criterion = self.criterion.map(lambda rows: rows[example][views])
-        predicted = criterion.predicted(evidence)
-        found = task.found(evidence, predicted, self.classifier.classes, when)
+        found = task.found(evidence, criterion.predicted(evidence), self.classifier.classes, when)
         if criterion.needs_truth:
             of_label = task.confidences(evidence).gather(1, criterion.source[:, None])[:, 0]
             found[f"label_confidence{when}"] = of_label.tolist()

@@ -228,8 +228,7 @@ def _as_object(name: str, given: Any) -> ObjectSettings:
         raise InputError(f"{name} is {shown}: give a pair of a mesh and a label, {EXAMPLE}")
     mesh, label = given
     if not errors.is_whole(label):
-        expected = "the name of a class, or its index"
-        errors.require_kind(f"{name}: its label", label, str, expected)
+        errors.require_kind(f"{name}: its label", label, str, "the name of a class, or its index")
     if not isinstance(mesh, str | Path):
         require_mesh(name, mesh)
         mesh = placed.name_mesh(mesh)

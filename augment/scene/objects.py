@@ -158,8 +158,7 @@ class SceneObject:
         """
         if not others:
             return self
-        mesh = concatenate([self.mesh, *others])
-        return replace(self, mesh=mesh, own=int(self.own_faces.sum()))
+        return replace(self, mesh=concatenate([self.mesh, *others]), own=int(self.own_faces.sum()))
 
 
 def name_mesh(mesh: Mesh) -> str:
@@ -268,8 +267,7 @@ def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObjec
 
 def with_own_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
     """Return a copy with another mesh of the first object. The others and the table stay."""
-    alone = replace(item, mesh=mesh, own=None)
-    return add_table(with_others(alone, item.others), item.ground)
+    return add_table(with_others(replace(item, mesh=mesh, own=None), item.others), item.ground)
 
 
 def _turn(azimuth: float) -> Float[np.ndarray, "3 3"]:
@@ -354,8 +352,7 @@ class FaceMaterials:
 
     def is_uniform(self) -> bool:
         """Return whether all faces belong to the object and have the same material."""
-        has_same_gloss = (self.face_gloss == self.face_gloss[0]).all()
-        return bool(self.object_mask.all() and has_same_gloss)
+        return bool(self.object_mask.all() and (self.face_gloss == self.face_gloss[0]).all())
 
     def first_face(self) -> FaceMaterials:
         """Return the material of the first face only. In a uniform mesh, it is that of all."""

@@ -304,8 +304,7 @@ def draw_projected(
     """
     # Index of the random photograph that each of the pictures shows, shape (count,).
     rows = torch.randint(len(photographs), (count,), generator=draws)
-    chosen = photographs[rows.to(photographs.device)].cpu()
-    linear = decode(to_unit(chosen), "srgb")
+    linear = decode(to_unit(photographs[rows.to(photographs.device)].cpu()), "srgb")
     return draw_photograph_patterns(linear, pixel_centers(size), draws)
 
 
@@ -478,8 +477,7 @@ def _text(points: Points, rng: np.random.Generator) -> Tensor:
 def _colors(points: Points, rng: np.random.Generator) -> Float[Tensor, "3 H W"]:
     """Draw smooth colors: random values on a coarse grid, interpolated by cubic splines."""
     rows, columns = rng.integers(3, 6), rng.integers(3, 6)
-    grid = rng.uniform(0, 1, (rows, columns, 3))
-    return _interpolate(grid, points, order=3).clamp(0, 1)
+    return _interpolate(rng.uniform(0, 1, (rows, columns, 3)), points, order=3).clamp(0, 1)
 
 
 def _pair(values: np.ndarray) -> Shaped[Tensor, "2 1 1"]:

@@ -352,8 +352,7 @@ class DirectRenderer:
         key = (object_index, camera)
         if key not in self._local_views:
             fragments, _ = self.view(object_index, camera)
-            mesh = self.objects[object_index].mesh
-            surface = Surface(mesh, fragments.to("cpu"), self.settings)
+            surface = Surface(self.objects[object_index].mesh, fragments.to("cpu"), self.settings)
             self._local_views[key] = LocalLightView(self._rays_of(object_index), surface)
         return self._local_views[key]
 

@@ -263,8 +263,7 @@ class DetectionCriterion(ObjectCriterion):
     def evidence(self, outputs: list[Detections]) -> Float[Tensor, "N K"]:
         """Return the log-odds of each class at the object, and of the threshold."""
         rows = []
-        views = zip(outputs, self.boxes, self.source.tolist(), strict=True)
-        for item, box, source in views:
+        for item, box, source in zip(outputs, self.boxes, self.source.tolist(), strict=True):
             scores = item["scores"].detach()
             # Largest score of each class near the object, and then the threshold.
             best_scores = scores.new_full((self.class_count + 1,), SMALLEST_SCORE)

@@ -351,8 +351,7 @@ class Material:
 def _resized(channel: np.ndarray, texture: np.ndarray) -> np.ndarray:
     """Resize a channel to the height and the width of a texture."""
     height, width = texture.shape[:2]
-    image = Image.fromarray(channel)
-    return np.array(image.resize((width, height), Image.Resampling.BILINEAR))
+    return np.array(Image.fromarray(channel).resize((width, height), Image.Resampling.BILINEAR))
 
 
 def ignored_features(tree: dict[str, Any]) -> list[str]:

@@ -140,8 +140,7 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
     if alpha is None:
         return color
     color.putalpha(alpha)
-    white = Image.new("RGBA", color.size, "white")
-    return Image.alpha_composite(white, color).convert("RGB")
+    return Image.alpha_composite(Image.new("RGBA", color.size, "white"), color).convert("RGB")
 
 
 def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None]:

@@ -358,8 +358,7 @@ def _clip_ears(points: Num[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], 
     count = len(points)
     ends = np.array([count], dtype=np.uint32)
     # Earcut cuts triangles (ears) off the polygon until nothing is left.
-    indices = mapbox_earcut.triangulate_float64(points, ends).astype(np.int64)
-    triangles = indices.reshape(-1, 3)
+    triangles = mapbox_earcut.triangulate_float64(points, ends).astype(np.int64).reshape(-1, 3)
     if not len(triangles):  # The polygon has no area.
         fan = np.arange(1, count - 1)
         return np.stack([0 * fan, fan, fan + 1], axis=1), False

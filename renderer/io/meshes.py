@@ -307,8 +307,7 @@ def _gltf_camera(camera: Camera, aspect: float) -> dict[str, Any]:
         half_height = half_width / camera.pixel_aspect * (1 / aspect + abs(camera.principal_up))
         half_width *= 1 + abs(camera.principal_right)
         vertical_angle = 2 * math.atan(half_height)
-        aspect_ratio = half_width / half_height
-        perspective = {"yfov": vertical_angle, "aspectRatio": aspect_ratio, **planes}
+        perspective = {"yfov": vertical_angle, "aspectRatio": half_width / half_height, **planes}
         return {"type": "perspective", "perspective": perspective}
     half_width = camera.width / 2
     orthographic = {"xmag": half_width, "ymag": half_width / aspect, **planes}

@@ -194,8 +194,7 @@ def load_light(
     elif suffix == ".json":
         _, coefficients = read_light(Path(light), Harmonics)
     elif suffix in SUFFIXES:
-        map_degree = DEGREE if degree is None else degree
-        coefficients = _read_light_map(Path(light), map_degree, roughness)
+        coefficients = _read_light_map(Path(light), DEGREE if degree is None else degree, roughness)
     else:
         raise InputError(
             f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or "

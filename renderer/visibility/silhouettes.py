@@ -500,6 +500,5 @@ def _edges(face_bytes: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     side i of face f at i F + f, shape (3 F,); and the number of faces at each edge. The
     argument holds int64 vertex indices as bytes, because a key of the cache is hashed.
     """
-    faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
-    ends, edge_of_side = shared_edges(faces)
+    ends, edge_of_side = shared_edges(np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3))
     return ends.T, edge_of_side.T.ravel(), np.bincount(edge_of_side.ravel())

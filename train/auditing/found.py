@@ -118,8 +118,7 @@ def find_in_lights(
         if isinstance(task, Detection):
             at_iou, at_half = (_match(pairs, iou) for iou in (task.iou, 0.5))
             measured = at_iou, [label], task.threshold, at_half, units
-            scores = detections.score(*measured, over=VIEWS)
-            metrics[title] = asdict(scores)
+            metrics[title] = asdict(detections.score(*measured, over=VIEWS))
         else:
             miou, _ = detections.mean_iou(pairs, 2, units, VIEWS)
             metrics[title] = {"n": len(pairs), "miou": asdict(miou)}

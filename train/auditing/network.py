@@ -295,11 +295,10 @@ class AuditedNetwork:
         """
         faults = []
         for kind, counts in self.counts.items():
-            light = KINDS[kind]
             for radius, fooled_count in self.lost(kind, "adversarial").items():
                 # At least half of the views that were correct before are lost.
                 if 0 < counts["correct"] <= 2 * fooled_count:
-                    attack = f"an attack with {light.title} of radius {radius:g}"
+                    attack = f"an attack with {KINDS[kind].title} of radius {radius:g}"
                     faults.append(f"{attack} loses {fooled_count} of {counts['correct']} views")
                     break
         return faults

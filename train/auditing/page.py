@@ -236,8 +236,7 @@ def screen_of_one(
     def show(title: str, value: Estimate, note: str = "higher is better") -> None:
         numbers.append(first_screen.ShownMetric(title, note, None, value))
 
-    views = fraction(network.plain.recognized, network.plain.n)
-    show("Views recognized in plain light", views)
+    show("Views recognized in plain light", fraction(network.plain.recognized, network.plain.n))
     kind = network.strongest_kind
     if kind is not None:
         light = KINDS[kind]

@@ -212,9 +212,8 @@ def attack_folder(
     all if it is None. `options` are those of `attack_photographs`.
     """
     found = find_unlabeled(folder)
-    chosen = evenly_spaced(found, limit or len(found))
     readable, images, unreadable = load_photographs(
-        folder, chosen, classifier.size, skip_unreadable=True
+        folder, evenly_spaced(found, limit or len(found)), classifier.size, skip_unreadable=True
     )
     result = attack_photographs(classifier, images, settings, limit=limit, **options)
     out.mkdir(parents=True, exist_ok=True)

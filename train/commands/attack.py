@@ -212,8 +212,7 @@ def attacks(
     for index, item in enumerate(settings.meshes):
         key = f"meshes[{index}]"
         mesh = read_object(item, "", key)
-        label = mesh.label or settings.label
-        mesh.label = class_of_meshes([item], classifier.classes, key, label)
+        mesh.label = class_of_meshes([item], classifier.classes, key, mesh.label or settings.label)
         build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
         chosen = settings.scene
         try:

@@ -120,7 +120,6 @@ def audit(
                 # A `TaskNetwork` knows itself whether it normalizes light.
                 named["normalize_light"] = None
             networks[HARDENED] = as_network(hardened, *options, argument="hardened", **named)
-        classifier = networks[CLASSIFIER]
         with folder_or_temporary(out) as folder:
             # `run_audit` takes settings, as the command does, so the arguments become settings.
             items = as_mappings("meshes", meshes)
@@ -130,5 +129,5 @@ def audit(
             given |= {"label": label, "meshes": items, "hard_negatives": negatives, "seed": seed}
             given |= {"budget": budget, "device": str(device), "overwrite": overwrite}
             maps = as_list("environments", environments, str, "a list of names")
-            settings = AuditSettings(network=classifier.name, environments=maps, **given)
+            settings = AuditSettings(network=networks[CLASSIFIER].name, environments=maps, **given)
             return run_audit(settings, networks).report()

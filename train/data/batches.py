@@ -173,8 +173,7 @@ def _draw(
         is_flipped_if_even = torch.randint(0, 2, (count,), generator=draws, dtype=torch.bool)
         is_flipped = (is_flipped_if_even ^ bool(this_round.epoch % 2))[order]
     draws = generator(seed, this_round.number, "crops")
-    seeds = torch.randint(2**62, order.shape, generator=draws)
-    return order, shifts, is_flipped, seeds
+    return order, shifts, is_flipped, torch.randint(2**62, order.shape, generator=draws)
 
 
 def crop_and_flip(

@@ -201,8 +201,7 @@ def load_cifar100(path: str) -> DataSet:
     with explained(fault, "give a copy, or connect to the internet", "path"):
         both = [CIFAR100(path, train=is_train, download=True) for is_train in (True, False)]
     images = [torch.from_numpy(cifar.data).permute(0, 3, 1, 2).contiguous() for cifar in both]
-    labels = [torch.tensor(cifar.targets) for cifar in both]
-    train, test = map(Split, images, labels)
+    train, test = map(Split, images, [torch.tensor(cifar.targets) for cifar in both])
     return DataSet(tuple(both[0].classes), train, test)
 
 
@@ -289,8 +288,7 @@ def load_unlabeled(path: str, size: int, test_fraction: float, skip: bool, worke
     It has no classes, every label is 0, and at most HELD_OUT images are test images.
     """
     split = _read(Path(path), (), size, skip, workers)
-    fraction = min(test_fraction, HELD_OUT / len(split))
-    is_test = held_out_rows(split, fraction, "test_fraction")
+    is_test = held_out_rows(split, min(test_fraction, HELD_OUT / len(split)), "test_fraction")
     return DataSet((), split[~is_test], split[is_test], labeled=False)
 
 

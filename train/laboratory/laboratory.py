@@ -345,8 +345,7 @@ def kept_aside_settings(
             meshes += _generated(_solid_name(label), label, POSITIVE_COUNT)
         else:
             # Meshes of the user are the objects of the training, in other lighting.
-            trained = settings.objects.values()
-            meshes += [asdict(item) for item in trained if item.label == label]
+            meshes += [asdict(item) for item in settings.objects.values() if item.label == label]
     # Names are compared in lower case and with spaces instead of "_" and "-", as `simplified`
     # returns them.
     class_of_simplified = {simplified(name): name for name in classes}

@@ -304,8 +304,7 @@ def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[L
     rows = []
     for method, runs in lines.items():
         for seed, metrics in runs:
-            cells = map(format_interval, metrics)
-            rows.append([method, "" if seed is None else str(seed), *cells])
+            rows.append([method, "" if seed is None else str(seed), *map(format_interval, metrics)])
         if len({seed for seed, _ in runs}) > 1:
             spreads = []
             # A column has the values of one metric in all runs of the method.

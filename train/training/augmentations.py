@@ -125,8 +125,7 @@ class Augmentation:
         transformed = []
         with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
             # Each process has a part of the batch. This is the index of its first image.
-            first = distributed.rank() * len(images)
-            for index, image in enumerate(images, first):
+            for index, image in enumerate(images, distributed.rank() * len(images)):
                 torch.manual_seed(stream_seed(self.seed, step, index, "distortion"))
                 transformed.append(self._transform(image))
         return torch.stack(transformed)

@@ -55,8 +55,7 @@ class MovingAverage(AveragedModel):
             chosen = [pair for pair in pairs if pair[0].is_floating_point() == is_floating]
             if chosen:
                 old = [average.detach() for average, _ in chosen]
-                new = [value.detach() for _, value in chosen]
-                self._average(old, new, None)
+                self._average(old, [value.detach() for _, value in chosen], None)
         self.n_averaged += 1
 
 

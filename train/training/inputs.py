@@ -266,8 +266,7 @@ def require_label(settings: ExperimentSettings, data: sets.DataSet) -> None:
     The sub-folders of photographs have names of classes, and no indices.
     """
     # Renders and the ranking loss are of a positive class.
-    needs_label = settings.augment.renders or settings.train.ranking_weight > 0
-    if settings.label is None and needs_label:
+    if settings.label is None and (settings.augment.renders or settings.train.ranking_weight > 0):
         choices = ", ".join(data.classes[:5])
         raise InputError(
             f"label is not set: give a class of the meshes, such as {choices}", "label"

@@ -332,8 +332,7 @@ class SharedTeacher(nn.Module):
 
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B classes"]:
         """Return the logits of the teacher for the images with which the pupil was called last."""
-        is_mixed = self._dtype != torch.float32
-        with torch.autocast(images.device.type, self._dtype, enabled=is_mixed):
+        with torch.autocast(images.device.type, self._dtype, enabled=self._dtype != torch.float32):
             return self.layer(self.features).float()
 
 

@@ -68,8 +68,7 @@ class Pose(Parameter):
         self._limit = self._largest_values(scene, settings)
         # A value with the unit 0 has no effect.
         used_mask = (self._unit > 0).expand(len(scene.object_of), -1)
-        start = self._unit.new_zeros(used_mask.shape)
-        super().__init__(settings, start=start, used_mask=used_mask)
+        super().__init__(settings, start=self._unit.new_zeros(used_mask.shape), used_mask=used_mask)
 
     def _largest_values(self, scene: Scene, settings: PoseSettings) -> Tensor:
         """Compute the largest magnitude of each attack value, shape (D,).
