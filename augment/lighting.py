@@ -370,10 +370,9 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
     if plain.ndim == 2:
         return _apply_to_tensor(plain[None], lights, depth)[0]
     if plain.ndim < 2 or not 1 <= plain.shape[-3] <= 4 or plain.dtype == torch.bool:
-        raise InputError(
-            f"the image is {str(image.dtype).removeprefix('torch.')} of shape {tuple(image.shape)}:"
-            " give numbers of shape (..., C, H, W) with 1 to 4 channels"
-        )
+        dtype = str(image.dtype).removeprefix("torch.")
+        fault = f"the image is {dtype} of shape {tuple(image.shape)}"
+        raise InputError(f"{fault}: give numbers of shape (..., C, H, W) with 1 to 4 channels")
     if plain.is_complex():
         raise InputError(f"the image is {image.dtype}: give real numbers")
     count = math.prod(_batch_shape(image))

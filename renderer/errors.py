@@ -495,10 +495,8 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
     """
     free = free_memory(device)
     if free is not None and needed > free:
-        raise InputError(
-            f"{name} need {needed / GIB:.1f} GB of memory, and {free / GIB:.1f} GB are free: "
-            "reduce them"
-        )
+        fault = f"{name} need {needed / GIB:.1f} GB of memory, and {free / GIB:.1f} GB are free"
+        raise InputError(f"{fault}: reduce them")
 
 
 def free_memory(device: torch.device) -> int | None:

@@ -141,10 +141,8 @@ class Mesh:
         for name, (least, most) in limits.items():
             ids = getattr(self, name)
             if ids is not None and not least <= ids.min() <= ids.max() <= most:
-                raise InputError(
-                    f"{name} has indices from {ids.min()} to {ids.max()}: "
-                    f"give indices from {least} to {most}"
-                )
+                fault = f"{name} has indices from {ids.min()} to {ids.max()}"
+                raise InputError(f"{fault}: give indices from {least} to {most}")
         if self.normal_ids is None:
             object.__setattr__(self, "normal_ids", normal_groups(self.vertices, self.faces))
 
@@ -298,10 +296,8 @@ def require_mesh(name: str, value: object) -> None:
     """Check that an argument is a mesh with colors in [0, 1]."""
     if not isinstance(value, Mesh):
         path = repr(value) if isinstance(value, str) else "path"
-        raise InputError(
-            f"{name} is {errors.describe(value)}: give an nb.Mesh, "
-            f"such as nb.load_mesh({path}) or nb.Mesh.plain(vertices, faces)"
-        )
+        advice = f"give an nb.Mesh, such as nb.load_mesh({path}) or nb.Mesh.plain(vertices, faces)"
+        raise InputError(f"{name} is {errors.describe(value)}: {advice}")
     if not value.displayable:
         raise InputError(f"{name}.corner_colors has values outside [0, 1]: divide bytes by 255")
 

@@ -208,10 +208,8 @@ def fit_photograph(
     """
     rows, columns = np.nonzero(mask > MASK_THRESHOLD)
     if not len(rows):
-        raise InputError(
-            "the mask has no white pixels: give a mask that is white where the object is, "
-            "or a box around the object"
-        )
+        advice = "give a mask that is white where the object is, or a box around the object"
+        raise InputError(f"the mask has no white pixels: {advice}")
     # Center (column, row) of the object's bounding box in the photograph, in pixels.
     center = np.array([columns.min() + columns.max() + 1, rows.min() + rows.max() + 1]) / 2
     # Side of the window in pixels.

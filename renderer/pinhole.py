@@ -297,10 +297,9 @@ def _lines(text: str) -> list[str]:
 def _colmap_intrinsics(model: str, parameters: list[str]) -> np.ndarray:
     """Convert one or two focal lengths and a principal point to an intrinsic matrix."""
     if model not in COLMAP_PARAMETERS:
-        raise InputError(
-            f"the camera model {model} is not supported, because it has lens distortion (supported "
-            f"are {' and '.join(COLMAP_PARAMETERS)}): {UNDISTORT}"
-        )
+        fault = f"the camera model {model} is not supported, because it has lens distortion"
+        supported = " and ".join(COLMAP_PARAMETERS)
+        raise InputError(f"{fault} (supported are {supported}): {UNDISTORT}")
     if len(parameters) != COLMAP_PARAMETERS[model]:
         raise ValueError(f"{model} with {len(parameters)} parameters")
     *focal_lengths, center_x, center_y = map(float, parameters)
@@ -336,10 +335,8 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
             raise InputError(f"{name}={value} is not supported: give perspective cameras")
     distortion_keys = [name for name in DISTORTION if entries.get(name)]
     if distortion_keys:
-        raise InputError(
-            f"the cameras have lens distortion ({', '.join(distortion_keys)}), which is not "
-            f"supported: {UNDISTORT}"
-        )
+        fault = f"the cameras have lens distortion ({', '.join(distortion_keys)})"
+        raise InputError(f"{fault}, which is not supported: {UNDISTORT}")
     if not {"w", "h"} <= entries.keys() and {"fl_x", "fl_y", "cx", "cy"} & entries.keys():
         raise InputError("the focal length is in pixels, but the image size w and h is missing")
     # A file with square images may have a field of view, but no image size. The focal length and
@@ -370,10 +367,9 @@ def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
         is_affine = np.array_equal(matrix[3:], np.eye(4)[3 : len(matrix)])
         if error <= MATRIX_TOLERANCE and np.linalg.det(rotation) > 0 and is_affine:
             return rotation, matrix[:3, 3]
-    raise InputError(
-        f"view={matrix.tolist()} is not a rotation with a translation: give the matrix (4, 4) or "
-        "(3, 4) from world to camera coordinates"
-    )
+    fault = f"view={matrix.tolist()} is not a rotation with a translation"
+    advice = "give the matrix (4, 4) or (3, 4) from world to camera coordinates"
+    raise InputError(f"{fault}: {advice}")
 
 
 def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
@@ -385,6 +381,5 @@ def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
         error = np.abs(matrix - expected).max()
         if focal_x > 0 and focal_y > 0 and error <= MATRIX_TOLERANCE * focal_x:
             return focal_x, focal_y, center_x, center_y
-    raise InputError(
-        f"intrinsics is {matrix.tolist()}: give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-    )
+    advice = "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+    raise InputError(f"intrinsics is {matrix.tolist()}: {advice}")

@@ -210,9 +210,8 @@ class LabSettings(Settings):
         # Each pattern and each environment lights the same number of setups, and names files.
         sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
         if not sources or self.setups % len(sources):
-            raise self.wrong(
-                "setups", f"must be a multiple of the {len(sources)} patterns and environments"
-            )
+            advice = f"must be a multiple of the {len(sources)} patterns and environments"
+            raise self.wrong("setups", advice)
         if len(set(sources)) < len(sources):
             raise InputError(f"patterns and environments {sources} must have different names")
 

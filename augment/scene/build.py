@@ -539,6 +539,5 @@ def warn_of_exposure(scene: Scene, images: Float[Tensor, "E V 3 H W"] | None = N
         if not DARK <= mean <= BRIGHT:
             kind = "dark" if mean < DARK else "bright"
             name = scene.objects[index].name
-            say_once(
-                f"{name} is too {kind}: its mean is {mean:.2f}; set exposure=auto or another light"
-            )
+            advice = "set exposure=auto or another light"
+            say_once(f"{name} is too {kind}: its mean is {mean:.2f}; {advice}")

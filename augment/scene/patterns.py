@@ -322,10 +322,8 @@ def require_photographs(name: str, photographs: Tensor) -> None:
     errors.require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
     shape = tuple(photographs.shape)
     if photographs.dtype != torch.uint8 or len(shape) != 4 or shape[1] != 3 or not all(shape):
-        raise InputError(
-            f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}: "
-            "give uint8 of shape (N, 3, height, width)"
-        )
+        fault = f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}"
+        raise InputError(f"{fault}: give uint8 of shape (N, 3, height, width)")
 
 
 class ProjectedLight(NamedTuple):

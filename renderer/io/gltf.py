@@ -293,9 +293,8 @@ def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: f
         if texels is None or not is_large.any():
             break
         if len(faces) > MAX_FACES:
-            raise ValueError(
-                f"the border of its alpha needs more than {MAX_FACES} faces: smooth it"
-            )
+            fault = f"the border of its alpha needs more than {MAX_FACES} faces"
+            raise ValueError(f"{fault}: smooth it")
         surface = _halve(values, faces[is_shown], lengths[is_shown], is_large[is_shown])
     # SciPy has rows first.
     places = positions.T[::-1]

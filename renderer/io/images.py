@@ -459,7 +459,5 @@ def _transform(profile: bytes, mode: str) -> ImageCms.ImageCmsTransform | None:
 
 def _warn_of_profile(reason: str) -> None:
     """Warn of photographs whose colors are described wrongly."""
-    warnings.warn(
-        f"a color profile cannot be used ({reason}): photographs with it are read as sRGB",
-        stacklevel=2,
-    )
+    fault = f"a color profile cannot be used ({reason})"
+    warnings.warn(f"{fault}: photographs with it are read as sRGB", stacklevel=2)

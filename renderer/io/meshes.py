@@ -97,10 +97,8 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     # The matrices of a scene may have huge numbers or NaN. A
     # comparison with NaN is False, so `not` also finds NaN.
     if not (np.abs(mesh.vertices) <= errors.MAX_MAGNITUDE).all():
-        raise InputError(
-            f"{path} has coordinates that are not finite or beyond {errors.MAX_MAGNITUDE:g}: "
-            "export the mesh again"
-        )
+        fault = f"{path} has coordinates that are not finite or beyond {errors.MAX_MAGNITUDE:g}"
+        raise InputError(f"{fault}: export the mesh again")
     if not mesh.face_areas().sum() > 0:
         raise InputError(f"the surface of {path} has the area 0: give faces with an area")
     is_gltf = path.suffix.lower().lstrip(".") in GLTF

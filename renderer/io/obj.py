@@ -247,9 +247,8 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
             case "map_kd":
                 texture = _NEUTRAL_OPTIONS.sub("", text, count=1)
                 if not texture or texture.startswith("-"):
-                    raise ValueError(
-                        f'"map_Kd {text}" is not an image alone: leave its options out'
-                    )
+                    fault = f'"map_Kd {text}" is not an image alone'
+                    raise ValueError(f"{fault}: leave its options out")
                 material = material._replace(texture=(texture, folder))
             case "d" | "tr" as key:
                 # A number may follow the option "-halo".

@@ -122,10 +122,8 @@ def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
         radiance = _in_rec709(texels[..., _color_channels(names)], chromaticities)
     # NaN is refused, too, because a comparison with NaN is False.
     if not (np.abs(radiance) <= MAX_MAGNITUDE).all():
-        raise InputError(
-            f"environment map {path} has NaN, infinity or radiance above {MAX_MAGNITUDE:g}: "
-            "replace these values and save the map again"
-        )
+        fault = f"environment map {path} has NaN, infinity or radiance above {MAX_MAGNITUDE:g}"
+        raise InputError(f"{fault}: replace these values and save the map again")
     return torch.from_numpy(radiance)
 
 
@@ -139,16 +137,13 @@ def read_panorama(path: str | Path) -> Float[Tensor, "H W 3"]:
     radiance = read_map(path)
     height, width = radiance.shape[:2]
     if height < FEWEST_ROWS or abs(width - 2 * height) > height // 8:
-        raise InputError(
-            f"environment map {path} has {width} × {height} texels: give an equirectangular map, "
-            f"which is twice as wide as high, with at least {FEWEST_ROWS} rows"
-        )
+        fault = f"environment map {path} has {width} × {height} texels"
+        shape = f"which is twice as wide as high, with at least {FEWEST_ROWS} rows"
+        raise InputError(f"{fault}: give an equirectangular map, {shape}")
     minimum = radiance.min()
     if minimum < -NEGATIVE * radiance.max():
-        raise InputError(
-            f"environment map {path} has negative radiance, down to {minimum:.3g}: "
-            "clip the map at 0 and save it again"
-        )
+        fault = f"environment map {path} has negative radiance, down to {minimum:.3g}"
+        raise InputError(f"{fault}: clip the map at 0 and save it again")
     return radiance.clamp(min=0)
 
 
@@ -253,11 +248,8 @@ def _in_rec709(radiance: Float[np.ndarray, "H W 3"], chromaticities: Sequence[fl
     # Fraction of all radiance that setting these channels to 0 changes.
     lost = -converted[is_beyond].sum() / max(np.abs(converted).sum(), np.finfo(np.float32).tiny)
     if lost > NEGATIVE:
-        warnings.warn(
-            f"{lost:.2%} of the radiance of the environment map is of colors beyond Rec. 709: "
-            "their negative channels are set to 0",
-            stacklevel=2,
-        )
+        fault = f"{lost:.2%} of the radiance of the environment map is of colors beyond Rec. 709"
+        warnings.warn(f"{fault}: their negative channels are set to 0", stacklevel=2)
     return np.where(is_beyond, 0, converted)
 
 

@@ -80,10 +80,8 @@ def save_light(
     path = errors.as_path("path", path)
     is_map = path.suffix.lower() in SUFFIXES and isinstance(basis, Harmonics)
     if path.suffix != ".json" and not is_map:
-        raise InputError(
-            f"path={path} is neither a .json file nor, for spherical harmonics, a map: "
-            f"use one of the suffixes .json, {', '.join(SUFFIXES)}"
-        )
+        fault = f"path={path} is neither a .json file nor, for spherical harmonics, a map"
+        raise InputError(f"{fault}: use one of the suffixes .json, {', '.join(SUFFIXES)}")
     expected = "Harmonics(degree), or lamps or a projector"
     errors.require_kind("basis", basis, Harmonics | LocalBasis, expected)
     coefficients = errors.as_tensor("coefficients", coefficients)
@@ -196,10 +194,9 @@ def load_light(
     elif suffix in SUFFIXES:
         coefficients = _read_light_map(Path(light), DEGREE if degree is None else degree, roughness)
     else:
-        raise InputError(
-            f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or "
-            f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)"
-        )
+        names = f"{', '.join(PROBES)}, {UNIFORM}"
+        path = f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)"
+        raise InputError(f"light {light!r} is not known: choose {names} or {path}")
     # Number of coefficients of the result. Only zeros may be appended or removed.
     size = len(coefficients) if degree is None else Harmonics(degree).size
     if coefficients[size:].any():

@@ -116,12 +116,11 @@ def write_audit_page(
     recommendation = None
     if images is not None and len(remedies) > 1:
         # One evaluation of each remedy, since an audit has no seeds.
-        recommendation = recommend(
-            {
-                name: [AuditedNetwork("", name, out / key).evaluation(images)]
-                for name, key in remedies.items()
-            }
-        )
+        evaluations = {
+            name: [AuditedNetwork("", name, out / key).evaluation(images)]
+            for name, key in remedies.items()
+        }
+        recommendation = recommend(evaluations)
     advice = []
     if recommendation is not None:
         # The top of the report shows the gain by hardening already.
@@ -134,8 +133,7 @@ def write_audit_page(
     slider = _slider(networks)
     unreadable = []
     for name in folders:
-        files = read_json(networks[-1].folder / name / SUMMARY)["unreadable"]
-        if files:
+        if files := read_json(networks[-1].folder / name / SUMMARY)["unreadable"]:
             text = f"{len(files)} of the {IN_WORDS[name]} cannot be read, such as {files[0]}."
             unreadable.append(text)
     path = write_page(
@@ -210,20 +208,16 @@ def plain_sentence(network: AuditedNetwork) -> str:
     """Write how many views a classifier recognizes in plain light, before any attack."""
     label, name, plain = in_words(network.label), network.name, network.plain
     if plain.recognized == 0:
-        return (
-            f"{name} recognizes none of {plain.n} views of {label} in plain light, at "
-            "any exposure and size that was tried. So this audit cannot tell what unusual light "
-            "does."
-        )
+        none = f"{name} recognizes none of {plain.n} views of {label} in plain light"
+        tried = "at any exposure and size that was tried"
+        return f"{none}, {tried}. So this audit cannot tell what unusual light does."
     sentence = f"In plain light, {name} recognizes {plain.recognized} of {plain.n} views of {label}"
     # The search changed nothing, or found nothing better.
     if plain.recognized == plain.recognized_as_given:
         return f"{sentence}."
-    return (
-        f"{sentence} in the light “{plain.light}” at exposure {plain.exposure:g}, size "
-        f"{plain.size:g}; before this search, {plain.recognized_as_given}. All lights are tested "
-        "there."
-    )
+    found = f"in the light “{plain.light}” at exposure {plain.exposure:g}, size {plain.size:g}"
+    before = f"before this search, {plain.recognized_as_given}"
+    return f"{sentence} {found}; {before}. All lights are tested there."
 
 
 def screen_of_one(
@@ -243,20 +237,17 @@ def screen_of_one(
         # Views that are still recognized at the largest radius.
         kept = network.remaining(kind, "adversarial")[-1]
         show(f"Of these, under attack by {light.title}", kept)
-        sentences.append(
-            f"If an attacker controls {light.title} (radius {light.radii[-1]:g}), it "
-            f"still recognizes {kept.hits} of the {kept.n} views that it recognizes "
-            "before the attack."
-        )
+        control = f"If an attacker controls {light.title} (radius {light.radii[-1]:g})"
+        views = f"{kept.hits} of the {kept.n} views that it recognizes before the attack"
+        sentences.append(f"{control}, it still recognizes {views}.")
     recall, mistaken = metrics.recall, metrics.false_positive_rate
     name = in_words(network.label)
     if mistaken.value is not None:
         show(f"Other objects called {name}", mistaken, "lower is better")
         if recall.value is not None:
-            sentences.append(
-                f"In the scored images, it recognizes {recall.value:.0%} of {name} and calls "
-                f"{mistaken.value:.0%} of other objects “{name}”."
-            )
+            right = f"recognizes {recall.value:.0%} of {name}"
+            wrong = f"calls {mistaken.value:.0%} of other objects “{name}”"
+            sentences.append(f"In the scored images, it {right} and {wrong}.")
     short, _ = network.verdict
     return first_screen.FirstScreen(VERDICTS.get(short, short), sentences, numbers, [network.name])
 

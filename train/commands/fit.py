@@ -120,10 +120,8 @@ def render_attacked(
     settings: FitSettings, scene: Mapping[str, Any], renderer: Mapping[str, Any]
 ) -> tuple[Float[torch.Tensor, "3 size size"], Float[torch.Tensor, "3 size size"]]:
     """Return the encoded background, and the render as it is before an attack by pnb-attack."""
-    attacked = AttackExperimentSettings(
-        scene=AttackSceneSettings(**scene),
-        renderer=RendererSettings(**{"shadows": True, **renderer}),
-    )
+    rendered = RendererSettings(**{"shadows": True, **renderer})
+    attacked = AttackExperimentSettings(scene=AttackSceneSettings(**scene), renderer=rendered)
     label = settings.label or ""
     mesh = ObjectSettings(settings.mesh, label=label, albedo_scale=settings.albedo_scale)
     shown = build_attacked(attacked, mesh, attacked.scene, ATTACKED_SIZE, torch.device("cpu"))

@@ -1,7 +1,7 @@
 """Hardening of any network in one call."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -144,9 +144,8 @@ def harden(
     device = device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with folder_or_temporary(out) as folder:
-        classifier = as_network(
-            _trainable_copy(network), *options, normalize_light=normalize_light, task=task
-        )
+        trainable = _trainable_copy(network)
+        classifier = as_network(trainable, *options, normalize_light=normalize_light, task=task)
         is_detector = isinstance(classifier.task, Detection)
         if not (is_detector or isinstance(classifier.task, Classification)):
             raise InputError(f"network is for {classifier.task.name}: give another")
@@ -178,7 +177,11 @@ def harden(
         require_new_run(folder, "out", overwrite, settings.train.resume)
         if meshes or label is not None:
             settings = class_names.with_class_names(settings, classifier.classes)
-        with sole_writer("out", folder), _restores_torch():
+        # Training changes threads, random generators and cuDNN's choices, which are restored.
+        with sole_writer("out", folder), ExitStack() as at_end, torch.random.fork_rng():
+            cudnn = torch.backends.cudnn
+            at_end.callback(torch.set_num_threads, torch.get_num_threads())
+            at_end.callback(setattr, cudnn, "benchmark", cudnn.benchmark)
             initial = initial_of(classifier, settings.size)
             run = Run(settings, load_data(settings, initial), folder, initial)
             run.begin()
@@ -232,12 +235,3 @@ def _read_settings(
         given[name] = values
     merged = OmegaConf.merge(settings, changes, given)
     return read_settings(ExperimentSettings, cast(DictConfig, merged))
-
-
-@contextmanager
-def _restores_torch() -> Iterator[None]:
-    """Restore threads, random generators and cuDNN's choices, which training changes."""
-    with ExitStack() as at_end, torch.random.fork_rng():
-        at_end.callback(torch.set_num_threads, torch.get_num_threads())
-        at_end.callback(setattr, torch.backends.cudnn, "benchmark", torch.backends.cudnn.benchmark)
-        yield

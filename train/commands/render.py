@@ -28,12 +28,12 @@ DEFAULT_SIZE = 224
 
 def run(settings: RenderSettings) -> None:
     """Render a data set, or what a stopped command left to do, and print a summary."""
-    objects = read_objects(settings.meshes, "", "meshes")
+    objects = [*read_objects(settings.meshes, "", "meshes").values()]
     # An object without a label gets the first label, or else the class that its mesh is named by.
     default = None if settings.label is None else label_names(settings.label)[0]
-    for item in objects.values():
+    for item in objects:
         item.label = item.label or default or name_of_mesh(item.mesh)
-    labels = [of.label for item in objects.values() for of in (item, *item.others)]
+    labels = [of.label for item in objects for of in (item, *item.others)]
     classes = [*dict.fromkeys(label for label in labels if label)]
     folder = writable_folder(settings.out, "out")
     for name in classes if settings.format == "imagefolder" else ():
@@ -63,9 +63,7 @@ def run(settings: RenderSettings) -> None:
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
         options["rasterizer"] = choose_rasterizer(settings.renderer)
-        renders = dataset.render_dataset(
-            [*objects.values()], settings.size, len(indices), **options
-        )
+        renders = dataset.render_dataset(objects, settings.size, len(indices), **options)
     data.write(progress(renders, "renders", missing))
     # Of several processes, the one that finishes last writes the files about all renders.
     if data.is_finished():

@@ -408,9 +408,8 @@ def fit_batches(
                     raise
                 except Exception as error:  # Pillow raises errors of almost any type.
                     if not skip_unreadable:
+                        fault = f"{item.path} cannot be read ({error})"
                         advice = "replace it, or set skip_unreadable=True"
-                        raise InputError(
-                            f"{item.path} cannot be read ({error}): {advice}"
-                        ) from error
+                        raise InputError(f"{fault}: {advice}") from error
                     console.warning("%s is skipped, because it cannot be read", item.path)
             yield fitted

@@ -109,12 +109,10 @@ def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]]) -> str
     counts = [sum(item["success"] for item in group) for group in (results, with_margin)]
     largest = 255 * max(item["largest_difference"] for item in results)
     mean = 255 * sum(item["mean_difference"] for item in results) / len(results)
-    return (
-        f"images as {VERSIONS.get(version, version)}: "
-        f"{counts[0]} of {len(results)} still succeed, "
-        f"{counts[1]} of the {len(with_margin)} with the margin; "
-        f"pixels differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
-    )
+    succeed = f"{counts[0]} of {len(results)} still succeed"
+    of_margin = f"{counts[1]} of the {len(with_margin)} with the margin"
+    differ = f"pixels differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
+    return f"images as {VERSIONS.get(version, version)}: {succeed}, {of_margin}; {differ}"
 
 
 def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:

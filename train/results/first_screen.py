@@ -201,8 +201,8 @@ def compare_networks(
     if trained:
         trained_labels = join_words(trained, "and")
         images += f" The images of {trained_labels} show the objects of the training in new light."
-    note = (
-        f"For other objects, any answer but {label} counts as right. Shown are the images on "
+    note = f"For other objects, any answer but {label} counts as right. Shown are the images on "
+    note += (
         "which the networks differ most: first one for each kind of object and light, then more."
     )
     rows = {}
@@ -223,8 +223,8 @@ def _describe_images(pool: Pool, labels: Sequence[str]) -> str:
     label = join_words([in_words(item) for item in labels], "or")
     text = (
         f"Scored on {scored.positives:,} images of {label} ({scored.positive_objects:,} objects) "
-        f"and {len(others):,} of other objects ({len({*others.values()}):,} objects)."
     )
+    text += f"and {len(others):,} of other objects ({len({*others.values()}):,} objects)."
     if len(labels) > 1:
         text += " For each class, the images of the other classes count as other objects, too."
     return text

@@ -222,18 +222,14 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
         )
     elif accuracies:
         images = runs[0].config.get("test_images", "the test images")
-        sentence = (
-            f"{method[0].upper()}{method[1:]}: accuracy went from {fmean(accuracies):.1%} to "
-            f"{mean('test/accuracy'):.1%} on {images}."
-        )
+        change = f"from {fmean(accuracies):.1%} to {mean('test/accuracy'):.1%}"
+        sentence = f"{method[0].upper()}{method[1:]}: accuracy went {change} on {images}."
         # Without photographs, nothing shows the price of hardening on real images.
         is_rendered = OmegaConf.select(runs[0].config, "data.name") == "shapes"
         folders = [images_folder(run, name) for run in runs for name in run.photographs]
         if is_rendered and all(folder and (folder / DESCRIPTION).is_file() for folder in folders):
-            sentence += (
-                " These are renders. No photographs were scored (setting photos), so the "
-                "price on photographs is unknown."
-            )
+            sentence += " These are renders. No photographs were scored (setting photos), "
+            sentence += "so the price on photographs is unknown."
         sentences.append(sentence)
     if (after := mean("test/relit_agreement_after")) is not None:
         sentences.append(

@@ -385,9 +385,8 @@ def choose_operating_points(
         # With fewer than 1 / rate negatives, not even one may score above the threshold.
         if count * exact_rate < 1:
             advice = f"give at least {math.ceil(1 / exact_rate)} for false_positive_rate={rate}"
-            raise InputError(
-                f"folder={folder} has {count} negatives for {name}: {advice}", "folder"
-            )
+            fault = f"folder={folder} has {count} negatives for {name}"
+            raise InputError(f"{fault}: {advice}", "folder")
         (threshold,) = thresholds(log_odds, np.ones(count, int), [str(rate)])
         chosen_on = (folder.resolve().name, predicted.images_hash, count)
         points.append(OperatingPoint(name, float(threshold), rate, *chosen_on))

@@ -267,10 +267,8 @@ def require_label(settings: ExperimentSettings, data: sets.DataSet) -> None:
     """
     # Renders and the ranking loss are of a positive class.
     if settings.label is None and (settings.augment.renders or settings.train.ranking_weight > 0):
-        choices = ", ".join(data.classes[:5])
-        raise InputError(
-            f"label is not set: give a class of the meshes, such as {choices}", "label"
-        )
+        advice = f"give a class of the meshes, such as {', '.join(data.classes[:5])}"
+        raise InputError(f"label is not set: {advice}", "label")
     for label in () if settings.label is None else label_names(settings.label):
         name = data.classes[class_index(data.classes, label, "label")]
         if name != label and settings.scored_folders:

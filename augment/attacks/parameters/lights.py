@@ -115,11 +115,8 @@ class LocalLight(LightParameter):
             if basis.name == name:
                 super().__init__(scene, settings, rows=rows, basis=basis, nonnegative=True)
                 return
-        raise InputError(
-            f"{name} cannot be attacked, because the scene has none: "
-            f"build the scene with {name}=...",
-            name,
-        )
+        fault = f"{name} cannot be attacked, because the scene has none"
+        raise InputError(f"{fault}: build the scene with {name}=...", name)
 
 
 # An attack on a daylight sky changes three values: two angles of the sun, and the turbidity (haze)
@@ -212,11 +209,8 @@ class Positions(Parameter):
         light = scene.basis.movable_light
         if light is None:
             kinds = " or ".join(name for name, kind in LOCAL_LIGHTS.items() if kind.is_movable)
-            raise InputError(
-                f"{self.name} cannot be attacked, because the scene has no {kinds}: "
-                f"build the scene with {kinds}=...",
-                self.name,
-            )
+            fault = f"{self.name} cannot be attacked, because the scene has no {kinds}"
+            raise InputError(f"{fault}: build the scene with {kinds}=...", self.name)
         # All examples start at the same positions of the L lamps, shape (L, 3).
         positions = light.basis.source_positions().to(scene.lights)
         super().__init__(settings, start=positions.flatten().expand(len(scene), -1))

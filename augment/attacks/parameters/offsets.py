@@ -26,6 +26,8 @@ class MeshParameter(Parameter):
     attack does not change these. The attack starts at zero.
     """
 
+    fits_other_meshes = False
+
     def __init__(self, scene: Scene, settings: StepSettings, object_masks: Sequence[np.ndarray]):
         """Find the values that each example uses.
 
@@ -65,7 +67,6 @@ class Geometry(MeshParameter):
     """
 
     name = "geometry"
-    fits_other_meshes = False
 
     def __init__(self, scene: Scene, settings: StepSettings):
         self._vertices = scene.vertices
@@ -93,7 +94,6 @@ class Albedo(MeshParameter):
     """
 
     name = "albedo"
-    fits_other_meshes = False
 
     def __init__(self, scene: Scene, settings: StepSettings):
         super().__init__(scene, settings, [item.own_faces for item in scene.objects])

@@ -57,10 +57,8 @@ class Pose(Parameter):
     def __init__(self, scene: Scene, settings: PoseSettings):
         """Compute units and limits of the attack values."""
         if not scene.settings.silhouettes:
-            raise InputError(
-                "silhouettes=False: set silhouettes=True, since an attack on the pose needs them",
-                "silhouettes",
-            )
+            advice = "set silhouettes=True, since an attack on the pose needs them"
+            raise InputError(f"silhouettes=False: {advice}", "silhouettes")
         self._object_of = scene.object_of
         self._vertices = scene.vertices
         self._movable_objects = _movable_objects(scene)
@@ -138,12 +136,8 @@ def _movable_objects(scene: Scene) -> list[_MovableObject]:
     movable_objects = []
     for item, object_mask in zip(scene.objects, object_masks, strict=True):
         # `item.own` is None if the mesh contains the object only, without props or table.
-        stands_on_ground = item.own is not None
-        movable_objects.append(
-            _MovableObject(
-                object_mask=object_mask, ground_height=item.lowest if stands_on_ground else None
-            )
-        )
+        ground_height = None if item.own is None else item.lowest
+        movable_objects.append(_MovableObject(object_mask, ground_height))
     return movable_objects
 
 
