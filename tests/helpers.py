@@ -41,8 +41,7 @@ def colored_noise(labels: np.ndarray, rng: np.random.Generator, contrast: int) -
 def save_noise(path: Path, rng: np.random.Generator, shape=(20, 24), low=0, high=256) -> None:
     """Save an image of noise of some 8-bit levels, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    pixels = rng.integers(low, high, (*shape, 3)).astype(np.uint8)
-    Image.fromarray(pixels).save(path)
+    Image.fromarray(rng.integers(low, high, (*shape, 3)).astype(np.uint8)).save(path)
 
 
 def save_colored_noise(path: Path, rng: np.random.Generator, contrast: int) -> None:

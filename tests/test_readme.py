@@ -169,13 +169,11 @@ def test_many_views_block_renders_each_view_and_light():
 
 
 def test_cameras_block_renders_and_builds_a_scene_of_the_camera_in_the_files(folder):
-    sphere = trimesh.creation.icosphere(2)
-    sphere.export(folder / "orange.ply")
+    trimesh.creation.icosphere(2).export(folder / "orange.ply")
     (folder / "sparse").mkdir()
     (folder / "sparse" / "cameras.txt").write_text("1 SIMPLE_PINHOLE 224 224 300 112 112\n")
     # A camera without rotation looks along +z. The sphere is 4 units in front of it.
-    pose = "1 1 0 0 0 0 0 4 1 view.png\n\n"
-    (folder / "sparse" / "images.txt").write_text(pose)
+    (folder / "sparse" / "images.txt").write_text("1 1 0 0 0 0 0 4 1 view.png\n\n")
     names = run("Your own cameras")
     assert names["images"].shape == (1, 3, 224, 224)
     assert names["images"][0, :, 112, 112].min() > 0
@@ -275,8 +273,7 @@ def test_data_set_block_shows_the_class_of_each_render(capsys):
 
 
 def read_auc(folder: Path) -> float:
-    summary = json.loads((folder / "laboratory" / "summary.json").read_text())
-    return summary["auc"]["value"]
+    return json.loads((folder / "laboratory" / "summary.json").read_text())["auc"]["value"]
 
 
 @pytest.mark.slow

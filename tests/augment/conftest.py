@@ -34,8 +34,7 @@ def stone() -> Mesh:
     turn = Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix()
     vertices = solid.vertices @ turn * [1.0, 0.9, 0.8]
     mesh = Mesh.plain(vertices, solid.faces)
-    draws = np.random.default_rng(0)
-    mesh.corner_colors[:] = draws.uniform(0.3, 0.8, (len(solid.faces), 1, 3))
+    mesh.corner_colors[:] = np.random.default_rng(0).uniform(0.3, 0.8, (len(solid.faces), 1, 3))
     return mesh
 
 

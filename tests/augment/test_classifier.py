@@ -292,7 +292,6 @@ def test_onnx_gives_the_scores_of_its_graph_and_a_size_that_it_tells_is_not_assu
 def test_timm_tells_the_size_of_a_network_in_memory_which_is_assumed(said, warned):
     timm = pytest.importorskip("timm")
     # timm records the size of the images in the configuration of a network.
-    network = timm.create_model("test_efficientnet", num_classes=3).eval()
-    assert as_network(network).size == 160
+    assert as_network(timm.create_model("test_efficientnet", num_classes=3).eval()).size == 160
     assert "160 × 160 pixels, assumed" in said()[0]
     assert warned() == ["size=160"]

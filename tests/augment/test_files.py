@@ -30,8 +30,7 @@ def save_torchscript(network: nn.Module, folder: Path) -> Path:
 def save_exported(network: nn.Module, folder: Path) -> Path:
     path = folder / "network.pt2"
     # The batch has one image, as in torch's own examples.
-    program = torch.export.export(network, (torch.rand(1, 3, SIZE, SIZE),))
-    torch.export.save(program, path)
+    torch.export.save(torch.export.export(network, (torch.rand(1, 3, SIZE, SIZE),)), path)
     return path
 
 

@@ -214,16 +214,14 @@ def test_the_fraction_p_of_the_images_changes():
 
 def test_strength_mixes_with_the_unchanged_light():
     model = lights.CastShadow()
-    values = draw_values(model)
-    drawn = model.draw(values, (5, 5))
+    drawn = model.draw(draw_values(model), (5, 5))
     mixed = 0.7 + 0.3 * model.illumination(drawn).total()
     torch.testing.assert_close(model.illumination(drawn, 0.3).total(), mixed)
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_values_above_1_are_not_clipped_unless_the_sensor_is_full(name):
-    image = 8 * torch.rand(3, 9, 9)
-    relit = nb.RandomLighting(name)(image)
+    relit = nb.RandomLighting(name)(8 * torch.rand(3, 9, 9))
     assert relit.isfinite().all()
     if name in ("color_temperature", "linear", "highlights"):
         assert relit.max() > 2

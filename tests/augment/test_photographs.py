@@ -34,8 +34,7 @@ class HueNetwork(nn.Module):
 
 @pytest.fixture(scope="module")
 def photographs():
-    draws = torch.Generator().manual_seed(0)
-    coarse = torch.rand(12, 3, 4, 4, generator=draws)
+    coarse = torch.rand(12, 3, 4, 4, generator=torch.Generator().manual_seed(0))
     return (255 * nn.functional.interpolate(coarse, SIZE)).to(torch.uint8)
 
 

@@ -91,8 +91,7 @@ def logits_of(model: nn.Module, images: Tensor) -> Tensor:
 @pytest.mark.parametrize("settings", [{"mode": "none"}, {"mode": "random", "examples": 0}])
 def test_without_an_arm_or_examples_there_are_no_renders_and_no_scene_is_needed(model, settings):
     no_labels = torch.zeros(0, dtype=torch.int64)
-    choices = AugmentationSettings(**settings)
-    service = AugmentationService(choices, None, no_labels, 0, Phases())
+    service = AugmentationService(AugmentationSettings(**settings), None, no_labels, 0, Phases())
     renders = service.regenerate(model, 0)
     assert (len(renders.images), len(renders.labels), renders.diagnostics) == (0, 0, {})
 
@@ -339,5 +338,4 @@ def test_attack_examples_show_what_was_right_before_and_is_wrong_after(serve, sc
         torch.testing.assert_close(predictions, logits_of(model, images).softmax(1))
         for image, light in zip(images, lights, strict=True):
             # The example is one of those of the scene.
-            differences = (render_in(scene, light) - image).flatten(1).abs().amax(1)
-            assert differences.min() < 100 * EPS32
+            assert (render_in(scene, light) - image).flatten(1).abs().amax(1).min() < 100 * EPS32

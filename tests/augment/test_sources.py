@@ -143,8 +143,7 @@ def test_torchvision_models_give_its_logits_from_file_or_download(hub, model, ar
     rounding = 100 * EPS32 * float(expected.abs().max())
     name = f"torchvision:{model}"
     downloaded = load_classifier(name)
-    renamed = path.rename(path.with_name("mine.pth"))
-    for classifier in (downloaded, load_classifier(name, renamed)):
+    for classifier in (downloaded, load_classifier(name, path.rename(path.with_name("mine.pth")))):
         with torch.no_grad():
             logits = classifier(images)
         torch.testing.assert_close(logits, expected, rtol=0, atol=rounding)

@@ -46,12 +46,10 @@ def test_targets_are_the_pixels_that_differ_from_the_background(renders):
 
 def test_an_attack_hides_objects_and_draws_random_light_for_images_without_a_class():
     attack = TrainingAttackSettings(max_steps=9, lighting=StepSettings(step_size=2.0))
-    task = Detection(threshold=0.45, iou=0.1)
-    service = serve(task=task, mode="adversarial", attack=attack)
+    service = serve(task=Detection(threshold=0.45, iou=0.1), mode="adversarial", attack=attack)
     renders = service.regenerate(BrightBox((0, 0, SIZE, SIZE), 2), 0)
     assert renders.diagnostics["attack_success"] == 1
-    is_bottle = renders.labels == 2
-    assert (renders.images[is_bottle].mean((1, 2, 3)) < 0.45).all()
+    assert (renders.images[renders.labels == 2].mean((1, 2, 3)) < 0.45).all()
     assert [len(target["labels"]) for target in renders.targets] == [1, 1, 0, 0, 1, 1]
     other = service.regenerate(BrightBox((0, 0, SIZE, SIZE), 2), 1)
     assert not torch.equal(other.images[renders.labels < 0], renders.images[renders.labels < 0])

@@ -59,8 +59,7 @@ def test_a_network_that_is_added_again_has_the_same_scores(add, tmp_path):
     before = rows_in(networks.SCORES)
     once = add(networks.SCORES, tmp_path / "once.csv")
     shutil.rmtree(tmp_path / "renders")
-    again = add(tmp_path / "once.csv", tmp_path / "again.csv")
-    assert again == once
+    assert add(tmp_path / "once.csv", tmp_path / "again.csv") == once
     assert {key: once[key] for key in before} == before
     own = {key[1] for key in once.keys() - before.keys()}
     assert own == {light for light in networks.LIGHTS if not light.endswith("real")}

@@ -47,8 +47,7 @@ def test_normalized_light_ranks_images_whose_contrast_tells_the_class(renders, m
     monkeypatch.setattr(benchmark, "load", load)
     monkeypatch.setattr(benchmark, "CANDIDATES", {"level": (0.6, 0.9)})
     benchmark.main(["choose", "--renders", str(renders)])
-    chosen = capsys.readouterr().out
-    assert "best: {'percentile': 98.0" in chosen
+    assert "best: {'percentile': 98.0" in capsys.readouterr().out
     benchmark.main(["test", "--renders", str(renders)])
     lines = capsys.readouterr().out.splitlines()
     rows = [line.split(" | ") for line in lines if "efficientnet_lite0" in line]

@@ -117,8 +117,7 @@ def test_a_pixel_attack_lowers_means_by_its_radius_unlike_random_draws(fraction_
     assert image.max() < 1 - radius
     gray = float(image.mean()) - fraction_of_radius * radius
     classifier = classify_by_brightness(gray, rows=slice(None))
-    settings = norm_balls.make_settings("pixels", radius, 3)
-    attacked = attack(classifier, scene, settings=settings)
+    attacked = attack(classifier, scene, settings=norm_balls.make_settings("pixels", radius, 3))
     results = norm_balls.search_ball(attacked, "pixels", radius, generator(0, "test"))
     assert results["adversarial"].item() == success
     # The mean of 432 draws has a standard deviation of radius / √(3 · 432), a

@@ -26,14 +26,12 @@ SCANS = Path(__file__).parents[3] / "shared" / "data" / "meshes"
 
 def draw(*shape: int, seed: int = 0) -> torch.Tensor:
     """Draw standard normal numbers in float64."""
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(*shape, dtype=torch.float64, generator=generator)
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def draw_uniform(*shape: int, seed: int = 0) -> torch.Tensor:
     """Draw numbers in [0, 1) in float64."""
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand(*shape, dtype=torch.float64, generator=generator)
+    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def random_directions(count: int, seed: int = 0) -> torch.Tensor:
@@ -132,8 +130,7 @@ def linear_of(srgb: ArrayLike) -> np.ndarray:
 
 def encoded(texels: np.ndarray | Image.Image) -> bytes:
     content = io.BytesIO()
-    image = texels if isinstance(texels, Image.Image) else Image.fromarray(texels)
-    image.save(content, "PNG")
+    (texels if isinstance(texels, Image.Image) else Image.fromarray(texels)).save(content, "PNG")
     return content.getvalue()
 
 

@@ -70,8 +70,7 @@ def test_nearness_falls_with_the_distance_and_is_linear_in_the_image_of_a_plane(
     steps_away = -np.linspace(-0.5, 0.5, 9)[:, None] * camera.axes()[2]
     assert (camera.homogeneous(torch.from_numpy(steps_away))[1].diff() < 0).all()
     corners = np.array([[0.5, 0.1, -0.3], [-0.4, 0.6, 0.2], [-0.1, -0.5, 0.4]])
-    inside = np.array([0.2, 0.5, 0.3]) @ corners
-    points = np.vstack([corners, inside])
+    points = np.vstack([corners, np.array([0.2, 0.5, 0.3]) @ corners])
     image = camera.project(points)[:, :2]
     corners_of_image = np.column_stack([image[:3], np.ones(3)])
     weights = np.append(image[3], 1.0) @ np.linalg.inv(corners_of_image)

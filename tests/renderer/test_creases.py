@@ -115,8 +115,7 @@ def test_normals_of_a_file_decide_where_they_are_given():
     facets = ball.face_normals[:, None].repeat(3, axis=1)
     assert normal_groups(ball.vertices, ball.faces, facets).max() + 1 == 3 * len(ball.faces)
     for missing in (0.0, np.nan):
-        file_normals = np.full((len(box.faces), 3, 3), missing)
-        ids = normal_groups(box.vertices, box.faces, file_normals)
+        ids = normal_groups(box.vertices, box.faces, np.full((len(box.faces), 3, 3), missing))
         assert is_same_partition(ids, normal_groups(box.vertices, box.faces))
 
 
@@ -194,8 +193,7 @@ def test_a_file_keeps_the_rim_of_a_can_apart_and_its_side_together(tmp_path):
     is_side = ~lids(can)
     normals[is_side] = corners_of(can)[is_side] * [2, 2, 0]
     (tmp_path / "can.obj").write_text(obj_of(can, normals))
-    loaded = nb.load_mesh(tmp_path / "can.obj")
-    assert loaded.normal_ids.max() + 1 == 2 * 6 * 2 + 2
+    assert nb.load_mesh(tmp_path / "can.obj").normal_ids.max() + 1 == 2 * 6 * 2 + 2
     (tmp_path / "flat.obj").write_text(obj_of(can, 0 * normals))
     assert nb.load_mesh(tmp_path / "flat.obj").normal_ids.max() + 1 == 6 * 4 + 2 * 7
 

@@ -87,8 +87,7 @@ def test_a_renders_camera_and_light_are_found_before_any_background():
 
 def path_traced(folder: Path, mesh: renderer.Mesh, camera: Camera, light: Tensor) -> Tensor:
     write_map(folder / "light.exr", mitsuba_map(light, 192))
-    settings = ImageSettings(64, bounces=3)
-    write_mitsuba_scene(folder, mesh, 1.0, [camera], settings, "light.exr")
+    write_mitsuba_scene(folder, mesh, 1.0, [camera], ImageSettings(64, bounces=3), "light.exr")
     [image] = render_mitsuba_scene(folder / SCENE, 1, (64, 64))
     return image.double().clamp(0, 1)
 
@@ -122,8 +121,7 @@ def test_the_polar_angle_of_the_camera_is_found_from_an_image_of_a_round_object(
     mesh = renderer.normalize(renderer.solid("bottle", 3))
     camera = PerspectiveCamera(31.5, 286.5, 2.6, 0.1, 0.1, distance=4.0)
     image = renderer.render(mesh, camera, positive_light("st_peters"), 64, 0.0, samples=8)
-    mask = coverage_of(mesh, camera, 64)
-    found = fit_scene(image.clamp(0, 1), mask, mesh, fov=camera.angle)
+    found = fit_scene(image.clamp(0, 1), coverage_of(mesh, camera, 64), mesh, fov=camera.angle)
     assert found.camera.polar == pytest.approx(camera.polar, abs=1)
 
 

@@ -112,8 +112,7 @@ def mitsuba_image(folder, mesh, camera, settings, ray_count) -> NoisyImage:
     write_map(folder / "light.exr", mitsuba_map(LIGHT, MAP_ROWS))
     write_mitsuba_scene(folder, mesh, 1.0, [camera], settings, "light.exr")
     scene_path = folder / SCENE
-    scene_text = scene_path.read_text()
-    scene_path.write_text(scene_text.replace("multijitter", "independent"))
+    scene_path.write_text(scene_path.read_text().replace("multijitter", "independent"))
     images = []
     with mitsuba() as mi:
         scene = mi.load_file(str(scene_path))

@@ -20,8 +20,7 @@ def error(actual: torch.Tensor, expected: torch.Tensor) -> float:
 
 
 def photographed(mesh: renderer.Mesh, camera: renderer.camera.Camera) -> np.ndarray:
-    image = renderer.render(mesh, camera, GRACE, SIZE, 0.0)
-    return to_bytes(image.permute(1, 2, 0)).numpy()
+    return to_bytes(renderer.render(mesh, camera, GRACE, SIZE, 0.0).permute(1, 2, 0)).numpy()
 
 
 @pytest.mark.parametrize(("size", "side"), [(48, 260.0), (160, 120.0)])

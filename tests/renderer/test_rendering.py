@@ -174,8 +174,7 @@ def test_lamps_and_projectors_are_rendered_as_by_operators(sky, samples):
     projector = Projector(8, 28.6, 91.7)
     pattern = draw_uniform(64, 3).float()
     options = SMALL | {"samples": samples, "normals": "flat", "shadows": True}
-    lights = [lamps, (projector, pattern)]
-    images = renderer.render(cup, CAMERAS, sky, lights=lights, **options)
+    images = renderer.render(cup, CAMERAS, sky, lights=[lamps, (projector, pattern)], **options)
     full_power = torch.full((1, 3), lamps.power)
     sky_coefficients = torch.zeros(49, 3) if sky is None else sky
     local_lights = [(lamps, full_power), (projector, pattern)]

@@ -55,8 +55,7 @@ def tiny(tiny_npz) -> Callable[..., ExperimentSettings]:
 @pytest.fixture(scope="session")
 def finished(tiny, photos, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "finished"
-    settings = tiny(f"photos={photos}")
-    completed_run(settings, folder)
+    completed_run(tiny(f"photos={photos}"), folder)
     return folder
 
 

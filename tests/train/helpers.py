@@ -27,8 +27,7 @@ def read_quickly(command: Command, words: Sequence[str], overrides: Sequence[str
     if (command.name, *choices) not in COMPOSED:
         COMPOSED[command.name, *choices] = command.compose(choices)
     changes = OmegaConf.from_dotlist(command.to_overrides(values))
-    merged = OmegaConf.merge(COMPOSED[command.name, *choices], changes)
-    return read_settings(command.kind, merged)
+    return read_settings(command.kind, OmegaConf.merge(COMPOSED[command.name, *choices], changes))
 
 
 def save_untrained_network(folder: Path, size: int) -> None:

@@ -118,8 +118,7 @@ def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, two_met
     busy = tmp_path / "here" / "none"
     with locked(busy):
         assert call("train", "out=here", *two_methods, *SMALL, "train.resume=true") == USER_ERROR
-    error = capsys.readouterr().err
-    assert error.startswith(f"error: out={busy} is in use by another process")
+    assert capsys.readouterr().err.startswith(f"error: out={busy} is in use by another process")
     assert not list(tmp_path.rglob("config.yaml"))
     assert not list(tmp_path.rglob("metrics.jsonl"))
 

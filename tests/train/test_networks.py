@@ -220,8 +220,7 @@ def test_other_networks_are_loaded_by_their_name_and_copied_without_their_code(t
             load_run(tmp_path)
     fresh = build_network(CLASSES, 16, name)
     (tmp_path / "own_models.py").write_text("raise SystemExit('code ran')")
-    description = {"classes": [*CLASSES], "size": 16, "name": name}
-    initial_of(tmp_path / BEST).copy_to(fresh, description)
+    initial_of(tmp_path / BEST).copy_to(fresh, {"classes": [*CLASSES], "size": 16, "name": name})
     assert torch.equal(fresh.eval()(images), network(images))
 
 
@@ -257,8 +256,7 @@ def test_a_published_network_has_the_weights_in_half_precision(network, tmp_path
         assert rounded.dtype == value.dtype
         error = (rounded.double() - value.double()).abs()
         # Values are rounded to 11 bits, and below 2⁻¹⁴ to multiples of 2⁻²⁴.
-        limit = value.double().abs() * 2**-11 + 2**-25
-        assert (error <= limit).all(), name
+        assert (error <= value.double().abs() * 2**-11 + 2**-25).all(), name
 
 
 @pytest.mark.parametrize("name", ["pretrained/none", "pretrained/none/model.safetensors"])

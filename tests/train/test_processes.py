@@ -45,8 +45,7 @@ def one_of_two(index: int, port: int, folder: Path) -> None:
 
 
 def run_from_file(config: Path, folder: Path) -> None:
-    settings = read_settings(ExperimentSettings, OmegaConf.load(config))
-    completed_run(settings, folder)
+    completed_run(read_settings(ExperimentSettings, OmegaConf.load(config)), folder)
 
 
 def linear() -> torch.nn.Module:

@@ -21,8 +21,7 @@ EXPERIMENTS += ["photographs"]
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_takes_other_data(experiment):
-    overrides = [f"experiment={experiment}", *OTHER_DATA, "network=b"]
-    settings = train_command.read(overrides)
+    settings = train_command.read([f"experiment={experiment}", *OTHER_DATA, "network=b"])
     assert settings.data.name == "npz"
     assert settings.data.path == "a.npz"
     assert settings.network == "b"
@@ -83,8 +82,7 @@ def test_a_wrong_setting_is_one_sentence_that_starts_with_its_key(overrides, sta
 
 
 def test_an_attack_on_the_pose_has_gradients_at_silhouettes():
-    settings = train_command.read(["attack@augment.attack=[pose]"])
-    assert settings.renderer.silhouettes
+    assert train_command.read(["attack@augment.attack=[pose]"]).renderer.silhouettes
     assert not train_command.read([]).renderer.silhouettes
 
 
@@ -131,8 +129,7 @@ TWO_CLASSES += ["scene.views=1", "augment.examples=null"]
 )
 def test_wrong_input_is_one_sentence_before_anything_is_written(tiny, tmp_path, overrides, message):
     with pytest.raises(InputError, match=re.escape(message)) as refusal:
-        settings = tiny(*overrides)
-        loaded_run(settings, tmp_path / "run")
+        loaded_run(tiny(*overrides), tmp_path / "run")
     assert "\n" not in str(refusal.value)
     assert not (tmp_path / "run").exists()
 

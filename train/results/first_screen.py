@@ -202,9 +202,8 @@ def compare_networks(
         trained_labels = join_words(trained, "and")
         images += f" The images of {trained_labels} show the objects of the training in new light."
     note = f"For other objects, any answer but {label} counts as right. Shown are the images on "
-    note += (
-        "which the networks differ most: first one for each kind of object and light, then more."
-    )
+    order = "first one for each kind of object and light, then more"
+    note += f"which the networks differ most: {order}."
     rows = {}
     if folder is not None:
         # The pictures are from the first seed.
@@ -221,10 +220,9 @@ def _describe_images(pool: Pool, labels: Sequence[str]) -> str:
     others = {item.path: item.mesh or item.path for item in shown if item.label not in labels}
     scored = pool.metrics.auc
     label = join_words([in_words(item) for item in labels], "or")
-    text = (
-        f"Scored on {scored.positives:,} images of {label} ({scored.positive_objects:,} objects) "
-    )
-    text += f"and {len(others):,} of other objects ({len({*others.values()}):,} objects)."
+    positives = f"{scored.positives:,} images of {label} ({scored.positive_objects:,} objects)"
+    negatives = f"{len(others):,} of other objects ({len({*others.values()}):,} objects)"
+    text = f"Scored on {positives} and {negatives}."
     if len(labels) > 1:
         text += " For each class, the images of the other classes count as other objects, too."
     return text

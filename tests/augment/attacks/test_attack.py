@@ -21,8 +21,7 @@ TWO_BACKGROUNDS = {"backgrounds": [0.4, 0.5]}
 @pytest.fixture(scope="module", params=[*PARAMETER_NAMES, "lighting+geometry+pixels"])
 def result(request, attacked) -> augment.AttackResult:
     done = attacked(request.param, TWO_BACKGROUNDS, max_steps=3)
-    names = [parameter.name for parameter in done.problem.parameters]
-    assert names == request.param.split("+")
+    assert [parameter.name for parameter in done.problem.parameters] == request.param.split("+")
     return done
 
 

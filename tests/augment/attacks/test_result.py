@@ -44,8 +44,7 @@ def test_an_animation_shows_the_images_from_before_to_after(result, tmp_path, su
             pixels = np.asarray(frame.convert("RGB"), dtype=float) / 255
             means.append(pixels[MARGIN : MARGIN + SIDE, MARGIN : MARGIN + SIDE].mean())
     assert len(means) == 5
-    values = [result.images_before[1], result.images[1]]
-    expected = [float(image.mean()) for image in values]
+    expected = [float(image.mean()) for image in [result.images_before[1], result.images[1]]]
     assert [means[0], means[-1]] == pytest.approx(expected, abs=0.01)
     # The light is interpolated linearly, and so is an image in light alone.
     assert means[2] == pytest.approx((means[0] + means[4]) / 2, abs=0.02)

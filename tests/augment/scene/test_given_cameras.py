@@ -105,8 +105,7 @@ def test_an_attack_and_its_files_keep_pinhole_cameras(tmp_path):
 def test_variations_keep_pinhole_cameras():
     scene = placed_scene()
     settings = VariationSettings(shift=0.1, scale=[0.8, 1.2], azimuth=20.0, fov=[20.0, 40.0])
-    varied = vary(scene, settings, torch.Generator().manual_seed(0))
-    [camera] = varied.cameras[0]
+    [camera] = vary(scene, settings, torch.Generator().manual_seed(0)).cameras[0]
     assert isinstance(camera, renderer.PinholeCamera)
     assert camera.roll == scene.cameras[0][0].roll
     assert 20 <= camera.angle <= 40

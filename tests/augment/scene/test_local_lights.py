@@ -34,8 +34,7 @@ CUP = {"solid": "solid:cup", "exposure": 0.2, "backgrounds": [0.0]}
 
 def scene(size: int = SIZE, solid: str = "solid:orange", **choices) -> Scene:
     """Build two views of a solid before gray, with a projector and two lamps."""
-    lights = {"projector": PROJECTOR, "lamps": LAMPS, "light": "st_peters"}
-    options = lights | choices
+    options = {"projector": PROJECTOR, "lamps": LAMPS, "light": "st_peters"} | choices
     return augment.build_scene([(solid, "orange")], size, 2, rasterizer="numpy", **options)
 
 

@@ -139,8 +139,7 @@ def test_patterns_and_slides_are_the_center_of_the_square(shape):
     points = patterns.pixel_centers(shape)
     whole = patterns.pixel_centers(max(shape)) * (max(shape) / width)
     torch.testing.assert_close(points, center(whole, shape))
-    drawn = patterns.draw_slides(8, shape, generator(0, "slides"))
-    assert drawn.shape == (8, 3, *shape)
+    assert patterns.draw_slides(8, shape, generator(0, "slides")).shape == (8, 3, *shape)
     assert draw_shading(2, shape, generator(0, "shading")).shape == (2, 1, *shape)
 
 
@@ -163,8 +162,7 @@ def test_varied_scenes_have_tables_and_effects_of_the_size(shape):
     )
     varied = vary(scene, settings, generator(0, "vary"))
     examples = torch.arange(2)
-    images = varied.render(varied.conditions(examples), examples)
-    assert images.shape == (2, 1, 3, *shape)
+    assert varied.render(varied.conditions(examples), examples).shape == (2, 1, 3, *shape)
 
 
 def logits(images):

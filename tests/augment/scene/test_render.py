@@ -23,8 +23,7 @@ ROUNDING = 13 * 8 * EPS
 
 
 def own_lights(scene: Scene) -> Tensor:
-    draws = torch.Generator().manual_seed(0)
-    offsets = torch.randn(len(scene), 49, 3, generator=draws)
+    offsets = torch.randn(len(scene), 49, 3, generator=torch.Generator().manual_seed(0))
     return scene.lights + 0.01 * offsets.to(scene.lights)
 
 
@@ -68,8 +67,7 @@ def test_a_changed_albedo_looks_like_a_mesh_of_that_color(make_scene, stone, enc
     """The linear albedo changes, whatever the encoding, and stays in [0, 1]."""
     scene = make_scene(encoding=encoding)
     lights = own_lights(scene)
-    draws = torch.Generator().manual_seed(0)
-    offsets = torch.rand(3, 20, 3, generator=draws).double() - 0.5
+    offsets = torch.rand(3, 20, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
     images = scene.render(Conditions(lights, albedo=offsets), EVERY)
     linear = decode(torch.from_numpy(stone.corner_colors).double(), encoding)
     changed = linear + offsets[:, :, None]  # (3, 20, 3 corners, 3)
@@ -119,8 +117,7 @@ def test_a_mesh_outside_the_image_leaves_backgrounds_and_a_zero_gradient(make_sc
     starts = {"light": scene.lights[0], "vertices": scene.vertices[0], "albedo": albedo}
     values = starts[part].expand(3, -1, -1).clone().requires_grad_(True)
     images = scene.render(replace(scene.conditions(EVERY), **{part: values}), EVERY)
-    backgrounds = scene.backgrounds[:, None].expand_as(images)
-    assert torch.equal(images.detach(), backgrounds)
+    assert torch.equal(images.detach(), scene.backgrounds[:, None].expand_as(images))
     assert not torch.autograd.grad(images.sum(), values)[0].any()
 
 

@@ -60,8 +60,7 @@ def test_renders_are_shared_as_equally_as_possible(examples, meshes, backgrounds
     assert sum(shares) == examples
     assert shares == sorted(shares, reverse=True) and shares[0] - shares[-1] <= 1
     # Views and backgrounds are not repeated before all were shown.
-    shown = {(e.object, e.cameras, e.background) for e in scene.examples}
-    assert len(shown) == examples
+    assert len({(e.object, e.cameras, e.background) for e in scene.examples}) == examples
 
 
 @pytest.mark.parametrize(("light", "encoding"), [("grace", "linear"), ("st_peters", "srgb")])
@@ -98,8 +97,7 @@ def test_an_object_that_is_mostly_black_or_red_is_not_overexposed(red, white, tm
 @pytest.mark.parametrize(("exposure", "word"), [(1e-3, "dark"), (1e3, "bright"), (1.0, "")])
 def test_an_almost_black_or_white_object_is_warned_about(exposure, word, caplog):
     say_once.cache_clear()
-    scene = build_scene([("solid:orange", "orange")], 16, exposure=exposure)
-    warn_of_exposure(scene)
+    warn_of_exposure(build_scene([("solid:orange", "orange")], 16, exposure=exposure))
     assert (f"too {word}" in caplog.text) == bool(word)
 
 
@@ -183,8 +181,7 @@ def test_a_copy_in_other_light_is_not_rasterized_again_and_shows_that_light(rast
     copy = scene.changed(lights=scene.lights.flip(-1) / 2)
     found = copy.render(copy.conditions(every), every)
     assert rasterized == [4, 4]
-    expected = fresh.render(copy.conditions(every), every)
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(found, fresh.render(copy.conditions(every), every))
 
 
 def test_the_same_views_in_another_order_are_not_rasterized_again(rasterized):

@@ -373,8 +373,7 @@ def test_backgrounds_come_from_the_images_of_a_folder(scene, tmp_path):
     files = [tmp_path / "a.png", tmp_path / "below" / "b.jpg"]
     for file in files:
         file.parent.mkdir(exist_ok=True)
-        pixels = draws.integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8)
-        Image.fromarray(pixels).save(file)
+        Image.fromarray(draws.integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8)).save(file)
     (tmp_path / "notes.txt").write_text("no image")
     is_free = ~(images_of(scene).sum(1) > 0).any(0)
     choices = [read_image(file, SIZE)[:, is_free] for file in files]

@@ -158,5 +158,4 @@ def test_coefficients_beyond_the_power_of_a_projector_are_white_in_the_image(tmp
     coefficients = torch.full((projector.size, 3), 2.1)
     coefficients[0] = -0.1
     renderer.save_light(tmp_path / "light.json", coefficients, projector)
-    values = np.unique(np.asarray(Image.open(tmp_path / "light.png")))
-    assert values.tolist() == [0, 255]
+    assert np.unique(np.asarray(Image.open(tmp_path / "light.png"))).tolist() == [0, 255]

@@ -327,8 +327,7 @@ def test_a_specular_color_that_gloss_cannot_hold_is_named(tmp_path):
 )
 def test_morph_targets_move_vertices_by_their_weights(tmp_path, mesh_weights, node_weights, height):
     gltf = Gltf()
-    tip = np.float32([[0, 0, 0], [1, 0, 0], [0, 0, 1]])
-    primitive = gltf.mesh({"POSITION": tip})
+    primitive = gltf.mesh({"POSITION": np.float32([[0, 0, 0], [1, 0, 0], [0, 0, 1]])})
     primitive["targets"] = [{"POSITION": gltf.array(np.float32([[0] * 3, [0] * 3, [0, 0, 2]]))}]
     if mesh_weights:
         gltf.tree["meshes"][0]["weights"] = mesh_weights

@@ -180,8 +180,7 @@ def test_an_image_inside_of_a_gltf_is_read(tmp_path):
 
 
 def test_names_and_comments_of_an_obj_may_be_latin_1(tmp_path):
-    library = "# Müller\nnewmtl schäl\nmap_Kd peel.png\n"
-    write(tmp_path / "peel.mtl", library.encode("latin-1"))
+    write(tmp_path / "peel.mtl", "# Müller\nnewmtl schäl\nmap_Kd peel.png\n".encode("latin-1"))
     write(tmp_path / "peel.png", encoded(TEXTURE))
     content = "# by Müller\nmtllib peel.mtl\n" + OBJ.replace("peel", "schäl")
     assert has_texture(load_mesh(write(tmp_path / "mesh.obj", content.encode("latin-1"))))

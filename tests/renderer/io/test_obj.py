@@ -152,9 +152,8 @@ def test_an_object_without_vertex_colors_does_not_bleach_the_others(tmp_path):
 
 
 def test_vertex_colors_from_0_to_255_are_read_with_a_warning(tmp_path):
-    text = "v 0 0 0 51 0 255\nv 1 0 0 51 0 255\nv 0 1 0 51 0 255\nf 1 2 3\n"
     with pytest.warns(UserWarning, match="255"):
-        mesh = load(tmp_path, text)
+        mesh = load(tmp_path, "v 0 0 0 51 0 255\nv 1 0 0 51 0 255\nv 0 1 0 51 0 255\nf 1 2 3\n")
     assert_allclose(mesh.corner_colors[0], [[0.2, 0, 1]] * 3, atol=1e-7)
 
 

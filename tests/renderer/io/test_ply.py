@@ -81,8 +81,7 @@ def test_all_encodings_of_a_ply_give_the_same_mesh(tmp_path, form, types, line_b
 def test_a_truncated_ply_is_refused(tmp_path, form, faces):
     path = write_ply(tmp_path / "mesh.ply", form, faces)
     content = path.read_bytes()
-    start = content.index(b"\nend_header") + len("\nend_header\n")
-    for length in range(start, len(content), 7):
+    for length in range(content.index(b"\nend_header") + len("\nend_header\n"), len(content), 7):
         path.write_bytes(content[:length])
         with pytest.raises(InputError, match=r"mesh\.ply"):
             load_mesh(path)

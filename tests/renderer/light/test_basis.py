@@ -25,8 +25,7 @@ def test_a_light_is_split_into_environment_light_and_local_lights_in_any_order()
 
 def test_each_projector_has_its_own_pattern_in_a_scene_of_mitsuba(tmp_path):
     dark_pattern = torch.full((4, 3), 0.25)
-    bright_pattern = torch.full((4, 3), 0.5)
-    lights = [(Projector(2), dark_pattern), (Projector(2), bright_pattern)]
+    lights = [(Projector(2), dark_pattern), (Projector(2), torch.full((4, 3), 0.5))]
     ball = Mesh.plain(*sphere(1))
     camera = OrthographicCamera(57.3, 0.0, 2.0)
     write_mitsuba_scene(tmp_path, ball, 1.0, [camera], ImageSettings(4), "light.exr", lights)

@@ -130,8 +130,7 @@ def test_directional_light_is_the_clamped_cosine_within_the_error_of_degree_6():
 
 @pytest.mark.parametrize("amplitude", [0.01, 100.0])
 def test_perturbations_with_a_radius_have_this_norm_on_the_nonzero_coefficients(amplitude):
-    draws = torch.Generator().manual_seed(0)
-    offsets = perturb(torch.zeros(49, 3), 50, amplitude, 1.5, draws)
+    offsets = perturb(torch.zeros(49, 3), 50, amplitude, 1.5, torch.Generator().manual_seed(0))
     expected_norms = torch.full((50,), 1.5)
     norms = offsets.flatten(1).norm(dim=1)
     torch.testing.assert_close(norms, expected_norms, rtol=4 * EPS32, atol=0)
@@ -142,8 +141,7 @@ def test_perturbations_with_a_radius_have_this_norm_on_the_nonzero_coefficients(
 def test_perturbations_without_a_radius_are_uniform_in_all_coefficients():
     """A thousand uniform draws leave 1% at one end without a value with a chance of e^-10."""
     grace = probe("grace")
-    draws = torch.Generator().manual_seed(0)
-    offsets = perturb(grace, 1000, 0.5, None, draws) - grace
+    offsets = perturb(grace, 1000, 0.5, None, torch.Generator().manual_seed(0)) - grace
     assert offsets.abs().max() <= 0.5 + EPS32
     assert (offsets.amin(0) < -0.49).all()
     assert (offsets.amax(0) > 0.49).all()

@@ -64,8 +64,7 @@ def test_quadrature_agrees_with_adaptive_cubature_of_the_published_formula(sky):
 
 
 def test_errors_of_the_fit_are_as_documented():
-    fit = load_file(FIT)["fit"]
-    assert fit_skylight.fit_error(fit, 10, np.random.default_rng(1)) < 7e-5
+    assert fit_skylight.fit_error(load_file(FIT)["fit"], 10, np.random.default_rng(1)) < 7e-5
     for corner in itertools.product([0.0, HORIZON], [1.0], [2.0, 10.0]):
         assert relative_error(coefficients(*corner), by_quadrature(*corner)) < 4e-4
 

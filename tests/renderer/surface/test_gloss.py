@@ -116,8 +116,7 @@ def test_lobes_and_roughness_gradients_are_those_of_quadrature_in_float32(degree
         """Evaluate the library's lobe (K,) in axes whose z-axis is the normal."""
         metallic, _ = PARTS[part]
         gloss = SampleGloss(roughness, double(metallic).float(), double(1.0).float())
-        seen = toward(cosine).float()
-        colored, white, frame = gloss.specular_transfer(UP.float(), seen, degree)
+        colored, white, frame = gloss.specular_transfer(UP.float(), toward(cosine).float(), degree)
         return frame.to_world(colored if part == "colored" else white)[:, 0]
 
     def require_close(found: Tensor, expected: Tensor, tolerance: float) -> None:
@@ -187,8 +186,7 @@ def test_a_highlight_under_its_window_is_nowhere_negative(roughness):
     window = highlight_window(degree, roughness, 0.7)[first_of_band].numpy()
     amplitudes = zonal_amplitudes(roughness * math.sqrt(0.7), degree, rings=120)
     cosines = np.cos(np.linspace(0, math.pi, 2000))
-    series = (2 * np.arange(degree + 1) + 1) * amplitudes * window
-    radiance = legendre.legval(cosines, series)
+    radiance = legendre.legval(cosines, (2 * np.arange(degree + 1) + 1) * amplitudes * window)
     assert window[0] == 1
     assert radiance.min() >= -1e-3 * radiance.max()
 

@@ -340,5 +340,4 @@ def test_gradients_by_single_vertices_are_differences_if_a_part_hides_another(na
     expected = (4 * fine - coarse) / 3
     for samples, bound in ERROR_BY_SAMPLES.items():
         if samples * size <= FINEST:
-            found = derivatives(image, directions, samples)
-            assert relative_error(found, expected) < bound
+            assert relative_error(derivatives(image, directions, samples), expected) < bound

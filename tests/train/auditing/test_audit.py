@@ -273,8 +273,7 @@ def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None
     recognized = {"uniform": is_recognized, "random 1": is_recognized}
     (folder / RECOGNIZED).write_text(json.dumps(recognized))
     for kind in lights.KINDS:
-        counts = {"correct": 4, "adversarial": adversarial}
-        (folder / f"{kind}.json").write_text(json.dumps(counts))
+        (folder / f"{kind}.json").write_text(json.dumps({"correct": 4, "adversarial": adversarial}))
     rates = {"recall": fraction(hits, n), "false_positive_rate": fraction(0, n)}
     scores = {"label": "orange"} | {name: asdict(rate) for name, rate in rates.items()}
     (folder / LABORATORY).mkdir()

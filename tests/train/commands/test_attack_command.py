@@ -94,8 +94,7 @@ def test_an_adversary_of_two_views_is_rendered_again_and_attacked_further(run, t
 @pytest.mark.slow
 def test_an_adversary_of_a_detector_is_rendered_and_detected_again(tmp_path):
     scene = nb.build_scene([("solid:orange:0", "orange")], size=32, views=2, light="uniform")
-    light = nb.StepSettings(step_size=0.2)
-    settings = nb.AttackSettings(lighting=light, max_steps=3)
+    settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.2), max_steps=3)
     result = nb.attack(find_red, scene, settings=settings, classes=["orange", "apple"], force=True)
     nb.save(result, tmp_path)
     lines = read_lines(tmp_path / "attack.jsonl")

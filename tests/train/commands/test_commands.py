@@ -52,8 +52,7 @@ def test_an_evaluation_writes_the_log_odds_of_the_network_for_each_photograph(ca
     with torch.no_grad():
         fig, lime, orange = load_run(here / "1.10")(image[None])[0]
     log_odds = float(orange - torch.logaddexp(fig, lime))
-    found = float(rows["orange/a.png"]["orange_log_odds"])
-    assert found == pytest.approx(log_odds, abs=1e-4)
+    assert float(rows["orange/a.png"]["orange_log_odds"]) == pytest.approx(log_odds, abs=1e-4)
 
 
 class TestEvaluationWithoutALabel:

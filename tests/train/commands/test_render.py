@@ -118,8 +118,7 @@ def test_an_object_too_thin_for_a_box_has_an_image_and_no_annotation(tmp_path):
     found = json.loads((coco / "annotations/instances_train.json").read_text())
     assert len(found["images"]) == 2 and not found["annotations"]
     yolo = write(wires, tmp_path / "yolo", format="yolo", **options)
-    lines = [path.read_text() for path in (yolo / "labels/train").iterdir()]
-    assert lines == ["", ""]
+    assert [path.read_text() for path in (yolo / "labels/train").iterdir()] == ["", ""]
 
 
 def test_without_maps_the_pictures_are_the_same(meshes, written, tmp_path):

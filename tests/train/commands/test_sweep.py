@@ -133,8 +133,7 @@ def test_a_second_call_trains_nothing_and_shows_finished_runs(run_sweep, folder_
     before = read_files(folders)
     assert run_sweep(swept, "seed=0,1") == 0
     assert read_files(folders) == before
-    printed = capsys.readouterr().out
-    (table,) = read_markdown(printed).values()
+    (table,) = read_markdown(capsys.readouterr().out).values()
     assert [row[:2] for row in table] == [["network", "runs"], ["none", "2"]]
 
 

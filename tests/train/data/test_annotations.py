@@ -135,30 +135,29 @@ def test_names_of_yolo_are_a_list_or_a_mapping_of_indices(tmp_path, names, expec
     assert read.photographs[0].labels.tolist() == [1]
 
 
+WRONG_LINES = (
+    b"2 .5 .5 .1 .1",
+    b"0 40 20 10 10",
+    b"0 .5 .5 .1",
+    b"cat .5 .5 .1 .1",
+    b"0 nan 0 0 0",
+)
+
+
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
         ("data.yaml", b"names: {cat: 0}", "give names as a list"),
         ("a.txt", b"\xff\xfe\x00", "no text"),
+        *(("a.txt", b"0 0.5 0.5 0.1 0.1\n" + line, r"line 2 of .*a\.txt") for line in WRONG_LINES),
     ],
 )
-def test_files_of_yolo_in_another_form_are_refused(tmp_path, file, content, message):
+def test_wrong_files_and_lines_of_yolo_are_refused(tmp_path, file, content, message):
     _draw(tmp_path / "a.png")
-    (tmp_path / "data.yaml").write_text("names: [cat]\n")
+    (tmp_path / "data.yaml").write_text("names: [cat, dog]\n")
     (tmp_path / "a.txt").write_text("0 0.5 0.5 0.1 0.1\n")
     (tmp_path / file).write_bytes(content)
     with pytest.raises(InputError, match=message):
-        read_annotations(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "line", ["2 .5 .5 .1 .1", "0 40 20 10 10", "0 .5 .5 .1", "cat .5 .5 .1 .1", "0 nan 0 0 0"]
-)
-def test_a_wrong_line_of_yolo_is_refused_by_its_number(tmp_path, line):
-    _draw(tmp_path / "a.png")
-    (tmp_path / "classes.txt").write_text("cat\ndog\n")
-    (tmp_path / "a.txt").write_text(f"0 0.5 0.5 0.1 0.1\n{line}\n")
-    with pytest.raises(InputError, match=r"line 2 of .*a\.txt"):
         read_annotations(tmp_path)
 
 

@@ -29,8 +29,7 @@ def numbered(images: torch.Tensor) -> batches.TrainingImages:
 
 
 def gray_images(count: int) -> torch.Tensor:
-    values = torch.arange(count, dtype=torch.uint8)
-    return values.view(-1, 1, 1, 1).expand(-1, 3, 8, 8)
+    return torch.arange(count, dtype=torch.uint8).view(-1, 1, 1, 1).expand(-1, 3, 8, 8)
 
 
 @pytest.mark.parametrize("shape", [(5, 5), (6, 11)])

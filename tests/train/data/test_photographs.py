@@ -61,8 +61,7 @@ def find(folder: Path, label: str = "orange") -> list[tuple[str, str]]:
     ids=["class folders at any depth", "flat", "hidden files"],
 )
 def test_images_are_found_with_their_class_in_sorted_order(tmp_path, files, expected):
-    found = find(touch(tmp_path, *files.split()))
-    assert " ".join(map(":".join, found)) == expected
+    assert " ".join(map(":".join, find(touch(tmp_path, *files.split())))) == expected
 
 
 def test_links_to_folders_and_files_are_followed_but_not_in_circles(tmp_path):

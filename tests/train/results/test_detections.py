@@ -101,8 +101,7 @@ def test_average_precision_of_three_detections_is_that_of_the_definition():
 )
 def test_an_object_has_at_most_one_detection_of_its_class(boxes, labels, scores, expected):
     marked = _marked([BOX, [[90, 90, 150, 150]]], [0, 0], [False, True])
-    found = _found(boxes, labels, scores)
-    assert detections.match(found, marked, 0.5).tolist() == expected
+    assert detections.match(_found(boxes, labels, scores), marked, 0.5).tolist() == expected
 
 
 def test_objects_of_the_same_photograph_add_nothing_to_its_interval():
@@ -118,8 +117,7 @@ def test_objects_of_the_same_photograph_add_nothing_to_its_interval():
 
 
 def test_no_false_detection_has_an_upper_limit_like_the_rule_of_three():
-    empty = [_found([], [], [])] * 100
-    matches = _match(empty, [_marked([], [])] * 100)
+    matches = _match([_found([], [], [])] * 100, [_marked([], [])] * 100)
     metrics = detections.score(matches, [0], 0.4)
     assert metrics.false_per_image.value == 0
     assert 0.03 < metrics.false_per_image.high < 0.05
@@ -127,8 +125,7 @@ def test_no_false_detection_has_an_upper_limit_like_the_rule_of_three():
 
 
 def test_mean_iou_is_that_of_the_confusion_matrix():
-    rng = np.random.default_rng(0)
-    masks, predicted = rng.integers(0, 3, (2, 4, 5, 6))
+    masks, predicted = np.random.default_rng(0).integers(0, 3, (2, 4, 5, 6))
     masks[0, 0] = detections.NO_CLASS_PIXEL
     mean, by_class = detections.mean_iou(zip(predicted, masks, strict=True), 4)
     is_scored = masks != detections.NO_CLASS_PIXEL

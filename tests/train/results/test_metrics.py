@@ -161,8 +161,7 @@ def test_a_recall_has_no_lower_limit_if_too_few_negatives_set_the_threshold():
 
 
 def test_equal_networks_have_equal_recalls():
-    scores = np.random.default_rng(0).normal(size=(2, 40))
-    recall = roc_of(*scores)[1]
+    recall = roc_of(*np.random.default_rng(0).normal(size=(2, 40)))[1]
     gain = intervals.change([recall], [recall])
     wilson = binomtest(0, 40).proportion_ci(method="wilson")
     assert (gain.low, gain.high) == pytest.approx((-wilson.high, wilson.high))

@@ -177,8 +177,7 @@ def test_pgd_stays_within_its_radius_and_raises_the_loss(images, model):
     adversarial = augmentation("pgd", model, 0).apply(images, LABELS, 0)
     changes = to_unit(adversarial) - to_unit(images)
     assert changes.abs().max() <= PGD.radius + 1e-6
-    draws = torch.Generator().manual_seed(1)
-    noise = torch.randint(-8, 9, images.shape, generator=draws)
+    noise = torch.randint(-8, 9, images.shape, generator=torch.Generator().manual_seed(1))
     noisy = (images.int() + noise).clamp(0, 255)
     model.eval()
     losses = [F.cross_entropy(model(batch / 255), LABELS) for batch in (images, adversarial, noisy)]

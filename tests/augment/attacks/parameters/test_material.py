@@ -208,8 +208,7 @@ def test_mitsuba_shows_the_material_that_an_attack_leaves(tmp_path, change):
     scene = scene_of(egg(Gloss(0.5, 0.3, 0.4)), **options)
     scene = scene.changed(lights=scene.basis.project_nonnegative(scene.lights))
     problem = problem_of(scene)
-    start = problem.start
-    values = problem.project(start + torch.tensor([change]), FIRST)
+    values = problem.project(problem.start + torch.tensor([change]), FIRST)
     adversary = write(problem, values, tmp_path)
     before, after = adversary.images_before, adversary.images
     expected = render_again(tmp_path, ["mitsuba"], scene.rasterizer)["mitsuba"].double()
