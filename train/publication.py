@@ -53,7 +53,7 @@ def load(name: str) -> PublishedNetwork | PublishedDetector:
     """Load a network that is published with the library, with its results.
 
     Args:
-        name: "best", "adversarial", "random", "none" or "detector". The file
+        name: "best", "adversarial", "random", "none", "dim" or "detector". The file
             pretrained/README.md describes these networks.
 
     Returns:
