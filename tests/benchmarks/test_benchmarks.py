@@ -46,7 +46,7 @@ def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
     # Two meshes have, for each of two numbers of samples, four steps and two
     # preparations, and four steps of many views.
     assert len(whole_steps_rows) == 2 * (2 * (4 + 2) + 4)
-    assert len(savings) == 13
+    assert len(savings) == 15
     for row in rows:
         if row not in whole_steps_rows + savings:
             assert math.isfinite(float(row["image_error"]))
