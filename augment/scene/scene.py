@@ -147,7 +147,10 @@ class Scene:
         count = f"{len(self) * self.views} renders of {height} × {width} pixels"
         errors.require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
         # Images are numbered by example and then by view: e · V + v.
-        built_with: dict[str, Any] = {"rasterizer": rasterizer, "basis": basis, "device": device}
+        built_with: dict[str, Any] = {"rasterizer": rasterizer, "basis": basis}
+        if device.type == "cuda":
+            # On other devices, operators are computed on the CPU, and their stacks are moved.
+            built_with["device"] = device
         self._operator_renderer = OperatorRenderer(
             self.objects,
             [(item.object, camera) for item in self.examples for camera in item.cameras],

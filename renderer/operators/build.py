@@ -64,7 +64,7 @@ def build_operators(
     is_matte = mesh.gloss is None and gloss is None
     casts_rays = settings.global_illumination or bool(basis.local_lights)
     vertices: Any = mesh.vertices
-    if is_matte and not casts_rays and torch.device(device).type != "cpu":
+    if is_matte and not casts_rays and torch.device(device).type == "cuda":
         vertices = torch.from_numpy(vertices).to(device)
     shown = vertices, mesh.faces, cameras, settings, rasterizer, mesh.closed
     views = build_fragments(*shown, 1 if casts_rays else views_at_once(settings, vertices))
@@ -234,7 +234,7 @@ def _box_filter(
     entry_counts = torch.bincount(entry_to_pixel, minlength=pixel_count)
     if fragments.pixels.device.type not in SCIPY_DEVICES:
         values = face_values[entry_to_face] if is_flat else basis.irradiance(surface.normals)
-        # The entries of a pixel follow each other.
+        # The entries of a pixel follow each other, so each sum is over a segment.
         add_up = partial(torch.segment_reduce, reduce="sum", lengths=entry_counts, unsafe=True)
         rows = torch.stack([add_up(values * weight[:, None]) for weight in weights.T])
         return rows.mT.to(dtype)
