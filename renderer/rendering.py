@@ -186,6 +186,7 @@ def render(
     transport = build_transport(colored_mesh, settings, albedo_scale, split.basis)
     rays = transport.rays if transport else Rays(moved_mesh)
     images = []
+    # Only silhouettes use the camera, and they have single views.
     cameras_of_views = all_cameras[::at_once]
     for camera, view, behind in zip(cameras_of_views, views, backgrounds_of_views, strict=True):
         fragments = view.to(like.device)

@@ -121,7 +121,7 @@ class Adversary(ShortRepr):
         row = example if row is None else row
         before_attack = scene.examples[example]
         item = scene.objects[before_attack.object]
-        # Cameras that an attack on the pose has moved, with numbers in place of tensors below.
+        # The method `fixed` replaces the tensors of cameras that an attack has moved by numbers.
         return Adversary(
             shown=_attacked_object(item, after.row(row, item.mesh), scene.settings.encoding),
             cameras=tuple(camera.fixed() for camera in scene.cameras_under(after, row, example)),

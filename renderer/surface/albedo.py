@@ -287,7 +287,7 @@ def _corner_albedo(
 def of_seen_faces(rows: np.ndarray, fragments: Fragments) -> Tensor:
     """Select the rows of the G faces that a view shows, on the device of the view."""
     faces = fragments.faces
-    if faces.is_cuda:
+    if faces.device.type != "cpu":
         return torch.from_numpy(rows).to(faces.device, non_blocking=True)[faces]
     return torch.from_numpy(rows.take(faces.numpy(), axis=0))
 
@@ -355,7 +355,6 @@ def with_added_albedo(
         for block in np.array_split(np.arange(len(faces)), block_count):
             chart, on_sheet, center = charts.texels(block)
             bytes_of_texels = torch.from_numpy(_texels_at(center, texture)).long()
-            # `take` and flat indices are several times as fast as indexing.
             albedo = albedo_of_byte.take(bytes_of_texels)
             if mesh.one_color_per_face:
                 albedo *= corner_albedo[faces[chart], 0]

@@ -344,11 +344,11 @@ def toward_camera(fragments: Fragments, vertices: Float[Tensor, "V 3"]) -> Float
     The vectors are differentiable with respect to the vertices. They are in world axes.
     Without perspective, all samples of the only view share one vector, and the shape is (1, 3).
     """
-    # (x, y, z, 1) with the position of a perspective camera, or (x, y, z, 0) with the direction to
-    # an orthographic camera, for the only view or for each sample.
+    # A row is (x, y, z, 1) with the position of a perspective camera, or (x, y, z, 0) with the
+    # direction to an orthographic camera. There is one row for the only view, or for each sample.
     eyes = fragments.eyes.to(vertices)
-    position, is_near = eyes[:, :3], eyes[:, 3:]
-    if len(eyes) == 1 and not is_near:
+    position, w = eyes[:, :3], eyes[:, 3:]
+    if len(eyes) == 1 and not w:
         return position
     points = fragments.interpolate(vertices[fragments.corners])
-    return unit((position - is_near * points).T).T
+    return unit((position - w * points).T).T

@@ -26,7 +26,8 @@ from renderer.errors import require_finite
 from renderer.settings import ImageSettings
 from renderer.visibility import Rasterizer
 
-# Samples of the views that a GPU shades at once, and a CPU, whose cache they should fit.
+# Largest number of samples of the views that are shaded at once on a GPU, and on a CPU, into whose
+# cache their values should fit. A larger view is shaded alone.
 SAMPLES_ON_GPU = 2**21
 SAMPLES_ON_CPU = 2**16
 # Number of samples that are interpolated at once on a CPU. Their values fit into the cache of the
@@ -123,7 +124,7 @@ class Fragments:
         return eyes.to(view.device).index_select(0, view)
 
     def of_views(self, *values: Shaped[Tensor, "*axes P"]) -> list[tuple[Tensor, ...]]:
-        """Return the indices of the pixels of each view in its image, and values at them."""
+        """Split values at the P pixels by view. Before them, return the pixels in the image."""
         if len(self.cameras) < 2:
             return [(self.pixels, *values)]
         size = math.prod(self.shape)
@@ -348,7 +349,7 @@ def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
 
 
 def views_at_once(settings: ImageSettings, vertices: np.ndarray | Tensor) -> int:
-    """Return how many views are shaded together, since operations on few samples take as long."""
+    """Return how many views are shaded at once. Few samples take as long as many."""
     is_on_gpu = isinstance(vertices, Tensor) and vertices.is_cuda
     samples = SAMPLES_ON_GPU if is_on_gpu else SAMPLES_ON_CPU
     return max(1, samples // (settings.pixel_count * settings.samples**2))
@@ -390,7 +391,7 @@ def build_fragments(
         some = slice(first, first + at_once)
         depths = None
         if any(camera.has_perspective for camera in cameras[some]):
-            # Depths that are all equal are as none.
+            # If all depths are equal, the result is that of no perspective.
             given = [camera.depths(points) for camera in cameras[some]]
             equal = projected.new_ones(projected.shape[1])
             depths = torch.cat([equal if d is None else torch.as_tensor(d) for d in given])
@@ -407,7 +408,11 @@ def _fragments_of_views(
     faces: Int[Tensor, "F 3"],
     settings: ImageSettings,
 ) -> Fragments:
-    """Create fragments of N views from face indices (-1: no face) and depths (perspective)."""
+    """Create fragments of N views from face indices (-1: no face).
+
+    The depths are those of all vertices in the first view, then in the second, and so on. None
+    stands for no perspective.
+    """
     view_count, vertex_count, _ = projected.shape
     height, width = settings.shape
     # Order in which the samples of a pixel follow each other.
