@@ -172,13 +172,13 @@ class TaskNetwork(CheckedNetwork):
         if images.shape[1:] != shape:
             errors.require_shape(f"images of {self.title}", images, "N", *shape)
         outputs = super().forward(images)
-        # Check the range of the images after the call of the network. The check waits until the
-        # GPU is idle.
+        # The check may wait until the GPU is idle, so the network is called before.
         if len(images):
-            low, high = torch.stack(torch.aminmax(images.detach())).tolist()
-            if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
-                advice = "use RGB in [0, 1], without normalization (divide bytes by 255)"
-                raise InputError(f"images has values from {low:g} to {high:g}: {advice}")
+            low, high = images.detach().aminmax()
+            advice = "use RGB in [0, 1], without normalization (divide bytes by 255)"
+            fault = f"images has values from {{:g}} to {{:g}}: {advice}".format
+            is_in_range = (low >= -OVERSHOOT) & (high <= 1 + OVERSHOOT)
+            errors.require(is_in_range, lambda: InputError(fault(low, high)))
         self.task.require_finite(outputs, images, self.title)
         return outputs
 

@@ -14,8 +14,9 @@ import re
 import reprlib
 import textwrap
 import unicodedata
-from collections.abc import Collection, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
 from numbers import Integral, Real
 from pathlib import Path
@@ -227,9 +228,8 @@ def require_finite(**tensors: Tensor) -> None:
     import torch
 
     for name, tensor in tensors.items():
-        # A comparison with NaN is False, so `not` also finds NaN.
-        if not _largest_magnitude(tensor) <= torch.finfo(tensor.dtype).max:
-            raise InputError(f"{name} holds NaN or infinity: give finite values", name)
+        fault = f"{name} holds NaN or infinity: give finite values"
+        _require_magnitude(name, tensor, torch.finfo(tensor.dtype).max, fault)
 
 
 def require_bounded(**tensors: Tensor) -> None:
@@ -243,9 +243,8 @@ def require_bounded(**tensors: Tensor) -> None:
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
             kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
             raise InputError(f"{name} is {kind}: give a tensor of floating-point numbers", name)
-        # A comparison with NaN is False, so `not` also finds NaN.
-        if not _largest_magnitude(tensor) <= MAX_MAGNITUDE:
-            raise InputError(f"{name} holds NaN, infinity or values beyond {MAX_MAGNITUDE:g}", name)
+        fault = f"{name} holds NaN, infinity or values beyond {MAX_MAGNITUDE:g}"
+        _require_magnitude(name, tensor, MAX_MAGNITUDE, fault)
 
 
 def as_tensor(name: str, value: object) -> Tensor:
@@ -470,17 +469,56 @@ _SIZES = _Sizes()
 _SIZES.maxother = 60
 
 
-def _largest_magnitude(tensor: Tensor) -> float:
-    """Compute the largest magnitude of the values of a tensor. It is NaN if a value is NaN."""
+def _require_magnitude(name: str, tensor: Tensor, limit: float, fault: str) -> None:
+    """Check that no magnitude of the values of a tensor is above a limit, or NaN."""
     if not tensor.numel():
-        return 0.0
+        return
     values = tensor.detach()
     # aminmax copies a tensor that is not contiguous. If a matrix is not
     # contiguous, its transpose usually is, and aminmax does not copy it.
     if values.ndim == 2 and not values.is_contiguous():
         values = values.T
     lowest, highest = values.aminmax()
-    return max(-lowest.item(), highest.item())
+    # A comparison with NaN is False, and the extremes of values with NaN are NaN.
+    require((lowest >= -limit) & (highest <= limit), lambda: InputError(fault, name))
+
+
+# A truth value on a device, and the error if it is false.
+Check = tuple["Tensor", Callable[[], InputError]]
+# Checks that are decided later. None decides each at once.
+_LATE: ContextVar[list[Check] | None] = ContextVar("late checks", default=None)
+
+
+def require(holds: Tensor, error: Callable[[], InputError]) -> None:
+    """Check a truth value that was computed on a device, now or at the end of `late_checks`."""
+    late = _LATE.get()
+    if late is not None:
+        late.append((holds, error))
+    elif not holds:
+        raise error()
+
+
+@contextmanager
+def late_checks(checks: list[Check] | None) -> Iterator[None]:
+    """Append the checks of `require` to a list, which `raise_first` decides: a CPU waits once."""
+    token = _LATE.set(checks)
+    try:
+        yield
+    finally:
+        _LATE.reset(token)
+
+
+def raise_first(checks: list[Check]) -> None:
+    """Raise the error of the first check that failed, and empty the list."""
+    import torch
+
+    # Some truth values may be on the CPU, others on a GPU.
+    held = [holds.to(checks[0][0].device, non_blocking=True) for holds, _ in checks]
+    is_held = torch.stack(held).tolist() if held else []
+    failed = [error for (_, error), holds in zip(checks, is_held, strict=True) if not holds]
+    checks.clear()
+    if failed:
+        raise failed[0]()
 
 
 MEMORY = Path("/proc/meminfo")  # Linux writes the free memory of the machine here.

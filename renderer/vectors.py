@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -184,7 +185,9 @@ def _nearest_in_box_and_sphere(values: Rows, low: Any, high: Any, ball: Ball) ->
     # derivative with respect to f².
     squared_distance = offset.new_zeros(())
     slope = _squared_norm(offset)
-    for _ in range(_MAX_STEPS):
+    # Without a box, the function is linear.
+    is_ball = isinstance(low, float) and low == -math.inf and high == math.inf
+    for _ in range(1 if is_ball else _MAX_STEPS):
         # Newton step for squared distance = squared radius.
         missing = squared_radius - squared_distance
         step = missing / slope.clamp(min=torch.finfo(values.dtype).tiny)
@@ -199,7 +202,8 @@ def _nearest_in_box_and_sphere(values: Rows, low: Any, high: Any, ball: Ball) ->
         squared_distance = _squared_norm(nearest - ball.center)
         is_inside = squared_radius - squared_distance > rounding
         is_too_short = (squared_factor < 1) & is_inside
-        if not is_too_short.any():
+        # A GPU takes all steps, so that the CPU need not wait for it.
+        if values.device.type == "cpu" and not is_too_short.any():
             break
     return nearest
 

@@ -21,16 +21,30 @@ from torch import Tensor
 
 from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
 from augment.attacks.objective import NOISE_DRAWS, Examples, Images, Objective, Score, Values
-from augment.attacks.optimizers import CMAES, Evaluation, Gradient, Optimizer, Problem, RandomSearch
+from augment.attacks.optimizers import (
+    CMAES,
+    Evaluation,
+    Gradient,
+    Optimizer,
+    Problem,
+    RandomSearch,
+    chosen,
+)
 from augment.network import frozen_eval_mode
 from augment.progress import progress
 from augment.scene.truth import Rows
+from renderer import errors
 from renderer.errors import ShortRepr
 
 # Fields of a `Minimum` that belong to the returned candidate: the keys of `Evaluation.found`.
 FOUND = ("values", "images", "success", "cost", "predicted")
 # Optimizers by their names in the settings.
 KINDS: dict[str, type[Optimizer]] = {GRADIENT: Gradient, RANDOM_SEARCH: RandomSearch, CMA_ES: CMAES}
+
+
+def drop_period(device: torch.device) -> int:
+    """Return after how many steps finished examples are dropped, for which a CPU waits."""
+    return 1 if device.type == "cpu" else 4
 
 
 @dataclass(frozen=True, repr=False)
@@ -100,9 +114,9 @@ class Minimum(Rows, ShortRepr):
 
     def record(self, rows: Examples, found: dict[str, Tensor], mask: Bool[Tensor, " E"]) -> None:
         """Make candidates the present results of some examples, where the mask is true."""
-        kept = mask.nonzero()[:, 0]
         for name, candidates in found.items():
-            getattr(self, name)[rows[kept]] = candidates[kept]
+            column = getattr(self, name)
+            column[rows] = chosen(mask, candidates, column[rows])
 
     def add_restart(self, rows: Int[Tensor, " N"], restart: Minimum) -> None:
         """Add an attack on some examples from other initial values.
@@ -206,43 +220,57 @@ def minimize_from(
     """Attack E examples from one set of initial values.
 
     Each example takes steps until it reaches its criterion with the required margin, or has used up
-    its steps or queries. Without `scores_last`, the values after the last step are the result of
-    the examples that are not finished, whatever they cost. Their images and costs are older then.
+    its steps or queries. On a GPU, finished examples stay in the batch for up to `drop_period`
+    steps, which do not change their results, and candidates are tested with noise only in the last
+    of these. Without `scores_last`, the values after the last step are the result of the examples
+    that are not finished, whatever they cost. Their images and costs are older then.
     """
     settings = objective.settings
-    # Rows of the examples that are not finished.
+    evaluation_count = settings.step_limit + scores_last
+    period = drop_period(start.device) if settings.query_limit_of_start is None else 1
+    checks: list[errors.Check] = []
+    # Rows of the examples that are attacked, their numbers, and a mask of those that are finished.
     active = torch.arange(len(start), device=start.device)
+    shown, part, is_over = examples, objective, torch.zeros_like(active, dtype=torch.bool)
     optimizer.begin(examples, start)
     with frozen_eval_mode(objective.model):
-        evaluation_count = settings.step_limit + scores_last
         for step in progress(range(evaluation_count), "attack, until all succeed"):
+            # Only steps that drop examples wait for a GPU.
+            drops = step % period == 0 or step == evaluation_count - 1
             # Step 0 evaluates the initial values.
             candidates = optimizer.ask(active) if step else start[:, None]
             # The last evaluation needs no gradient, because no step follows.
             needs_gradient = optimizer.uses_gradients and step < settings.step_limit
-            part = objective.select(active)
-            shown = candidates, examples[active], needs_gradient
-            evaluation = evaluate(optimizer.problem, part, *shown)
+            with errors.late_checks(checks if step and period > 1 else None):
+                evaluation = evaluate(optimizer.problem, part, candidates, shown, needs_gradient)
             if not step:
                 result = Minimum.at_start(evaluation)
             is_accepted = optimizer.tell(active, evaluation)
             score = evaluation.score
-            is_finished, noisy_count = part.finished(score, evaluation.images, examples[active])
+            is_finished, noisy_count = part.finished(score, evaluation.images, shown, drops)
             # An example without a success takes each candidate that the optimizer accepts as its
             # result. An example with a success takes only successes of lower cost.
             is_cheaper = score.is_success & (score.cost < result.cost[active])
             is_first = ~result.success[active] & (score.is_success | is_accepted)
-            result.record(active, evaluation.found, is_finished | is_cheaper | is_first)
+            is_better = is_finished | is_cheaper | is_first
+            result.record(active, evaluation.found, is_better & ~is_over)
             passes = candidates.shape[1] * objective.passes_per_candidate
-            result.steps[active] = step
-            result.queries[active] += passes + noisy_count
-            result.backward_passes[active] += passes * needs_gradient
-            active = active[~is_finished]
-            # Drop the examples that cannot pay for another step.
+            result.steps[active] = torch.where(is_over, result.steps[active], step)
+            result.queries[active] += torch.where(is_over, 0, passes + noisy_count)
+            result.backward_passes[active] += torch.where(is_over, 0, passes * needs_gradient)
+            is_over = is_over | is_finished
+            if not drops:
+                continue
+            errors.raise_first(checks)
+            is_kept = ~is_over
+            # Drop also the examples that cannot pay for another step.
             if settings.query_limit_of_start is not None:
                 needed = optimizer.candidate_count * objective.passes_per_candidate
-                affordable = settings.query_limit_of_start - needed
-                active = active[result.queries[active] <= affordable]
+                is_kept &= result.queries[active] <= settings.query_limit_of_start - needed
+            kept = active[is_kept]
+            if len(kept) < len(active):
+                active, shown, part = kept, examples[kept], objective.select(kept)
+                is_over = torch.zeros_like(kept, dtype=torch.bool)
             if not len(active):
                 break
     if not scores_last:
@@ -267,13 +295,15 @@ def evaluate(
     gradients: list[Tensor] = []
     for group in torch.arange(len(rows), device=rows.device).split(problem.group_size):
         part = values[group].requires_grad_(needs_gradient)
+        # A renderer keeps what it made for the same tensor of examples.
+        is_all = len(group) == len(rows) == len(examples)
+        shown = examples if is_all else examples[rows[group]]
         with torch.set_grad_enabled(needs_gradient):
-            rendered = problem.render(part, examples[rows[group]])
+            rendered = problem.render(part, shown)
         images.append(rendered.detach())
-        chosen = objective.select(rows[group])
         # The values may move the objects, and with them the truth that the criterion needs.
-        chosen = chosen.moved(problem, part.detach(), examples[rows[group]])
-        score, image_gradient = chosen.score(images[-1], needs_gradient)
+        moved = objective.select(rows[group]).moved(problem, part.detach(), shown)
+        score, image_gradient = moved.score(images[-1], needs_gradient)
         scores.append(score)
         if needs_gradient:
             # Chain rule: the gradient with respect to the images gives the gradient with respect

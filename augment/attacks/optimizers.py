@@ -277,8 +277,8 @@ class Optimizer(ABC):
         By default, the best candidate of an example is accepted if it lowers the cost.
         """
         is_accepted = self._is_accepted(rows, evaluation.score.cost)
-        self.values[rows] = _chosen(is_accepted, evaluation.values, self.values[rows])
-        self.cost[rows] = _chosen(is_accepted, evaluation.score.cost, self.cost[rows])
+        self.values[rows] = chosen(is_accepted, evaluation.values, self.values[rows])
+        self.cost[rows] = chosen(is_accepted, evaluation.score.cost, self.cost[rows])
         self.length[rows] *= torch.where(is_accepted, *self.length_factors)[:, None]
         return is_accepted
 
@@ -286,7 +286,7 @@ class Optimizer(ABC):
         return cost < self.cost[rows]
 
 
-def _chosen(mask: Bool[Tensor, " N"], new: Tensor, old: Tensor) -> Tensor:
+def chosen(mask: Bool[Tensor, " N"], new: Tensor, old: Tensor) -> Tensor:
     """Return the new rows where the mask is true, and the old rows elsewhere."""
     return torch.where(mask.view(-1, *[1] * (new.ndim - 1)), new, old)
 
@@ -317,7 +317,7 @@ class Gradient(Optimizer):
         is_accepted = super().tell(rows, evaluation)
         if evaluation.gradient is not None:
             kept = self.gradient[rows]
-            self.gradient[rows] = _chosen(is_accepted, evaluation.gradient, kept)
+            self.gradient[rows] = chosen(is_accepted, evaluation.gradient, kept)
         return is_accepted
 
     def _is_accepted(self, rows: Int[Tensor, " N"], cost: Float[Tensor, " N"]) -> Tensor:

@@ -125,9 +125,10 @@ class OperatorRenderer:
         self.built: dict[int, _BuiltStack] = {}
 
     def layers(self, light: Float[Tensor, "A _ 3"], images: Int[Tensor, " A"]) -> Iterator[Layer]:
-        """Compute the radiance of a batch of images, differentiable in the light."""
-        # Copying waits until the GPU is idle. This happens once for all stacks.
-        images = images.cpu()
+        """Compute the radiance of a batch of images, differentiable in the light.
+
+        `images` are indices on the CPU.
+        """
         # Index of the stack of each image of the batch, shape (A,).
         row_to_stack = self._stack_of_image[images]
         needed_stacks = row_to_stack.unique().tolist()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from inspect import signature
 from itertools import cycle, islice, product
 from typing import Any
@@ -493,9 +493,8 @@ class Scene:
         The light is multiplied by the exposure already. There is one layer for each stack of
         operators.
         """
-        views = torch.arange(self.views, device=examples.device)
         # The renderer numbers the views of all examples of the scene, shape (A · V,).
-        images = (examples[:, None] * self.views + views).flatten()
+        images = (_on_cpu(examples)[:, None] * self.views + torch.arange(self.views)).flatten()
         if self.views > 1:
             # All views of an example have the same light, shape (A · V, K, 3).
             light = light.repeat_interleave(self.views, dim=0)
@@ -517,7 +516,7 @@ class Scene:
             for image in batch_images[rows].tolist():
                 # Image a · V + v is view v of row a.
                 row, view = divmod(image, self.views)
-                example = self.examples[int(examples[row])]
+                example = self.examples[int(_on_cpu(examples)[row])]
                 shown = (example.object, example.cameras[view])
                 fragments, albedo = self._direct_renderer.view(*shown)
                 local = self._direct_renderer.local_view(*shown)
@@ -541,7 +540,7 @@ class Scene:
         if len(examples) * self.views > MAX_VIEWS_WITHOUT_PROGRESS:
             row_and_view = progress(list(row_and_view), "rendering views")
         for image, (row, view) in enumerate(row_and_view):
-            example_index = int(examples[row])
+            example_index = int(_on_cpu(examples)[row])
             example = self.examples[example_index]
             camera = self.cameras_under(conditions, row, example_index)[view]
             background = self.backgrounds[example.background].flatten(1)
@@ -552,6 +551,18 @@ class Scene:
             # Pixels at the border of the object show a part of the background.
             term = background_term(coverage[None], background_pixels, self.settings.encoding)
             yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])
+
+
+def _on_cpu(indices: Tensor) -> Tensor:
+    """Copy indices to the CPU, which waits for a GPU. The last copies are kept."""
+    is_kept = indices.device.type != "cpu" and not indices.is_inference()
+    return _copied(indices, indices._version) if is_kept else indices.cpu()
+
+
+@lru_cache(maxsize=8)
+def _copied(indices: Tensor, _version: int) -> Tensor:
+    """Copy indices to the CPU. Tensors have equal keys if they are the same and unchanged."""
+    return indices.cpu()
 
 
 def _view_of(example: Example) -> tuple[int, tuple[Camera, ...]]:

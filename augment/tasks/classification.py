@@ -18,7 +18,7 @@ from torch import Tensor
 
 from augment.network import are_probabilities, plain_outputs, unwrapped
 from augment.tasks.task import NO_CLASS, Criterion, GetTruth, Task, stored_names
-from renderer.errors import InputError, require_range
+from renderer.errors import InputError, require
 
 # Logits of N images, and labels or predicted classes of them.
 Logits = Float[Tensor, "N C"]
@@ -190,7 +190,9 @@ def complementary_label(label: int) -> int:
 
 def require_known(labels: Labels, logits: Float[Tensor, "_ classes"]) -> None:
     """Check that every label has a logit. Labels may be complementary."""
-    require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
+    largest, last = _class_of(labels).amax(), logits.shape[1] - 1
+    fault = "label={} must be at least 0 and at most {}".format
+    require(largest <= last, lambda: InputError(fault(largest, last), "label"))
 
 
 def label_loss(

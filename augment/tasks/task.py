@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from augment.scene.truth import Rows, Truth
-from renderer.errors import InputError
+from renderer.errors import InputError, require
 
 # Index that stands for "no class" in attacks without a source or a target class. It differs from
 # all labels.
@@ -178,8 +178,11 @@ class Task(ABC):
     def require_finite(self, outputs: Any, images: Tensor, title: str) -> None:
         """Check that outputs of an attacked network are finite, and have the gradient of images."""
         values = [item for item in _tensors(outputs) if item.is_floating_point()]
-        if not values or not all(item.isfinite().all() for item in values):
-            raise InputError(f"{title} returned NaN or infinite outputs: check its weights")
+        fault = f"{title} returned NaN or infinite outputs: check its weights"
+        if not values:
+            raise InputError(fault)
+        for item in values:
+            require(item.isfinite().all(), lambda: InputError(fault))
         # A detector that finds nothing has no gradient.
         is_empty = not any(item.numel() for item in values)
         needs_gradient = torch.is_grad_enabled() and images.requires_grad and not is_empty

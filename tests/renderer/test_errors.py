@@ -55,3 +55,16 @@ def test_the_ends_of_a_range_are_inside(value):
     for check in (errors.require_whole, errors.require_number, errors.require_range):
         check("x", value, 0, 9)
     errors.require_bounded(x=torch.tensor([float(value), 0.99e12]))
+
+
+def test_late_checks_raise_the_error_of_the_first_that_failed_and_then_begin_anew():
+    checks = []
+    with errors.late_checks(checks):
+        errors.require_bounded(first=torch.ones(2))
+        errors.require_finite(second=torch.tensor([1, math.nan]))
+        errors.require_bounded(third=torch.tensor(-2e12))
+    with pytest.raises(errors.InputError, match="second holds NaN"):
+        errors.raise_first(checks)
+    errors.raise_first(checks)
+    with pytest.raises(errors.InputError, match="third"):
+        errors.require_bounded(third=torch.tensor(-2e12))

@@ -1,9 +1,12 @@
 """Training on a GPU agrees with training on a CPU. The tests are skipped without one."""
 
+from itertools import count
+
 import pytest
 import torch
 
 import norm_balls as nb
+from augment.attacks import loop as attack_loop
 from tests.runs import completed_run
 from train import checkpoints, run_folder
 from train.run_folder import read_metrics
@@ -58,6 +61,27 @@ def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, ema_decay):
     monkeypatch.setattr(loop, "training_batches", watched)
     few = ("augment=none", "train.epochs=1", "train.batch_size=4")
     weights_of(tiny("train.device=cuda", *few, f"train.ema_decay={ema_decay}"), tmp_path)
+
+
+def test_no_step_of_an_attack_on_lighting_waits_for_the_gpu(monkeypatch):
+    network = nb.load("none").cuda()
+    scene = nb.build_scene([("solid:orange:7", "orange")], network.size, views=3, device="cuda")
+    evaluate = attack_loop.evaluate
+    calls = count()
+
+    def watched(*arguments):
+        # The first steps build operators, and choose algorithms of the network.
+        torch.cuda.set_sync_debug_mode("error" if next(calls) > 2 else "default")
+        try:
+            return evaluate(*arguments)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+
+    monkeypatch.setattr(attack_loop, "evaluate", watched)
+    steps = nb.StepSettings("l2", radius=0.1)
+    settings = nb.AttackSettings(lighting=steps, margin=1e4, allow_negative=True)
+    nb.attack(network, scene, settings=settings, force=True)
+    assert next(calls) > 20
 
 
 def test_moved_shapes_render_on_a_gpu_as_on_a_cpu():

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from augment.attack_settings import NORMS, OPTIMIZERS, STEPS, AttackSettings, StepSettings
+from augment.attacks import loop
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Objective
 from augment.attacks.optimizers import NormBalls, sample
@@ -20,6 +23,8 @@ EPS = torch.finfo(torch.float64).eps
 IMAGE_SHAPE = (3, 2, 2)
 VALUE_COUNT = 5
 FIELDS = [field.name for field in dataclasses.fields(Minimum)]
+
+aten = torch.ops.aten
 
 
 def random(*shape: int, seed: int) -> Tensor:
@@ -293,12 +298,15 @@ def small_network() -> nn.Sequential:
 NINE_STARTS = 3 * random(9, VALUE_COUNT, seed=3)
 
 
-def attack_nine(views: int, examples: Tensor | None = None, seed: int = 0, **settings) -> Minimum:
+def attack_nine(
+    views: int, examples: Tensor | None = None, seed: int = 0, norm: str = "l2", **settings
+) -> Minimum:
     """Attack nine examples, of which some succeed at once, some on the way and some never."""
-    problem = LinearScene(NINE_STARTS, StepSettings("l2", 3.0, step_size=0.3), views=views)
+    problem = LinearScene(NINE_STARTS, StepSettings(norm, 3.0, step_size=0.3), views=views)
     chosen = torch.arange(9) if examples is None else examples
     criterion = ClassCriterion((chosen % 4)[:, None].expand(-1, views))
-    objective = Objective(small_network(), criterion, settings_of(8, **settings), seed)
+    options = {"max_steps": 8} | settings
+    objective = Objective(small_network(), criterion, settings_of(**options), seed)
     return minimize(problem, objective, examples=examples)
 
 
@@ -336,6 +344,44 @@ def test_every_example_is_attacked_as_if_alone_and_alike_with_the_same_seed(opti
             torch.testing.assert_close(found, getattr(together, name)[row], rtol=0, atol=1e-12)
     other = attack_nine(2, seed=1, **options)
     assert torch.equal(other.values, together.values) == ("optimizer" not in options)
+
+
+@pytest.mark.parametrize("backtracking", [False, True])
+def test_finished_examples_that_stay_in_the_batch_change_no_result(backtracking, monkeypatch):
+    at_once = attack_nine(2, backtracking=backtracking)
+    monkeypatch.setattr(loop, "drop_period", lambda device: 4)
+    later = attack_nine(2, backtracking=backtracking)
+    assert len(at_once.steps[at_once.success].unique()) > 2
+    for name in FIELDS:
+        found = getattr(later, name)
+        torch.testing.assert_close(found, getattr(at_once, name), rtol=0, atol=1e-12)
+
+
+class Waits(TorchDispatchMode):
+    """Counts the operations for whose results a CPU would wait for a GPU."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, function, types, arguments=(), options=None):
+        is_read = function.overloadpacket in (aten._local_scalar_dense, aten.nonzero)
+        tensors = [item for item in tree_leaves(arguments[1:2]) if isinstance(item, Tensor)]
+        is_mask = "index" in str(function) and any(item.dtype == torch.bool for item in tensors)
+        self.count += is_read or is_mask
+        return function(*arguments, **(options or {}))
+
+
+@pytest.mark.parametrize("period", [1, 4])
+def test_only_steps_that_drop_examples_wait_for_a_gpu(period, monkeypatch):
+    """Both attacks drop examples after steps 0 and 4, and after the last."""
+    monkeypatch.setattr(loop, "drop_period", lambda device: period)
+    counts = []
+    for steps in (5, 7):
+        with Waits() as waits:
+            attack_nine(2, norm="linf", max_steps=steps, margin=1e4)
+        counts.append(waits.count)
+    assert (counts[0] == counts[1]) == (period == 4)
 
 
 @pytest.mark.parametrize("backtracking", [False, True])
