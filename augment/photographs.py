@@ -19,12 +19,11 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Generator, Tensor
 
-from augment import attack_settings
 from augment import network as wrappers
-from augment.attack_settings import AttackSettings, RelightingSettings, StepSettings
+from augment.attack_settings import RANDOM_SEARCH, AttackSettings, RelightingSettings, StepSettings
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Examples, Objective, preprocessed_model
-from augment.attacks.optimizers import Gradient, NormBalls, Optimizer, sample
+from augment.attacks.optimizers import NormBalls, Optimizer, sample
 from augment.classifier import MAX_PROBED, UNIT_RANGE, Normalization, TaskNetwork, as_network
 from augment.progress import progress
 from augment.random_streams import generator
@@ -339,28 +338,24 @@ def _attack_slide(
     """
     settings = result.settings
     indices = rows.tolist()
-    problem = RelitPhotographs(
-        decode(images, "srgb"),
-        _draw_lights(result, indices, slide).to(images.device),
-        settings,
-        [generator(result.seed, "factors", index, slide) for index in indices],
-    )
+    light_of_slide = _draw_lights(result, indices, slide).to(images.device)
+    draws = [generator(result.seed, "factors", index, slide) for index in indices]
+    problem = RelitPhotographs(decode(images, "srgb"), light_of_slide, settings, draws)
     criterion = result.criterion.select(rows).map(lambda values: values.to(images.device))
     examples = torch.arange(len(rows), device=images.device)
     for light in result.changed:
         # No search reaches this margin, so each uses all passes. The slide as it is takes no step.
+        is_random = light == RANDOM
         search = replace(
             success,
-            optimizer=attack_settings.RANDOM_SEARCH
-            if light == RANDOM
-            else attack_settings.GRADIENT,
+            optimizer=RANDOM_SEARCH if is_random else None,
             max_steps=0 if light == SLIDE else settings.steps,
             max_queries=settings.passes,
             margin=errors.MAX_SCALE,
             sensor_noise=0.0,
         )
         objective = Objective(result.classifier, criterion, search)
-        optimizer: type[Optimizer] = UniformDraws if light == RANDOM else Gradient
+        optimizer = UniformDraws if is_random else None
         minimum = minimize(problem, objective, examples=examples, optimizer=optimizer)
         # The sensor noise differs for each pair of a photograph and a slide.
         noise_indices = rows * settings.slides + slide

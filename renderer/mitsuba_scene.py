@@ -221,14 +221,8 @@ def shape(
     properties["bsdf"] = load(module, surface)
     properties["face_normals"] = normals is None
     # Mitsuba creates empty buffers of these sizes, which are filled below.
-    mesh = module.Mesh(
-        "mesh",
-        len(positions),
-        len(faces),
-        props=properties,
-        has_vertex_normals=normals is not None,
-        has_vertex_texcoords=uvs is not None,
-    )
+    given = {"has_vertex_normals": normals is not None, "has_vertex_texcoords": uvs is not None}
+    mesh = module.Mesh("mesh", len(positions), len(faces), props=properties, **given)
     if colors is not None:
         mesh.add_attribute("vertex_color", 3, colors.astype(np.float32).ravel())
     buffers = module.traverse(mesh)

@@ -169,15 +169,10 @@ def render(
     # Several views at once form a tall image. Rays and silhouettes need single views.
     is_single = bool(local_lights) or settings.global_illumination or silhouettes
     at_once = 1 if is_single else views_at_once(settings, vertices)
-    views = build_fragments(
-        vertices,
-        mesh.faces,
-        [camera.fixed() for camera in all_cameras],
-        settings,
-        _choose(rasterizer),
-        closed=moved_mesh.closed if is_moved else mesh.closed,
-        at_once=at_once,
-    )
+    is_closed = moved_mesh.closed if is_moved else mesh.closed
+    fixed_cameras = [camera.fixed() for camera in all_cameras]
+    shown = vertices, mesh.faces, fixed_cameras, settings, _choose(rasterizer), is_closed
+    views = build_fragments(*shown, at_once)
     backgrounds_of_views = backgrounds.expand(view_count, -1, -1, -1).split(at_once)
     # Object that computes bounces and shadows of environment light. None without both.
     colored_mesh = moved_mesh
@@ -317,15 +312,8 @@ def precompute_transfer(
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     all_cameras = _checked_cameras(mesh, cameras, albedo_scale, gloss)
-    operators = build_operators(
-        mesh,
-        all_cameras,
-        settings,
-        _choose(rasterizer),
-        albedo_scale,
-        gloss=gloss,
-        device=errors.as_device(device),
-    )
+    shown = mesh, all_cameras, settings, _choose(rasterizer), albedo_scale
+    operators = build_operators(*shown, gloss=gloss, device=errors.as_device(device))
     return operators[0] if isinstance(cameras, Camera) else TransferOperators(operators)
 
 

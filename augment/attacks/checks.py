@@ -8,15 +8,15 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 from torch import Tensor
 
 from augment.attack_settings import StepSettings
 from augment.attacks.adversary import Adversary, final_images
 from augment.attacks.loop import minimize
-from augment.attacks.objective import Examples, Objective, Values
+from augment.attacks.objective import Examples, Images, Objective, Values
 from augment.attacks.parameters import parameter_class
-from augment.attacks.problem import SceneProblem, build_problem
+from augment.attacks.problem import build_problem
 from augment.attacks.result import AttackResult, require_result
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
 from augment.network import gradient_flags_kept
@@ -87,7 +87,7 @@ def check(result: AttackResult) -> dict[str, Any]:
     rates = {result.settings.step_limit: success}
     for factor in GROWTH:
         longer = replace(result, settings=result.settings.with_budget(factor))
-        _attack_others(found, longer, result.problem, result.problem.start.clone())
+        _attack_others(found, longer, result.problem.start.clone())
         rates[longer.settings.step_limit] = _rates(found, is_clean)
     columns = zip(*rates.values(), strict=True)
     rates_by_steps = [dict(zip(rates, column, strict=True)) for column in columns]
@@ -151,7 +151,7 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
         balls = {name: _scaled(settings, scale) for name, settings in parameters}
         scaled_settings = replace(result.settings, **balls)  # type: ignore[arg-type]
         problem = build_problem(scaled_settings, result.problem.scene)
-        _attack_others(adversarial, result, problem, values)
+        _attack_others(adversarial, replace(result, problem=problem), values)
         _add_draws(random, result, partial(problem.sample, draws))
         row: dict[str, Any] = {"radii": {name: ball.radius for name, ball in balls.items()}}
         for method, found in (("adversarial", adversarial), ("random", random)):
@@ -267,9 +267,7 @@ def require_transferable(
                 raise InputError(f"{reason}: remove {argument}, or attack another parameter")
 
 
-def _attack_others(
-    found: Successes, result: AttackResult, problem: SceneProblem, values: Values
-) -> None:
+def _attack_others(found: Successes, result: AttackResult, values: Values) -> None:
     """Attack the examples without a success, and add the successes and the values reached.
 
     `found` and `values` are changed in place. The attack starts at `values`.
@@ -278,10 +276,10 @@ def _attack_others(
     examples = torch.nonzero(~found[0])[:, 0]
     if len(examples):
         objective = result.objective().select(examples)
-        end = minimize(problem, objective, examples=examples, start=values[examples])
+        end = minimize(result.problem, objective, examples=examples, start=values[examples])
         # In `success_by_radius`, the attack in the next larger norm-ball starts here.
         values[examples] = end.values
-        _add_successes(found, result, problem, end.values, examples, end.images)
+        _add_successes(found, result, end.values, examples, end.images)
 
 
 def _add_draws(found: Successes, result: AttackResult, draw: Callable[[], Tensor]) -> None:
@@ -303,24 +301,19 @@ def _add_draws(found: Successes, result: AttackResult, draw: Callable[[], Tensor
         values = draw()[examples]
         with torch.no_grad():
             images = result.problem.render(values, examples)
-        _add_successes(found, result, result.problem, values, examples, images)
+        _add_successes(found, result, values, examples, images)
 
 
 def _add_successes(
-    found: Successes,
-    result: AttackResult,
-    problem: SceneProblem,
-    values: Float[Tensor, "R D"],
-    examples: Int[Tensor, " R"],
-    images: Float[Tensor, "R V _ H W"],
+    found: Successes, result: AttackResult, values: Values, examples: Examples, images: Images
 ) -> None:
     """Add the examples that meet the criterion with some attack values.
 
     An example is first judged by its given images. If they meet the criterion, it is rendered
     again with exact shadows and bounces, and these images decide, without and with sensor noise.
     """
-    objective = result.objective().select(examples)
-    objective = objective.moved(problem, values, examples)
+    problem = result.problem
+    objective = result.objective().select(examples).moved(problem, values, examples)
     criterion = objective.criterion
     # Judge the given images, which are cheaper than the final images.
     is_reached = criterion.reached(criterion.predicted(objective.evidence(images)))

@@ -48,13 +48,8 @@ def _loop(
             for helper in (_between, _segment, _interpolate):
                 numba.extending.register_jitable(fastmath=True)(helper)
             # Bytes are equal to those of torch, and light is to rounding.
-            njit: Any = partial(
-                numba.njit,
-                f"void({signature})",
-                nogil=True,
-                error_model="numpy",
-                fastmath=not uses_tables,
-            )
+            options = {"nogil": True, "error_model": "numpy", "fastmath": not uses_tables}
+            njit: Any = partial(numba.njit, f"void({signature})", **options)
             try:
                 loop = njit(cache=True)(function)
             except Exception:  # If its cache is read-only or damaged.

@@ -203,13 +203,9 @@ def _place(part: _Primitive, pose: Float[np.ndarray, "4 4"]) -> list[Part]:
     vertices = values[:, POSITION]
     # Axes: face, corner, column of the values.
     corners = values[faces]
-    mesh = colored_mesh(
-        vertices,
-        faces,
-        encode(torch.from_numpy(corners[..., COLOR]), "srgb").numpy(),
-        corners[..., U:ALPHA],
-        textures=[] if material.texture is None else [material.texture],
-    )
+    colors = encode(torch.from_numpy(corners[..., COLOR]), "srgb").numpy()
+    textures = [] if material.texture is None else [material.texture]
+    mesh = colored_mesh(vertices, faces, colors, corners[..., U:ALPHA], textures=textures)
     if material.gloss is not None:
         # All faces have the same roughness, metallic and specular factor.
         gloss = np.tile(material.gloss.astype(np.float32), (len(faces), 1))

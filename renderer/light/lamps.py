@@ -134,12 +134,8 @@ class Projector(Settings, LocalBasis):
         lit_point = torch.nonzero(is_lit).squeeze(1)
         irradiance = cosine_ratio * (self.distance / depth) ** 2
         pattern_pixel = (row * self.pixels + column)[lit_point].long()
-        return LightPaths(
-            point=lit_point,
-            function=pattern_pixel,
-            source=source.expand(len(lit_point), 3),
-            irradiance=irradiance[lit_point],
-        )
+        sources = source.expand(len(lit_point), 3)
+        return LightPaths(lit_point, pattern_pixel, sources, irradiance[lit_point])
 
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
         """Create the entry of the projector in a Mitsuba scene.

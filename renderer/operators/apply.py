@@ -398,11 +398,9 @@ class TransferOperator:
         device = as_device(device)
         if device == self.transfer.device:
             return self
-        moved: dict[str, Any] = {
-            field.name: getattr(self, field.name).to(device)
-            for field in fields(self)
-            if isinstance(getattr(self, field.name), Tensor | SparseTransfer)
-        }
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        tensors = {k: v for k, v in values.items() if isinstance(v, Tensor | SparseTransfer)}
+        moved: dict[str, Any] = {name: tensor.to(device) for name, tensor in tensors.items()}
         return replace(self, **moved)
 
     @property

@@ -243,12 +243,9 @@ class Fragments:
         Each value is multiplied by the barycentric weight of the corner at the
         sample. This is the transpose of `interpolate`, as in backpropagation.
         """
-        corner_rows = _distribute(
-            values.T,
-            self.sample_to_seen_face.index_select(0, samples),
-            self.barycentric[samples].T,
-            (3 * values.shape[1], len(self.faces)),
-        )
+        seen_face = self.sample_to_seen_face.index_select(0, samples)
+        shape = (3 * values.shape[1], len(self.faces))
+        corner_rows = _distribute(values.T, seen_face, self.barycentric[samples].T, shape)
         # The axes corner, value, seen face become seen face, corner, value.
         return corner_rows.unflatten(0, (3, -1)).permute(2, 0, 1)
 
@@ -279,12 +276,10 @@ class Fragments:
         """Return the fragments with all tensors on a device."""
         if self.pixels.device == torch.device(device):
             return self
-        tensors_on_device: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, Tensor):
-                tensors_on_device[field.name] = value.to(device)
-        return replace(self, **tensors_on_device)
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
+        moved: dict[str, Any] = {name: tensor.to(device) for name, tensor in tensors.items()}
+        return replace(self, **moved)
 
 
 class _Interpolation(torch.autograd.Function):

@@ -399,14 +399,10 @@ class _Silhouettes:
         # Of all cuts between the same two samples, keep the one with the smallest distance.
         order = visible[np.lexsort([distance[visible], after[visible]])]
         kept = order[np.diff(after[order], prepend=-1) != 0]
-        return (
-            self.ends[:, edge[kept]],
-            fraction[kept],
-            self.normal[:, edge[kept]],
-            np.full(len(kept), axis == X),
-            cells[:, kept],
-            samples[:, kept],
-        )
+        edge = edge[kept]
+        horizontal = np.full(len(kept), axis == X)
+        of_edges = self.ends[:, edge], fraction[kept], self.normal[:, edge]
+        return *of_edges, horizontal, cells[:, kept], samples[:, kept]
 
     def _surface_nearness(
         self, samples: Int[np.ndarray, "2 K"], place: Float[np.ndarray, "2 K"]

@@ -95,12 +95,9 @@ def _triangles(
     by_column, by_row = -SUBSAMPLES * to_y * sign, SUBSAMPLES * to_x * sign
     is_owner = (by_column > 0) | ((by_column == 0) & (by_row > 0))
     constant = (x * to_y - y * to_x) * sign - (~is_owner).long()
-    return _Triangles(
-        torch.stack([by_column, by_row, constant]),
-        torch.stack(planes),
-        torch.stack([first_column, first_row, widths, ends - counts]),
-        ends,
-    )
+    edges = torch.stack([by_column, by_row, constant])
+    boxes = torch.stack([first_column, first_row, widths, ends - counts])
+    return _Triangles(edges, torch.stack(planes), boxes, ends)
 
 
 def _draw(

@@ -34,7 +34,7 @@ from augment.scene.build import build_local_light
 from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
-from augment.settings import LampsSettings, ProjectorSettings
+from augment.settings import LOCAL_LIGHT_SETTINGS
 from augment.tasks.task import Criterion
 from renderer.camera import orbit_cameras
 from renderer.errors import MAX_SCALE
@@ -108,14 +108,11 @@ class LightKind(NamedTuple):
         title: Name of the lighting in the report.
         unit: Unit of the radii in the report.
         radii: Radii of the L∞ norm-balls, in ascending order.
-        local: Projectors or lamps of the scene, in addition to environment
-            lighting.
     """
 
     title: str
     unit: str
     radii: tuple[float, ...]
-    local: tuple[ProjectorSettings | LampsSettings, ...] = ()
 
 
 # The kinds of lighting that an audit attacks. A key is also the name of the parameter
@@ -128,17 +125,9 @@ KINDS = {
         "a daylight sky", "1 is 57.3° of the sun, or 4 of turbidity", (0.1, 0.3, 1.0, 3.0)
     ),
     "projector": LightKind(
-        "a projector",
-        "fraction of its power, in each pixel",
-        (0.03, 0.1, 0.3, 1.0),
-        (ProjectorSettings(),),
+        "a projector", "fraction of its power, in each pixel", (0.03, 0.1, 0.3, 1.0)
     ),
-    "lamps": LightKind(
-        "four lamps",
-        "change of the power in each channel",
-        (0.3, 1.0, 3.0, 10.0),
-        (LampsSettings(),),
-    ),
+    "lamps": LightKind("four lamps", "change of the power in each channel", (0.3, 1.0, 3.0, 10.0)),
 }
 
 
@@ -170,7 +159,8 @@ class Views:
         """Build a scene with one example for each view."""
         # The views show the objects in turn.
         objects = [self.objects[index % len(self.objects)] for index in range(self.count)]
-        local_lights = [build_local_light(light) for light in KINDS[kind].local]
+        is_local = kind in LOCAL_LIGHT_SETTINGS
+        local_lights = [build_local_light(LOCAL_LIGHT_SETTINGS[kind]())] if is_local else []
         natural_light = load_light(self.light) * self.exposure
         basis, lights = with_local_lights(natural_light, local_lights)
         scene = Scene.grid(

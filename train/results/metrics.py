@@ -239,9 +239,6 @@ class Pool(ShortRepr):
     @cached_property
     def metrics(self) -> Metrics:
         """Metrics of the predictions with their 95% intervals."""
-        proportions: dict[str, Any] = {
-            name: outcome.proportion for name, outcome in self.outcomes.items()
-        }
         # ROC metrics are missing without positives or without negatives. They are then unknown.
         known = {name: jackknife.estimate for name, jackknife in self._rankings.items()}
         auc, *recalls = (known.get(name, Estimate()) for name in ROC_METRICS)
@@ -253,14 +250,10 @@ class Pool(ShortRepr):
             negatives=len(negatives),
             negative_objects=len({*_objects(negatives)}),
         )
-        return Metrics(
-            n=len(self.predictions),
-            auc=auc_with_counts,
-            recall_at=dict(zip(RATES, recalls, strict=True)),
-            **proportions,
-            class_top1=known.get("class_top1"),
-            class_top5=known.get("class_top5"),
-        )
+        recall_at = dict(zip(RATES, recalls, strict=True))
+        others: dict[str, Any] = {name: known.get(name) for name in TOP_RANKS}
+        others |= {name: outcome.proportion for name, outcome in self.outcomes.items()}
+        return Metrics(n=len(self.predictions), auc=auc_with_counts, recall_at=recall_at, **others)
 
     @cached_property
     def classified(self) -> Predictions:

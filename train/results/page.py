@@ -135,12 +135,10 @@ def write_page(out: Path, script: str = "", **content: Any) -> Path:
     # This import takes time, and a training run needs it only at its end.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    loader = PackageLoader("train.results", ".")
+    whitespace: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(
-        loader=PackageLoader("train.results", "."),
-        undefined=StrictUndefined,
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, undefined=StrictUndefined, autoescape=True, **whitespace
     )
     environment.filters.update(as_text=tables.as_text, fraction=tables.fraction)
     environment.filters.update(hits=tables.format_fraction, interval=tables.format_interval)
@@ -318,13 +316,8 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
             ]
     except InputError as error:
         problem = str(error)
-    return {
-        "name": title,
-        "sheets": sheets,
-        "rocs": rocs,
-        "tables": [table.without_unknown_columns for table in shown],
-        "problem": problem,
-    }
+    known = [table.without_unknown_columns for table in shown]
+    return {"name": title, "sheets": sheets, "rocs": rocs, "tables": known, "problem": problem}
 
 
 def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:

@@ -136,14 +136,8 @@ def fraction(hits: int, n: int) -> Proportion:
         return Proportion()
     low, high = map(float, wilson(hits / n, n, NORMAL_QUANTILE))
     # Rounding must not move an end that is exactly 0 or 1.
-    return Proportion(
-        value=hits / n,
-        low=low if hits else 0.0,
-        high=high if hits < n else 1.0,
-        over=IMAGES,
-        hits=hits,
-        n=n,
-    )
+    ends = {"low": low if hits else 0.0, "high": high if hits < n else 1.0}
+    return Proportion(hits / n, **ends, over=IMAGES, hits=hits, n=n)
 
 
 def wilson(value: float | np.ndarray, n: int, quantile: float | np.ndarray) -> np.ndarray:

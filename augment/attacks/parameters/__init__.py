@@ -18,16 +18,7 @@ from augment.scene.scene import Scene
 from renderer.errors import require_choice
 from renderer.light.lamps import LOCAL_LIGHTS
 
-KINDS: tuple[type[Parameter], ...] = (
-    Albedo,
-    Geometry,
-    Lighting,
-    Material,
-    Pixels,
-    Pose,
-    Positions,
-    Skylight,
-)
+KINDS = (Albedo, Geometry, Lighting, Material, Pixels, Pose, Positions, Skylight)
 
 
 def parameter_class(name: str) -> type[Parameter]:

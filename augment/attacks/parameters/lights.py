@@ -14,7 +14,7 @@ from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.errors import InputError
-from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
+from renderer.light.basis import HARMONICS, Part
 from renderer.light.files import mean_luminance
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.ringing import nonnegative_window
@@ -33,21 +33,13 @@ class LightParameter(Parameter):
     the norm-ball and have no negative radiance.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        settings: StepSettings,
-        rows: slice,
-        basis: Harmonics | LocalBasis,
-        nonnegative: bool,
-    ):
-        """Compute the light at which the attack starts."""
-        self._rows = rows
-        self._basis = basis
-        self._nonnegative = nonnegative or not basis.allow_negative
-        initial_light = scene.lights[:, rows]
+    def __init__(self, scene: Scene, settings: StepSettings, light: Part, nonnegative: bool):
+        """Compute the values of the light of the scene at which the attack starts."""
+        self._rows, self._basis = light
+        self._nonnegative = nonnegative or not self._basis.allow_negative
+        initial_light = scene.lights[:, self._rows]
         if self._nonnegative:
-            initial_light = basis.project_nonnegative(initial_light)
+            initial_light = self._basis.project_nonnegative(initial_light)
         super().__init__(settings, start=initial_light.flatten(1))
 
     def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
@@ -64,7 +56,7 @@ class LightParameter(Parameter):
         return self._basis.nearest_nonnegative(coefficients, ball).flatten(1)
 
 
-def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
+def environment_light(scene: Scene) -> Part:
     """Return the rows of the environment lighting among all lights of a scene, and its basis."""
     # The environment is the first light of a scene.
     return scene.basis.lights[0]
@@ -98,8 +90,7 @@ class Lighting(LightParameter):
     name = "lighting"
 
     def __init__(self, scene: Scene, settings: StepSettings, nonnegative: bool = False):
-        rows, basis = environment_light(scene)
-        super().__init__(scene, settings, rows=rows, basis=basis, nonnegative=nonnegative)
+        super().__init__(scene, settings, environment_light(scene), nonnegative)
 
 
 class LocalLight(LightParameter):
@@ -111,9 +102,9 @@ class LocalLight(LightParameter):
     def __init__(self, scene: Scene, settings: StepSettings, name: str):
         """Find the light among the local lights of the scene."""
         self.name = name
-        for rows, basis in scene.basis.local_lights:
-            if basis.name == name:
-                super().__init__(scene, settings, rows=rows, basis=basis, nonnegative=True)
+        for light in scene.basis.local_lights:
+            if light.basis.name == name:
+                super().__init__(scene, settings, light, nonnegative=True)
                 return
         fault = f"{name} cannot be attacked, because the scene has none"
         raise InputError(f"{fault}: build the scene with {name}=...", name)
