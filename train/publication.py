@@ -7,7 +7,7 @@ from typing import Any
 
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.settings import PYTHON
-from renderer.errors import InputError, as_path, keyed, require_choice
+from renderer.errors import InputError, as_path, require_choice
 from train.checkpoints import load_run, load_selected, write_published
 from train.command_settings import require_calibration
 from train.results.metrics import METRICS, Metrics
@@ -182,9 +182,8 @@ def publish(
             # Published weights have 16 bits.
             loaded.half().float()
             predictor = Predictor(loaded, loaded.classes, loaded.size)
-            negatives = published_folder(as_path("calibrate", calibrate))
-            with keyed(folder="calibrate"):
-                points = choose_operating_points(predictor, negatives, labels, false_positive_rate)
+            negatives = as_path("calibrate", calibrate)
+            points = choose_operating_points(predictor, negatives, labels, false_positive_rate)
             state["operating_point"] = [asdict(point) for point in points]
     target.mkdir(parents=True, exist_ok=True)
     write_published(target / PUBLISHED, state)

@@ -203,12 +203,8 @@ def evaluate(
             stored = {point.label: point for point in made.operating_points}
             points = [stored[name] for name in labels] if stored.keys() >= set(labels) else []
             if calibrate is not None and false_positive_rate is not None:
-                negatives = published_folder(Path(calibrate))
-                # The caller knows this folder as the argument `calibrate`.
-                with keyed(folder="calibrate"):
-                    points = scoring.choose_operating_points(
-                        predictor, negatives, labels, false_positive_rate, skip_unreadable
-                    )
+                chosen_on = Path(calibrate), labels, false_positive_rate, skip_unreadable
+                points = scoring.choose_operating_points(predictor, *chosen_on)
             scores = scoring.score(predictor.predict(folder, labels, skip_unreadable), by, points)
             if target:
                 scoring.write(scores, target)

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from augment.classifier import CheckedNetwork, Label, OperatingPoint, log_odds
 from augment.network import compute_outputs
@@ -46,12 +47,12 @@ from train.results.predictions import (
     write_summary,
 )
 from train.results.tables import Estimate, Proportion, Table
-from train.settings import GROUPS, label_names
+from train.settings import GROUPS, label_names, published_folder
 
 # Number of images for which the model computes logits in one call.
 BATCH = 256
 # A PyTorch module, or a function, that maps images to logits.
-Model = Callable[[torch.Tensor], torch.Tensor]
+Model = Callable[[Tensor], Tensor]
 # Number of wrong predictions that are listed for the images of each class: the 5 most
 # common ones.
 WRONG_CLASSES = 5
@@ -82,7 +83,7 @@ class FolderPredictions(ShortRepr):
 
     folder: Path
     predictions: Predictions
-    images: torch.Tensor
+    images: Tensor
     labels: list[str]
     unreadable: list[str]
     left_out: list[str]
@@ -140,8 +141,8 @@ def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]
 
 
 def compute_logits(
-    model: Model, images: torch.Tensor, classes: int, device: str | torch.device
-) -> torch.Tensor:
+    model: Model, images: Tensor, classes: int, device: str | torch.device
+) -> Tensor:
     """Compute the logits of a model for images.
 
     A module is called in eval mode. Its mode is restored afterwards. The images are 8-bit sRGB,
@@ -160,10 +161,7 @@ def compute_logits(
 
 
 def rank_classes(
-    photographs: Sequence[Photograph],
-    logits: torch.Tensor,
-    classes: Sequence[str],
-    labels: Sequence[str],
+    photographs: Sequence[Photograph], logits: Tensor, classes: Sequence[str], labels: Sequence[str]
 ) -> Predictions:
     """Convert logits to predicted classes with their probabilities, ranks and log-odds."""
     logits = logits.double()
@@ -367,7 +365,7 @@ def write(scores: Scores, out: Path) -> None:
 
 
 def choose_operating_points(
-    predictor: Predictor, folder: Path, label: Label, rate: float, skip_unreadable: bool = False
+    predictor: Predictor, calibrate: Path, label: Label, rate: float, skip_unreadable: bool = False
 ) -> list[OperatingPoint]:
     """Choose a threshold on the log-odds of each label for a given false-positive rate.
 
@@ -376,6 +374,7 @@ def choose_operating_points(
     20 negatives, at most 2 negatives score above the threshold. Fewer than 1 / `rate` negatives
     raise InputError.
     """
+    folder = published_folder(calibrate)
     predicted = predictor.predict(folder, label, skip_unreadable)
     exact_rate = Fraction(str(rate))
     points = []
@@ -385,8 +384,8 @@ def choose_operating_points(
         # With fewer than 1 / rate negatives, not even one may score above the threshold.
         if count * exact_rate < 1:
             advice = f"give at least {math.ceil(1 / exact_rate)} for false_positive_rate={rate}"
-            fault = f"folder={folder} has {count} negatives for {name}"
-            raise InputError(f"{fault}: {advice}", "folder")
+            fault = f"calibrate={folder} has {count} negatives for {name}"
+            raise InputError(f"{fault}: {advice}", "calibrate")
         (threshold,) = thresholds(log_odds, np.ones(count, int), [str(rate)])
         chosen_on = (folder.resolve().name, predicted.images_hash, count)
         points.append(OperatingPoint(name, float(threshold), rate, *chosen_on))
