@@ -130,11 +130,10 @@ class Illumination(NamedTuple):
 class LightModel:
     """Light as a function of numbers in [0, 1]."""
 
-    # Smallest and largest value of each number, and whether its logarithm is uniform.
+    # Smallest and largest value of each number, and whether its logarithm is uniform. If METER is
+    # the last range, a meter sets the exposure, of which the last number has the stops.
     ranges: ClassVar[tuple[Range, ...]]
     constants: ClassVar[int] = 0
-    # Whether a meter sets the exposure, of which the last number has the stops.
-    has_meter: ClassVar[bool] = False
     # Whether the camera clips values above the white of HDR images.
     has_limit: ClassVar[bool] = False
 
@@ -165,7 +164,7 @@ class LightModel:
         light = self.light(drawn)
         if strength < 1:
             light = light.scaled(strength, 1 - strength)
-        if not self.has_meter:
+        if self.ranges[-1] != METER:
             return light
         mean = light._replace(field=light.field.mean((2, 3), keepdim=True)).total()
         gray = patterns.luminance(mean) if mean.shape[1] == 3 else mean
@@ -194,7 +193,6 @@ class ProjectedSlide(LightModel):
     cells: ClassVar[int] = 3
     ranges = (*SURFACE, WEAK, *[Range(-math.log(2), math.log(2))] * 3 * cells**2, METER)
     constants = surfaces.SURFACE_NODES**2
-    has_meter = True
 
     def __post_init__(self) -> None:
         if self.slides is not None:
@@ -235,7 +233,6 @@ class DirectionalLight(LightModel):
 
     ranges = (*SURFACE, WEAK, METER)
     constants = surfaces.SURFACE_NODES**2
-    has_meter = True
 
     def light(self, drawn: Drawn) -> Illumination:
         """Add weak ambient light to the shading."""
@@ -270,7 +267,6 @@ class PointLight(LightModel):
 
     ranges = (STEEPNESS, *LAMP, WEAK, METER)
     constants = surfaces.SURFACE_NODES**2
-    has_meter = True
 
     def light(self, drawn: Drawn) -> Illumination:
         """Add weak ambient light to the light of the lamp."""
@@ -289,7 +285,6 @@ class ColoredLamps(LightModel):
 
     ranges = (STEEPNESS, *[*LAMP, Range(0, 1), Range(0, 1)] * 3, WEAK, METER)
     constants = 1 + surfaces.SURFACE_NODES**2
-    has_meter = True
 
     def light(self, drawn: Drawn) -> Illumination:
         """Add the light of the lamps, of which some are off, to weak ambient light."""
@@ -313,7 +308,6 @@ class LinearLight(LightModel):
     """
 
     ranges = (TURN, Range(0, 0.95), METER)
-    has_meter = True
 
     def illumination(self, drawn: Drawn, strength: float = 1.0) -> Illumination:
         """Expose the light, whose mean is 1, by a loop that needs no meter."""
@@ -344,7 +338,6 @@ class FractalLight(LightModel):
     octaves: ClassVar[tuple[int, ...]] = (2, 4, 8, 16)
     ranges = (Range(0.1, 1.0), TURN, METER)
     constants = 2 * sum(count**2 for count in octaves)
-    has_meter = True
 
     def light(self, drawn: Drawn) -> Illumination:
         """Blend two random fields of the same variance, and take the exponential."""
