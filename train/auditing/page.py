@@ -109,10 +109,9 @@ def write_audit_page(
         return Audited(path, screen, label, {}, None)
     by_key = {key: AuditedNetwork(label, name, out / key) for key, name in names.items()}
     networks = [*by_key.values()]
-    plain = plain_sentence(networks[0])
     # The first kind of test images decides the top of the page and the recommendation.
     images = next(iter(folders), None)
-    screen = _first_screen(networks, images, folders, plain)
+    screen = _first_screen(networks, images, folders)
     recommendation = None
     if images is not None and len(remedies) > 1:
         # One evaluation of each remedy, since an audit has no seeds.
@@ -143,7 +142,7 @@ def write_audit_page(
         kinds=KINDS,
         steps=(STEPS, ADDITIONAL_STEPS),
         networks=networks,
-        plain_sentence=plain,
+        plain_sentence=plain_sentence(networks[0]),
         pictures={network.name: attack_pictures(network) for network in networks},
         charts=charts(networks),
         slider=slider,
@@ -171,11 +170,11 @@ def _slider(networks: Sequence[AuditedNetwork]) -> dict[str, Any]:
 
 
 def _first_screen(
-    networks: Sequence[AuditedNetwork], images: str | None, folders: Mapping[str, Path], plain: str
+    networks: Sequence[AuditedNetwork], images: str | None, folders: Mapping[str, Path]
 ) -> first_screen.FirstScreen:
     """Make the top of the report from two networks' scores, or else from the first network."""
     if images is None:
-        return screen_of_one(networks[0], plain, Metrics())
+        return screen_of_one(networks[0], Metrics())
     evaluations = [network.evaluation(images) for network in networks]
     if len(networks) > 1:
         folder = folders[images]
@@ -185,7 +184,7 @@ def _first_screen(
         screen = first_screen.compare_networks(before, after, names, folder, folder.name)
         if screen is not None:
             return screen
-    return screen_of_one(networks[0], plain, evaluations[0].pooled.all.metrics)
+    return screen_of_one(networks[0], evaluations[0].pooled.all.metrics)
 
 
 def _score_sections(
@@ -220,12 +219,10 @@ def plain_sentence(network: AuditedNetwork) -> str:
     return f"{sentence} {found}; {before}. All lights are tested there."
 
 
-def screen_of_one(
-    network: AuditedNetwork, plain: str, metrics: Metrics
-) -> first_screen.FirstScreen:
+def screen_of_one(network: AuditedNetwork, metrics: Metrics) -> first_screen.FirstScreen:
     """Make the top of the report of an audit of one network, with its scores on test images."""
     numbers = []
-    sentences = [plain]
+    sentences = [plain_sentence(network)]
 
     def show(title: str, value: Estimate, note: str = "higher is better") -> None:
         numbers.append(first_screen.ShownMetric(title, note, None, value))
