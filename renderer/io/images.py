@@ -54,7 +54,6 @@ MAX_STEP = 4
 
 def read_image(path: str | Path, size: Size) -> Float[Tensor, "3 height width"]:
     """Read the center of an image file, in the shape of `size`, as RGB values in [0, 1]."""
-    require_file(path, "give an image file")
     with reading(path, "cannot be read as an image"):
         square = read_center(path, size)
     # Pages of results need no tensors, and do not wait for this import.

@@ -132,7 +132,6 @@ def render_attacked(
 
 def read_file(path: str) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image file in sRGB at its full size, rotated as its EXIF orientation says."""
-    require_file(path, "give an image file")
     with explained(f"{path} cannot be read", "give an image file"):
         # Images whose shorter side has more pixels than this may be reduced.
         return np.asarray(read_rgb(Path(path), 10**6))
