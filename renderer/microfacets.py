@@ -24,8 +24,9 @@ from torch import Tensor
 
 from renderer.vectors import unit
 
-# One number for each of any number of points.
+# One number, or one vector, for each of any number of points.
 Numbers = Float[Tensor, " ..."]
+Vectors = Float[Tensor, "... 3"]
 # Refractive index of dielectric (non-metallic) surfaces. 1.5 is typical of varnish, and
 # the default of glTF.
 REFRACTIVE_INDEX = 1.5
@@ -37,10 +38,7 @@ SCHLICK, EDGE, DIELECTRIC = range(3)
 
 
 def reflectance(
-    normals: Float[Tensor, "... 3"],
-    toward: Float[Tensor, "... 3"],
-    directions: Float[Tensor, "... 3"],
-    roughness: Numbers,
+    normals: Vectors, toward: Vectors, directions: Vectors, roughness: Numbers
 ) -> Float[Tensor, "3 ..."]:
     """Compute π times the specular reflectance (BRDF) for light from single directions.
 

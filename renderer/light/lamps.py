@@ -19,6 +19,7 @@ from renderer.io.images import gray_or_image
 from renderer.io.mitsuba_entries import pose_of, projector
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.files import read_light
+from renderer.microfacets import Vectors
 from renderer.settings import Settings, setting
 from renderer.vectors import tangent_axes
 
@@ -351,10 +352,7 @@ class Lamps(LocalBasis):
         return positions[:, None] + offsets
 
     def _irradiance(
-        self,
-        to_lamp: Float[Tensor, "... 3"],
-        normals: Float[Tensor, "... 3"],
-        positions: Float[Tensor, "... 3"],
+        self, to_lamp: Vectors, normals: Vectors, positions: Vectors
     ) -> Float[Tensor, " ..."]:
         """Compute irradiance for a coefficient of 1, at most 0 behind the surface or a disc."""
         squared_distance = to_lamp.square().sum(-1)

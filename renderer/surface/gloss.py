@@ -44,7 +44,7 @@ from torch import Tensor
 from renderer.errors import InputError, as_tensor, require_flag
 from renderer.light.harmonics import bands, lambertian_factors
 from renderer.mesh import Mesh, require_mesh
-from renderer.microfacets import DIELECTRIC, EDGE, SCHLICK, reflectance
+from renderer.microfacets import DIELECTRIC, EDGE, SCHLICK, Vectors, reflectance
 from renderer.settings import MIN_ROUGHNESS
 from renderer.surface import lobes
 from renderer.surface.albedo import Texture, sample_textures
@@ -256,10 +256,7 @@ class SampleGloss(NamedTuple):
         return colored_transfer, frame.harmonics(white_lobe), frame
 
     def reflect_beams(
-        self,
-        normals: Float[Tensor, "... 3"],
-        toward: Float[Tensor, "... 3"],
-        directions: Float[Tensor, "... 3"],
+        self, normals: Vectors, toward: Vectors, directions: Vectors
     ) -> tuple[Tensor, Tensor]:
         """Compute the specular radiance per irradiance for light from single directions.
 
