@@ -136,11 +136,8 @@ class ShadedView:
             summands.append(self._indirect_radiance())
         for basis, coefficients in self.light.local_lights:
             assert self.lamp_view is not None
-            summands.append(
-                self.lamp_view.radiance(
-                    basis, self.albedo, coefficients, self.lamp_positions, fragments
-                )
-            )
+            shown = basis, self.albedo, coefficients, self.lamp_positions, fragments
+            summands.append(self.lamp_view.radiance(*shown))
         given_summands = [summand for summand in summands if summand is not None]
         if not given_summands:
             return torch.zeros(3, len(fragments.pixels)).to(self.albedo)

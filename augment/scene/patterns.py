@@ -142,14 +142,11 @@ def draw_patterns(
     # Without points, the coordinates of columns and rows are enough.
     x, y = _centers(*height_and_width(size)) if points is None else points
     # Draw all numbers of one pattern before those of the next.
-    drawn = [
-        (
-            torch.rand(4, generator=draws),
-            torch.randint(len(FAMILIES), (), generator=draws),
-            torch.rand(5, generator=draws),
-        )
-        for _ in range(count)
-    ]
+    drawn = []
+    for _ in range(count):
+        position = torch.rand(4, generator=draws)
+        family = torch.randint(len(FAMILIES), (), generator=draws)
+        drawn.append((position, family, torch.rand(5, generator=draws)))
     # Shapes (count, 4), (count,) and (count, 5).
     positions, family_of_pattern, colors = map(torch.stack, zip(*drawn, strict=True))
     # Four numbers in [0, 1] of each pattern, each of shape (count, 1, 1): angle as a fraction of

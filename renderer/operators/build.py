@@ -126,12 +126,8 @@ def _build(
         dense.sort(key=lambda part: part[0][:1].tolist())
         channel_count = 2 if is_glossy and albedo.shape[1] == 1 else albedo.shape[1]
         empty = torch.empty(channel_count, 0, pixel_count, dtype=dtype)
-        dense = [
-            (
-                torch.cat([torch.arange(0), *(coefficients for coefficients, _ in dense)]),
-                torch.cat([empty, *(transfer for _, transfer in dense)], dim=1),
-            )
-        ]
+        every = torch.cat([torch.arange(0), *(coefficients for coefficients, _ in dense)])
+        dense = [(every, torch.cat([empty, *(transfer for _, transfer in dense)], dim=1))]
     [(nonzero, transfer)] = dense
     parts = transfer, pixel_albedo.T.to(dtype), fragments.coverage.to(dtype)
     return [

@@ -371,11 +371,8 @@ def local_transfer(
     key_of_path = pixel_of_path * basis.size + paths.function
     keys, path_to_entry = key_of_path.unique(return_inverse=True)
     zeros = weights.new_zeros(len(keys), albedo.shape[1])
-    return SparseTransfer(
-        function=keys % basis.size,
-        pixel=keys // basis.size,
-        weight=zeros.index_add_(0, path_to_entry, weights),
-    )
+    weight = zeros.index_add_(0, path_to_entry, weights)
+    return SparseTransfer(function=keys % basis.size, pixel=keys // basis.size, weight=weight)
 
 
 def path_reflectance(

@@ -317,10 +317,7 @@ class OperatorStack:
     """
 
     def __init__(
-        self,
-        operators: Sequence[TransferOperator],
-        shown: Int[Tensor, " N"],
-        device: torch.device | str = "cpu",
+        self, operators: Sequence[TransferOperator], shown: Int[Tensor, " N"], device: torch.device
     ):
         """Copy operators into common tensors.
 

@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
+from typing import Any
 
 import numpy as np
 import torch
@@ -201,11 +202,9 @@ def paint_faces(
     # First, change the colors of the corners of faces and interpolate them, as if no face
     # had a texture. The three corners of a face have the same hue and added color.
     corner_albedo = _corner_albedo(mesh, fragments, encoding, added) * albedo_scale
-    painted_corners = changed_albedo(
-        corner_albedo,
-        None if hue_of_face is None else hue_of_face[:, None],
-        added.index_select(0, fragments.faces)[:, None],
-    )
+    hue_at_corners = None if hue_of_face is None else hue_of_face[:, None]
+    added_at_corners = added.index_select(0, fragments.faces)[:, None]
+    painted_corners = changed_albedo(corner_albedo, hue_at_corners, added_at_corners)
     albedo = fragments.interpolate(painted_corners)
     if not mesh.textures:
         return albedo
@@ -367,14 +366,9 @@ def with_added_albedo(
         textures.append(new_texture)
         gloss_textures.append(new_gloss)
         uvs[faces] = charts.uvs
-    baked = replace(
-        mesh,
-        corner_colors=colors,
-        corner_uvs=uvs,
-        textures=tuple(textures),
-        gloss_textures=tuple(gloss_textures) if mesh.gloss_textures else (),
-    )
-    return baked, new_scale
+    sheets: dict[str, Any] = {"textures": tuple(textures)}
+    sheets["gloss_textures"] = tuple(gloss_textures) if mesh.gloss_textures else ()
+    return replace(mesh, corner_colors=colors, corner_uvs=uvs, **sheets), new_scale
 
 
 def _texels_at(
