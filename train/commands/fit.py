@@ -134,7 +134,7 @@ def read_file(path: str) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image file in sRGB at its full size, rotated as its EXIF orientation says."""
     with explained(f"{path} cannot be read", "give an image file"):
         # Images whose shorter side has more pixels than this may be reduced.
-        return np.asarray(read_rgb(Path(path), 10**6))
+        return np.asarray(read_rgb(path, 10**6))
 
 
 def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height width"]:
