@@ -29,9 +29,9 @@ from renderer.settings import Size, height_and_width
 
 # `check` repeats an attack with these multiples of its number of steps.
 GROWTH = (3, 10)
-# Masks of the examples for which an attack has succeeded: also with sensor noise, and without it.
+# Masks of all N examples for which an attack has succeeded: also with sensor noise, and without it.
 # The functions that add successes change them in place.
-Successes = Bool[Tensor, "2 E"]
+Successes = Bool[Tensor, "2 N"]
 
 
 def check(result: AttackResult) -> dict[str, Any]:
@@ -325,7 +325,7 @@ def _add_successes(
         found[:, examples] |= torch.stack([fooled_in_views.all(1), without_noise])
 
 
-def _rates(found: Successes, is_counted: Bool[Tensor, " E"]) -> list[float]:
+def _rates(found: Successes, is_counted: Bool[Tensor, " N"]) -> list[float]:
     """Return the fractions of successes, with and without noise, among some examples."""
     return [_fraction(mask) for mask in found[:, is_counted]]
 
