@@ -59,12 +59,11 @@ def build_operators(
     """Compute the transfer operators of a mesh for several cameras.
 
     Surfaces are shaded on the side that the camera sees. A `gloss` of None is that of the
-    mesh. A GPU computes those of matte surfaces without rays, and many of them at once.
+    mesh. A GPU computes those without rays, and many of them at once.
     """
-    is_matte = mesh.gloss is None and gloss is None
     casts_rays = settings.global_illumination or bool(basis.local_lights)
     vertices: Any = mesh.vertices
-    if is_matte and not casts_rays and torch.device(device).type == "cuda":
+    if not casts_rays and torch.device(device).type == "cuda":
         vertices = torch.from_numpy(vertices).to(device)
     shown = vertices, mesh.faces, cameras, settings, rasterizer, mesh.closed
     views = build_fragments(*shown, 1 if casts_rays else views_at_once(settings, vertices))
@@ -269,7 +268,8 @@ def _glossy_box_filter(
     fragments = surface.fragments
     is_shared = albedo.shape[1] == 1
     channel_count = 2 if is_shared else COLORS
-    transfer = torch.zeros(channel_count, basis.size, len(fragments.pixels), dtype=dtype)
+    shape = channel_count, basis.size, len(fragments.pixels)
+    transfer = torch.zeros(shape, dtype=dtype, device=albedo.device)
     # Index of the channels to which reflection with the color of the light is added.
     white_channels = 1 if is_shared else slice(None)
     weights = albedo / fragments.samples**2
@@ -278,7 +278,7 @@ def _glossy_box_filter(
     for first_pixel in range(0, len(fragments.pixels), pixels_per_block):
         # Writing to this view of some columns fills the matrix.
         block_transfer = transfer[..., first_pixel : first_pixel + pixels_per_block]
-        block_ends = torch.tensor([first_pixel, first_pixel + pixels_per_block])
+        block_ends = fragments.pixels.new_tensor([first_pixel, first_pixel + pixels_per_block])
         samples = slice(*torch.searchsorted(fragments.sample_to_pixel, block_ends).tolist())
         pixels = fragments.sample_to_pixel[samples] - first_pixel
         sum_by_pixel = partial(_sum_by_pixel, pixels, block_transfer.shape[2])
