@@ -291,8 +291,8 @@ def precompute_transfer(
             or more includes shadows.
         rasterizer: Program that finds the visible faces: "auto", "opengl", "numba",
             "numpy" or "torch".
-        device: Device of the operators, such as "cuda". A GPU computes those of matte
-            surfaces itself, many views at once, except for shadows and bounces.
+        device: Device of the operators, such as "cuda". A GPU computes those without
+            shadows, bounces, projectors and lamps itself, many views at once.
 
     Returns:
         The operator for one camera, or the sequence of operators for a list of
