@@ -4,11 +4,11 @@
 maps the coefficients of the light to the pixels of one view. The objects are rasterized once, and
 each further light costs a matrix product.
 
-`DirectRenderer` renders objects whose vertices, colors, gloss or lamps change, one view at a time.
-Each view of moved vertices is rasterized again. The shadows and bounces of environment light take
-long to compute. `FrozenTransport` keeps them for one shape, and they are used again while the
-vertices are within `NEAR` of this shape. The shadows of projector and lamps are always those of
-the moved shape itself (`renderer.operators.rays`).
+`DirectRenderer` renders objects whose vertices, colors, gloss or lamps change, several small views
+at a time if no rays are cast. Each view of moved vertices is rasterized again. The shadows and
+bounces of environment light take long to compute. `FrozenTransport` keeps them for one shape, and
+they are used again while the vertices are within `NEAR` of this shape. The shadows of projector and
+lamps are always those of the moved shape itself (`renderer.operators.rays`).
 """
 
 import math
@@ -42,7 +42,7 @@ from renderer.shaded_view import PixelRadiance, ShadedView
 from renderer.surface.albedo import paint_faces, surface_albedo
 from renderer.surface.gloss import Gloss
 from renderer.visibility import Rasterizer
-from renderer.visibility.fragments import Fragments, build_fragments
+from renderer.visibility.fragments import Fragments, build_fragments, views_at_once
 
 
 class Layer(NamedTuple):
@@ -315,8 +315,8 @@ class DirectRenderer:
 
     def __post_init__(self) -> None:
         """Create empty caches."""
-        # Rasterized views of unmoved objects. A key has the index of the object, and the camera.
-        self._views: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
+        # Rasterized views of unmoved objects. A key has the index of the object, and the cameras.
+        self._views: dict[tuple[int, tuple[Camera, ...]], tuple[Fragments, Tensor]] = {}
         # Views of unmoved objects that were prepared for the light of projector and lamps.
         self._local_views: dict[tuple[int, Camera], LocalLightView] = {}
         # Ray tracers, and shadows and bounces, of unmoved objects by their indices.
@@ -330,18 +330,18 @@ class DirectRenderer:
         """Return the vertices of each object before any change, each of shape (V, 3)."""
         return [torch.from_numpy(item.mesh.vertices).to(self.like) for item in self.objects]
 
-    def view(self, object_index: int, camera: Camera) -> tuple[Fragments, Tensor]:
+    def view(self, object_index: int, *cameras: Camera) -> tuple[Fragments, Tensor]:
         """Rasterize an object whose vertices have not moved.
 
-        Return the S samples that the camera sees, and the albedo at the samples, shape (S, 3).
+        Return the S samples that the cameras see, and the albedo at the samples, shape (S, 3).
         """
-        key = (object_index, camera)
+        key = (object_index, cameras)
         if key not in self._views:
             if sum(len(albedo) for _, albedo in self._views.values()) > KEPT_SAMPLES:
                 self._views.clear()
             mesh = self.objects[object_index].mesh
             vertices = torch.as_tensor(mesh.vertices, device=self.like.device)
-            shown = (object_index, camera, vertices, self.settings)
+            shown = (object_index, cameras, vertices, self.settings)
             self._views[key] = self._rasterize(*shown)
         return self._views[key]
 
@@ -430,36 +430,45 @@ class DirectRenderer:
         mesh = self.objects[object_index].mesh
         if vertices is None:
             return mesh, self.view(object_index, camera)[0].to("cpu")
-        fragments, _ = self._rasterize(object_index, camera, vertices, self.settings)
+        fragments, _ = self._rasterize(object_index, [camera], vertices, self.settings)
         return _moved(mesh, vertices), fragments.to("cpu")
+
+    def views_at_once(self) -> int:
+        """Return how many views `radiance` renders at once: one, if rays or silhouettes need it."""
+        casts_rays = self.settings.global_illumination or bool(self.basis.local_lights)
+        is_single = casts_rays or self.settings.silhouettes
+        return 1 if is_single else views_at_once(self.settings, self.like)
 
     def radiance(
         self,
         example: int,
         object_index: int,
-        camera: Camera,
+        cameras: Sequence[Camera],
         light: Float[Tensor, "K 3"],
         changed: Conditions,
         background: Float[Tensor, "_ pixels"],
         is_draft: bool = False,
     ) -> PixelRadiance:
-        """Render a view of an object with changed shape, colors, gloss or lamps.
+        """Render `views_at_once` views of an object with changed shape, colors, gloss or lamps.
 
-        The result is differentiable in the light and in all changes. With
-        `settings.silhouettes`, it is also differentiable in fields of the
-        camera that are tensors. A draft of moved vertices with shadows or bounces has fewer samples
-        and rays.
+        Their images are one tall image. The result is differentiable in the light and in all
+        changes. With `settings.silhouettes`, it is also differentiable in fields of the camera that
+        are tensors. A draft of moved vertices with shadows or bounces has fewer samples and rays.
         """
         item = self.objects[object_index]
-        fixed_camera = camera.fixed()
+        fixed_cameras = tuple(camera.fixed() for camera in cameras)
+        # Only views that are rendered alone need their camera.
+        camera, fixed_camera = cameras[0], fixed_cameras[0]
         moved = changed.vertices
         # Without shadows, the images of a search are not rendered again, so they are no drafts.
         has_draft = is_draft and moved is not None and self.settings.global_illumination
         settings = self.settings
         if has_draft:
             settings = replace(settings, samples=min(settings.samples, DRAFT_SAMPLES))
-        seen = object_index, fixed_camera
-        rasterized = self.view(*seen) if moved is None else self._rasterize(*seen, moved, settings)
+        if moved is None:
+            rasterized = self.view(object_index, *fixed_cameras)
+        else:
+            rasterized = self._rasterize(object_index, fixed_cameras, moved, settings)
         fragments, albedo = rasterized
         if changed.albedo is not None:
             of_view = (item.mesh, fragments, settings.encoding, item.albedo_scale)
@@ -487,7 +496,7 @@ class DirectRenderer:
                 shown = rasterized
                 if not np.array_equal(frozen.mesh.vertices, positions):
                     vertices = torch.as_tensor(frozen.mesh.vertices, device=self.like.device)
-                    shown = self._rasterize(object_index, fixed_camera, vertices, settings)
+                    shown = self._rasterize(object_index, fixed_cameras, vertices, settings)
                 frozen.add(view, *shown, light if self.one_light else None)
             added = frozen.radiance(view, fragments, albedo, light)
             # A camera whose fields are tensors is attacked, so it differs in each call. Its views
@@ -542,14 +551,14 @@ class DirectRenderer:
     def _rasterize(
         self,
         object_index: int,
-        camera: Camera,
+        cameras: Sequence[Camera],
         vertices: Float[Tensor, "V 3"],
         settings: ImageSettings,
     ) -> tuple[Fragments, Tensor]:
         """Find the samples that show an object with given vertices, and their albedo (S, 3)."""
         item = self.objects[object_index]
-        shown = (vertices, item.mesh.faces, [camera], settings, self.rasterizer)
-        [fragments] = build_fragments(*shown, closed=item.mesh.closed)
+        shown = (vertices, item.mesh.faces, cameras, settings, self.rasterizer)
+        [fragments] = build_fragments(*shown, item.mesh.closed, at_once=len(cameras))
         fragments = fragments.to(self.like.device)
         albedo = surface_albedo(item.mesh, fragments, settings.encoding)
         return fragments, (albedo * item.albedo_scale).to(self.like)

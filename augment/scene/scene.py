@@ -27,6 +27,7 @@ from renderer.operators.build import build_operators
 from renderer.operators.stack import ScatterLayers
 from renderer.settings import ImageSettings
 from renderer.visibility import Rasterizer
+from renderer.visibility.fragments import split_views
 
 # Largest total number of pixels of the images that are rendered at a time.
 AT_ONCE = 2**24
@@ -531,26 +532,35 @@ class Scene:
     def _render_directly(
         self, conditions: Conditions, examples: Int[Tensor, " A"], is_draft: bool
     ) -> Iterator[Layer]:
-        """Render each view of examples by rasterization, without transfer operators.
+        """Render views of examples by rasterization, without transfer operators.
 
         The light of the conditions is multiplied by the exposure already. There is one layer for
         each of the A · V images.
         """
-        row_and_view: Iterable[tuple[int, int]] = product(range(len(examples)), range(self.views))
+        at_once = self._direct_renderer.views_at_once()
+        # Row of the conditions, and first view, of each group of views that are rendered together.
+        groups: Iterable[tuple[int, int]] = product(
+            range(len(examples)), range(0, self.views, at_once)
+        )
         if len(examples) * self.views > MAX_VIEWS_WITHOUT_PROGRESS:
-            row_and_view = progress(list(row_and_view), "rendering views")
-        for image, (row, view) in enumerate(row_and_view):
-            example_index = int(_on_cpu(examples)[row])
-            example = self.examples[example_index]
-            camera = self.cameras_under(conditions, row, example_index)[view]
-            background = self.backgrounds[example.background].flatten(1)
-            changed = conditions.row(row, self.mesh(example_index))
-            shown = example_index, example.object, camera, changed.light, changed, background
+            groups = progress(list(groups), "rendering views")
+        numbers = _on_cpu(examples).tolist()
+        for row, first in groups:
+            example = self.examples[numbers[row]]
+            all_cameras = self.cameras_under(conditions, row, numbers[row])
+            cameras = all_cameras[first : first + at_once]
+            background = self.backgrounds[example.background].flatten(1).repeat(1, len(cameras))
+            changed = conditions.row(row, self.mesh(numbers[row]))
+            shown = numbers[row], example.object, cameras, changed.light, changed, background
             pixels, coverage, radiance = self._direct_renderer.radiance(*shown, is_draft)
-            background_pixels = background.index_select(1, pixels)
             # Pixels at the border of the object show a part of the background.
-            term = background_term(coverage[None], background_pixels, self.settings.encoding)
-            yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])
+            behind = background.index_select(1, pixels)
+            term = background_term(coverage[None], behind, self.settings.encoding)
+            parts = split_views(pixels, len(cameras), self.settings.pixel_count, radiance + term)
+            for image, (pixels_of_view, composite) in enumerate(
+                parts, start=row * self.views + first
+            ):
+                yield Layer(slice(image, image + 1), pixels_of_view, composite[None])
 
 
 def _on_cpu(indices: Tensor) -> Tensor:

@@ -125,13 +125,7 @@ class Fragments:
 
     def of_views(self, *values: Shaped[Tensor, "*axes P"]) -> list[tuple[Tensor, ...]]:
         """Split values at the P pixels by view. Before them, return the pixels in the image."""
-        if len(self.cameras) < 2:
-            return [(self.pixels, *values)]
-        size = math.prod(self.shape)
-        view = self.pixels.div(size, rounding_mode="floor")
-        sizes = view.bincount(minlength=len(self.cameras)).tolist()
-        split = [part.split(sizes, dim=-1) for part in (self.pixels % size, *values)]
-        return list(zip(*split, strict=True))
+        return split_views(self.pixels, len(self.cameras), math.prod(self.shape), *values)
 
     @cached_property
     def barycentric(self) -> Tensor:
@@ -280,6 +274,18 @@ class Fragments:
         tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
         moved: dict[str, Any] = {name: tensor.to(device) for name, tensor in tensors.items()}
         return replace(self, **moved)
+
+
+def split_views(
+    pixels: Int[Tensor, " P"], view_count: int, view_size: int, *values: Shaped[Tensor, "*axes P"]
+) -> list[tuple[Tensor, ...]]:
+    """Split pixels of a tall image of several views, and values there, by view."""
+    if view_count < 2:
+        return [(pixels, *values)]
+    view = pixels.div(view_size, rounding_mode="floor")
+    sizes = view.bincount(minlength=view_count).tolist()
+    split = [part.split(sizes, dim=-1) for part in (pixels % view_size, *values)]
+    return list(zip(*split, strict=True))
 
 
 class _Interpolation(torch.autograd.Function):

@@ -254,6 +254,24 @@ def test_several_meshes_are_rendered_as_each_is_alone(several, examples, changed
 SIZES = {"geometry": lambda one: 3 * len(one.vertices), "albedo": lambda one: 3 * len(one.faces)}
 
 
+@pytest.mark.parametrize("at_once", [2, 3])
+@pytest.mark.parametrize("normals", ["smooth", "flat"])
+def test_views_that_are_rendered_together_are_those_that_are_rendered_alone(
+    normals, at_once, monkeypatch
+):
+    scene = built("ball", "cup", views=5, normals=normals, backgrounds=[0.2, 0.7], encoding="srgb")
+    examples = torch.arange(len(scene))
+    vertices = (1.05 * scene.vertices[scene.object_of[examples]]).requires_grad_()
+    conditions = replace(scene.conditions(examples), vertices=vertices)
+    found = []
+    for count in (1, at_once):
+        monkeypatch.setattr(render.DirectRenderer, "views_at_once", lambda self, count=count: count)
+        images = scene.render(conditions, examples)
+        found.append((images, *torch.autograd.grad(images.square().sum(), vertices)))
+    for alone, together in zip(*found, strict=True):
+        torch.testing.assert_close(together, alone, rtol=0, atol=2e-5)
+
+
 @pytest.mark.parametrize("name", SIZES)
 def test_a_smaller_mesh_draws_and_has_gradients_of_its_own_values_only(name, several):
     parameter = make_parameter(name, several, StepSettings("l2", 0.2))

@@ -118,16 +118,14 @@ def test_a_parameter_starts_at_the_scene_as_it_is(make_scene, name):
 
 @pytest.fixture
 def fixed_visibility(monkeypatch) -> None:
-    """Show each camera what it saw first, which is what the analytic gradient assumes."""
+    """Show cameras what they saw first, which is what the analytic gradient assumes."""
     build = render.build_fragments
-    seen_by_camera = {}
+    seen = {}
 
-    def build_once(vertices, faces, cameras, settings, rasterizer, closed=False):
-        camera = cameras[0]
-        if camera not in seen_by_camera:
-            fragments = build(vertices, faces, cameras, settings, rasterizer, closed=closed)
-            seen_by_camera[camera] = fragments
-        return seen_by_camera[camera]
+    def build_once(vertices, faces, cameras, *others, **options):
+        if cameras not in seen:
+            seen[cameras] = build(vertices, faces, cameras, *others, **options)
+        return seen[cameras]
 
     monkeypatch.setattr(render, "build_fragments", build_once)
 
@@ -310,8 +308,8 @@ def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):
     ("names", "steps", "expected"),
     [
         (("lighting", "pixels"), 3, [3]),  # All cameras at once.
-        (("lighting", "albedo"), 3, [1, 1, 1]),  # Each camera once.
-        (("lighting", "geometry"), 2, [1] * 3 * 6),  # Six views of three images.
+        (("lighting", "albedo"), 3, [2, 2, 2]),  # The two cameras of each example once.
+        (("lighting", "geometry"), 2, [2] * 3 * 3),  # Three examples of three images.
     ],
 )
 def test_only_an_attack_on_shape_rasterizes_in_every_step(
