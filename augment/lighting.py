@@ -75,7 +75,8 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
     - "linear", "fractal": light that rises from side to side, or is cloudy,
     - "color_temperature": black-body light with a wrong white balance,
     - "low_light": little light, with the noise of a camera,
-    - "highlights": an exposure that is too long.
+    - "highlights": an exposure that is too long,
+    - "stripes": stripes, waves or one border of a scanner, of full contrast.
 
     A sample may have the key "depth": distances from the camera in any unit,
     with the height and width of the images. "projected_slide", "directional",
@@ -84,7 +85,8 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
 
     Args:
         lights: Names or objects of the models, of which one is drawn for each
-            image, or a dictionary of their relative weights. None for all.
+            image, or a dictionary of their relative weights. None for all but
+            "stripes".
         p: Probability that an image is changed.
         strength: Fraction of the light that is random, in [0, 1]. At 0, images
             stay as they are.
@@ -114,7 +116,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         super().__init__()
         errors.require_number("p", p, 0, 1)
         errors.require_number("strength", strength, 0, 1)
-        given = [*MODELS] if lights is None else lights
+        given = [name for name in MODELS if name != "stripes"] if lights is None else lights
         if not isinstance(given, Mapping):
             named = [given] if isinstance(given, str | LightModel) else given
             expected = "names, or models of nb.lights"

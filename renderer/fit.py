@@ -387,10 +387,16 @@ class _Target(NamedTuple):
         lowest = [MIN_POLE_ANGLE, -np.inf, 0.5, -1.0, -1.0]
         highest = [math.pi - MIN_POLE_ANGLE, np.inf, 2.0, 1.0, 1.0]
         start = [math.radians(first.polar), math.radians(first.azimuth), 1.0, *shift]
-        limits: dict[str, Any] = {"bounds": (lowest, highest), "max_nfev": MAX_STEPS}
-        limits |= {"ftol": MIN_GAIN, "xtol": MIN_GAIN}
-        within = np.clip(start, lowest, highest)
-        solution = least_squares(residuals, within, jacobian, x_scale="jac", **limits)
+        solution = least_squares(
+            residuals,
+            np.clip(start, lowest, highest),
+            jacobian,
+            bounds=(lowest, highest),
+            x_scale="jac",
+            ftol=MIN_GAIN,
+            xtol=MIN_GAIN,
+            max_nfev=MAX_STEPS,
+        )
         return camera_of(solution.x)
 
     def fit_final_light(self, camera: Camera) -> FittedScene:

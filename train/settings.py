@@ -88,8 +88,10 @@ TRANSFORMS = ("color_jitter", "exposure_jitter", "trivial_augment", "augmix", "c
 RELIGHT = "relight"
 # Augmentation by low light with the noise of a camera, alone or for every second image.
 LOW_LIGHT, RELIGHT_AND_LOW_LIGHT = "low_light", "relight+low_light"
+# Augmentation by the stripes of a scanner.
+STRIPES = "stripes"
 # Choices of train.augmentation.
-AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT, LOW_LIGHT, RELIGHT_AND_LOW_LIGHT)
+AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT, LOW_LIGHT, RELIGHT_AND_LOW_LIGHT, STRIPES)
 # Choices of train.optimizer.
 OPTIMIZERS = ("sgd", "adamw")
 # Choices of train.flips.
@@ -261,7 +263,8 @@ class TrainSettings(Settings):
     flips: str = setting("random", "Flips of random images, or in alternate epochs.", choices=FLIPS)
     augmentation: str = setting(
         "none",
-        "relight: light of a projector. low_light: few photons. relight+low_light: both in turn.",
+        "relight: light of a projector. low_light: few photons. relight+low_light: both in turn. "
+        "stripes: light of a scanner.",
         choices=AUGMENTATIONS,
     )
     relight_gain: float = setting(

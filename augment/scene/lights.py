@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -27,29 +26,10 @@ from torch import Tensor
 
 from augment.scene import loops, patterns, surfaces
 from augment.scene.black_body import planckian_rgb
+from augment.scene.surfaces import Range, limits
 from renderer import errors
 from renderer.errors import InputError
 from renderer.settings import Size, height_and_width
-
-
-class Range(NamedTuple):
-    """Smallest and largest value of a number, and whether its logarithm is uniform."""
-
-    low: float
-    high: float
-    is_geometric: bool = False
-
-
-@lru_cache(maxsize=64)
-@torch.inference_mode(False)
-def _ranges(
-    ranges: tuple[Range, ...], device: torch.device, dtype: torch.dtype
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the low ends and the widths of ranges, and where they are of logarithms."""
-    ends = [[math.log(end) if log else end for end in (low, high)] for low, high, log in ranges]
-    low, high = torch.tensor(ends, device=device, dtype=dtype).T.contiguous()
-    return low, high - low, torch.tensor([each.is_geometric for each in ranges], device=device)
-
 
 # Ranges of the numbers that several models have.
 TURN = Range(0, 2 * math.pi)
@@ -154,7 +134,7 @@ class LightModel:
         seeds: Sequence[int] = (),
     ) -> Drawn:
         """Map the numbers of the lights of images to their ranges."""
-        low, span, is_geometric = _ranges(self.ranges, values.device, values.dtype)
+        low, span, is_geometric = limits(self.ranges, values.device, values.dtype)
         numbers = torch.addcmul(low, span, values[:, : self.dimensions])
         numbers = torch.where(is_geometric, numbers.exp(), numbers)
         return Drawn(numbers, values[:, self.dimensions :], size, depth, seeds)
@@ -563,6 +543,37 @@ class ClippedHighlights(LightModel):
         return Illumination(torch.exp2(drawn.numbers[0]))
 
 
+@dataclass(frozen=True)
+class Stripes(LightModel):
+    """A scanner projects stripes, waves or one border, of full contrast, on an object (Geng 2011).
+
+    They are along rows or columns, bend with a random smooth surface, and jump where it ends. No
+    meter sets the exposure.
+    """
+
+    # Period in half widths, position in periods, slope in radians, bend and jump in periods,
+    # ambient light, and exposure.
+    ranges = (
+        *(Range(0.05, 2.0, True), Range(0, 1), Range(-0.2, 0.2), Range(0, 0.5), Range(-0.5, 0.5)),
+        *(Range(0.01, 0.4, True), Range(0.3, 2.0, True)),
+    )
+    constants = 3 + 2 * surfaces.SURFACE_NODES**2
+
+    def light(self, drawn: Drawn) -> Illumination:
+        """Compute stripes whose edges are blurred by one to five pixels."""
+        period, phase, slope, bend, jump, ambient, exposure = drawn.numbers
+        is_upright, kind, blur = drawn.constants[:, :3].T[..., None, None, None]
+        nodes = surfaces.normal_numbers(drawn.constants[:, 3:])
+        nodes = nodes.view(-1, 2, surfaces.SURFACE_NODES, surfaces.SURFACE_NODES)
+        bent, side = surfaces.smooth(nodes, drawn.size).split(1, 1)
+        x, y = surfaces.axes(drawn.size, period)
+        turn = slope + math.pi / 2 * (is_upright < 0.5)
+        place = turn.cos() * x + turn.sin() * y + period * (bend * bent + jump * (side > 0))
+        edge = surfaces.between(blur, 1, 5) / height_and_width(drawn.size)[1]
+        pattern = patterns.waves(place, period, phase, kind, edge)
+        return Illumination(pattern, exposure * (1 - ambient), exposure * ambient)
+
+
 # Each model of light, by the name that selects it.
 MODELS: dict[str, type[LightModel]] = {
     "projected_slide": ProjectedSlide,
@@ -575,4 +586,5 @@ MODELS: dict[str, type[LightModel]] = {
     "color_temperature": ColorTemperature,
     "low_light": LowLight,
     "highlights": ClippedHighlights,
+    "stripes": Stripes,
 }

@@ -85,6 +85,19 @@ def solid(points: Points, shift: Tensor | float = 0.0) -> Float[Tensor, " ..."]:
     return torch.ones_like(points[0])
 
 
+def waves(
+    place: Pictures, period: Tensor, phase: Tensor, kind: Tensor, edge: Tensor
+) -> Float[Tensor, "N 1 H W"]:
+    """Return the light of a scanner: stripes if `kind` is below 0.6, waves below 0.8, one border.
+
+    It is in [0, 1] and differentiable. Period and width of the edges are lengths, as `place` is.
+    """
+    wave = torch.sin(2 * math.pi * (place / period + phase))
+    stripes = torch.sigmoid(wave * period / edge / 2)
+    border = torch.sigmoid((place + 1.6 * phase - 0.8) / edge * 2)
+    return torch.where(kind < 0.6, stripes, torch.where(kind < 0.8, (1 + wave) / 2, border))
+
+
 # Kinds of patterns, of which `draw_patterns` chooses at random.
 FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (stripes, checkers, spots, half, solid)
 

@@ -29,6 +29,25 @@ MAX_POLAR = 60.0
 FIELD_OF_VIEW = 60.0
 
 
+class Range(NamedTuple):
+    """Smallest and largest value of a number, and whether its logarithm is uniform."""
+
+    low: float
+    high: float
+    is_geometric: bool = False
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def limits(
+    ranges: tuple[Range, ...], device: torch.device, dtype: torch.dtype
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the low ends and the widths of ranges, and where they are of logarithms."""
+    ends = [[math.log(end) if log else end for end in (low, high)] for low, high, log in ranges]
+    low, high = torch.tensor(ends, device=device, dtype=dtype).T.contiguous()
+    return low, high - low, torch.tensor([each.is_geometric for each in ranges], device=device)
+
+
 def between(numbers: Tensor, low: float, high: float) -> Tensor:
     """Map numbers in [0, 1] to an interval."""
     return low + (high - low) * numbers

@@ -1,7 +1,8 @@
 """Augmentations of training batches.
 
 The usual ones, with which training on renders is compared, are image transforms of torchvision and
-adversarial attacks on pixels (PGD). "relight" shows the images in the light of a projector.
+adversarial attacks on pixels (PGD). "relight" shows the images in the light of a projector, and
+"stripes" in that of a scanner.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ from augment.tasks.classification import ClassCriterion, label_loss
 from renderer.errors import MAX_SCALE
 from renderer.image import decode, to_bytes, to_unit
 from renderer.vectors import Ball, nearest_in_box
-from train.settings import LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, TrainSettings
+from train.settings import LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, STRIPES, TrainSettings
 
 # Norm-ball and step size of the attack on pixels. Madry et al. (2018) use a radius of
 # 8/255 on CIFAR-10.
@@ -37,7 +38,10 @@ LIT = {
     RELIGHT: "in the light of a projector",
     LOW_LIGHT: "in low light",
     RELIGHT_AND_LOW_LIGHT: "in the light of a projector or in low light",
+    STRIPES: "in the light of a scanner",
 }
+# Fraction of the images under stripes that are gray, as those of many scanners.
+GRAY = 0.4
 
 
 def darken(images: Images, seed: int) -> Images:
@@ -68,7 +72,7 @@ def darken(images: Images, seed: int) -> Images:
 
 
 def relit(images: Images, seed: int, augmentation: str) -> Images:
-    """Show images in random light of an augmentation: low light, or else a projector's light.
+    """Show images in random light of an augmentation: low light, or a scanner's or projector's.
 
     A projector shows each image as a slide on itself.
     """
@@ -76,6 +80,14 @@ def relit(images: Images, seed: int, augmentation: str) -> Images:
 
     if augmentation == LOW_LIGHT:
         return darken(images, seed)
+    if augmentation == STRIPES:
+        from torchvision.transforms.functional import rgb_to_grayscale
+
+        shown = relight_photographs(images, seed, lights=[STRIPES])
+        is_gray = torch.rand(len(images), generator=generator(seed, "gray")) < GRAY
+        return torch.where(
+            is_gray.to(images.device).view(-1, 1, 1, 1), rgb_to_grayscale(shown, 3), shown
+        )
     shown = relight_photographs(images, seed, slides=images)
     if augmentation == RELIGHT_AND_LOW_LIGHT:
         shown[1::2] = darken(images, seed)[1::2]
@@ -114,12 +126,13 @@ class Augmentation:
             return self._attack_pixels(images, labels, step)
         if name == RELIGHT:
             return self._relight(images, step)
-        if name in (LOW_LIGHT, RELIGHT_AND_LOW_LIGHT):
-            dark = darken(images, stream_seed(self.seed, step, "low light", distributed.rank()))
+        if name in LIT:
+            seed = stream_seed(self.seed, step, "low light", distributed.rank())
+            shown = relit(images, seed, STRIPES if name == STRIPES else LOW_LIGHT)
             if name == RELIGHT_AND_LOW_LIGHT:
                 # Half of the images are relit, and the others stay dark.
-                dark[::2] = self._relight(images, step)[::2]
-            return dark
+                shown[::2] = self._relight(images, step)[::2]
+            return shown
         # A transform of torchvision draws the same random numbers for all images of a batch, from
         # the global generator. So it is called for each image, with a seed of its own.
         transformed = []

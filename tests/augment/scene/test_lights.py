@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from scipy import ndimage
+from scipy import ndimage, signal
 
 import norm_balls as nb
 from augment.scene import lights, patterns
@@ -111,6 +111,23 @@ def test_a_ramp_has_the_mean_1_and_its_contrast():
     light = model.light(drawn).total()
     assert light.mean() == pytest.approx(1, abs=1e-5)
     assert light.min() == pytest.approx(1 - 0.8 * 0.95, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", ["stripes", "waves", "border"])
+@pytest.mark.parametrize("axis", [2, 3])
+def test_stripes_of_a_scanner_have_their_period_place_and_contrast(kind, axis):
+    """The surface is flat. The period is 8 of 64 pixels, the ambient light 0.1, the exposure 1."""
+    numbers = {0: math.log(5) / math.log(40), 1: 0.6, 2: 0.5, 3: 0.0, 4: 0.5}
+    numbers |= {5: math.log(10) / math.log(40), 6: math.log(0.3) / math.log(0.15)}
+    constants = {7: axis == 3, 8: {"stripes": 0.3, "waves": 0.7, "border": 0.9}[kind], 9: 0.0}
+    drawn = drawn_of(model := lights.Stripes(), numbers | constants, size=(64, 64))
+    light = model.illumination(drawn).total()
+    assert (light.amax(5 - axis) - light.amin(5 - axis)).max() < 1e-5
+    profile = light.mean(5 - axis).flatten().numpy()
+    x = np.arange(64) - 31.5
+    wave = 2 * math.pi * (x / 8 + 0.6)
+    expected = {"stripes": signal.square(wave), "waves": np.sin(wave), "border": np.sign(x + 5.12)}
+    np.testing.assert_allclose(profile, 0.55 + 0.45 * expected[kind], atol=0.18)
 
 
 def test_each_octave_of_cloudy_light_has_half_the_amplitude():
