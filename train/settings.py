@@ -278,6 +278,9 @@ class TrainSettings(Settings):
     distillation_weight: float = weight("the divergence from the predictions of `network`.")
     consistency_weight: float = weight("the same divergence on augmented images.")
     interpolate: bool = setting(False, "Mix weights before and after by validation (WiSE-FT).")
+    agreement: float = setting(
+        0.0, "Smallest fraction of predictions that mixed weights keep.", within=(0, 1)
+    )
     ema_decay: float = setting(0.0, "Decay of averaged weights. 0: none.", minimum=0, below=1)
     soup: bool = setting(False, "Keep the mean of all epochs, which all start with `network`.")
     eval_mode: bool | None = setting(
@@ -301,6 +304,8 @@ class TrainSettings(Settings):
         super().__post_init__()
         if self.relight_steps and not self.consistency_weight:
             raise self.wrong("relight_steps", "needs a consistency loss: set its weight")
+        if self.agreement and not self.interpolate:
+            raise self.wrong("agreement", "is of mixed weights: set interpolate=true")
 
 
 @dataclass

@@ -144,8 +144,12 @@ def interpolate(
     seed: int,
     light: str,
     weights: tuple[float, float] = (1.0, 1.0),
+    agreement: float = 0.0,
 ) -> tuple[dict[str, Tensor], float]:
     """Interpolate between two sets of weights, by the factor with the lowest loss.
+
+    Of the factors, only those count with which the network keeps at least the fraction `agreement`
+    of the predictions for unchanged images.
 
     This is WiSE-FT (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models"). The
     validation images need no labels.
@@ -169,6 +173,8 @@ def interpolate(
         relit = predict(selected, validation, device, seed, "validation", light=light)
         divergences = [kl_divergence(logits, targets).mean() for logits in (unchanged, relit)]
         losses[factor] = weights[0] * float(divergences[0]) + weights[1] * float(divergences[1])
+        if (unchanged.argmax(1) == targets.argmax(1)).double().mean() < agreement:
+            losses[factor] = torch.inf
     factor = min(losses, key=losses.__getitem__)
     console.info("weights: %.0f%% trained, %.0f%% original", 100 * factor, 100 * (1 - factor))
     return mix(initial_weights, trained, factor), factor

@@ -317,9 +317,8 @@ class Run:
         validation = self.data.train[self.held_out]
         # Weights of the losses of unchanged and of relit images.
         losses = (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0)
-        weights, factor = interpolate(
-            *networks, validation, self.settings.seed, recipe.augmentation, losses
-        )
+        light = recipe.augmentation, losses, recipe.agreement
+        weights, factor = interpolate(*networks, validation, self.settings.seed, *light)
         trainer.best |= {"model": weights, INTERPOLATION: factor}
         if distributed.rank() == 0:
             checkpoints.save(self.folder / BEST, trainer.best)
