@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from threading import Timer
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tqdm import tqdm
@@ -59,13 +59,14 @@ class Phases:
     """Timer that adds up the seconds of named parts of a computation. Parts may nest.
 
     Args:
-        device: Device of the computation. At the beginning and the end of a
-            part, the timer waits until this device is idle.
+        device: Device of the computation. A GPU records when it reaches the beginning and the end
+            of a part, so the CPU waits for it only in `take`.
     """
 
     def __init__(self, device: torch.device | str = "cpu"):
         self._device = torch.device(device)
-        self._seconds: defaultdict[str, float] = defaultdict(float)
+        # Name, beginning and end of each part since the last `take`.
+        self._parts: list[tuple[str, Any, Any]] = []
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
@@ -74,16 +75,22 @@ class Phases:
         try:
             yield
         finally:
-            self._seconds[name] += self._now() - start
+            self._parts.append((name, start, self._now()))
 
     def take(self) -> dict[str, float]:
         """Return the seconds of each part since the last call, and start again from zero."""
-        seconds = dict(self._seconds)
-        self._seconds.clear()
-        return seconds
-
-    def _now(self) -> float:
-        """Wait until the device is idle, and return the time in seconds."""
-        if self._device.type == "cuda":
+        is_on_gpu = self._device.type == "cuda"
+        if is_on_gpu:
             torch.cuda.synchronize(self._device)
-        return time.perf_counter()
+        seconds: defaultdict[str, float] = defaultdict(float)
+        for name, start, end in self._parts:
+            seconds[name] += start.elapsed_time(end) / 1000 if is_on_gpu else end - start
+        self._parts.clear()
+        return dict(seconds)
+
+    def _now(self) -> Any:
+        """Return the time in seconds, or an event at which a GPU records it."""
+        if self._device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        return torch.cuda.current_stream(self._device).record_event(event)
