@@ -20,7 +20,7 @@ from train.training.recipe import kl_divergence
 
 # Factors of the interpolation that are tried: 0 gives the weights before the training, and
 # 1 the weights after it.
-FACTORS = (0.0, 0.25, 0.5, 0.75, 1.0)
+FACTORS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.5, 0.75, 1.0)
 # Entry of a checkpoint with interpolated weights. Its value is the factor.
 INTERPOLATION = "interpolation"
 # Number of images in a pass through a network.
