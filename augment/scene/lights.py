@@ -551,11 +551,14 @@ class Stripes(LightModel):
     meter sets the exposure.
     """
 
-    # Period in half widths, position in periods, slope in radians, bend and jump in periods,
-    # ambient light, and exposure.
     ranges = (
-        *(Range(0.05, 2.0, True), Range(0, 1), Range(-0.2, 0.2), Range(0, 0.5), Range(-0.5, 0.5)),
-        *(Range(0.01, 0.4, True), Range(0.3, 2.0, True)),
+        Range(0.05, 2.0, True),  # Period in half widths.
+        Range(0, 1),  # Position in periods.
+        Range(-0.2, 0.2),  # Slope in radians.
+        Range(0, 0.5),  # Bend in periods.
+        Range(-0.5, 0.5),  # Jump in periods.
+        Range(0.01, 0.4, True),  # Ambient light.
+        Range(0.3, 2.0, True),  # Exposure.
     )
     constants = 3 + 2 * surfaces.SURFACE_NODES**2
 

@@ -88,9 +88,10 @@ def solid(points: Points, shift: Tensor | float = 0.0) -> Float[Tensor, " ..."]:
 def waves(
     place: Pictures, period: Tensor, phase: Tensor, kind: Tensor, edge: Tensor
 ) -> Float[Tensor, "N 1 H W"]:
-    """Return the light of a scanner: stripes if `kind` is below 0.6, waves below 0.8, one border.
+    """Return the light of a scanner, in [0, 1] and differentiable.
 
-    It is in [0, 1] and differentiable. Period and width of the edges are lengths, as `place` is.
+    It has stripes if `kind` is below 0.6, waves if it is below 0.8, and otherwise one border.
+    `period` and the width `edge` of edges are lengths, as `place` is.
     """
     wave = torch.sin(2 * math.pi * (place / period + phase))
     stripes = torch.sigmoid(wave * period / edge / 2)

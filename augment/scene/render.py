@@ -434,10 +434,11 @@ class DirectRenderer:
         return _moved(mesh, vertices), fragments.to("cpu")
 
     def views_at_once(self) -> int:
-        """Return how many views `radiance` renders at once: one, if rays or silhouettes need it."""
+        """Return how many views `radiance` renders at once. Rays and silhouettes need one."""
+        if self.settings.silhouettes:
+            return 1
         casts_rays = self.settings.global_illumination or bool(self.basis.local_lights)
-        is_single = casts_rays or self.settings.silhouettes
-        return 1 if is_single else views_at_once(self.settings, self.like)
+        return views_at_once(self.settings, self.like, casts_rays)
 
     def radiance(
         self,

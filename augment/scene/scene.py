@@ -512,12 +512,13 @@ class Scene:
         other_light = light.clone()
         other_light[:, lamp_rows] = 0
         batch_images = torch.arange(len(light) * self.views, device=light.device)
+        numbers = _on_cpu(examples).tolist()
         for rows, pixels, composite in self._render_with_operators(other_light, examples):
             lamp_radiances = []
             for image in batch_images[rows].tolist():
                 # Image a · V + v is view v of row a.
                 row, view = divmod(image, self.views)
-                example = self.examples[int(_on_cpu(examples)[row])]
+                example = self.examples[numbers[row]]
                 shown = (example.object, example.cameras[view])
                 fragments, albedo = self._direct_renderer.view(*shown)
                 local = self._direct_renderer.local_view(*shown)

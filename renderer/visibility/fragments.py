@@ -349,8 +349,13 @@ def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
     return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
 
 
-def views_at_once(settings: ImageSettings, vertices: np.ndarray | Tensor) -> int:
-    """Return how many views are shaded at once. Few samples take as long as many."""
+def views_at_once(settings: ImageSettings, vertices: np.ndarray | Tensor, casts_rays: bool) -> int:
+    """Return how many views are shaded at once. Few samples take as long as many.
+
+    Rays need single views.
+    """
+    if casts_rays:
+        return 1
     is_on_gpu = isinstance(vertices, Tensor) and vertices.is_cuda
     samples = SAMPLES_ON_GPU if is_on_gpu else SAMPLES_ON_CPU
     return max(1, samples // (settings.pixel_count * settings.samples**2))

@@ -72,9 +72,10 @@ def darken(images: Images, seed: int) -> Images:
 
 
 def relit(images: Images, seed: int, augmentation: str) -> Images:
-    """Show images in random light of an augmentation: low light, or a scanner's or projector's.
+    """Show images in random light of an augmentation.
 
-    A projector shows each image as a slide on itself.
+    This is low light, the light of a scanner, or else that of a projector, which shows each image
+    as a slide on itself.
     """
     from augment.lighting import relight_photographs
 
@@ -85,9 +86,8 @@ def relit(images: Images, seed: int, augmentation: str) -> Images:
 
         shown = relight_photographs(images, seed, lights=[STRIPES])
         is_gray = torch.rand(len(images), generator=generator(seed, "gray")) < GRAY
-        return torch.where(
-            is_gray.to(images.device).view(-1, 1, 1, 1), rgb_to_grayscale(shown, 3), shown
-        )
+        is_gray = is_gray.to(images.device).view(-1, 1, 1, 1)
+        return torch.where(is_gray, rgb_to_grayscale(shown, 3), shown)
     shown = relight_photographs(images, seed, slides=images)
     if augmentation == RELIGHT_AND_LOW_LIGHT:
         shown[1::2] = darken(images, seed)[1::2]
