@@ -24,9 +24,8 @@ from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT
 from augment.service import AugmentationService
-from renderer import errors
 from renderer.camera import Camera
-from renderer.errors import InputError
+from renderer.errors import InputError, require_kind, require_whole
 from renderer.image import to_bytes
 from renderer.settings import Size, height_and_width
 
@@ -129,10 +128,10 @@ def render_dataset(
         ['apple'] torch.Size([3, 32, 32]) torch.Size([1, 4])
     """
     for name, value in {"count": count, "first": first, "seed": seed}.items():
-        errors.require_whole(name, value)
+        require_whole(name, value)
     expected = "nb.AugmentationSettings(...) or None"
-    errors.require_kind("settings", settings, AugmentationSettings | None, expected)
-    errors.require_kind("network", network, TaskNetwork | None, "nb.load_classifier(...) or None")
+    require_kind("settings", settings, AugmentationSettings | None, expected)
+    require_kind("network", network, TaskNetwork | None, "nb.load_classifier(...) or None")
     mode = "random" if network is None else "adversarial"
     settings = settings or AugmentationSettings(mode=mode)
     if settings.mode != mode:

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer import errors
-from renderer.errors import InputError
 from renderer.settings import MAX_VIEWS
 
 # An array of points, or a tensor on any device.
@@ -169,7 +168,7 @@ class Camera(ABC):
         if self.has_perspective:
             distance = self.distance - back
             if not distance > 0:
-                raise InputError(
+                raise errors.InputError(
                     f"cameras: the center {np.round(center, 3).tolist()} of the mesh lies behind a "
                     "camera: give cameras that have the whole mesh in front of them"
                 )
@@ -387,7 +386,7 @@ class PerspectiveCamera(Camera):
         """Compute the depths of points, which must lie in front of the camera."""
         depths = self.distance - self._from_pivot(points) @ _like(self.axes()[2], points)
         if not (depths >= self._limits(depths)[0]).all():
-            raise InputError(
+            raise errors.InputError(
                 f"the mesh reaches the camera at {self.pose()[:3, 3].round(3).tolist()} or lies "
                 "behind it: normalize the mesh, increase the distance (by a smaller fov or a "
                 "larger width), or give cameras that have the whole mesh in front of them"
@@ -406,7 +405,7 @@ def _as_scalar(name: str, value: Any) -> Any:
     elif isinstance(value, np.ndarray | list | tuple) and np.size(value) == 1:
         value = np.asarray(value).item()
     if not errors.is_number(value):
-        raise InputError(f"{name} is {errors.describe(value)}: give one number")
+        raise errors.InputError(f"{name} is {errors.describe(value)}: give one number")
     return value.item() if isinstance(value, np.generic | np.ndarray) else value
 
 

@@ -19,7 +19,6 @@ from augment.scene.objects import Conditions, Example, SceneObject
 from augment.scene.scene import Scene
 from renderer import errors
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.errors import MAX_SCALE, ShortRepr
 from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.io.images import gray_or_image, write_image
 from renderer.io.meshes import export_mesh, load_mesh
@@ -52,7 +51,7 @@ RGBE_TOLERANCE = 2.0**-8
 
 
 @dataclass(frozen=True, repr=False)
-class Adversary(ShortRepr):
+class Adversary(errors.ShortRepr):
     """All that is needed to render one example after an attack, and its images before and after.
 
     An example is one object in front of a background, seen from V cameras.
@@ -309,7 +308,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
         cameras.append((PinholeCamera if "roll" in fields else kind)(**fields))
     mesh = load_mesh(folder / MESH, gloss=bool(description["gloss"]))
     albedo_scale = float(description["albedo_scale"])
-    errors.require_range("albedo_scale", albedo_scale, 1 / MAX_SCALE, MAX_SCALE)
+    errors.require_range("albedo_scale", albedo_scale, 1 / errors.MAX_SCALE, errors.MAX_SCALE)
     own_faces = description["own_faces"]
     errors.require_range("own_faces", own_faces, 1, len(mesh.faces))
     label, name = str(description["label"]), str(description["name"])

@@ -33,8 +33,7 @@ from augment.attacks.optimizers import (
 from augment.network import frozen_eval_mode
 from augment.progress import progress
 from augment.scene.truth import Rows
-from renderer import errors
-from renderer.errors import ShortRepr
+from renderer.errors import Check, ShortRepr, late_checks, raise_first
 
 # Fields of a `Minimum` that belong to the returned candidate: the keys of `Evaluation.found`.
 FOUND = ("values", "images", "success", "cost", "predicted")
@@ -228,7 +227,7 @@ def minimize_from(
     settings = objective.settings
     evaluation_count = settings.step_limit + scores_last
     period = drop_period(start.device) if settings.query_limit_of_start is None else 1
-    checks: list[errors.Check] = []
+    checks: list[Check] = []
     # Rows of the examples that are attacked, their numbers, and a mask of those that are finished.
     active = torch.arange(len(start), device=start.device)
     shown, part, is_over = examples, objective, torch.zeros_like(active, dtype=torch.bool)
@@ -241,7 +240,7 @@ def minimize_from(
             candidates = optimizer.ask(active) if step else start[:, None]
             # The last evaluation needs no gradient, because no step follows.
             needs_gradient = optimizer.uses_gradients and step < settings.step_limit
-            with errors.late_checks(checks if step and period > 1 else None):
+            with late_checks(checks if step and period > 1 else None):
                 evaluation = evaluate(optimizer.problem, part, candidates, shown, needs_gradient)
             if not step:
                 result = Minimum.at_start(evaluation)
@@ -261,7 +260,7 @@ def minimize_from(
             is_over = is_over | is_finished
             if not drops:
                 continue
-            errors.raise_first(checks)
+            raise_first(checks)
             is_kept = ~is_over
             # Drop also the examples that cannot pay for another step.
             if settings.query_limit_of_start is not None:

@@ -27,8 +27,7 @@ from torch import Tensor
 from augment.scene import loops, patterns, surfaces
 from augment.scene.black_body import planckian_rgb
 from augment.scene.surfaces import Range, limits
-from renderer import errors
-from renderer.errors import InputError
+from renderer.errors import InputError, as_list, require_choice, require_number
 from renderer.settings import Size, height_and_width
 
 # Ranges of the numbers that several models have.
@@ -358,8 +357,8 @@ class CastShadow(LightModel):
     constants = 1 + 2 * nodes**2
 
     def __post_init__(self) -> None:
-        for kind in errors.as_list("kinds", self.kinds, str, "a list of names"):
-            errors.require_choice("kinds", kind, SHADOWS)
+        for kind in as_list("kinds", self.kinds, str, "a list of names"):
+            require_choice("kinds", kind, SHADOWS)
         if not self.kinds:
             raise InputError("kinds is empty: name at least one kind of shadow")
 
@@ -478,7 +477,7 @@ class LowLight(LightModel):
     ranges = (Range(0, 1), Range(1, 5), Range(-1, 1))
 
     def __post_init__(self) -> None:
-        errors.require_number("exposure", self.exposure, 1e-6, 1)
+        require_number("exposure", self.exposure, 1e-6, 1)
 
     def light(self, drawn: Drawn) -> Illumination:
         """Return 1, because the camera receives less light (see `camera`)."""

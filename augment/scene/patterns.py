@@ -22,8 +22,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Generator, Tensor
 
 from augment.scene.surfaces import draw_shading, smooth
-from renderer import errors
-from renderer.errors import InputError
+from renderer.errors import InputError, require_kind
 from renderer.image import LUMINANCE, clamp, decode, encode, to_unit
 from renderer.settings import Size, height_and_width
 
@@ -330,7 +329,7 @@ DARKEST = 1e-6
 
 def require_photographs(name: str, photographs: Tensor) -> None:
     """Check that a value is a tensor of photographs of 8 bits."""
-    errors.require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
+    require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
     shape = tuple(photographs.shape)
     if photographs.dtype != torch.uint8 or len(shape) != 4 or shape[1] != 3 or not all(shape):
         fault = f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}"
