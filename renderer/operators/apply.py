@@ -26,7 +26,6 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
 from renderer import errors
-from renderer.errors import as_device, as_tensor, require_bounded
 from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light.basis import HARMONICS, Basis
 from renderer.settings import ImageSettings
@@ -139,8 +138,7 @@ class TransferOperator:
             InputError: If `lights` has NaN or another number of coefficients
                 than the basis, or if `background` has a wrong shape.
         """
-        lights = as_tensor("lights", lights)
-        self.require_lights(lights)
+        lights = self.require_lights(lights)
         if isinstance(background, Tensor) and background.requires_grad:
             # `_Image` has no gradient with respect to the background, so the image is composed
             # of differentiable operations.
@@ -195,9 +193,7 @@ class TransferOperator:
             >>> image.shape, gradient.shape
             (torch.Size([3, 16, 16]), torch.Size([49, 3]))
         """
-        lights = as_tensor("lights", lights)
-        self.require_lights(lights)
-        lights = lights.detach()
+        lights = self.require_lights(lights).detach()
         if isinstance(background, Tensor):
             background = background.detach()
         prepared = self._prepare_background(background, lights)
@@ -226,9 +222,7 @@ class TransferOperator:
             InputError: If `lights` has NaN or another number of coefficients
                 than the basis.
         """
-        lights = as_tensor("lights", lights)
-        self.require_lights(lights)
-        return self._radiance(lights)
+        return self._radiance(self.require_lights(lights))
 
     def light_gradient(
         self, radiance_gradient: Float[Tensor, "*lights 3 P"]
@@ -250,8 +244,8 @@ class TransferOperator:
         Raises:
             InputError: If the gradient has NaN or a wrong shape.
         """
-        radiance_gradient = as_tensor("radiance_gradient", radiance_gradient)
-        require_bounded(radiance_gradient=radiance_gradient)
+        radiance_gradient = errors.as_tensor("radiance_gradient", radiance_gradient)
+        errors.require_bounded(radiance_gradient=radiance_gradient)
         errors.require_shape("radiance_gradient", radiance_gradient, "...", *self.albedo.shape)
         return self._light_gradient(radiance_gradient)
 
@@ -293,28 +287,31 @@ class TransferOperator:
         # Checking the few numbers of the result is fast. If one is not finite,
         # `require_bounded` checks the gradient of all pixels and raises the error.
         if not math.isfinite(gradient.sum().item()):
-            require_bounded(image_gradient=pixel_gradient)
+            errors.require_bounded(image_gradient=pixel_gradient)
         return gradient
 
-    def require_lights(self, lights: Tensor) -> None:
-        """Check that lights fit the basis of the operator, and have no NaN.
+    def require_lights(self, lights: object) -> Tensor:
+        """Convert lights to a tensor, and check that they fit the basis, and have no NaN.
 
         Args:
             lights: Coefficients, shape (..., coefficients, 3).
+
+        Returns:
+            Coefficients as a tensor of floating-point numbers.
 
         Raises:
             InputError: If `lights` has NaN or another number of coefficients
                 than the basis.
         """
-        if not lights.is_floating_point():
-            require_bounded(lights=lights)
+        lights = errors.as_tensor("lights", lights)
         if lights.shape[-2:] != (self.basis.size, COLORS):
             errors.require_shape(f"lights of {self.basis}", lights, "...", self.basis.size, COLORS)
         # The sum of squares is faster to check than each value. If it is too large or NaN,
         # `require_bounded` checks each value and raises the error.
         values = lights.detach().reshape(-1)
         if not torch.dot(values, values).item() <= errors.MAX_MAGNITUDE**2:
-            require_bounded(lights=lights)
+            errors.require_bounded(lights=lights)
+        return lights
 
     def _radiance(self, lights: Lights) -> PixelValues:
         """Compute `radiance` without checks."""
@@ -395,7 +392,7 @@ class TransferOperator:
         Raises:
             InputError: If there is no such device.
         """
-        device = as_device(device)
+        device = errors.as_device(device)
         if device == self.transfer.device:
             return self
         values = {field.name: getattr(self, field.name) for field in fields(self)}

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, as_tensor, explained
+from renderer.errors import InputError, explained
 from renderer.image import as_background, background_term, clamp, encode
 from renderer.operators import apply
 from renderer.operators.apply import COLORS, SparseTransfer, TransferOperator
@@ -136,8 +136,7 @@ class TransferOperators(Sequence[TransferOperator]):
                 images.
         """
         first = self._operators[0]
-        lights = as_tensor("lights", lights)
-        first.require_lights(lights)
+        lights = first.require_lights(lights)
         if light_per_view and (lights.ndim < 3 or len(lights) != len(self)):
             raise InputError(
                 f"lights has shape {tuple(lights.shape)}, but light_per_view=True needs the shape "
@@ -193,9 +192,7 @@ class TransferOperators(Sequence[TransferOperator]):
             InputError: If `image` raises it, or if the result of
                 `loss_gradient` has another shape than the images.
         """
-        lights = as_tensor("lights", lights)
-        self._operators[0].require_lights(lights)
-        variable_lights = lights.detach().requires_grad_()
+        variable_lights = self._operators[0].require_lights(lights).detach().requires_grad_()
         with torch.enable_grad():
             images = self.image(variable_lights, background, light_per_view=light_per_view)
         detached_images = images.detach()
