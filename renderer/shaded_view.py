@@ -22,7 +22,6 @@ from renderer.light.basis import SplitLight
 from renderer.mesh import Mesh
 from renderer.operators.rays import LocalLightView
 from renderer.settings import ImageSettings
-from renderer.surface.albedo import of_seen_faces
 from renderer.surface.gloss import Gloss, sample_gloss
 from renderer.surface.shading import glossy_radiance, normals_in_sight, radiance
 from renderer.visibility.fragments import Fragments
@@ -200,8 +199,5 @@ class ShadedView:
         """Normals at the corners of the G seen faces, shape (G, 3, 3), or None for flat shading."""
         if self.settings.normals == "flat":
             return None
-        if not self.is_moved:
-            # The mesh caches these normals, so all its views share them.
-            return of_seen_faces(self.mesh.corner_normals, self.fragments)
-        normal_ids = torch.from_numpy(self.mesh.normal_ids).to(self._faces)
-        return normals_in_sight(self.fragments, self.vertices, self._faces, normal_ids)
+        moved = self.vertices if self.is_moved else None
+        return normals_in_sight(self.mesh, self.fragments, moved)

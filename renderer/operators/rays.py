@@ -35,7 +35,6 @@ from renderer.mesh import Mesh
 from renderer.normals import face_normals
 from renderer.operators.apply import SparseTransfer
 from renderer.settings import ImageSettings
-from renderer.surface.albedo import of_seen_faces
 from renderer.surface.gloss import Gloss, SampleGloss, at_samples, sample_gloss, toward_camera
 from renderer.surface.shading import normals_in_sight, smooth_normals
 from renderer.vectors import unit, unit_vectors
@@ -123,13 +122,8 @@ class Surface:
         """
         if self.settings.normals == "flat":
             return self.planes
-        if self.moved is None:
-            # The mesh caches these normals, so all its views share them.
-            corner_normals = of_seen_faces(self.mesh.corner_normals, self.fragments)
-        else:
-            faces = torch.from_numpy(self.mesh.faces)
-            normal_ids = torch.from_numpy(self.mesh.normal_ids)
-            corner_normals = normals_in_sight(self.fragments, self.vertices, faces, normal_ids)
+        moved = None if self.moved is None else self.vertices
+        corner_normals = normals_in_sight(self.mesh, self.fragments, moved)
         # The function `unit` takes vectors with their components along the first axis.
         return unit(smooth_normals(self.fragments, corner_normals).T).T
 

@@ -33,13 +33,15 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_bounded
 from renderer.light import harmonics
+from renderer.mesh import Mesh
 from renderer.normals import area_vectors, vertex_normals
+from renderer.surface.albedo import of_seen_faces
 from renderer.surface.gloss import SampleGloss, at_samples, toward_camera
 from renderer.surface.lobes import coat_irradiance_factors, roughness_polynomials
 from renderer.vectors import unit, unit_vectors
@@ -379,12 +381,17 @@ def _diffuse_basis(directions: Float[Tensor, "3 N"], degree: int) -> tuple[list[
 
 
 def normals_in_sight(
-    fragments: Fragments,
-    vertices: Float[Tensor, "V 3"],
-    faces: Int[Tensor, "F 3"],
-    normal_ids: Int[Tensor, "F 3"],
+    mesh: Mesh, fragments: Fragments, moved: Float[Tensor, "V 3"] | None
 ) -> Float[Tensor, "G 3 3"]:
-    """Compute the normals at the corners of the G faces that a view shows."""
+    """Compute the normals at the corners of the G faces that a view shows.
+
+    `moved` are other positions of the vertices, with a gradient, or None for those of the mesh.
+    """
+    if moved is None:
+        # The mesh caches these normals, so all its views share them.
+        return of_seen_faces(mesh.corner_normals, fragments)
+    arrays = mesh.faces, mesh.normal_ids
+    faces, normal_ids = (torch.from_numpy(ids).to(moved.device) for ids in arrays)
     # All first corners of the seen faces, then all second and third corners.
     seen_ids = normal_ids.index_select(0, fragments.faces).T.flatten()
     count = int(normal_ids.max()) + 1
@@ -392,7 +399,7 @@ def normals_in_sight(
     is_seen[seen_ids] = True
     # A normal is an average over all faces that share it, so these are all needed.
     is_needed = is_seen.index_select(0, normal_ids.flatten()).view(-1, 3).any(1)
-    vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
+    vertices = moved.to(torch.promote_types(moved.dtype, torch.float32))
     normals = vertex_normals(vertices, faces[is_needed], normal_ids[is_needed], count)
     return normals.T.index_select(1, seen_ids).unflatten(1, (3, -1)).permute(2, 1, 0)
 

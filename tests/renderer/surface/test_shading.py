@@ -122,9 +122,7 @@ class Scene:
         """Return the normals that `radiance` takes. Flat normals are None."""
         if not self.smooth:
             return None
-        faces = torch.from_numpy(self.mesh.faces)
-        normal_ids = torch.from_numpy(self.mesh.normal_ids)
-        return shading.normals_in_sight(self.fragments, vertices, faces, normal_ids)
+        return shading.normals_in_sight(self.mesh, self.fragments, vertices)
 
 
 SCENES = {
