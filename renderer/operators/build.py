@@ -28,7 +28,7 @@ from renderer.settings import ImageSettings
 from renderer.surface.albedo import shared_albedo, surface_albedo
 from renderer.surface.gloss import Gloss, SampleGloss, at_samples
 from renderer.visibility import Rasterizer
-from renderer.visibility.fragments import build_fragments, views_at_once
+from renderer.visibility.fragments import build_fragments, split_views, views_at_once
 
 # Devices on which SciPy adds up samples. On a CPU, it takes a tenth of the time of torch.
 SCIPY_DEVICES = ("cpu",)
@@ -128,7 +128,8 @@ def _build(
         every = torch.cat([torch.arange(0), *(coefficients for coefficients, _ in dense)])
         dense = [(every, torch.cat([empty, *(transfer for _, transfer in dense)], dim=1))]
     [(nonzero, transfer)] = dense
-    parts = transfer, pixel_albedo.T.to(dtype), fragments.coverage.to(dtype)
+    in_pixels = transfer, pixel_albedo.T.to(dtype), fragments.coverage.to(dtype)
+    views = len(fragments.cameras), surface.settings.pixel_count
     return [
         TransferOperator(
             transfer=transfer,
@@ -140,7 +141,7 @@ def _build(
             basis=basis,
             sparse=concatenate_entries(sparse) if sparse else None,
         )
-        for pixels, transfer, albedo, coverage in fragments.of_views(*parts)
+        for pixels, transfer, albedo, coverage in split_views(fragments.pixels, *views, *in_pixels)
     ]
 
 

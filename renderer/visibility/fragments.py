@@ -123,10 +123,6 @@ class Fragments:
         view = self.sample_numbers.div(math.prod(self.sample_shape), rounding_mode="floor")
         return eyes.to(view.device).index_select(0, view)
 
-    def of_views(self, *values: Shaped[Tensor, "*axes P"]) -> list[tuple[Tensor, ...]]:
-        """Split values at the P pixels by view. Before them, return the pixels in the image."""
-        return split_views(self.pixels, len(self.cameras), math.prod(self.shape), *values)
-
     @cached_property
     def barycentric(self) -> Tensor:
         """Barycentric weights of the three corners at each of the S samples, shape (S, 3).
