@@ -46,7 +46,7 @@ from torch.autograd.function import once_differentiable
 from renderer.camera import Camera
 from renderer.mesh import EDGES, shared_edges
 from renderer.visibility.fragments import Fragments
-from renderer.visibility.numpy import SUBSAMPLES, to_fixed_point
+from renderer.visibility.numpy import SUBSAMPLES, doubled_areas, to_fixed_point
 
 # A silhouette counts as visible if it is behind the surface beside it by at most this
 # fraction of the depth range of the mesh. For example, the lower edge of an object that
@@ -470,9 +470,7 @@ def _silhouette_edges(
 ) -> Int[np.ndarray, "2 N"]:
     """Find the vertices of edges whose faces all lie on one side of the edge in the image."""
     ends, edge_of_side, face_count = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
-    # Positions (x, y) of the corners a, b and c of all faces, shape (F,) each.
-    (ax, bx, cx), (ay, by, cy) = places.take(faces.T, axis=1)
-    orientation = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+    orientation = np.sign(doubled_areas(places.take(faces.T, axis=1)))
     # 1 for sides of faces that lead from the lower to the higher vertex index, and -1 for
     # other sides, shape (3, F).
     start, end = faces.T.take(EDGES, axis=0).swapaxes(0, 1)
