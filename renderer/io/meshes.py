@@ -1,6 +1,5 @@
 """Read meshes with their colors and textures from files, and write them to .glb files."""
 
-import io
 import json
 import math
 import struct
@@ -13,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 
 from renderer import errors
 from renderer.camera import Camera, PerspectiveCamera
@@ -21,6 +19,7 @@ from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io.files import atomic_write
 from renderer.io.gltf import read_gltf
+from renderer.io.images import encode_image
 from renderer.io.mesh_file import MeshFile, Part
 from renderer.io.obj import read_obj
 from renderer.io.ply_off_stl import read_off, read_ply, read_stl
@@ -259,10 +258,9 @@ class _Tree(dict[str, Any]):
 
     def add_texture(self, texels: np.ndarray) -> dict[str, int]:
         """Append an image, and return a reference to its texture."""
-        png = io.BytesIO()
         # A texture of 2048 pixels is written in a fifth of the time, and gets 1.2 times as large.
-        Image.fromarray(texels).save(png, "PNG", compress_level=1)
-        image = {"bufferView": self.add_bytes(png.getvalue()), "mimeType": "image/png"}
+        png = encode_image(texels, "PNG", compress_level=1)
+        image = {"bufferView": self.add_bytes(png), "mimeType": "image/png"}
         return {"index": self.add("textures", {"source": self.add("images", image)})}
 
     def content(self) -> bytes:

@@ -16,7 +16,6 @@ from typing import TypeVar
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
 from renderer import errors
@@ -97,8 +96,7 @@ def save_light(
     picture = basis.picture(coefficients)
     atomic_write(path, json.dumps(description, allow_nan=False) + "\n")
     if picture is not None:
-        image = Image.fromarray(to_bytes(picture.clamp(0, 1)).numpy())
-        write_image(path.with_suffix(".png"), image)
+        write_image(path.with_suffix(".png"), to_bytes(picture.clamp(0, 1)).numpy())
     return 0.0
 
 
