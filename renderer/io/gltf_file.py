@@ -63,12 +63,11 @@ class GltfFile:
 
     def entry(self, kind: str, index: int) -> dict[str, Any]:
         """Look up an entry of a list of the JSON object, such as number 2 of "meshes"."""
-        entries = self.tree.get(kind, [])
+        entries: list[dict[str, Any]] = self.tree.get(kind, [])
         # Python would count a negative index from the end.
         if not 0 <= index < len(entries):
             raise ValueError(f"it refers to number {index} of {len(entries)} {kind}")
-        entry: dict[str, Any] = entries[index]
-        return entry
+        return entries[index]
 
     # Arrays
 
@@ -140,8 +139,7 @@ class GltfFile:
         if not uri.startswith("data:"):
             return self.file.read(uri)
         with urlopen(uri) as response:
-            content: bytes = response.read()
-        return content
+            return bytes(response.read())
 
     # Images
 
@@ -422,8 +420,7 @@ def _specular_factor(extensions: dict[str, Any]) -> float:
     ior = extensions.get(IOR, {}).get("ior", 1.5)
     # Reflectance at normal incidence (Fresnel) for the index of refraction, 1.5 by default.
     reflectance = ((ior - 1) / (ior + 1)) ** 2
-    factor: float = specular.get("specularFactor", 1.0) * colors[0] * reflectance / DIELECTRIC
-    return factor
+    return float(specular.get("specularFactor", 1.0) * colors[0] * reflectance / DIELECTRIC)
 
 
 def _specular_glossiness(
