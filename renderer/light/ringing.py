@@ -92,10 +92,7 @@ def nonnegative_window(degree: int) -> Tensor:
     # The first harmonic of band l has the index l².
     first_of_band = np.arange(degree + 1) ** 2
     irradiance_by_band = irradiance_weights(degree)[first_of_band].numpy()
-    # The squared coefficients of a point source in band l add up to (2l + 1) / 4π. The
-    # weights therefore contain √(2l + 1). The constant factor 4π does not matter.
-    weights = np.sqrt(2 * np.arange(degree + 1) + 1) * irradiance_by_band
-    return best_window(np.ones(degree + 1), weights)
+    return best_window(np.ones(degree + 1), irradiance_by_band)
 
 
 def best_window(
@@ -105,7 +102,7 @@ def best_window(
 
     A lobe is a function of the angle θ from an axis, Σ_l (2l + 1) s_l P_l(cos θ),
     with the Legendre polynomials P_l. A window multiplies s_l by a factor w_l.
-    The best window minimizes Σ_l weight_l² (w_l - 1)² under the condition that the
+    The best window minimizes Σ_l (2l + 1) weight_l² (w_l - 1)² under the condition that the
     windowed lobe Σ_l (2l + 1) s_l w_l P_l(cos θ) is negative at no angle. All s_l must be
     positive. They are 1 for a point source. The result has one factor for each coefficient of a
     light, and the first is 1.
@@ -114,6 +111,9 @@ def best_window(
     if degree == 0:
         return torch.ones(1, dtype=torch.float64)
     odd_numbers = 2 * np.arange(degree + 1) + 1
+    # The squared coefficients of a point source in band l add up to (2l + 1) / 4π. The constant
+    # factor 4π does not matter.
+    root_weight = np.sqrt(odd_numbers) * weight
     # Cosines of the angles at which the windowed lobe must not be negative.
     cosines = np.cos(np.linspace(0, math.pi, 2 * degree + 1))
     for _ in range(_MAX_ROUNDS):
@@ -121,9 +121,10 @@ def best_window(
         terms = legendre.legvander(cosines, degree) * odd_numbers * spectrum
         # The sum over a row is the value of the lobe at this angle if all factors are 1. The change
         # of the factors must add at least the negative of this value. The error is the squared
-        # length of the vector with the entries weight_l (w_l - 1), so the shortest one is searched.
-        weighted_change = shortest(terms[:, 1:] / weight[1:], -terms.sum(1))
-        factors = np.concatenate([[1.0], 1 + weighted_change / weight[1:]])
+        # length of the vector with the entries root_weight_l (w_l - 1), so the shortest one is
+        # searched.
+        weighted_change = shortest(terms[:, 1:] / root_weight[1:], -terms.sum(1))
+        factors = np.concatenate([[1.0], 1 + weighted_change / root_weight[1:]])
         # Legendre coefficients of the windowed lobe.
         series = odd_numbers * spectrum * factors
         # The minima of the lobe are at roots of its derivative, or at an end.
@@ -287,8 +288,7 @@ def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
     # The squared errors of the highlight and of the irradiance add up, so the squared weights do,
     # too.
     weight = np.hypot(highlight, IRRADIANCE_WEIGHT * irradiance)
-    harmonics_per_degree = 2 * np.arange(degree + 1) + 1
-    return best_window(highlight, np.sqrt(harmonics_per_degree) * weight)
+    return best_window(highlight, weight)
 
 
 def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degrees"]:
