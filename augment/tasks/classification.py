@@ -70,10 +70,6 @@ class Classification(Task):
         """Return a function that checks logits."""
         return _LogitReader(title, class_count)
 
-    def output_count(self, network: Any, outputs: Tensor) -> int:
-        """Return the number of logits of an image."""
-        return outputs.shape[1]
-
     def criterion(self, source: Tensor, truth: GetTruth, class_count: int) -> ClassCriterion:
         """Return the criterion of an untargeted attack, for which positions do not matter."""
         return ClassCriterion(source)

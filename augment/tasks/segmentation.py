@@ -76,10 +76,6 @@ class Segmentation(Task):
         """Return the names that transformers stores. A network of another library has none."""
         return stored_names(unwrapped(network)) or None
 
-    def output_count(self, network: Any, outputs: Tensor) -> int:
-        """Return the number of logits of a pixel."""
-        return outputs.shape[1]
-
     def reader(self, title: str, class_count: int | None = None) -> Reader:
         """Return a function that checks the logits of pixels."""
         return partial(self._read, title, class_count)

@@ -171,9 +171,12 @@ class Task(ABC):
         classes.
         """
 
-    @abstractmethod
     def output_count(self, network: Any, outputs: Any) -> int | None:
-        """Return the number of classes of a network and its outputs. None if they do not tell."""
+        """Return the number of classes of a network and its outputs. None if they do not tell.
+
+        By default, it is the number of logits of an image, or of a pixel.
+        """
+        return int(outputs.shape[1])
 
     def require_finite(self, outputs: Any, images: Tensor, title: str) -> None:
         """Check that outputs of an attacked network are finite, and have the gradient of images."""
