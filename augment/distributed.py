@@ -1,6 +1,5 @@
 """Divide examples among the processes of a distributed training, and gather their results."""
 
-import torch
 import torch.distributed as dist
 from jaxtyping import Int, Shaped
 from torch import Tensor
@@ -14,15 +13,6 @@ def world_size() -> int:
 def rank() -> int:
     """Return the index of this process among those that train together, counted from 0."""
     return dist.get_rank() if dist.is_initialized() else 0
-
-
-def shard(total: int, rank: int, world_size: int) -> Tensor:
-    """Select the examples that one of several processes works on.
-
-    Return every `world_size`-th index. With more processes than examples, several processes get the
-    same example.
-    """
-    return torch.arange(rank % total, total, world_size)
 
 
 def all_gather_rows(

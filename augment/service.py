@@ -481,8 +481,11 @@ class AugmentationService:
         return _Made(values, result.images[:, 0], diagnostics, is_new_success)
 
     def _own_rows(self, count: int) -> Int[Tensor, " A"]:
-        """Return the indices of those of some examples that this process renders or attacks."""
-        return distributed.shard(count, self.rank, self.world_size).to(self.labels.device)
+        """Return the indices of those of some examples that this process renders or attacks.
+
+        With more processes than examples, several processes get the same example.
+        """
+        return torch.arange(self.rank % count, count, self.world_size).to(self.labels.device)
 
     def _gather(self, part: Tensor, own: Int[Tensor, " A"], count: int) -> Tensor:
         """Collect from all processes what each computed for its `_own_rows` of the examples."""
