@@ -339,7 +339,7 @@ class Smoothest(NamedTuple):
             degree -= 1
         return degree
 
-    def warn(self, subject: str, degree: int) -> None:
+    def warn(self, subject: str) -> None:
         """Warn that the degree of the lighting is too low for the highlights of the surface."""
         surface = f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}"
         needed = f"which takes light of degree {self.degree}"
@@ -402,12 +402,12 @@ def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int
     if given is None:
         degree = smoothest.affordable_degree(pixels)
         if degree < smoothest.degree:
-            smoothest.warn(f"degree={degree}, the highest that fits in memory,", degree)
+            smoothest.warn(f"degree={degree}, the highest that fits in memory,")
         elif degree > DEGREE:
-            smoothest.warn(f"degree={DEGREE} takes less time, but", DEGREE)
+            smoothest.warn(f"degree={DEGREE} takes less time, but")
         return degree
     if smoothest.degree > given:
-        smoothest.warn(f"degree={given}", given)
+        smoothest.warn(f"degree={given}")
     return given
 
 
@@ -455,11 +455,11 @@ def with_needed_degree(
         _, built = scene.lights_of_degree(degree, reached_gloss(scene.objects).gloss_roughness)
         has_same_shape = scene.lights.shape[1:] == built.shape
         if has_same_shape and (scene.lights == built.to(scene.lights)).all():
-            smoothest.warn(f"degree={degree} takes less time, but", degree)
+            smoothest.warn(f"degree={degree} takes less time, but")
             basis, lights = scene.lights_of_degree(needed, smoothest.gloss_roughness)
             return scene.changed(basis=basis, lights=lights.to(scene.lights))
     if has_detail:
-        smoothest.warn(f"degree={degree}", degree)
+        smoothest.warn(f"degree={degree}")
     return scene
 
 

@@ -320,7 +320,7 @@ class DirectRenderer:
         # Views of unmoved objects that were prepared for the light of projector and lamps.
         self._local_views: dict[tuple[int, Camera], LocalLightView] = {}
         # Ray tracers, and shadows and bounces, of unmoved objects by their indices.
-        self._rays: dict[int, Rays] = {}
+        self._rays = [Rays(item.mesh) for item in self.objects]
         self._transport_of_object: dict[int, FrozenTransport] = {}
         # Shadows and bounces of moved shapes, by the indices of their examples.
         self._transport_of_example: dict[int, FrozenTransport] = {}
@@ -354,7 +354,7 @@ class DirectRenderer:
         if key not in self._local_views:
             fragments, _ = self.view(object_index, camera)
             surface = Surface(self.objects[object_index].mesh, fragments.to("cpu"), self.settings)
-            self._local_views[key] = LocalLightView(self._rays_of(object_index), surface)
+            self._local_views[key] = LocalLightView(self._rays[object_index], surface)
         return self._local_views[key]
 
     def masks(
@@ -484,7 +484,7 @@ class DirectRenderer:
         if split.local_lights and moved is None and gloss is None:
             lamp_view = self.local_view(object_index, fixed_camera)
         elif split.local_lights:
-            rays = self._rays_of(object_index) if moved is None else Rays(_moved(item.mesh, moved))
+            rays = self._rays[object_index] if moved is None else Rays(_moved(item.mesh, moved))
             surface = Surface(item.mesh, fragments.to("cpu"), settings, moved, gloss)
             lamp_view = LocalLightView(rays, surface)
 
@@ -520,12 +520,6 @@ class DirectRenderer:
             lamp_positions=changed.positions,
         )
         return shown.pixel_radiance(camera, background)
-
-    def _rays_of(self, object_index: int) -> Rays:
-        """Return the ray tracer of an unmoved object with the given index. It is built once."""
-        if object_index not in self._rays:
-            self._rays[object_index] = Rays(self.objects[object_index].mesh)
-        return self._rays[object_index]
 
     def _transport(self, example: int, object_index: int, positions: np.ndarray) -> FrozenTransport:
         """Return the shadows and bounces of a shape that is near the given one.
