@@ -6,7 +6,6 @@ direction.
 """
 
 import base64
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -39,7 +38,7 @@ from augment.tasks.task import Criterion
 from renderer.camera import orbit_cameras
 from renderer.errors import MAX_SCALE
 from renderer.image import to_bytes
-from renderer.io.files import atomic_write
+from renderer.io.files import write_numbers
 from renderer.io.images import encode_image
 from renderer.light.basis import HARMONICS, with_local_lights
 from renderer.light.files import UNIFORM, load_light, perturb
@@ -285,9 +284,7 @@ def success_by_light(
     for suffix, success in successes.items():
         counts |= {f"adversarial{suffix}": [int(success[clean].sum())], f"random{suffix}": []}
     is_wrong = clean & result.success
-    content = io.BytesIO()
-    np.save(content, to_bytes(result.images_in_views.cpu()))
-    atomic_write(out / f"{kind}.npy", content.getbuffer())
+    write_numbers(out / f"{kind}.npy", to_bytes(result.images_in_views.cpu()).numpy())
     if is_wrong.any():
         # The first view that is lost is shown before and after the attack.
         example = int(is_wrong.nonzero()[0])
