@@ -47,7 +47,9 @@ TINT = 8
 
 def run(settings: FitSettings) -> None:
     """Find camera and lighting of a photograph, and print a command that attacks the lighting."""
-    image = read_file(settings.photograph)
+    with explained(f"{settings.photograph} cannot be read", "give an image file"):
+        # The full size, because images whose shorter side has more pixels than this may be reduced.
+        image = np.asarray(read_rgb(settings.photograph, 10**6))
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
     # The mask is 255 where the object is, shape (H, W).
@@ -128,13 +130,6 @@ def render_attacked(
     first_example = torch.arange(1)
     # The render has one example and one view, shape (1, 1, 3, size, size).
     return shown.backgrounds[0], shown.render(shown.conditions(first_example), first_example)[0, 0]
-
-
-def read_file(path: str) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an image file in sRGB at its full size, rotated as its EXIF orientation says."""
-    with explained(f"{path} cannot be read", "give an image file"):
-        # Images whose shorter side has more pixels than this may be reduced.
-        return np.asarray(read_rgb(path, 10**6))
 
 
 def read_mask(path: str, height: int, width: int) -> UInt8[np.ndarray, "height width"]:
