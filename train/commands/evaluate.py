@@ -25,7 +25,7 @@ from train.device import MixedPrecision, choose_device, choose_precision
 from train.results import annotated_scores, scoring
 from train.results.annotated_scores import AnnotatedScores, evaluate_detector, evaluate_segmenter
 from train.results.overwrite import require_replaceable
-from train.results.scoring import Predictor, Scores, format_overall, format_scores
+from train.results.scoring import Predictor, Scores, format_scores
 from train.results.store import trained_labels
 from train.run_folder import sole_writer, writable_folder
 from train.settings import GROUPS, label_names, published_folder
@@ -62,7 +62,7 @@ def run(settings: EvaluateSettings) -> None:
     if settings.label is None:
         source = "each class with a sub-folder" if label is None else f"those of {settings.run}"
         print(f"positive classes: {', '.join(scores.predicted.labels)} ({source})")
-    text = format_scores(scores) if is_verbose() else format_overall(scores)
+    text = format_scores(scores) if is_verbose() else str(scores)
     print(f"{text}\ntable, scores and image: {Path(settings.out)}")
 
 

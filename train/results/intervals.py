@@ -92,12 +92,13 @@ class Jackknife:
         # Without a unit, a value keeps at least MIN_RATIO of its distance from 0 and from 1.
         lowest, highest = MIN_RATIO * inner[..., None], 1 - MIN_RATIO * (1 - inner[..., None])
         errors = [item.clip(lowest, highest) for item in self.without]
-        spread = _Spread.of([np.where(is_inner[..., None], _logit(item), 0.0) for item in errors])
-        half_width = spread.quantile * spread.variance**0.5
+        logits = [np.where(is_inner[..., None], _logit(item), 0.0) for item in errors]
+        variance, quantile = _spread(logits)
+        half_width = quantile * variance**0.5
         # The logistic function turns logit(value) ∓ half width back into fractions.
         ends = 1 / (1 + np.exp(np.stack([half_width, -half_width]) - _logit(inner)))
-        without_variance = wilson(value, self.unit_count, spread.quantile)
-        return np.where(spread.variance > 0, ends, without_variance)
+        without_variance = wilson(value, self.unit_count, quantile)
+        return np.where(variance > 0, ends, without_variance)
 
     @property
     def is_open(self) -> np.ndarray:
@@ -217,7 +218,7 @@ def change_ends(one: Jackknife, other: Jackknife, is_paired: bool = True) -> np.
     group_count = None if is_paired or not one.over.startswith(SEEDS) else -1
     pairs = list(zip(one.without[:group_count], other.without, strict=False))
     # correlation = covariance / sqrt(variance · other variance). Without variance, it is 0.
-    product = _Spread.of(one.without).variance * _Spread.of(other.without).variance
+    product = _spread(one.without)[0] * _spread(other.without)[0]
     covariance = np.sum([_covariance(*pair) for pair in pairs], axis=0)
     correlation = np.where(product > 0, covariance / np.where(product > 0, product, 1) ** 0.5, 0)
     low, high = one.interval
@@ -255,26 +256,22 @@ def _covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return (count - 1) * np.mean(np.multiply(*deviations), axis=-1)
 
 
-class _Spread(NamedTuple):
-    """Jackknife variance of a statistic, and the quantile of Student's t for its interval."""
+def _spread(without: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the jackknife variance of a statistic, and the quantile of t for its interval.
 
-    variance: np.ndarray
-    quantile: np.ndarray
+    The variances of the groups of units, from the values without each unit, add up.
+    """
+    # This import is here because it takes a second.
+    from scipy.special import stdtrit
 
-    @classmethod
-    def of(cls, without: Sequence[np.ndarray]) -> "_Spread":
-        """Add the variances of the groups of units, from the values without each unit."""
-        # This import is here because it takes a second.
-        from scipy.special import stdtrit
-
-        # A group of k units has k - 1 degrees of freedom.
-        degrees = np.array([item.shape[-1] - 1 for item in without])
-        variances = np.stack([_covariance(values, values) for values in without], axis=-1)
-        total = variances.sum(axis=-1)
-        terms = (variances / degrees).sum(axis=-1)
-        # Harmonic mean of the degrees, weighted by variance. Without variance, the smallest.
-        freedom = np.where(total > 0, total / np.where(total > 0, terms, 1), degrees.min())
-        return cls(total, stdtrit(freedom, 0.975))
+    # A group of k units has k - 1 degrees of freedom.
+    degrees = np.array([item.shape[-1] - 1 for item in without])
+    variances = np.stack([_covariance(values, values) for values in without], axis=-1)
+    total = variances.sum(axis=-1)
+    terms = (variances / degrees).sum(axis=-1)
+    # Harmonic mean of the degrees, weighted by variance. Without variance, the smallest.
+    freedom = np.where(total > 0, total / np.where(total > 0, terms, 1), degrees.min())
+    return total, stdtrit(freedom, 0.975)
 
 
 def _logit(values: np.ndarray) -> np.ndarray:

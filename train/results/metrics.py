@@ -301,11 +301,9 @@ def choose_units(*groups: Predictions) -> Units:
     """
     objects = [_objects(group) for group in groups]
     images = [[item.path for item in group.photograph] for group in groups]
-    if all(len({*names}) >= MIN_OBJECTS for names in objects):
-        over = IMAGES if objects == images else OBJECTS
-        return Units([_number(names) for names in objects], over)
-    over = IMAGES if images == objects else THESE_OBJECTS
-    return Units([_number(names) for names in images], over)
+    has_enough = all(len({*names}) >= MIN_OBJECTS for names in objects)
+    units, over = (objects, OBJECTS) if has_enough else (images, THESE_OBJECTS)
+    return Units([_number(names) for names in units], IMAGES if objects == images else over)
 
 
 def _objects(predictions: Predictions) -> list[object]:

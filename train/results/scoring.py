@@ -60,7 +60,7 @@ WRONG_CLASSES = 5
 SUMMARY_KEYS = {"source": "by_source", "mesh": "by_mesh", "class": "class_metrics"}
 # Metrics that depend on a ranking of images or classes.
 RANKING_METRICS = (*metrics.ROC_METRICS, *metrics.TOP_RANKS)
-# Metrics that `format_overall` leaves out, because they matter less.
+# Metrics that the lines of `Scores` leave out, because they matter less.
 DETAILS = ("top5", "recall_at/0.05", "recall_at/0.20")
 
 
@@ -227,8 +227,18 @@ class Scores(ShortRepr):
     by: str
 
     def __str__(self) -> str:
-        """Return the lines that pnb-evaluate prints."""
-        return format_overall(self)
+        """Return the lines that pnb-evaluate prints.
+
+        A Markdown table has a row for each metric of all images, with its 95% interval. The metrics
+        in `DETAILS` are left out.
+        """
+        rows = []
+        for name in (*_fraction_metrics(self), *RANKING_METRICS):
+            if name not in DETAILS:
+                rows.append((metric_title(name), _format_metric(self.overall.find(name))))
+        shown = (self.overall.recall, self.overall.false_positive_rate, self.overall.auc)
+        title = f"{_count_images(self)}; {tables.describe_intervals(shown)}"
+        return "\n".join([str(Table(title, ["metric", self.label], rows)), *_notes(self)])
 
     @property
     def label(self) -> str:
@@ -414,21 +424,6 @@ def _count_images(scores: Scores) -> str:
     negatives = len(scores.pooled.all.negatives)
     each = metrics.COUNTED_EACH if scores.by_label else ""
     return f"{positives} images of {scores.label}, {negatives} negatives{each}"
-
-
-def format_overall(scores: Scores) -> str:
-    """Format the metrics of all images as one Markdown table, with 95% intervals.
-
-    The table has a row for each metric. The metrics in `DETAILS` are left out.
-    """
-    overall = scores.overall
-    rows = []
-    for name in (*_fraction_metrics(scores), *RANKING_METRICS):
-        if name not in DETAILS:
-            rows.append((metric_title(name), _format_metric(overall.find(name))))
-    shown = (overall.recall, overall.false_positive_rate, overall.auc)
-    title = f"{_count_images(scores)}; {tables.describe_intervals(shown)}"
-    return "\n".join([str(Table(title, ["metric", scores.label], rows)), *_notes(scores)])
 
 
 def _fraction_metrics(scores: Scores) -> list[str]:

@@ -335,7 +335,7 @@ def test_photographs_that_cannot_be_read_are_counted_and_named_if_they_are_skipp
     summary = scores.to_summary()
     assert summary["unreadable"] == ["orange/broken.jpg"]
     assert summary["n"] == COUNTS | {"unreadable": 1, "left_out": 1}
-    for text in (scoring.format_scores(scores), scoring.format_overall(scores)):
+    for text in (scoring.format_scores(scores), str(scores)):
         assert "orange/broken.jpg" in text
         assert "orange/photo.HEIC" in text
 
