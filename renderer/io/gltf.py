@@ -55,18 +55,6 @@ class _Surface(NamedTuple):
     faces: Int[np.ndarray, "F 3"]
 
 
-class _Primitive(NamedTuple):
-    """Part with one material.
-
-    Attributes:
-        surface: Surface in its own axes.
-        material: Material of the part.
-    """
-
-    surface: _Surface
-    material: Material
-
-
 def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     """Read the parts of a .gltf or .glb file in the axes of its scene."""
     file = GltfFile(mesh_file)
@@ -93,12 +81,12 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
             if mode < TRIANGLES:
                 mesh_file.ignore("points and lines")
             else:
-                primitive_part = read_part(node["mesh"], number, weights)
+                surface, material_of_part = read_part(node["mesh"], number, weights)
                 # A small file can show one mesh very often.
-                needed += FACE_BYTES * len(primitive_part.surface.faces)
-                needed += VERTEX_BYTES * len(primitive_part.surface.values)
+                needed += FACE_BYTES * len(surface.faces)
+                needed += VERTEX_BYTES * len(surface.values)
                 require_memory("its faces", needed, CPU)
-                placed_parts += _place(primitive_part, file.poses[index])
+                placed_parts += _place(surface, material_of_part, file.poses[index])
     modes = {material.get("alphaMode") for material in file.tree.get("materials", ())}
     if not placed_parts and "MASK" in modes:
         raise ValueError("its alpha cuts out all faces (alphaMode MASK): use OPAQUE")
@@ -107,8 +95,11 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
 
 def _read_part(
     file: GltfFile, material_of: Any, mesh: int, number: int, weights: tuple[float, ...]
-) -> _Primitive:
-    """Read a primitive of a mesh, with its morph targets at the given weights."""
+) -> tuple[_Surface, Material]:
+    """Read a primitive of a mesh, with its morph targets at the given weights.
+
+    Return its surface in its own axes, and its material.
+    """
     primitive = file.tree["meshes"][mesh]["primitives"][number]
     material: Material = material_of(primitive.get("material"))
     # Name of the attribute with the texture coordinates that the textures use.
@@ -135,7 +126,7 @@ def _read_part(
     normals = attributes.get("NORMAL", np.zeros_like(positions))
     # The columns have the order of `_Surface.values`.
     values = np.column_stack([positions, uvs, colors[:, 3], colors[:, :3], normals])
-    return _Primitive(_Surface(values, faces), material)
+    return _Surface(values, faces), material
 
 
 def _attributes(
@@ -188,14 +179,14 @@ def _faces(file: GltfFile, primitive: dict[str, Any], vertex_count: int) -> np.n
     return indices[: len(indices) // 3 * 3].reshape(-1, 3)
 
 
-def _place(part: _Primitive, pose: Float[np.ndarray, "4 4"]) -> list[Part]:
+def _place(surface: _Surface, material: Material, pose: Float[np.ndarray, "4 4"]) -> list[Part]:
     """Return a part without its holes, with its matrix in the scene, or none if no face is left."""
-    material, visible = part.material, part.surface
+    visible = surface
     if material.mode != "OPAQUE":
         # The alpha of a material decides what is visible (3.9.6).
         cutoff = ALMOST_ONE if material.mode == "BLEND" else material.cutoff
-        visible = _cut_out(part.surface, material.alpha, cutoff)
-    if material.mode == "BLEND" and visible is not part.surface:
+        visible = _cut_out(surface, material.alpha, cutoff)
+    if material.mode == "BLEND" and visible is not surface:
         raise ValueError("its surface is transparent (alphaMode BLEND): use OPAQUE or MASK")
     values, faces = visible
     if not len(faces):
