@@ -6,8 +6,6 @@ less 1 for an edge that leaves its samples to the other face (the top-left rule)
 therefore faces are those of `renderer.visibility.numpy`.
 """
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -45,30 +43,24 @@ def rasterize(
     return keys.int()
 
 
-class _Triangles(NamedTuple):
-    """The M = N · F triangles of N views, and their pairs with samples of their bounding boxes.
-
-    Pairs are numbered triangle by triangle, and row by row in a bounding box.
-
-    Attributes:
-        edges: Integers by which column and row of a sample are multiplied, and a constant, for
-            each of the three edge functions, shape (3, 3, M).
-        planes: Results of `depth_planes`, shape (5, M).
-        boxes: First column and first row of the bounding box, its width, and the number of the
-            first pair, shape (4, M).
-        ends: First number behind the pairs of each triangle, shape (M,).
-    """
-
-    edges: Int[Tensor, "3 3 M"]
-    planes: Float[Tensor, "5 M"]
-    boxes: Int[Tensor, "4 M"]
-    ends: Int[Tensor, " M"]
-
-
 def _triangles(
     points: Float[Tensor, "N V 3"], faces: Int[Tensor, "F 3"], shape: tuple[int, int], closed: bool
-) -> _Triangles:
-    """Prepare the triangles of all views. Those that are not drawn have no pairs."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Prepare the M = N · F triangles of N views, and their pairs with samples of bounding boxes.
+
+    Pairs are numbered triangle by triangle, and row by row in a bounding box. Triangles that are
+    not drawn have no pairs.
+
+    Returns:
+        A tuple of
+
+        - integers by which column and row of a sample are multiplied, and a constant, for each of
+          the three edge functions, shape (3, 3, M);
+        - results of `depth_planes`, shape (5, M);
+        - first column and first row of the bounding box, its width, and the number of the first
+          pair, shape (4, M);
+        - first number behind the pairs of each triangle, shape (M,).
+    """
     rows, columns = shape
     # As on GPUs, positions in samples are computed with one multiplication and one addition, and
     # rounded to float32. x points to the right and y down.
@@ -97,7 +89,7 @@ def _triangles(
     constant = (x * to_y - y * to_x) * sign - (~is_owner).long()
     edges = torch.stack([by_column, by_row, constant])
     boxes = torch.stack([first_column, first_row, widths, ends - counts])
-    return _Triangles(edges, torch.stack(planes), boxes, ends)
+    return edges, torch.stack(planes), boxes, ends
 
 
 def _draw(
@@ -112,18 +104,18 @@ def _draw(
     smallest key of a sample is therefore the nearest face, or the first of equally near faces.
     """
     rows, columns = keys.shape[1:]
-    triangles = _triangles(points, faces, (rows, columns), closed)
-    pair_count = int(triangles.ends[-1:].sum())  # The only wait for a GPU.
+    edges, planes, boxes, ends = _triangles(points, faces, (rows, columns), closed)
+    pair_count = int(ends[-1:].sum())  # The only wait for a GPU.
     for begin in range(0, pair_count, PAIRS_PER_TILE):
         pair = torch.arange(begin, min(begin + PAIRS_PER_TILE, pair_count), device=points.device)
         # Triangle of each pair, and the sample from the place of the pair in the bounding box.
-        triangle = torch.searchsorted(triangles.ends, pair, right=True)
-        column, row, width, first_pair = triangles.boxes[:, triangle]
+        triangle = torch.searchsorted(ends, pair, right=True)
+        column, row, width, first_pair = boxes[:, triangle]
         step = pair - first_pair
         column, row = column + step % width, row + step // width
-        by_column, by_row, constant = triangles.edges[..., triangle]
+        by_column, by_row, constant = edges[..., triangle]
         is_inside = (by_column * column + by_row * row + constant >= 0).all(0)
-        x, y, depth, slope_x, slope_y = triangles.planes[:, triangle]
+        x, y, depth, slope_x, slope_y = planes[:, triangle]
         rounded = (depth + (row - y) * slope_y + slope_x * (column - x)).round()
         is_seen = is_inside & (rounded >= 0) & (rounded < FAR)
         view, face = triangle // len(faces), triangle % len(faces)
