@@ -1,9 +1,7 @@
 """A classifier: a network whose outputs are logits, with the names of its classes."""
 
-import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any, Self
 
 import numpy as np
@@ -12,10 +10,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from augment import network as wrappers
-from augment.exposure import DIM, DIM_NAME, DimSwitch, light_settings, with_normalized_light
+from augment.exposure import DIM, light_settings, with_normalized_light
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
+from augment.switch import DIM_NAME, LIT_NAME, Dimness, Recognizer, Switch
 from augment.tasks import recognized_task
-from augment.tasks.classification import Classification
+from augment.tasks.classification import Classification, class_index, log_odds
 from augment.tasks.task import Task
 from renderer import errors
 from renderer.errors import InputError
@@ -145,6 +144,8 @@ class TaskNetwork(CheckedNetwork):
         self.size = as_size(f"{kind} {name}: size", size, MAX_SIZE)
         self.classes = names
         self.name = name
+        # Whether an image is in the light of the training of this network.
+        self.recognizer: Recognizer | None = None
         if len(set(self.classes)) < len(self.classes):
             reason = f"{self.title}: classes has a name that occurs twice"
             raise InputError(f"{reason}: give each class a name of its own")
@@ -236,13 +237,40 @@ class TaskNetwork(CheckedNetwork):
             tensor([[1., 1., 1.]])
         """
         errors.require_number("below", below, 1e-6, 1)
-        errors.require_kind("dim", dim, TaskNetwork, "a network with its task, size and classes")
+        return self._with_other(dim, "dim", Dimness(below), DIM_NAME)
+
+    def with_lit(self, lit: Self) -> Self:
+        """Return a network that shows images in an unusual light to another network.
+
+        Every image passes through both networks, because the other network
+        recognizes the light of its own training.
+
+        Args:
+            lit: Network of a run with `train.recognize=true`, with the same task,
+                size and classes.
+
+        Raises:
+            InputError: If the networks differ in task, size or classes, or if
+                `lit` recognizes no light.
+
+        Example:
+            >>> import norm_balls as nb
+            >>> switched = nb.load("none").with_lit(nb.load_run("runs/stripes"))  # doctest: +SKIP
+        """
+        errors.require_kind("lit", lit, TaskNetwork, "the network of a run")
+        if lit.recognizer is None:
+            raise InputError(f"{lit.title} recognizes no light: train it with train.recognize=true")
+        return self._with_other(lit, "lit", lit.recognizer, LIT_NAME)
+
+    def _with_other(self, other: Self, key: str, chooses: Any, prefix: str) -> Self:
+        """Return a network that shows the chosen images to another network."""
+        errors.require_kind(key, other, TaskNetwork, "a network with its task, size and classes")
         for name in ("task", "size", "classes"):
-            if getattr(dim, name) != getattr(self, name):
-                reason = f"dim has another {name} than {self.title}"
+            if getattr(other, name) != getattr(self, name):
+                reason = f"{key} has another {name} than {self.title}"
                 raise InputError(f"{reason}: give a network of the same task, size and classes")
-        name = f"{DIM_NAME}{self.name}+{dim.name}"
-        return self.with_network(DimSwitch(self, dim, below), name=name)
+        name = f"{prefix}{self.name}+{other.name}"
+        return self.with_network(Switch(self, other, chooses), name=name)
 
     def with_network(
         self, network: nn.Module, normalize_light: NormalizeLight = None, name: str | None = None
@@ -252,6 +280,7 @@ class TaskNetwork(CheckedNetwork):
         given = self.size, self.classes, name or self.name, normalize_light
         made = type(self)(network, *given, **options)
         made.inputs = self.inputs
+        made.recognizer = self.recognizer
         return made
 
     def describe_inputs(self) -> str:
@@ -382,52 +411,12 @@ def as_class_names(name: str, classes: object) -> tuple[str, ...]:
     return tuple(map(errors.composed, errors.as_list(name, classes, str, expected)))
 
 
-def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
-    """Return the index of a class.
-
-    The name may be an index, also as text. `subject` starts the error, which suggests similar
-    names.
-    """
-    errors.require_kind("label", name, str | Integral, "the name of a class, or its index")
-    # Unicode can write an accent in two ways. `composed` makes them equal.
-    text = errors.composed(str(name))
-    names = [*map(errors.composed, classes)]
-    if isinstance(name, str) and text in names:
-        return names.index(text)
-    last = len(classes) - 1
-    if text.isascii() and text.isdecimal():
-        if int(text) <= last:
-            return int(text)
-        reason = f"the label {text} is not a class: indices go from 0 to {last}"
-    elif names == [*map(str, range(len(classes)))]:
-        advice = f"give an index from 0 to {last}, or name the classes"
-        reason = f"{text!r} is not a class, and the classes have only indices: {advice}"
-    else:
-        similar = nearest(text, classes)
-        reason = f"{text!r} is not a class of the model: choose one, such as {similar}"
-    raise InputError(f"{subject}: {reason}")
-
-
-def nearest(name: str, choices: Sequence[str]) -> str:
-    """Return the three names that are most similar to a misspelled name, as one text."""
-    return ", ".join(difflib.get_close_matches(name, choices, n=3, cutoff=0))
-
-
 def remembering(classifier: TaskNetwork) -> TaskNetwork:
     """Return a copy of a classifier that classifies each different image only once."""
     is_remembering = isinstance(classifier.network, wrappers.Remembered)
     if is_remembering or not isinstance(classifier, Classifier):
         return classifier
     return classifier.with_network(wrappers.Remembered(classifier.network))
-
-
-def log_odds(logits: Float[Tensor, "N classes"], label: int) -> Float[Tensor, " N"]:
-    """Compute the log-odds of a class, log(p / (1 − p)), where p is its probability.
-
-    The result is finite even if p rounds to 0 or 1.
-    """
-    others = torch.cat([logits[:, :label], logits[:, label + 1 :]], dim=1)
-    return logits[:, label] - others.logsumexp(dim=1)
 
 
 def as_network(

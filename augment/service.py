@@ -20,7 +20,7 @@ from augment.attacks.loop import minimize
 from augment.attacks.objective import Objective, preprocessed_model
 from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed_light
 from augment.augmentation_settings import AugmentationSettings, views_of
-from augment.classifier import CheckedNetwork, class_index
+from augment.classifier import CheckedNetwork
 from augment.progress import Phases
 from augment.renders import Renders, select_examples_to_log
 from augment.scene.build import MeshItem, build_scene, warn_of_exposure, with_needed_degree
@@ -28,7 +28,7 @@ from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT, Truth
 from augment.scene.vary import vary
-from augment.tasks.classification import ClassCriterion, Classification
+from augment.tasks.classification import ClassCriterion, Classification, class_index
 from augment.tasks.task import NO_CLASS, Criterion, Task
 from renderer.errors import InputError, as_integers, require_kind, require_shape, require_whole
 from renderer.image import to_unit

@@ -20,10 +20,11 @@ from torch import Tensor, nn
 
 from augment import files, huggingface, progress
 from augment import network as wrappers
-from augment.classifier import Classifier, Normalization, as_network, mean_and_std, nearest
+from augment.classifier import Classifier, Normalization, as_network, mean_and_std
 from augment.files import NetworkFacts, State
 from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network, unwrapped
 from augment.settings import PYTHON, NormalizeLight
+from augment.tasks.classification import nearest
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
 from renderer.settings import Size, height_and_width

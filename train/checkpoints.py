@@ -21,11 +21,12 @@ from safetensors import safe_open
 from torch import Tensor, cuda
 
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
-from augment.exposure import DIM, DIM_NAME, with_normalized_light
+from augment.exposure import DIM, with_normalized_light
 from augment.files import as_facts, is_network_file, require_no_facts
 from augment.network import FROM_FILE, Inputs, say_inputs, say_once
 from augment.settings import PYTHON, NormalizeLight
 from augment.sources import SOURCES, import_function, load_classifier
+from augment.switch import DIM_NAME, LIT_NAME, Recognizer
 from augment.tasks.detection import Detection
 from renderer.errors import InputError, as_path, explained, keyed, require_file, require_kind
 from renderer.io.files import atomic_write
@@ -44,6 +45,8 @@ FACTS = ("version", "encoding", "validation", "assumed")
 ASSUMED = "assumed"
 # Entry in the description of a network that normalizes the light of images, with its settings.
 NORMALIZE_LIGHT = "normalize_light"
+# Entry in best.pt of a run with `train.recognize`: what `Recognizer` needs beside the network.
+RECOGNIZER = "recognizer"
 # If a network normalizes the light of images, the names of its weights begin with this text.
 LIGHT_PREFIX = "network."
 
@@ -137,17 +140,22 @@ def load_network(
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     options: dict[str, Any] = {"normalize_light": normalize_light, "trust_code": trust_code}
-    if name.startswith(DIM_NAME):
-        plain, plus, dim = name.removeprefix(DIM_NAME).rpartition("+")
+    if name.startswith((DIM_NAME, LIT_NAME)):
+        prefix, _, names = name.partition(":")
+        plain, plus, other = names.rpartition("+")
         if not plus:
-            reason = f"name={name} names one network: give {DIM_NAME}NETWORK+DIM_NETWORK"
+            reason = f"name={name} names one network: give {prefix}:NETWORK+OTHER_NETWORK"
             raise InputError(reason, "name")
         network = load_network(plain, weights, trust_code=trust_code, **facts)
-        if not dim.startswith(RUN):
+        if not other.startswith(RUN):
             options |= {"weights": weights, **facts}
-        say_once(f"{dim} gets the images whose 98th percentile of linear values is below {DIM}")
         # The light of plain images is not normalized.
-        return network.with_dim(load_network(dim, **options))
+        second = load_network(other, **options)
+        if name.startswith(LIT_NAME):
+            say_once(f"{other} gets the images whose light it recognizes as that of its training")
+            return network.with_lit(second)
+        say_once(f"{other} gets the images whose 98th percentile of linear values is below {DIM}")
+        return network.with_dim(second)
     path = Path(name)
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path
@@ -268,6 +276,8 @@ def load_run(
                 # This call raises InputError if the network lacks the class.
                 loaded.label(point.label)
         loaded.inputs = stated_inputs(state["architecture"])
+        if RECOGNIZER in state:
+            loaded.recognizer = Recognizer(network, **state[RECOGNIZER])
         say_inputs(loaded.name, network, size, loaded.inputs)
         return loaded
 

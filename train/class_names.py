@@ -5,9 +5,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from augment.classifier import class_index, nearest
 from augment.scene.objects import MESHES_IN_MEMORY, name_mesh
 from augment.settings import ObjectSettings
+from augment.tasks.classification import class_index, nearest
 from renderer.errors import InputError, as_list, describe
 from renderer.mesh import Mesh
 from renderer.solids import HARD_NEGATIVES, SOLIDS

@@ -90,8 +90,10 @@ RELIGHT = "relight"
 LOW_LIGHT, RELIGHT_AND_LOW_LIGHT = "low_light", "relight+low_light"
 # Augmentation by the stripes of a scanner.
 STRIPES = "stripes"
+# Augmentations that are a light.
+LIGHTS = (RELIGHT, LOW_LIGHT, RELIGHT_AND_LOW_LIGHT, STRIPES)
 # Choices of train.augmentation.
-AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT, LOW_LIGHT, RELIGHT_AND_LOW_LIGHT, STRIPES)
+AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", *LIGHTS)
 # Choices of train.optimizer.
 OPTIMIZERS = ("sgd", "adamw")
 # Choices of train.flips.
@@ -278,8 +280,8 @@ class TrainSettings(Settings):
     distillation_weight: float = weight("the divergence from the predictions of `network`.")
     consistency_weight: float = weight("the same divergence on augmented images.")
     interpolate: bool = setting(False, "Mix weights before and after by validation (WiSE-FT).")
-    agreement: float = setting(
-        0.0, "Smallest fraction of predictions that mixed weights keep.", within=(0, 1)
+    recognize: bool = setting(
+        False, "Learn to recognize the light of the augmentation, for network=lit:A+B."
     )
     ema_decay: float = setting(0.0, "Decay of averaged weights. 0: none.", minimum=0, below=1)
     soup: bool = setting(False, "Keep the mean of all epochs, which all start with `network`.")
@@ -304,8 +306,8 @@ class TrainSettings(Settings):
         super().__post_init__()
         if self.relight_steps and not self.consistency_weight:
             raise self.wrong("relight_steps", "needs a consistency loss: set its weight")
-        if self.agreement and not self.interpolate:
-            raise self.wrong("agreement", "is of mixed weights: set interpolate=true")
+        if self.recognize and self.augmentation not in LIGHTS:
+            raise self.wrong("recognize", f"needs a light: set augmentation={' or '.join(LIGHTS)}")
 
 
 @dataclass

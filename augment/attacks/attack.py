@@ -27,7 +27,7 @@ from augment.random_streams import generator
 from augment.scene.build import warn_of_exposure, with_needed_degree
 from augment.scene.scene import Scene
 from augment.settings import NormalizeLight, SceneSettings
-from augment.tasks.classification import Classification
+from augment.tasks.classification import Classification, class_index
 from augment.tasks.task import Criterion, Task
 from renderer.errors import InputError, as_list, is_whole, require_flag, require_kind, require_whole
 from renderer.light import basis, files
@@ -281,7 +281,7 @@ def target_labels(
         advice = f"give one for each of the {view_count} views, in a scene with shared=True"
         raise InputError(f"target={names} names {len(names)} classes: {advice}")
     classes = classifier.classes
-    indices = [classifiers.class_index(classes, name, f"target={name}") for name in names]
+    indices = [class_index(classes, name, f"target={name}") for name in names]
     labels = source.new_tensor(indices).repeat(len(source), 1)
     if torch.eq(labels, source).any():
         raise InputError(f"target={target} is the true class of an example: choose another class")

@@ -7,8 +7,10 @@ other classes that images with a complementary label do not show, either.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -18,7 +20,7 @@ from torch import Tensor
 
 from augment.network import are_probabilities, plain_outputs, unwrapped
 from augment.tasks.task import NO_CLASS, Criterion, GetTruth, Task, stored_names
-from renderer.errors import InputError, require
+from renderer.errors import InputError, composed, require, require_kind
 
 # Logits of N images, and labels or predicted classes of them.
 Logits = Float[Tensor, "N C"]
@@ -226,3 +228,43 @@ def is_correct(predicted: Labels, labels: Labels, absent: Sequence[int] = ()) ->
 def _class_of(labels: Tensor) -> Tensor:
     """Return the class c of each label, which is c or, if it is complementary, −1 − c."""
     return torch.where(labels < 0, -1 - labels, labels)
+
+
+def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
+    """Return the index of a class.
+
+    The name may be an index, also as text. `subject` starts the error, which suggests similar
+    names.
+    """
+    require_kind("label", name, str | Integral, "the name of a class, or its index")
+    # Unicode can write an accent in two ways. `composed` makes them equal.
+    text = composed(str(name))
+    names = [*map(composed, classes)]
+    if isinstance(name, str) and text in names:
+        return names.index(text)
+    last = len(classes) - 1
+    if text.isascii() and text.isdecimal():
+        if int(text) <= last:
+            return int(text)
+        reason = f"the label {text} is not a class: indices go from 0 to {last}"
+    elif names == [*map(str, range(len(classes)))]:
+        advice = f"give an index from 0 to {last}, or name the classes"
+        reason = f"{text!r} is not a class, and the classes have only indices: {advice}"
+    else:
+        similar = nearest(text, classes)
+        reason = f"{text!r} is not a class of the model: choose one, such as {similar}"
+    raise InputError(f"{subject}: {reason}")
+
+
+def nearest(name: str, choices: Sequence[str]) -> str:
+    """Return the three names that are most similar to a misspelled name, as one text."""
+    return ", ".join(difflib.get_close_matches(name, choices, n=3, cutoff=0))
+
+
+def log_odds(logits: Logits, label: int) -> Float[Tensor, " N"]:
+    """Compute the log-odds of a class, log(p / (1 − p)), where p is its probability.
+
+    The result is finite even if p rounds to 0 or 1.
+    """
+    others = torch.cat([logits[:, :label], logits[:, label + 1 :]], dim=1)
+    return logits[:, label] - others.logsumexp(dim=1)

@@ -15,8 +15,9 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from augment.classifier import Label, class_index, nearest
+from augment.classifier import Label
 from augment.progress import progress
+from augment.tasks.classification import class_index, nearest
 from renderer.errors import InputError, composed, explained, require_memory
 from renderer.io.images import SUFFIXES, read_center
 from renderer.settings import Size, height_and_width

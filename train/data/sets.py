@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Shaped, UInt8
 from torch import Tensor
 
-from augment.classifier import class_index
 from augment.progress import progress
 from augment.random_streams import generator
+from augment.tasks.classification import class_index
 from renderer.errors import InputError, describe, explained
 from train import console
 from train.data import photographs

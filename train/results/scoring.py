@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.classifier import CheckedNetwork, Label, OperatingPoint, log_odds
+from augment.classifier import CheckedNetwork, Label, OperatingPoint
 from augment.network import compute_outputs
-from augment.tasks.classification import Classification
+from augment.tasks.classification import Classification, log_odds
 from renderer.errors import InputError, ShortRepr, require_choice
 from renderer.io.images import write_image
 from renderer.settings import Size, as_size

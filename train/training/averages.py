@@ -20,7 +20,7 @@ from train.training.recipe import kl_divergence
 
 # Factors of the interpolation that are tried: 0 gives the weights before the training, and
 # 1 the weights after it.
-FACTORS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.5, 0.75, 1.0)
+FACTORS = (0.0, 0.25, 0.5, 0.75, 1.0)
 # Entry of a checkpoint with interpolated weights. Its value is the factor.
 INTERPOLATION = "interpolation"
 # Number of images in a pass through a network.
@@ -144,12 +144,8 @@ def interpolate(
     seed: int,
     light: str,
     weights: tuple[float, float] = (1.0, 1.0),
-    agreement: float = 0.0,
 ) -> tuple[dict[str, Tensor], float]:
     """Interpolate between two sets of weights, by the factor with the lowest loss.
-
-    Of the factors, only those count with which the network keeps at least the fraction `agreement`
-    of the predictions for unchanged images.
 
     This is WiSE-FT (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models"). The
     validation images need no labels.
@@ -173,8 +169,6 @@ def interpolate(
         relit = predict(selected, validation, device, seed, "validation", light=light)
         divergences = [kl_divergence(logits, targets).mean() for logits in (unchanged, relit)]
         losses[factor] = weights[0] * float(divergences[0]) + weights[1] * float(divergences[1])
-        if (unchanged.argmax(1) == targets.argmax(1)).double().mean() < agreement:
-            losses[factor] = torch.inf
     factor = min(losses, key=losses.__getitem__)
     console.info("weights: %.0f%% trained, %.0f%% original", 100 * factor, 100 * (1 - factor))
     return mix(initial_weights, trained, factor), factor

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.classifier import TaskNetwork, class_index
-from augment.exposure import DIM_NAME, without_normalized_light
+from augment.classifier import TaskNetwork
+from augment.exposure import without_normalized_light
 from augment.files import as_facts, is_network_file, name_from_anywhere, require_no_facts
 from augment.network import FROM_FILE, YOU, Inputs
 from augment.progress import Phases
@@ -19,7 +19,8 @@ from augment.scene.scene import Scene
 from augment.service import AugmentationService
 from augment.settings import PYTHON
 from augment.sources import load_source
-from augment.tasks.classification import Classification, complementary_label
+from augment.switch import DIM_NAME, LIT_NAME
+from augment.tasks.classification import Classification, class_index, complementary_label
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, is_whole, keyed, keys_of, require_range
 from renderer.settings import MAX_SIZE
@@ -104,7 +105,7 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     name = settings.network
     if not name:
         return None
-    if name.startswith(DIM_NAME):
+    if name.startswith((DIM_NAME, LIT_NAME)):
         raise InputError(f"network={name} has two networks: train one of them", "network")
     # A classifier comes from a library or a file. Any other name is the folder of a training run.
     if checkpoints.is_classifier(name):

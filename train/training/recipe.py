@@ -15,9 +15,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
-from augment.classifier import log_odds, nearest
 from augment.network import eval_mode, keep_text_vectors, plain_outputs, text_vectors
-from augment.tasks.classification import is_correct, label_loss
+from augment.tasks.classification import is_correct, label_loss, log_odds, nearest
 from renderer.errors import MAX_SCALE, InputError
 from renderer.image import to_unit
 from train.device import PRECISIONS, MixedPrecision
@@ -83,15 +82,15 @@ def last_layer(network: nn.Module) -> str:
     return _module_of(names[-1])
 
 
-def _last_called_layer(network: nn.Module, size: int) -> tuple[str, int]:
-    """Return the name of the layer with a matrix that a network calls last, and its class count.
+def called_layers(network: nn.Module, size: int) -> tuple[list[tuple[str, Any]], Any]:
+    """Return the layers with matrices in the order of their calls, and the outputs of the network.
 
-    The order of the calls may differ from the order of the parameters, which is
-    that of the definitions. Normalizations and activations with parameters do not
-    count, unless a network has no other layer. A network of TorchScript or torch.export calls no
-    modules, so the module of its last parameter is returned.
+    Each layer has its name and its output for one gray image. The order of the calls may differ
+    from the order of the parameters, which is that of the definitions. Normalizations and
+    activations with parameters do not count, unless a network has no other layer. A network of
+    TorchScript or torch.export calls no modules.
     """
-    called: list[tuple[bool, str]] = []
+    called: list[tuple[bool, str, Any]] = []
     hooks = []
     for name, module in network.named_modules():
         own = list(module.parameters(recurse=False))
@@ -99,16 +98,21 @@ def _last_called_layer(network: nn.Module, size: int) -> tuple[str, int]:
         is_layer = own and len(own) == len(list(module.parameters()))
         if is_layer and not isinstance(module, torch.jit.ScriptModule):
             call = (any(parameter.ndim > 1 for parameter in own), name)
-            hooks.append(module.register_forward_hook(lambda *_, call=call: called.append(call)))
+
+            def note(_: nn.Module, __: Any, output: Any, call: tuple[bool, str] = call) -> None:
+                called.append((*call, output))
+
+            hooks.append(module.register_forward_hook(note))
     device = next(network.parameters()).device
     # The hooks note the layers that are called for a gray image.
     with eval_mode(network), torch.no_grad():
-        logits = plain_outputs(network(torch.full((1, 3, size, size), 0.5, device=device)))
+        outputs = plain_outputs(network(torch.full((1, 3, size, size), 0.5, device=device)))
     for hook in hooks:
         hook.remove()
     # Layers with a matrix, or else all layers, in the order of their calls.
-    names = [name for has_matrix, name in called if has_matrix] or [name for _, name in called]
-    return names[-1] if names else last_layer(network), logits.shape[1]
+    has_any = any(has_matrix for has_matrix, *_ in called)
+    layers = [(name, output) for has_matrix, name, output in called if has_matrix or not has_any]
+    return layers, outputs
 
 
 def _module_of(parameter: str) -> str:
@@ -123,7 +127,9 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
     network, the vectors of its texts.
     """
     if stage == ALL_BUT_LAST:
-        last, class_count = _last_called_layer(network, size)
+        called, logits = called_layers(network, size)
+        class_count = logits.shape[1]
+        last = called[-1][0] if called else last_layer(network)
         named = network.named_parameters()
         weights = [weight for name, weight in named if _module_of(name) == last]
         # The last layer of a classifier has a row for each class, that of a zero-shot network none.

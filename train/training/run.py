@@ -34,6 +34,7 @@ from train.training.augmentations import LIT
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, scale_learning_rate
+from train.training.recognition import fit_recognizer
 from train.training.run_log import Logger, RunLog
 
 # If the training images are on disk, the mean and the standard deviation of their color
@@ -201,6 +202,8 @@ class Run:
         with keyed(**keys_of("train", self.settings.train)):
             trainer.fit(split, self.held_out, log)
         scores |= self._score() if has_labels else {}
+        if self.settings.train.recognize:
+            self._recognize()
         if log:  # Only the first process has a log.
             scores |= self._score_photographs(trainer.selected, self.folder)
             log.scalars(scores)
@@ -317,11 +320,28 @@ class Run:
         validation = self.data.train[self.held_out]
         # Weights of the losses of unchanged and of relit images.
         losses = (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0)
-        light = recipe.augmentation, losses, recipe.agreement
+        light = recipe.augmentation, losses
         weights, factor = interpolate(*networks, validation, self.settings.seed, *light)
         trainer.best |= {"model": weights, INTERPOLATION: factor}
+        self._save_best()
+
+    def _recognize(self) -> None:
+        """Write to best.pt what recognizes the light of the training, unless it is there."""
+        trainer, recipe = self.trainer, self.settings.train
+        if checkpoints.RECOGNIZER in trainer.best:
+            return
+        splits = self.data.train[~self.held_out], self.data.train[self.held_out]
+        light = self.settings.seed, recipe.augmentation
+        network = trainer.selected.network
+        network.load_state_dict(trainer.best["model"])
+        fitted = fit_recognizer(network, *splits, *light)
+        trainer.best[checkpoints.RECOGNIZER] = fitted
+        self._save_best()
+
+    def _save_best(self) -> None:
+        """Write best.pt in the first process."""
         if distributed.rank() == 0:
-            checkpoints.save(self.folder / BEST, trainer.best)
+            checkpoints.save(self.folder / BEST, self.trainer.best)
 
     def _relit_agreement(self, targets: Int[Tensor, " N"], unchanged: float) -> dict[str, float]:
         """Measure on which fraction of the test images light does not change the prediction.

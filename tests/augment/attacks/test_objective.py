@@ -13,10 +13,15 @@ import augment
 from augment.attack_settings import EOTSettings
 from augment.attacks import objective
 from augment.attacks.objective import as_jpeg, average_transformed
-from augment.classifier import log_odds
 from augment.network import Network, Quantization
 from augment.random_streams import generator
-from augment.tasks.classification import ClassCriterion, complementary_label, is_correct, label_loss
+from augment.tasks.classification import (
+    ClassCriterion,
+    complementary_label,
+    is_correct,
+    label_loss,
+    log_odds,
+)
 from augment.tasks.task import NO_CLASS
 from train.training.recipe import ranking_loss
 

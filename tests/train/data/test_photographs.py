@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from augment.classifier import class_index
+from augment.tasks.classification import class_index
 from renderer.errors import InputError
 from train.class_names import classes_of_meshes
 from train.data import photographs

@@ -7,18 +7,17 @@ import pytest
 import torch
 
 from augment.random_streams import generator
-from renderer.image import to_bytes, to_unit
+from renderer.image import to_unit
 from tests.helpers import save_noise
 from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.checkpoints import load
 from train.commands.experiment import train
 from train.data.sets import Split
-from train.device import MixedPrecision
 from train.results.page import PAGE
 from train.run_folder import BEST, LAST, read_metrics
 from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
-from train.training import averages, run
+from train.training import run
 from train.training.augmentations import Augmentation
 from train.training.averages import FACTORS, INTERPOLATION, predict
 from train.training.recipe import TrainingLoss
@@ -143,34 +142,6 @@ def test_weights_are_interpolated_by_predictions_in_the_light_of_the_training():
         return float(shown.median())
 
     assert brightness("low_light") < 0.6 * 180 / 255 < brightness("relight")
-
-
-@pytest.mark.parametrize(
-    ("agreement", "expected"), [(0.0, 1.0), (0.5, 0.75), (0.6, 0.5), (0.9, 0.25), (0.95, 0.1)]
-)
-def test_interpolated_weights_keep_the_wanted_fraction_of_the_predictions(
-    agreement, expected, monkeypatch
-):
-    """At the factor f, the network takes image i of 10 for bright if its brightness is above f."""
-    levels = torch.tensor([0.3, 0.3, 0.6, 0.6, 0.8, 0.8, 0.8, 0.9, 0.1, 1.0])
-    images = to_bytes(levels.view(-1, 1, 1, 1).expand(-1, 3, 4, 4))
-    networks = []
-    for limit in (0.0, 1.0):
-        layer = torch.nn.Linear(48, 2)
-        layer.weight.data = torch.tensor([[0.0], [1 / 48]]).expand(2, 48).clone()
-        layer.bias.data = torch.tensor([0.0, -limit])
-        network = torch.nn.Sequential(torch.nn.Flatten(), layer)
-        networks.append(MixedPrecision(network, "float32"))
-    initial, selected = networks
-    # The loss is lowest for the trained weights.
-    monkeypatch.setattr(averages, "kl_divergence", lambda logits, _: logits[:, 1:].clone())
-    split = Split(images, torch.zeros(10).long())
-    trained = {name: value.clone() for name, value in selected.network.state_dict().items()}
-    shown = initial, selected, trained, split, 0, "low_light"
-    mixed, factor = averages.interpolate(*shown, agreement=agreement)
-    bias = mixed["1.bias"]
-    assert factor == expected
-    assert float(bias[1]) == pytest.approx(-expected)
 
 
 @pytest.mark.parametrize("weight", [2.0, 0.0])

@@ -1,0 +1,110 @@
+"""A second network for images in some light, beside another network for all other images."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from augment.exposure import are_dim
+
+# A name that begins with one of these texts names a network, and a second one after a "+".
+DIM_NAME, LIT_NAME = "dim:", "lit:"
+
+
+class Switch(nn.Module):
+    """Network that shows the images which a function chooses to another network."""
+
+    def __init__(
+        self, network: nn.Module, other: nn.Module, chooses: Callable[[Tensor], Bool[Tensor, " N"]]
+    ):
+        super().__init__()
+        self.network, self.other, self.chooses = network, other, chooses
+        self.training = network.training
+
+    def forward(self, images: Tensor) -> Any:
+        is_chosen = self.chooses(images.detach())
+        if not is_chosen.any():
+            return self.network(images)
+        if is_chosen.all():
+            return self.other(images)
+        # Place of each image among the outputs of both networks.
+        places = torch.cat([(~is_chosen).nonzero(), is_chosen.nonzero()])[:, 0].argsort()
+        return _joined([self.network(images[~is_chosen]), self.other(images[is_chosen])], places)
+
+    def extra_repr(self) -> str:
+        """Write what chooses, on which the keys of stored logits depend."""
+        return repr(self.chooses)
+
+
+@dataclass(frozen=True)
+class Dimness:
+    """Whether the 98th percentile of the linear values of each image is below a limit."""
+
+    below: float
+
+    def __call__(self, images: Float[Tensor, "N 3 H W"]) -> Bool[Tensor, " N"]:
+        return are_dim(images, self.below)
+
+
+@dataclass(frozen=True, eq=False)
+class Recognizer:
+    """Whether images are in the light of a training: a linear classifier of `statistics`.
+
+    It says so if the statistics times `weights`, plus `bias`, are above 0.
+    """
+
+    network: nn.Module
+    layers: Sequence[str]
+    weights: Float[Tensor, " D"]
+    bias: float
+
+    def __call__(self, images: Float[Tensor, "N 3 H W"]) -> Bool[Tensor, " N"]:
+        values = statistics(self.network, self.layers, images).double()
+        return values @ self.weights.to(values) + self.bias > 0
+
+    def __repr__(self) -> str:
+        # The weights come from the same training as those of the network.
+        return f"Recognizer({self.bias})"
+
+
+@torch.no_grad()
+def statistics(
+    network: nn.Module, layers: Sequence[str], images: Float[Tensor, "N 3 H W"]
+) -> Float[Tensor, "N D"]:
+    """Compute mean and standard deviation of each channel in the outputs of layers of a network."""
+    found: dict[str, Tensor] = {}
+
+    def note(name: str, layer: nn.Module, output: Tensor) -> None:
+        # Linear layers have their channels last, and convolutions behind the images.
+        channels = -1 if isinstance(layer, nn.Linear) else 1
+        values = output.movedim(channels, 1).reshape(len(images), output.shape[channels], -1)
+        found[name] = torch.cat([values.mean(2), values.std(2, correction=0)], 1)
+
+    modules = [(name, network.get_submodule(name)) for name in layers]
+    hooks = [
+        layer.register_forward_hook(lambda layer, _, output, name=name: note(name, layer, output))
+        for name, layer in modules
+    ]
+    try:
+        network(images)
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return torch.cat([found[name] for name in layers], 1).float()
+
+
+def _joined(outputs: list[Any], places: Int[Tensor, " N"]) -> Any:
+    """Join outputs of several batches of images, and put them in another order."""
+    first = outputs[0]
+    if isinstance(first, Tensor):
+        return torch.cat(outputs)[places]
+    if isinstance(first, Mapping):
+        # Outputs of transformers have keys without values.
+        given = [key for key, value in first.items() if value is not None]
+        parts = {key: [item[key] for item in outputs] for key in given}
+        return type(first)(**{key: _joined(values, places) for key, values in parts.items()})
+    rows = [row for item in outputs for row in item]
+    return [rows[place] for place in places.tolist()]

@@ -1,0 +1,124 @@
+"""A run recognizes the light of its training, and a switch shows it only images in this light."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+from torch import nn
+
+import norm_balls as nb
+from augment.switch import LIT_NAME, Recognizer, statistics
+from renderer import InputError
+from renderer.image import to_unit
+from tests.helpers import save_noise
+from tests.runs import completed_run
+from train.__main__ import main as train_command
+from train.checkpoints import load_network
+from train.data.sets import Split
+from train.training.augmentations import relit
+from train.training.recognition import DECAY, fit_recognizer, logistic_weights
+
+SIZE = 32
+
+
+def photographs(count: int, seed: int) -> torch.Tensor:
+    """Return smooth random images, uint8, shape (count, 3, SIZE, SIZE)."""
+    rng = torch.Generator().manual_seed(seed)
+    coarse = 255 * torch.rand(count, 3, 4, 4, generator=rng)
+    smooth = nn.functional.interpolate(coarse, (SIZE, SIZE), mode="bilinear")
+    return (smooth + 20 * torch.rand(smooth.shape, generator=rng)).clamp(0, 255).byte()
+
+
+@pytest.fixture(scope="module")
+def network():
+    torch.manual_seed(0)
+    layers = nn.Conv2d(3, 16, 3), nn.ReLU(), nn.Conv2d(16, 16, 3, stride=2), nn.ReLU()
+    return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(16, 3)).eval()
+
+
+def test_the_statistics_of_convolutions_and_tokens_are_those_of_each_channel():
+    class Tokens(nn.Module):
+        """Linear layer for tokens, whose channels are last, before a linear layer for images."""
+
+        def __init__(self):
+            super().__init__()
+            self.patches, self.mix = nn.Conv2d(3, 5, 4, stride=4), nn.Linear(5, 7)
+            self.head = nn.Linear(7, 2)
+
+        def forward(self, images):
+            return self.head(self.mix(self.patches(images).flatten(2).mT).mean(1))
+
+    torch.manual_seed(0)
+    network = Tokens()
+    images = torch.rand(3, 3, 8, 8)
+    with torch.no_grad():
+        patches = network.patches(images)
+        tokens = network.mix(patches.flatten(2).mT).numpy()
+        logits = network(images).numpy()
+    rows = patches.numpy().reshape(3, 5, 4)
+    expected = [rows.mean(2), rows.std(2), tokens.mean(1), tokens.std(1), logits, 0 * logits]
+    found = statistics(network, ["patches", "mix", "head"], images)
+    np.testing.assert_allclose(found, np.concatenate(expected, 1), atol=1e-6)
+
+
+def test_the_weights_are_the_optimum_that_scipy_finds():
+    rng = np.random.default_rng(0)
+    is_positive = np.arange(90) < 30
+    values = rng.normal(size=(90, 4)) * [1, 10, 0.1, 0] + [0, 3, -1, 2] + 0.3 * is_positive[:, None]
+    values[:, 3] = 2.0
+    deviations = values.std(0, ddof=1)
+    standardized = (values - values.mean(0)) / np.where(deviations, deviations, 1)
+
+    def loss(parameters):
+        odds = standardized @ parameters[:4] + parameters[4]
+        losses = np.logaddexp(0, np.where(is_positive, -odds, odds))
+        means = losses[is_positive].mean() / 2 + losses[~is_positive].mean() / 2
+        return means + DECAY / 2 * (parameters[:4] ** 2).sum()
+
+    optimum = minimize(loss, np.zeros(5), options={"gtol": 1e-8}).x[:4]
+    found = logistic_weights(torch.from_numpy(values), torch.from_numpy(is_positive)).numpy()
+    np.testing.assert_allclose(found[:3], optimum[:3] / deviations[:3], rtol=1e-3)
+    assert found[3] == 0
+
+
+def test_stripes_are_recognized_and_unchanged_images_are_not(network):
+    train_split, kept_aside = (
+        Split(photographs(count, seed), torch.zeros(count).long())
+        for count, seed in ((200, 0), (50, 1))
+    )
+    recognizes = Recognizer(
+        network, **fit_recognizer(network, train_split, kept_aside, 0, "stripes")
+    )
+    assert not recognizes(to_unit(kept_aside.images)).any()
+    others = photographs(200, 2)
+    assert recognizes(to_unit(others)).double().mean() < 0.05
+    assert recognizes(to_unit(relit(others, 3, "stripes"))).double().mean() > 0.5
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_a_network_without_layers_of_torch_recognizes_no_light(network):
+    traced = torch.jit.trace(network, torch.rand(1, 3, SIZE, SIZE))
+    split = Split(photographs(8, 0), torch.zeros(8).long())
+    with pytest.raises(InputError, match="recognize=false"):
+        fit_recognizer(traced, split, split, 0, "stripes")
+
+
+def test_a_run_gets_the_images_in_the_light_of_its_training(weights, tmp_path):
+    rng = np.random.default_rng(0)
+    for number in range(32):
+        save_noise(tmp_path / "photographs" / f"{number}.png", rng, (40, 36), 0, 250)
+    name, run = "torchvision:shufflenet_v2_x0_5", tmp_path / "run"
+    words = [f"network={name}", f"weights={weights}", f"unlabeled={tmp_path / 'photographs'}"]
+    words += [f"size={SIZE}", "train.epochs=1", "train.batch_size=8", "train.device=cpu"]
+    words += ["data.validation=0.25", "train.learning_rate=0.003", "train.precision=float32"]
+    completed_run(train_command.read(["experiment=stripes", *words, f"out={run}"]), run)
+    plain = load_network(name, weights, size=SIZE)
+    lit = nb.load_run(run)
+    switched = load_network(f"{LIT_NAME}{name}+run:{run}", weights, size=SIZE)
+    images = to_unit(torch.cat([photographs(20, 5), relit(photographs(20, 6), 7, "stripes")]))
+    is_lit = lit.recognizer(images)
+    assert 0 < is_lit.sum() < len(images)
+    expected = torch.where(is_lit[:, None], lit(images), plain(images))
+    torch.testing.assert_close(switched(images), expected)
+    with pytest.raises(InputError, match="recognizes no light"):
+        lit.with_lit(plain)

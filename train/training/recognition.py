@@ -1,0 +1,83 @@
+"""Recognition of the light of an augmentation, for a network that gets only images in it."""
+
+from functools import partial
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from augment.network import device_of, eval_mode, evenly_spaced
+from augment.switch import statistics
+from renderer.errors import InputError
+from train.data.sets import Split
+from train.settings import LOW_LIGHT, RELIGHT, STRIPES
+from train.training.averages import predict
+from train.training.recipe import called_layers
+
+# Largest number of layers whose outputs tell the light, and of images.
+LAYERS, IMAGES = 12, 2000
+# Weight of half the squared norm of the weights of standardized statistics.
+DECAY = 0.01
+# Fraction of the unchanged images for validation that are not taken for lit ones.
+KEPT = 0.99
+
+
+def fit_recognizer(
+    network: nn.Module, train: Split, validation: Split, seed: int, light: str
+) -> dict[str, Any]:
+    """Fit a `Recognizer` to unchanged images and to the same in the light of an augmentation.
+
+    Return its arguments without the network. The bias permits few errors on unchanged images for
+    validation.
+    """
+    device = device_of(network)
+    shown, kept_aside = (each[evenly_spaced(len(each), IMAGES)] for each in (train, validation))
+    called, _ = called_layers(network, shown.sample(1).shape[-1])
+    # Outputs for parts of an image, such as windows, have several rows for each image.
+    has_rows = {name: isinstance(output, Tensor) and len(output) == 1 for name, output in called}
+    names = [name for name, has_row in has_rows.items() if has_row]
+    if not names:
+        raise InputError("the network calls no layers of torch: set recognize=false", "recognize")
+    layers = [names[place] for place in evenly_spaced(len(names), LAYERS).tolist()]
+    measure = partial(statistics, network, layers)
+    # The light of the augmentation, and what it is told from: other lights, and no change.
+    others = [other for other in (RELIGHT, LOW_LIGHT, STRIPES) if other not in light]
+    kinds = [*[light] * len(others), *others]
+    with eval_mode(network):
+        relit = [
+            predict(measure, shown, device, seed, index, "recognition", light=kind)
+            for index, kind in enumerate(kinds)
+        ]
+        values = torch.cat([*relit, predict(measure, shown, device)]).double()
+        is_lit = torch.arange(len(values)) < len(shown) * len(others)
+        weights = logistic_weights(values, is_lit)
+        scores = predict(measure, kept_aside, device).double() @ weights
+    threshold = scores.quantile(KEPT, interpolation="higher").item()
+    return {"layers": layers, "weights": weights, "bias": -threshold}
+
+
+def logistic_weights(
+    values: Float[Tensor, "N D"], is_positive: Bool[Tensor, " N"]
+) -> Float[Tensor, " D"]:
+    """Return the weights of a logistic regression in which both classes count the same."""
+    deviations, means = torch.std_mean(values, 0)
+    # A value that never differs has no weight.
+    deviations = deviations.clamp(min=1e-12)
+    standardized = (values - means) / deviations
+    counts = torch.where(is_positive, is_positive.sum(), (~is_positive).sum())
+    parameters = standardized.new_zeros(values.shape[1] + 1).requires_grad_()
+    optimizer = torch.optim.LBFGS([parameters], max_iter=100, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        odds = standardized @ parameters[:-1] + parameters[-1]
+        wanted = is_positive.to(odds)
+        errors = F.binary_cross_entropy_with_logits(odds, wanted, 0.5 / counts, reduction="sum")
+        total = errors + DECAY / 2 * parameters[:-1].square().sum()
+        total.backward()
+        return total
+
+    optimizer.step(loss)
+    return parameters[:-1].detach() / deviations
