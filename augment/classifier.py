@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from augment import network as wrappers
-from augment.exposure import DIM, light_settings, with_normalized_light
+from augment.exposure import DIM, IsDim, light_settings, with_normalized_light
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
-from augment.switch import DIM_NAME, LIT_NAME, Dimness, Recognizer, Switch
+from augment.switch import DIM_NAME, LIT_NAME, Recognizer, Switch
 from augment.tasks import recognized_task
 from augment.tasks.classification import Classification, class_index, log_odds
 from augment.tasks.task import Task
@@ -237,7 +237,7 @@ class TaskNetwork(CheckedNetwork):
             tensor([[1., 1., 1.]])
         """
         errors.require_number("below", below, 1e-6, 1)
-        return self._with_other(dim, "dim", Dimness(below), DIM_NAME)
+        return self._with_other(dim, "dim", IsDim(below), DIM_NAME)
 
     def with_lit(self, lit: Self) -> Self:
         """Return a network that shows images in an unusual light to another network.
@@ -259,7 +259,7 @@ class TaskNetwork(CheckedNetwork):
         """
         errors.require_kind("lit", lit, TaskNetwork, "the network of a run")
         if lit.recognizer is None:
-            raise InputError(f"{lit.title} recognizes no light: train it with train.recognize=true")
+            raise InputError(f"{lit.title} recognizes no light: train it with recognize=true")
         return self._with_other(lit, "lit", lit.recognizer, LIT_NAME)
 
     def _with_other(self, other: Self, key: str, chooses: Any, prefix: str) -> Self:

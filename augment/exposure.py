@@ -1,6 +1,7 @@
 """Exposure of images: normalized light, and which images are dim."""
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -49,7 +50,7 @@ class MeanOfLights(Network):
             raise InputError("normalize_light.average is for classifiers alone: set it to false")
         unchanged, normalized = unchanged.log_softmax(1), normalized.log_softmax(1)
         mean = torch.logaddexp(unchanged, normalized) - math.log(2)
-        return torch.where(are_dim(images)[:, None], mean, unchanged)
+        return torch.where(IsDim()(images)[:, None], mean, unchanged)
 
 
 def with_normalized_light(network: nn.Module, value: NormalizeLight) -> nn.Module:
@@ -108,7 +109,11 @@ def percentiles(images: Float[Tensor, "N 3 H W"], percentile: float) -> Float[Te
     return values.kthvalue(math.ceil(percentile / 100 * values.shape[1]), dim=1).values
 
 
-def are_dim(images: Float[Tensor, "N 3 H W"], below: float = DIM) -> Bool[Tensor, " N"]:
-    """Return whether the 98th percentile of the linear values of each image is below a limit."""
-    linear = decode(clamp(images.detach()), "srgb")
-    return percentiles(linear, DIM_PERCENTILE) < below
+@dataclass(frozen=True)
+class IsDim:
+    """Whether the 98th percentile of the linear values of each image is below a limit."""
+
+    below: float = DIM
+
+    def __call__(self, images: Float[Tensor, "N 3 H W"]) -> Bool[Tensor, " N"]:
+        return percentiles(decode(clamp(images.detach()), "srgb"), DIM_PERCENTILE) < self.below

@@ -233,11 +233,8 @@ class Function(nn.Module):
             if module.training and (has_weights or isinstance(module, kinds)):
                 in_training.append(type(module).__name__)
 
-        hook = register_module_forward_pre_hook(note)
-        try:
+        with register_module_forward_pre_hook(note):
             scores = self._first_call(images)
-        finally:
-            hook.remove()
         if in_training:
             self.takes = None
             reason = f"the function calls a network in training mode ({in_training[0]})"

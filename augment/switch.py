@@ -1,14 +1,14 @@
 """A second network for images in some light, beside another network for all other images."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-
-from augment.exposure import are_dim
 
 # A name that begins with one of these texts names a network, and a second one after a "+".
 DIM_NAME, LIT_NAME = "dim:", "lit:"
@@ -39,16 +39,6 @@ class Switch(nn.Module):
         return repr(self.chooses)
 
 
-@dataclass(frozen=True)
-class Dimness:
-    """Whether the 98th percentile of the linear values of each image is below a limit."""
-
-    below: float
-
-    def __call__(self, images: Float[Tensor, "N 3 H W"]) -> Bool[Tensor, " N"]:
-        return are_dim(images, self.below)
-
-
 @dataclass(frozen=True, eq=False)
 class Recognizer:
     """Whether images are in the light of a training: a linear classifier of `statistics`.
@@ -56,18 +46,14 @@ class Recognizer:
     It says so if the statistics times `weights`, plus `bias`, are above 0.
     """
 
-    network: nn.Module
+    network: nn.Module = field(repr=False)
     layers: Sequence[str]
-    weights: Float[Tensor, " D"]
+    weights: Float[Tensor, " D"] = field(repr=False)
     bias: float
 
     def __call__(self, images: Float[Tensor, "N 3 H W"]) -> Bool[Tensor, " N"]:
         values = statistics(self.network, self.layers, images).double()
         return values @ self.weights.to(values) + self.bias > 0
-
-    def __repr__(self) -> str:
-        # The weights come from the same training as those of the network.
-        return f"Recognizer({self.bias})"
 
 
 @torch.no_grad()
@@ -77,22 +63,17 @@ def statistics(
     """Compute mean and standard deviation of each channel in the outputs of layers of a network."""
     found: dict[str, Tensor] = {}
 
-    def note(name: str, layer: nn.Module, output: Tensor) -> None:
+    def note(name: str, layer: nn.Module, _: Any, output: Tensor) -> None:
         # Linear layers have their channels last, and convolutions behind the images.
         channels = -1 if isinstance(layer, nn.Linear) else 1
         values = output.movedim(channels, 1).reshape(len(images), output.shape[channels], -1)
         found[name] = torch.cat([values.mean(2), values.std(2, correction=0)], 1)
 
-    modules = [(name, network.get_submodule(name)) for name in layers]
-    hooks = [
-        layer.register_forward_hook(lambda layer, _, output, name=name: note(name, layer, output))
-        for name, layer in modules
-    ]
-    try:
+    with ExitStack() as hooks:
+        for name in layers:
+            layer = network.get_submodule(name)
+            hooks.enter_context(layer.register_forward_hook(partial(note, name)))
         network(images)
-    finally:
-        for hook in hooks:
-            hook.remove()
     return torch.cat([found[name] for name in layers], 1).float()
 
 

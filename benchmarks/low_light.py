@@ -22,8 +22,8 @@ from PIL import Image
 from torch import nn
 
 import norm_balls as nb
-from augment.exposure import DIM, with_normalized_light
-from augment.switch import Dimness, Switch
+from augment.exposure import IsDim, with_normalized_light
+from augment.switch import Switch
 from benchmarks.common import machine
 from benchmarks.detectors import SIZE, FastestDet, decode
 from renderer.io.images import crop_center, read_rgb
@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         write_photographs(others, objects, photographs)
 
     def for_dim(network: nn.Module) -> nn.Module:
-        return Switch(original, with_normalized_light(network, True), Dimness(DIM))
+        return Switch(original, with_normalized_light(network, True), IsDim())
 
     networks = {"original": original, "normalized light": with_normalized_light(original, True)}
     networks["normalized light, dim images alone"] = for_dim(original)

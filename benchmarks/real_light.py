@@ -37,7 +37,7 @@ from scipy.stats import spearmanr
 
 import norm_balls as nb
 from augment.classifier import Classifier
-from augment.exposure import are_dim
+from augment.exposure import IsDim
 from augment.switch import DIM_NAME, LIT_NAME
 from renderer.image import to_unit
 from renderer.io.images import SUFFIXES, crop_center, read_rgb, write_image
@@ -382,9 +382,8 @@ def count_dim(options: argparse.Namespace) -> None:
     for path in paths:
         if path.suffix.lower() in SUFFIXES:
             square = crop_center(read_rgb(path, options.size), options.size)
-            counts[0] += bool(
-                are_dim(to_unit(torch.tensor(np.array(square))).permute(2, 0, 1)[None])
-            )
+            image = to_unit(torch.tensor(np.array(square))).permute(2, 0, 1)
+            counts[0] += bool(IsDim()(image[None]))
             counts[1] += 1
     print(f"{counts[0]} of {counts[1]} photographs are dim")
 

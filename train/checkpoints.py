@@ -149,13 +149,13 @@ def load_network(
         network = load_network(plain, weights, trust_code=trust_code, **facts)
         if not other.startswith(RUN):
             options |= {"weights": weights, **facts}
+        is_dim = name.startswith(DIM_NAME)
+        light = f"98th percentile of linear values is below {DIM}"
+        light = light if is_dim else "light it recognizes as that of its training"
+        say_once(f"{other} gets the images whose {light}")
         # The light of plain images is not normalized.
         second = load_network(other, **options)
-        if name.startswith(LIT_NAME):
-            say_once(f"{other} gets the images whose light it recognizes as that of its training")
-            return network.with_lit(second)
-        say_once(f"{other} gets the images whose 98th percentile of linear values is below {DIM}")
-        return network.with_dim(second)
+        return network.with_dim(second) if is_dim else network.with_lit(second)
     path = Path(name)
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path

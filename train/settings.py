@@ -90,8 +90,13 @@ RELIGHT = "relight"
 LOW_LIGHT, RELIGHT_AND_LOW_LIGHT = "low_light", "relight+low_light"
 # Augmentation by the stripes of a scanner.
 STRIPES = "stripes"
-# Augmentations that are a light.
-LIGHTS = (RELIGHT, LOW_LIGHT, RELIGHT_AND_LOW_LIGHT, STRIPES)
+# Augmentations that show images in a light, with this light in words.
+LIGHTS = {
+    RELIGHT: "in the light of a projector",
+    LOW_LIGHT: "in low light",
+    RELIGHT_AND_LOW_LIGHT: "in the light of a projector or in low light",
+    STRIPES: "in the light of a scanner",
+}
 # Choices of train.augmentation.
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", *LIGHTS)
 # Choices of train.optimizer.

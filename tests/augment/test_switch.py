@@ -7,7 +7,8 @@ from oracles import srgb_of
 from torch import Tensor
 
 import norm_balls as nb
-from augment.switch import Dimness, Switch
+from augment.exposure import IsDim
+from augment.switch import Switch
 from renderer import InputError
 
 SIZE = 8
@@ -47,7 +48,7 @@ def rows(outputs: Any) -> np.ndarray:
 @pytest.mark.parametrize("levels", [(0.1, 0.9, 0.2, 0.4, 0.24), (0.1, 0.2), (0.3, 0.9)])
 def test_each_image_gets_the_outputs_of_the_network_for_its_brightness(kind, levels):
     images = torch.cat([brightness(level) for level in levels])
-    network = Switch(Constant(0.0, kind), Constant(10.0, kind), Dimness(BELOW))
+    network = Switch(Constant(0.0, kind), Constant(10.0, kind), IsDim(BELOW))
     added = np.where(np.array(levels) < BELOW, 10, 0)[:, None]
     expected = images.mean((2, 3)).numpy() + added
     np.testing.assert_array_equal(rows(network(images)), expected)
@@ -58,7 +59,7 @@ def test_an_image_with_more_than_two_percent_of_bright_values_is_not_dim(fractio
     image = brightness(0.05).float()[..., :1, :].repeat(1, 1, 100, 1)
     values = image.flatten()
     values[: round(fraction * len(values))] = 1.0
-    network = Switch(Constant(0.0, "tensor"), Constant(10.0, "tensor"), Dimness(BELOW))
+    network = Switch(Constant(0.0, "tensor"), Constant(10.0, "tensor"), IsDim(BELOW))
     assert (network(values.view_as(image)) > 5).all() == is_dim
 
 

@@ -26,20 +26,13 @@ from augment.tasks.classification import ClassCriterion, label_loss
 from renderer.errors import MAX_SCALE
 from renderer.image import decode, to_bytes, to_unit
 from renderer.vectors import Ball, nearest_in_box
-from train.settings import LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, STRIPES, TrainSettings
+from train.settings import LIGHTS, LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, STRIPES, TrainSettings
 
 # Norm-ball and step size of the attack on pixels. Madry et al. (2018) use a radius of
 # 8/255 on CIFAR-10.
 PGD = StepSettings(norm="linf", radius=2 / 255, step="sign", step_size=1 / 255)
 PGD_STEPS = 3
 Images = UInt8[Tensor, "B 3 H W"]
-# Light in which `relit` shows images for an augmentation, in words.
-LIT = {
-    RELIGHT: "in the light of a projector",
-    LOW_LIGHT: "in low light",
-    RELIGHT_AND_LOW_LIGHT: "in the light of a projector or in low light",
-    STRIPES: "in the light of a scanner",
-}
 # Fraction of the images under stripes that are gray, as those of many scanners.
 GRAY = 0.4
 
@@ -126,7 +119,7 @@ class Augmentation:
             return self._attack_pixels(images, labels, step)
         if name == RELIGHT:
             return self._relight(images, step)
-        if name in LIT:
+        if name in LIGHTS:
             seed = stream_seed(self.seed, step, "low light", distributed.rank())
             shown = relit(images, seed, STRIPES if name == STRIPES else LOW_LIGHT)
             if name == RELIGHT_AND_LOW_LIGHT:

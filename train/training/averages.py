@@ -179,12 +179,9 @@ def mix(initial: Weights, trained: Weights, factor: float) -> dict[str, Tensor]:
 
     The factor 0 gives `initial`. Integers, such as counters, are those of `trained`.
     """
-    mixed = {}
-    for name, value in trained.items():
-        mixed[name] = value.clone()
-        if value.is_floating_point():
-            mixed[name] = torch.lerp(initial[name].to(value), value, factor)
-    return mixed
+    floats = {name: value for name, value in trained.items() if value.is_floating_point()}
+    mixed = {name: initial[name].to(value).lerp(value, factor) for name, value in floats.items()}
+    return {**trained, **mixed}
 
 
 def predict(

@@ -6,7 +6,9 @@ features before it are the same in both networks, and are computed once.
 
 import math
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from statistics import fmean
 from typing import Any
 
@@ -15,7 +17,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
-from augment.network import eval_mode, keep_text_vectors, plain_outputs, text_vectors
+from augment.network import device_of, eval_mode, keep_text_vectors, plain_outputs, text_vectors
 from augment.tasks.classification import is_correct, label_loss, log_odds, nearest
 from renderer.errors import MAX_SCALE, InputError
 from renderer.image import to_unit
@@ -90,29 +92,24 @@ def called_layers(network: nn.Module, size: int) -> tuple[list[tuple[str, Any]],
     activations with parameters do not count, unless a network has no other layer. A network of
     TorchScript or torch.export calls no modules.
     """
-    called: list[tuple[bool, str, Any]] = []
-    hooks = []
-    for name, module in network.named_modules():
-        own = list(module.parameters(recurse=False))
-        # A layer has parameters itself, and contains no module with others.
-        is_layer = own and len(own) == len(list(module.parameters()))
-        if is_layer and not isinstance(module, torch.jit.ScriptModule):
-            call = (any(parameter.ndim > 1 for parameter in own), name)
+    called: list[tuple[str, Any]] = []
+    matrices: list[tuple[str, Any]] = []
 
-            def note(_: nn.Module, __: Any, output: Any, call: tuple[bool, str] = call) -> None:
-                called.append((*call, output))
+    def note(name: str, layer: nn.Module, _: Any, output: Any) -> None:
+        called.append((name, output))
+        if any(parameter.ndim > 1 for parameter in layer.parameters()):
+            matrices.append((name, output))
 
-            hooks.append(module.register_forward_hook(note))
-    device = next(network.parameters()).device
-    # The hooks note the layers that are called for a gray image.
-    with eval_mode(network), torch.no_grad():
-        outputs = plain_outputs(network(torch.full((1, 3, size, size), 0.5, device=device)))
-    for hook in hooks:
-        hook.remove()
-    # Layers with a matrix, or else all layers, in the order of their calls.
-    has_any = any(has_matrix for has_matrix, *_ in called)
-    layers = [(name, output) for has_matrix, name, output in called if has_matrix or not has_any]
-    return layers, outputs
+    image = torch.full((1, 3, size, size), 0.5, device=device_of(network))
+    with ExitStack() as hooks, eval_mode(network), torch.no_grad():
+        for name, module in network.named_modules():
+            own = list(module.parameters(recurse=False))
+            # A layer has parameters itself, and contains no module with others.
+            is_layer = own and len(own) == len(list(module.parameters()))
+            if is_layer and not isinstance(module, torch.jit.ScriptModule):
+                hooks.enter_context(module.register_forward_hook(partial(note, name)))
+        outputs = plain_outputs(network(image))
+    return matrices or called, outputs
 
 
 def _module_of(parameter: str) -> str:

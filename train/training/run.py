@@ -28,9 +28,8 @@ from train.results.overwrite import remove_run
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, BEST, WEIGHTS
-from train.settings import KEPT_ASIDE, LABORATORY, RELIGHT, WIDERESNET, ExperimentSettings
+from train.settings import KEPT_ASIDE, LABORATORY, LIGHTS, RELIGHT, WIDERESNET, ExperimentSettings
 from train.training import inputs
-from train.training.augmentations import LIT
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, scale_learning_rate
@@ -203,7 +202,8 @@ class Run:
             trainer.fit(split, self.held_out, log)
         scores |= self._score() if has_labels else {}
         if self.settings.train.recognize:
-            self._recognize()
+            with keyed(**keys_of("train", self.settings.train)):
+                self._recognize()
         if log:  # Only the first process has a log.
             scores |= self._score_photographs(trainer.selected, self.folder)
             log.scalars(scores)
@@ -354,7 +354,7 @@ class Run:
             relit = self._predict(cast(Model, model), self.data.test, self.settings.seed, "test")
             scores[f"test/relit_agreement_{name}"] = (relit == targets).double().mean().item()
         line = "agreement with the original on %d test images: unchanged %.3f; "
-        light = LIT.get(self.settings.train.augmentation, LIT[RELIGHT])
+        light = LIGHTS.get(self.settings.train.augmentation, LIGHTS[RELIGHT])
         line += f"{light} %.3f before, %.3f after"
         console.info(line, len(targets), unchanged, *scores.values())
         return scores

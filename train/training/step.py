@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.network import eval_mode
+from augment.network import device_of, eval_mode
 from augment.progress import progress_message
 from augment.service import AugmentationService
 from augment.tasks.detection import Detection
@@ -131,8 +131,7 @@ def fitting_batch_size(settings: TrainSettings, model: nn.Module, in_round: int,
         console.warning(fault, settings.batch_size, in_round, batch_size)
     at_once = batch_size // shares
     needed = at_once * activation_bytes(deepcopy(model), size)
-    device = next(model.parameters()).device
-    require_memory(f"the activations of batch_size={at_once}", needed, device)
+    require_memory(f"the activations of batch_size={at_once}", needed, device_of(model))
     return batch_size
 
 
