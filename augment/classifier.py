@@ -257,10 +257,11 @@ class TaskNetwork(CheckedNetwork):
             >>> import norm_balls as nb
             >>> switched = nb.load("none").with_lit(nb.load_run("runs/stripes"))  # doctest: +SKIP
         """
-        errors.require_kind("lit", lit, TaskNetwork, "the network of a run")
-        if lit.recognizer is None:
-            raise InputError(f"{lit.title} recognizes no light: train it with recognize=true")
-        return self._with_other(lit, "lit", lit.recognizer, LIT_NAME)
+        recognizer = getattr(lit, "recognizer", None)
+        if recognizer is None:
+            name = getattr(lit, "title", "lit")
+            raise InputError(f"{name} recognizes no light: train it with recognize=true")
+        return self._with_other(lit, "lit", recognizer, LIT_NAME)
 
     def _with_other(self, other: Self, key: str, chooses: Any, prefix: str) -> Self:
         """Return a network that shows the chosen images to another network."""

@@ -17,7 +17,7 @@ from train.training.averages import predict
 from train.training.recipe import called_layers
 
 # Largest number of layers whose outputs tell the light, and of images.
-LAYERS, IMAGES = 12, 2000
+LAYERS, IMAGES = 12, 1000
 # Weight of half the squared norm of the weights of standardized statistics.
 DECAY = 0.01
 # Fraction of the unchanged images for validation that are not taken for lit ones.
@@ -36,8 +36,8 @@ def fit_recognizer(
     shown, kept_aside = (each[evenly_spaced(len(each), IMAGES)] for each in (train, validation))
     called, _ = called_layers(network, shown.sample(1).shape[-1])
     # Outputs for parts of an image, such as windows, have several rows for each image.
-    has_rows = {name: isinstance(output, Tensor) and len(output) == 1 for name, output in called}
-    names = [name for name, has_row in has_rows.items() if has_row]
+    rows = {name: output for name, output in called if isinstance(output, Tensor)}
+    names = [name for name, output in rows.items() if len(output) == 1]
     if not names:
         raise InputError("the network calls no layers of torch: set recognize=false", "recognize")
     layers = [names[place] for place in evenly_spaced(len(names), LAYERS).tolist()]
