@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from augment import distributed, exposure
 from augment import network as wrappers
 from augment.random_streams import stream_seed
+from augment.switch import LIT_NAME
 from augment.tasks.classification import Classification
 from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
@@ -337,6 +338,8 @@ class Run:
         fitted = fit_recognizer(network, *splits, *light)
         trainer.best[checkpoints.RECOGNIZER] = fitted
         self._save_best()
+        name = f"{LIT_NAME}ORIGINAL+{checkpoints.RUN}{self.folder}"
+        console.info("network=%s shows this network only images in the light of its training", name)
 
     def _save_best(self) -> None:
         """Write best.pt in the first process."""
