@@ -18,6 +18,8 @@ from train.training.recipe import called_layers
 
 # Largest number of layers whose outputs tell the light, and of images.
 LAYERS, IMAGES = 12, 1000
+# Statistics are divided by their standard deviations, or by at least this fraction of the median.
+SMALLEST = 1e-3
 # Weight of half the squared norm of the weights of standardized statistics.
 DECAY = 0.01
 # Fraction of the unchanged images for validation that are not taken for lit ones.
@@ -63,8 +65,9 @@ def logistic_weights(
 ) -> Float[Tensor, " D"]:
     """Return the weights of a logistic regression in which both classes count the same."""
     deviations, means = torch.std_mean(values, 0)
-    # A value that never differs has no weight.
-    deviations = deviations.clamp(min=1e-12)
+    # A value that differs only by rounding would get a huge weight.
+    typical = deviations[deviations > 0].median().item()
+    deviations = deviations.clamp(min=SMALLEST * typical)
     standardized = (values - means) / deviations
     counts = torch.where(is_positive, is_positive.sum(), (~is_positive).sum())
     parameters = standardized.new_zeros(values.shape[1] + 1).requires_grad_()
