@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from augment import network as wrappers
 from augment.exposure import DIM, IsDim, light_settings, with_normalized_light
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
-from augment.switch import DIM_NAME, LIT_NAME, Recognizer, Switch
+from augment.switch import DIM_NAME, LIT_NAME, Chooser, Recognizer, Switch
 from augment.tasks import recognized_task
 from augment.tasks.classification import Classification, class_index, log_odds
 from augment.tasks.task import Task
@@ -263,8 +263,8 @@ class TaskNetwork(CheckedNetwork):
             raise InputError(f"{name} recognizes no light: train it with recognize=true")
         return self._with_other(lit, "lit", recognizer, LIT_NAME)
 
-    def _with_other(self, other: Self, key: str, chooses: Any, prefix: str) -> Self:
-        """Return a network that shows the chosen images to another network."""
+    def _with_other(self, other: Self, key: str, chooses: Chooser, prefix: str) -> Self:
+        """Return a network that shows images which `chooses` chooses to another network."""
         errors.require_kind(key, other, TaskNetwork, "a network with its task, size and classes")
         for name in ("task", "size", "classes"):
             if getattr(other, name) != getattr(self, name):

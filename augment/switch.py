@@ -11,15 +11,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 # A name that begins with one of these texts names a network, and a second one after a "+".
-DIM_NAME, LIT_NAME = "dim:", "lit:"
+SWITCHES = DIM_NAME, LIT_NAME = "dim:", "lit:"
+# Function that tells which of N images another network gets.
+Chooser = Callable[[Tensor], Bool[Tensor, " N"]]
 
 
 class Switch(nn.Module):
     """Network that shows the images which a function chooses to another network."""
 
-    def __init__(
-        self, network: nn.Module, other: nn.Module, chooses: Callable[[Tensor], Bool[Tensor, " N"]]
-    ):
+    def __init__(self, network: nn.Module, other: nn.Module, chooses: Chooser):
         super().__init__()
         self.network, self.other, self.chooses = network, other, chooses
         self.training = network.training

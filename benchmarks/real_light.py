@@ -38,7 +38,7 @@ from scipy.stats import spearmanr
 import norm_balls as nb
 from augment.classifier import Classifier
 from augment.exposure import IsDim
-from augment.switch import DIM_NAME, LIT_NAME
+from augment.switch import SWITCHES
 from renderer.image import to_unit
 from renderer.io.images import SUFFIXES, crop_center, read_rgb, write_image
 from train.checkpoints import RUN, is_classifier, load_network, load_run
@@ -75,7 +75,7 @@ def load(name: str) -> Classifier:
         return load(name.removeprefix(NORMALIZED)).normalizing_light()
     if name.startswith(MEAN):
         return load(name.removeprefix(MEAN)).normalizing_light(MEAN_OF_LIGHTS)
-    is_known = is_classifier(name) or name.startswith((DIM_NAME, LIT_NAME))
+    is_known = is_classifier(name) or name.startswith(SWITCHES)
     return load_network(name) if is_known else load_run(name.removeprefix(RUN))
 
 

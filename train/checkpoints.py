@@ -26,7 +26,7 @@ from augment.files import as_facts, is_network_file, require_no_facts
 from augment.network import FROM_FILE, Inputs, say_inputs, say_once
 from augment.settings import PYTHON, NormalizeLight
 from augment.sources import SOURCES, import_function, load_classifier
-from augment.switch import DIM_NAME, LIT_NAME, Recognizer
+from augment.switch import LIT_NAME, SWITCHES, Recognizer
 from augment.tasks.detection import Detection
 from renderer.errors import InputError, as_path, explained, keyed, require_file, require_kind
 from renderer.io.files import atomic_write
@@ -140,7 +140,7 @@ def load_network(
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     options: dict[str, Any] = {"normalize_light": normalize_light, "trust_code": trust_code}
-    if name.startswith((DIM_NAME, LIT_NAME)):
+    if name.startswith(SWITCHES):
         prefix, _, names = name.partition(":")
         plain, plus, other = names.rpartition("+")
         if not plus:
@@ -149,13 +149,13 @@ def load_network(
         network = load_network(plain, weights, trust_code=trust_code, **facts)
         if not other.startswith(RUN):
             options |= {"weights": weights, **facts}
-        is_dim = name.startswith(DIM_NAME)
-        light = f"98th percentile of linear values is below {DIM}"
-        light = light if is_dim else "light it recognizes as that of its training"
-        say_once(f"{other} gets the images whose {light}")
         # The light of plain images is not normalized.
         second = load_network(other, **options)
-        return network.with_dim(second) if is_dim else network.with_lit(second)
+        if name.startswith(LIT_NAME):
+            say_once(f"{other} gets the images whose light it recognizes as that of its training")
+            return network.with_lit(second)
+        say_once(f"{other} gets the images whose 98th percentile of linear values is below {DIM}")
+        return network.with_dim(second)
     path = Path(name)
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path

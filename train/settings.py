@@ -512,6 +512,11 @@ def in_words(label: str) -> str:
     return label.removeprefix(OTHER_PREFIX).replace("_", " ")
 
 
+def in_light(augmentation: str) -> str:
+    """Write in words in which light photographs are tested. By default, it is a projector's."""
+    return LIGHTS.get(augmentation, LIGHTS[RELIGHT])
+
+
 def is_of_no_class(label: object) -> bool:
     """Return whether the label of an object names no class: "", "other", or "other_NAME"."""
     return label in (None, "", OTHER) or str(label).startswith(OTHER_PREFIX)

@@ -1,7 +1,5 @@
 """Surfaces: smooth random heights or depths, their shading, and the disc of the sun at an edge.
 
-The numbers of surfaces and of lights have ranges.
-
 The image is 2 units wide: x points to the right, y down, and heights towards the camera.
 """
 

@@ -23,15 +23,7 @@ from train.results.predictions import CONTACT_SHEET
 from train.results.store import Methods, RunSummary, Scored
 from train.run_config import CONFIG, read_config
 from train.run_folder import RENDERS, attack_success
-from train.settings import (
-    KEPT_ASIDE,
-    LABORATORY,
-    LIGHTS,
-    PHOTOGRAPHS,
-    RELIGHT,
-    in_words,
-    published_folder,
-)
+from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, in_light, in_words, published_folder
 from train.system import user_message
 
 # File name of the page.
@@ -238,9 +230,9 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
             sentence += "so the price on photographs is unknown."
         sentences.append(sentence)
     if (after := mean("test/relit_agreement_after")) is not None:
-        name = OmegaConf.select(runs[0].config, "train.augmentation")
+        light = in_light(OmegaConf.select(runs[0].config, "train.augmentation"))
         sentences.append(
-            f"{method}: for photographs {LIGHTS.get(name, LIGHTS[RELIGHT])}, "
+            f"{method}: for photographs {light}, "
             f"{after:.1%} of the predictions are those for the unchanged photographs, "
             f"and {mean('test/relit_agreement_before'):.1%} before."
         )

@@ -19,7 +19,7 @@ from augment.scene.scene import Scene
 from augment.service import AugmentationService
 from augment.settings import PYTHON
 from augment.sources import load_source
-from augment.switch import DIM_NAME, LIT_NAME
+from augment.switch import SWITCHES
 from augment.tasks.classification import Classification, class_index, complementary_label
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, is_whole, keyed, keys_of, require_range
@@ -105,7 +105,7 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     name = settings.network
     if not name:
         return None
-    if name.startswith((DIM_NAME, LIT_NAME)):
+    if name.startswith(SWITCHES):
         raise InputError(f"network={name} has two networks: train one of them", "network")
     # A classifier comes from a library or a file. Any other name is the folder of a training run.
     if checkpoints.is_classifier(name):

@@ -22,17 +22,17 @@ LAYERS, IMAGES = 12, 1000
 SMALLEST = 1e-3
 # Weight of half the squared norm of the weights of standardized statistics.
 DECAY = 0.01
-# Fraction of the unchanged images for validation that are not taken for lit ones.
+# Fraction of the unchanged images for validation that are taken for unchanged ones.
 KEPT = 0.99
 
 
 def fit_recognizer(
     network: nn.Module, train: Split, validation: Split, seed: int, light: str
 ) -> dict[str, Any]:
-    """Fit a `Recognizer` to unchanged images and to the same in the light of an augmentation.
+    """Fit a `Recognizer` of the light of an augmentation, and return its arguments but the network.
 
-    Return its arguments without the network. The bias permits few errors on unchanged images for
-    validation.
+    The light is told from other lights and from unchanged images. The bias permits the fraction
+    1 − KEPT of errors on unchanged images for validation.
     """
     device = device_of(network)
     shown, kept_aside = (each[evenly_spaced(len(each), IMAGES)] for each in (train, validation))
@@ -44,7 +44,7 @@ def fit_recognizer(
         raise InputError("the network calls no layers of torch: set recognize=false", "recognize")
     layers = [names[place] for place in evenly_spaced(len(names), LAYERS).tolist()]
     measure = partial(statistics, network, layers)
-    # The light of the augmentation, and what it is told from: other lights, and no change.
+    # The light is shown as often as other lights.
     others = [other for other in (RELIGHT, LOW_LIGHT, STRIPES) if other not in light]
     kinds = [*[light] * len(others), *others]
     with eval_mode(network):
@@ -69,6 +69,7 @@ def logistic_weights(
     typical = deviations[deviations > 0].median().item()
     deviations = deviations.clamp(min=SMALLEST * typical)
     standardized = (values - means) / deviations
+    wanted = is_positive.to(values)
     counts = torch.where(is_positive, is_positive.sum(), (~is_positive).sum())
     parameters = standardized.new_zeros(values.shape[1] + 1).requires_grad_()
     optimizer = torch.optim.LBFGS([parameters], max_iter=100, line_search_fn="strong_wolfe")
@@ -76,7 +77,6 @@ def logistic_weights(
     def loss() -> Tensor:
         optimizer.zero_grad()
         odds = standardized @ parameters[:-1] + parameters[-1]
-        wanted = is_positive.to(odds)
         errors = F.binary_cross_entropy_with_logits(odds, wanted, 0.5 / counts, reduction="sum")
         total = errors + DECAY / 2 * parameters[:-1].square().sum()
         total.backward()

@@ -29,7 +29,7 @@ from train.results.overwrite import remove_run
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, BEST, WEIGHTS
-from train.settings import KEPT_ASIDE, LABORATORY, LIGHTS, RELIGHT, WIDERESNET, ExperimentSettings
+from train.settings import KEPT_ASIDE, LABORATORY, WIDERESNET, ExperimentSettings, in_light
 from train.training import inputs
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate
@@ -202,7 +202,7 @@ class Run:
         with keyed(**keys_of("train", self.settings.train)):
             trainer.fit(split, self.held_out, log)
         scores |= self._score() if has_labels else {}
-        if self.settings.train.recognize:
+        if self.settings.train.recognize and checkpoints.RECOGNIZER not in trainer.best:
             with keyed(**keys_of("train", self.settings.train)):
                 self._recognize()
         if log:  # Only the first process has a log.
@@ -321,28 +321,24 @@ class Run:
         validation = self.data.train[self.held_out]
         # Weights of the losses of unchanged and of relit images.
         losses = (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0)
-        light = recipe.augmentation, losses
-        weights, factor = interpolate(*networks, validation, self.settings.seed, *light)
-        trainer.best |= {"model": weights, INTERPOLATION: factor}
-        self._save_best()
+        light = recipe.augmentation
+        weights, factor = interpolate(*networks, validation, self.settings.seed, light, losses)
+        self._add_to_best({"model": weights, INTERPOLATION: factor})
 
     def _recognize(self) -> None:
-        """Write to best.pt what recognizes the light of the training, unless it is there."""
-        trainer, recipe = self.trainer, self.settings.train
-        if checkpoints.RECOGNIZER in trainer.best:
-            return
+        """Write to best.pt what recognizes the light of the training."""
+        trainer, light = self.trainer, self.settings.train.augmentation
         splits = self.data.train[~self.held_out], self.data.train[self.held_out]
-        light = self.settings.seed, recipe.augmentation
         network = trainer.selected.network
         network.load_state_dict(trainer.best["model"])
-        fitted = fit_recognizer(network, *splits, *light)
-        trainer.best[checkpoints.RECOGNIZER] = fitted
-        self._save_best()
+        fitted = fit_recognizer(network, *splits, self.settings.seed, light)
+        self._add_to_best({checkpoints.RECOGNIZER: fitted})
         name = f"{LIT_NAME}ORIGINAL+{checkpoints.RUN}{self.folder}"
         console.info("network=%s shows this network only images in the light of its training", name)
 
-    def _save_best(self) -> None:
-        """Write best.pt in the first process."""
+    def _add_to_best(self, entries: dict[str, Any]) -> None:
+        """Add entries to the selected network, and write best.pt in the first process."""
+        self.trainer.best |= entries
         if distributed.rank() == 0:
             checkpoints.save(self.folder / BEST, self.trainer.best)
 
@@ -357,8 +353,7 @@ class Run:
             relit = self._predict(cast(Model, model), self.data.test, self.settings.seed, "test")
             scores[f"test/relit_agreement_{name}"] = (relit == targets).double().mean().item()
         line = "agreement with the original on %d test images: unchanged %.3f; "
-        light = LIGHTS.get(self.settings.train.augmentation, LIGHTS[RELIGHT])
-        line += f"{light} %.3f before, %.3f after"
+        line += f"{in_light(self.settings.train.augmentation)} %.3f before, %.3f after"
         console.info(line, len(targets), unchanged, *scores.values())
         return scores
 
