@@ -165,7 +165,7 @@ class ShadedView:
             sample_radiance = sample_radiance + self._divide_among_samples(indirect.detach())
         # Adding these zeros to the radiance adds the gradients of moving silhouettes.
         uncovered_pixels, zeros_with_gradient = moving_outlines(
-            fragments, camera, self.vertices, self._faces, sample_radiance, background
+            fragments, camera, self.vertices, self.mesh.faces, sample_radiance, background
         )
         uncovered_count = len(uncovered_pixels)
         return PixelRadiance(
@@ -188,11 +188,6 @@ class ShadedView:
         radiance_sums = pixel_radiance * self.fragments.samples**2
         radiance_per_albedo = radiance_sums / albedo_sums.masked_fill(albedo_sums == 0, 1)
         return radiance_per_albedo[:, sample_to_pixel] * sample_albedo
-
-    @cached_property
-    def _faces(self) -> Tensor:
-        """Vertex indices of the faces, on the device of the vertices, shape (F, 3)."""
-        return torch.from_numpy(self.mesh.faces).to(self.vertices.device)
 
     @cached_property
     def _normals(self) -> Tensor | None:

@@ -46,7 +46,8 @@ from torch.autograd.function import once_differentiable
 from renderer.camera import Camera
 from renderer.mesh import EDGES, shared_edges
 from renderer.visibility.fragments import Fragments
-from renderer.visibility.numpy import SUBSAMPLES, doubled_areas, to_fixed_point
+from renderer.visibility.numpy import SUBSAMPLES, doubled_areas
+from renderer.visibility.torch import to_fixed_point
 
 # A silhouette counts as visible if it is behind the surface beside it by at most this
 # fraction of the depth range of the mesh. For example, the lower edge of an object that
@@ -94,7 +95,7 @@ def moving_outlines(
     fragments: Fragments,
     camera: Camera,
     vertices: Float[Tensor, "V 3"],
-    faces: Int[Tensor, "F 3"],
+    faces: Int[np.ndarray, "F 3"],
     radiance: Float[Tensor, "3 S"],
     background: Float[Tensor, "3 pixels"],
 ) -> tuple[Int[Tensor, " E"], Float[Tensor, "3 P_E"]]:
@@ -111,10 +112,8 @@ def moving_outlines(
     indices = torch.arange(len(fragments.sample_numbers), dtype=torch.int32, device=vertices.device)
     # Index of each sample of the image among the covered samples, or NOT_COVERED.
     sample_grid = fragments.image_of_samples(indices, NOT_COVERED)
-    tensors = (positions, nearness, faces, sample_grid)
-    arrays = (tensor.detach().cpu().numpy() for tensor in tensors)
-    silhouettes = _Silhouettes(fragments.to("cpu"), *arrays)
-    crossings = Crossings(*(array.to(sample_grid.device) for array in silhouettes.crossings()))
+    places = positions.detach(), nearness.detach()
+    crossings = _Silhouettes(fragments, *places, faces, sample_grid).crossings()
     # Pixels that show no mesh, but have a sample beside a visible silhouette.
     crossed_pixels = _pixels_of_cells(crossings.cells, fragments).unique()
     uncovered_pixels = crossed_pixels[~torch.isin(crossed_pixels, fragments.pixels)]
@@ -336,34 +335,35 @@ class _Silhouettes:
     def __init__(
         self,
         fragments: Fragments,
-        positions: Float[np.ndarray, "V 3"],
-        nearness: Float[np.ndarray, " V"],
+        positions: Float[Tensor, "V 3"],
+        nearness: Float[Tensor, " V"],
         faces: Int[np.ndarray, "F 3"],
-        sample_grid: Int[np.ndarray, "_ _"],
+        sample_grid: Int[Tensor, "_ _"],
     ):
         """Find the silhouette edges, from homogeneous positions."""
         self.fragments = fragments
         self.nearness = nearness
         self.sample_grid = sample_grid
         x, y, w = positions.T
-        points = np.stack([x / w, y / w, nearness]).T
+        points = torch.stack([x / w, y / w, nearness], dim=1)
         # Positions are rounded to subsamples as in rasterizers.
-        self.places = to_fixed_point(points, sample_grid.shape)[0] / SUBSAMPLES
+        rows, columns = sample_grid.shape
+        self.places = to_fixed_point(points, (rows, columns))[0].T.double() / SUBSAMPLES
         self.ends = _silhouette_edges(self.places, faces)
         if len(fragments.sample_to_seen_face) == 0:
             self.ends = self.ends[:, :0]  # If no sample shows the mesh, no silhouette is visible.
         # An edge (a, b) with y down has the normal (b, a) with y up.
-        normal = np.diff(self.places[:, self.ends], axis=1)[::-1, 0]
+        normal = self.places[:, self.ends].diff(dim=1)[:, 0].flip(0)
         # Edges without length divide by a small number instead of 0.
-        self.normal = normal / np.maximum(np.linalg.norm(normal, axis=0), 1 / SUBSAMPLES)
+        self.normal = normal / normal.square().sum(0).sqrt().clamp(min=1 / SUBSAMPLES)
 
     def crossings(self) -> Crossings:
         """Find where visible silhouettes pass between neighboring samples, in rows first."""
         both = zip(self.crossings_along(X), self.crossings_along(Y), strict=True)
-        return Crossings(*(torch.from_numpy(np.concatenate(pair, axis=-1)) for pair in both))
+        return Crossings(*(torch.cat(pair, dim=-1) for pair in both))
 
-    def crossings_along(self, axis: int) -> tuple[np.ndarray, ...]:
-        """Find the arrays of `Crossings` between neighbors in a row (`axis` is X) or column."""
+    def crossings_along(self, axis: int) -> Crossings:
+        """Find the crossings between neighbors in a row (`axis` is X) or column."""
         rows, columns = self.sample_grid.shape
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
@@ -379,9 +379,9 @@ class _Silhouettes:
         else:
             after = next_sample * columns + line
             before = after - columns
-        cells = np.stack([before, after])
+        cells = torch.stack([before, after])
         # Indices among the covered samples before and after the cuts, or NOT_COVERED.
-        samples = self.sample_grid.ravel()[cells].astype(np.int64)
+        samples = self.sample_grid.flatten()[cells].long()
         place = start[:, edge] + fraction * (end - start)[:, edge]
         surface_nearness = self._surface_nearness(samples, place)
         start_nearness, end_nearness = self.nearness[self.ends[:, edge]]
@@ -389,53 +389,52 @@ class _Silhouettes:
         # An edge is hidden if the surfaces at both samples beside it are nearer to the camera.
         # It counts as hidden, too, if no sample beside it shows a surface. If one of them
         # shows no surface, the minimum is minus infinity, and the edge is in front.
-        tolerance = VISIBILITY_TOLERANCE * np.ptp(self.nearness)
-        is_in_front = edge_nearness >= surface_nearness.min(axis=0) - tolerance
-        is_visible = (samples != NOT_COVERED).any(axis=0) & is_in_front
+        tolerance = VISIBILITY_TOLERANCE * (self.nearness.max() - self.nearness.min())
+        is_in_front = edge_nearness >= surface_nearness.amin(0) - tolerance
+        is_visible = (samples != NOT_COVERED).any(0) & is_in_front
         # Distance from the sample with the farther surface, plus the same number for all cuts
         # between the same two samples.
-        distance = np.where(surface_nearness[0] < surface_nearness[1], 1, -1) * place[axis]
-        visible = np.flatnonzero(is_visible)
+        distance = torch.where(surface_nearness[0] < surface_nearness[1], place[axis], -place[axis])
+        order = is_visible.nonzero().squeeze(1)
         # Of all cuts between the same two samples, keep the one with the smallest distance.
-        order = visible[np.lexsort([distance[visible], after[visible]])]
-        kept = order[np.diff(after[order], prepend=-1) != 0]
+        for keys in (distance, after):
+            order = order[keys[order].argsort(stable=True)]
+        is_first = after[order].diff(prepend=after.new_tensor([-1])) != 0
+        kept = order[is_first]
         edge = edge[kept]
-        horizontal = np.full(len(kept), axis == X)
+        horizontal = torch.full_like(edge, axis == X, dtype=torch.bool)
         of_edges = self.ends[:, edge], fraction[kept], self.normal[:, edge]
-        return *of_edges, horizontal, cells[:, kept], samples[:, kept]
+        return Crossings(*of_edges, horizontal, cells[:, kept], samples[:, kept])
 
     def _surface_nearness(
-        self, samples: Int[np.ndarray, "2 K"], place: Float[np.ndarray, "2 K"]
-    ) -> Float[np.ndarray, "2 K"]:
+        self, samples: Int[Tensor, "2 K"], place: Float[Tensor, "2 K"]
+    ) -> Float[Tensor, "2 K"]:
         """Compute how near the faces beside K cuts are, if they are extended to the cuts.
 
         A cut is the place where a silhouette edge crosses a row or a column of
         samples. The faces are those that the samples before and after it show. The result
         is minus infinity for NOT_COVERED. Places are in units of samples.
         """
-        sample_to_seen_face = self.fragments.sample_to_seen_face.numpy()
         # Axes: before or after the cut, cut, corner. The index -1 (NOT_COVERED) selects an
         # arbitrary face, whose result is replaced at the end.
-        corners = self.fragments.corners.numpy()[sample_to_seen_face[samples]]
-        nearness_of_corners = self.nearness[corners]
-        # Positions (x, y) of the corners a, b and c of the faces before and after each cut.
-        (ax, bx, cx), (ay, by, cy) = np.moveaxis(self.places[:, corners], 3, 1)
+        corners = self.fragments.corners[self.fragments.sample_to_seen_face[samples]]
+        # Nearness and positions (x, y) of the corners a, b and c of the faces beside each cut.
+        nearness_a, nearness_b, nearness_c = self.nearness[corners].unbind(2)
+        (ax, bx, cx), (ay, by, cy) = self.places[:, corners].movedim(3, 1)
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
         # For a face without area, divide by infinity. The result is the nearness of corner a.
-        area = np.where(area == 0, np.inf, area)
+        area = area.masked_fill(area == 0, torch.inf)
         # Barycentric weights of the corners b and c.
         weight_b = ((place[0] - ax) * (cy - ay) - (place[1] - ay) * (cx - ax)) / area
         weight_c = ((bx - ax) * (place[1] - ay) - (by - ay) * (place[0] - ax)) / area
-        nearness_a = nearness_of_corners[..., 0]
-        difference_b = nearness_of_corners[..., 1] - nearness_a
-        difference_c = nearness_of_corners[..., 2] - nearness_a
-        plane = nearness_a + weight_b * difference_b + weight_c * difference_c
-        return np.where(samples >= 0, plane, -np.inf)
+        to_b, to_c = nearness_b - nearness_a, nearness_c - nearness_a
+        plane = nearness_a + weight_b * to_b + weight_c * to_c
+        return torch.where(samples >= 0, plane, -torch.inf)
 
 
 def _cut_edges(
-    start: Float[np.ndarray, "2 N"], end: Float[np.ndarray, "2 N"], shape: tuple[int, int]
-) -> tuple[np.ndarray, ...]:
+    start: Float[Tensor, "2 N"], end: Float[Tensor, "2 N"], shape: tuple[int, int]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Find where N edges cross rows of samples, or columns of samples.
 
     Rows and columns are both called lines. The first coordinate of the ends of the edges is across
@@ -446,53 +445,54 @@ def _cut_edges(
     edge from 0 (start) to 1 (end), and the index in the line of the first sample at or after the
     crossing.
     """
-    lower = np.minimum(start[0], end[0])
-    upper = np.maximum(start[0], end[0])
     # Each edge crosses the lines from `first_line` to `end_line` - 1.
-    first_line = np.ceil(lower).clip(0, shape[0]).astype(np.int64)
-    end_line = np.ceil(upper).clip(0, shape[0]).astype(np.int64)
+    lower, upper = torch.minimum(start[0], end[0]), torch.maximum(start[0], end[0])
+    first_line, end_line = (ends.ceil().clamp(0, shape[0]).long() for ends in (lower, upper))
     cuts_per_edge = end_line - first_line
     # One entry for each pair of an edge and a line (row or column of samples) that the edge
     # crosses. The index of an edge is repeated for all lines that it crosses.
-    edge = np.repeat(np.arange(len(lower)), cuts_per_edge)
-    cuts_before_edge = np.cumsum(cuts_per_edge) - cuts_per_edge
-    line = np.arange(len(edge)) - (cuts_before_edge - first_line)[edge]
+    edge = torch.repeat_interleave(cuts_per_edge)
+    cuts_before_edge = cuts_per_edge.cumsum(0) - cuts_per_edge
+    cut = torch.arange(len(edge), device=edge.device)
+    line = cut - (cuts_before_edge - first_line)[edge]
     # Position of the crossing on the edge, from 0 at the start of the edge to 1 at its end.
     fraction = (line - start[0, edge]) / (end[0] - start[0])[edge]
     position = start[1, edge] + fraction * (end[1] - start[1])[edge]
-    next_sample = np.ceil(position).astype(np.int64)
+    next_sample = position.ceil().long()
     is_inside = (next_sample > 0) & (next_sample < shape[1])
     return edge[is_inside], line[is_inside], fraction[is_inside], next_sample[is_inside]
 
 
 def _silhouette_edges(
-    places: Float[np.ndarray, "2 V"], faces: Int[np.ndarray, "F 3"]
-) -> Int[np.ndarray, "2 N"]:
+    places: Float[Tensor, "2 V"], faces: Int[np.ndarray, "F 3"]
+) -> Int[Tensor, "2 N"]:
     """Find the vertices of edges whose faces all lie on one side of the edge in the image."""
-    ends, edge_of_side, face_count = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
-    orientation = np.sign(doubled_areas(places.take(faces.T, axis=1)))
-    # 1 for sides of faces that lead from the lower to the higher vertex index, and -1 for
-    # other sides, shape (3, F).
-    start, end = faces.T.take(EDGES, axis=0).swapaxes(0, 1)
-    direction = np.where(start < end, 1.0, -1.0)
+    key = np.ascontiguousarray(faces, dtype=np.int64).tobytes()
+    ends, edge_of_side, direction, face_count = _edges(key, places.device)
+    corners = torch.from_numpy(faces).to(places.device).T
+    orientation = doubled_areas(places[:, corners]).sign()
     # One number for each face and each of its three edges: 1 if the face lies on one side of
     # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
-    side_of_face = (orientation * direction).ravel()
-    side_sums = np.bincount(edge_of_side, side_of_face, len(face_count))
+    side_of_face = (orientation * direction).flatten()
+    side_sums = places.new_zeros(len(face_count)).index_add_(0, edge_of_side, side_of_face)
     # All n faces of an edge lie on the same side if the sum is n or -n. It is n - 1 or
     # 1 - n if one of them is seen edge-on, because this face counts 0.
-    is_silhouette = np.abs(side_sums) > face_count - 2
-    return ends.take(np.flatnonzero(is_silhouette), axis=1)
+    return ends[:, side_sums.abs() > face_count - 2]
 
 
 @lru_cache(maxsize=4)
-def _edges(face_bytes: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _edges(face_bytes: bytes, device: torch.device) -> tuple[Tensor, ...]:
     """Find the N edges of a mesh with F faces, of which each has three sides.
 
     Sides with the same two vertices are one edge. The results are the vertices at both
     ends of each edge, the lower index first, shape (2, N); the edge of each side, with
-    side i of face f at i F + f, shape (3 F,); and the number of faces at each edge. The
+    side i of face f at i F + f, shape (3 F,); 1 for sides that lead from the lower to the higher
+    vertex index, and -1 for others, shape (3, F); and the number of faces at each edge. The
     argument holds int64 vertex indices as bytes, because a key of the cache is hashed.
     """
-    ends, edge_of_side = shared_edges(np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3))
-    return ends.T, edge_of_side.T.ravel(), np.bincount(edge_of_side.ravel())
+    faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
+    ends, edge_of_side = shared_edges(faces)
+    start, end = faces.T[np.array(EDGES)].swapaxes(0, 1)
+    direction = np.where(start < end, 1.0, -1.0)
+    arrays = ends.T, edge_of_side.T.ravel(), direction, np.bincount(edge_of_side.ravel())
+    return tuple(torch.from_numpy(array.copy()).to(device) for array in arrays)

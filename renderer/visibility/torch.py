@@ -62,12 +62,7 @@ def _triangles(
         - first number behind the pairs of each triangle, shape (M,).
     """
     rows, columns = shape
-    # As on GPUs, positions in samples are computed with one multiplication and one addition, and
-    # rounded to float32. x points to the right and y down.
-    halves = points.new_tensor([columns / 2, rows / 2])
-    window = points[..., :2].float() * points.new_tensor([columns / 2, -columns / 2]) + halves
-    positions = (window.float() * SUBSAMPLES).round().long() - SUBSAMPLES // 2
-    depths = (points[..., 2] + 1) / 2 * FAR
+    positions, depths = to_fixed_point(points, shape)
     # A closed mesh shows only faces that are counter-clockwise in the image.
     areas = doubled_areas(_by_corner(positions, faces))
     is_drawn = areas < 0 if closed else areas != 0
@@ -90,6 +85,19 @@ def _triangles(
     edges = torch.stack([by_column, by_row, constant])
     boxes = torch.stack([first_column, first_row, widths, ends - counts])
     return edges, torch.stack(planes), boxes, ends
+
+
+def to_fixed_point(
+    points: Float[Tensor, "*N V 3"], shape: tuple[int, int]
+) -> tuple[Int[Tensor, "*N V 2"], Float[Tensor, "*N V"]]:
+    """Convert points to integers and depths, as `renderer.visibility.numpy` does."""
+    rows, columns = shape
+    # As on GPUs, positions in samples are computed with one multiplication and one addition, and
+    # rounded to float32. x points to the right and y down.
+    halves = points.new_tensor([columns / 2, rows / 2])
+    window = points[..., :2].float() * points.new_tensor([columns / 2, -columns / 2]) + halves
+    positions = (window.float() * SUBSAMPLES).round().long() - SUBSAMPLES // 2
+    return positions, (points[..., 2] + 1) / 2 * FAR
 
 
 def _draw(
