@@ -5,7 +5,9 @@ World axes are right-handed, and z points up.
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -158,7 +160,7 @@ class Camera(ABC):
             InputError: If the center lies behind a perspective camera.
         """
         # The center relative to the pivot (`_from_pivot`), in the axes of the camera.
-        right, up, back = self.axes() @ self._from_pivot(center)
+        right, up, back = self.axes() @ _from_pivots([self], center)[0, 0]
         changed: dict[str, Any] = {
             "right": scale * (self.right + right),
             "up": scale * (self.up + up),
@@ -202,12 +204,8 @@ class Camera(ABC):
         """
         axes = self.axes()
         position = np.array([-self.right, -self.up, self.distance]) @ axes
-        columns = np.column_stack([axes.T, position - self._from_pivot(np.zeros(3))])
+        columns = np.column_stack([axes.T, position - _from_pivots([self], np.zeros(3))[0, 0]])
         return np.vstack([columns, [0, 0, 0, 1]])
-
-    def _from_pivot(self, points: Points) -> Points:
-        """Subtract the point about which attacks turn the camera from other points."""
-        return points - _like(np.array([self.center_x, self.center_y, self.center_z]), points)
 
     def eye(self) -> np.ndarray:
         """Return the position of the camera in homogeneous world coordinates.
@@ -236,7 +234,6 @@ class Camera(ABC):
         position = torch.stack([tensor_like(offset, origin) for offset in offsets])
         return F.pad((position - origin) @ axes, (0, 1), value=1.0)
 
-    @abstractmethod
     def project(self, points: Points) -> Points:
         """Project points to normalized device coordinates.
 
@@ -254,6 +251,12 @@ class Camera(ABC):
         Raises:
             InputError: If a perspective camera lies in or behind the points.
         """
+        return self.project_views([self], points)[0]
+
+    @staticmethod
+    @abstractmethod
+    def project_views(cameras: Sequence[Any], points: Points) -> Points:
+        """Project points by N cameras of this class at once, shape (N, V, 3)."""
 
     def homogeneous(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Project points to homogeneous image coordinates.
@@ -314,7 +317,12 @@ class Camera(ABC):
             InputError: If a point lies behind a perspective camera or very near
                 to it.
         """
-        return None
+        return self.depths_of_views([self], points)[0] if self.has_perspective else None
+
+    @staticmethod
+    def depths_of_views(cameras: Sequence[Any], points: Points) -> Points:
+        """Compute the depths of points from N perspective cameras of this class, shape (N, V)."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -335,13 +343,16 @@ class OrthographicCamera(Camera):
         """Distance that files of cameras store. Images do not depend on it."""
         return 2 * self.clip_range
 
-    def project(self, points: Points) -> Points:
+    @staticmethod
+    def project_views(cameras: Sequence[Any], points: Points) -> Points:
         """Project points without perspective, with depths from -1 at `near` to 1 at `far`."""
-        scale = np.array([2 / self.width, 2 / self.width, -1 / self.clip_range])
-        shift = np.array([self.right, self.up, 0.0])
-        coordinates = _like(self.axes() * scale[:, None], points) @ points.T
-        coordinates += _like((shift * scale)[:, None], points)
-        return coordinates.T
+        scales = [[2 / each.width, 2 / each.width, -1 / each.clip_range] for each in cameras]
+        scale = np.array(scales)[..., None]
+        shift = np.array([[each.right, each.up, 0.0] for each in cameras])[..., None]
+        axes = np.stack([each.axes() for each in cameras])
+        coordinates = _like(axes * scale, points) @ points.T
+        coordinates += _like(shift * scale, points)
+        return coordinates.swapaxes(1, 2)
 
 
 @dataclass(frozen=True)
@@ -368,34 +379,81 @@ class PerspectiveCamera(Camera):
         """Field of view, the angle between the left and the right side of the image."""
         return math.degrees(2 * math.atan(self.width / 2 / self.distance))
 
-    def project(self, points: Points) -> Points:
+    @staticmethod
+    def project_views(cameras: Sequence[Any], points: Points) -> Points:
         """Project points with perspective, with depths from -1 (near plane) to 1 (far plane)."""
-        depths = self.depths(points)
-        right, up, back = _like(self.axes(), points) @ self._from_pivot(points).T
-        scale = 2 / self.width * (self.distance / depths)
-        x = (right + self.right) * scale + self.principal_right
-        y = (up + self.up) * scale * self.pixel_aspect + self.principal_up
-        _, near, far = self._limits(depths)
+        depths = PerspectiveCamera.depths_of_views(cameras, points)
+        field = partial(_column, cameras, points)
+        axes = _like(np.stack([each.axes() for each in cameras]), points)
+        right, up, back = (axes @ _from_pivots(cameras, points).swapaxes(1, 2)).swapaxes(0, 1)
+        distance = field("distance")
+        scale = 2 / field("width") * (distance / depths)
+        x = (right + field("right")) * scale + field("principal_right")
+        y = (up + field("up")) * scale * field("pixel_aspect") + field("principal_up")
+        _, near, far = cameras[0].limits(cameras, depths)
         # The near plane is measured along the axis from the pivot to the camera.
         depth_scale = 2 * far / (far - near)
-        normalized_depth = depth_scale * ((self.distance - near - back) / depths) - 1
-        stack: Any = torch.stack if isinstance(points, Tensor) else np.stack
-        return stack([x, y, normalized_depth]).T
+        normalized_depth = depth_scale * ((distance - near - back) / depths) - 1
+        return _stack([x, y, normalized_depth], 1).swapaxes(1, 2)
 
-    def depths(self, points: Points) -> Points:
-        """Compute the depths of points, which must lie in front of the camera."""
-        depths = self.distance - self._from_pivot(points) @ _like(self.axes()[2], points)
-        if not (depths >= self._limits(depths)[0]).all():
+    @staticmethod
+    def depths_of_views(cameras: Sequence[Any], points: Points) -> Points:
+        """Compute the depths (N, V) of points that must lie in front of N cameras."""
+        backs = _like(np.stack([each.axes()[2] for each in cameras]), points)
+        along = (_from_pivots(cameras, points) @ backs[..., None])[..., 0]
+        depths = _column(cameras, points, "distance") - along
+        is_behind = depths < cameras[0].limits(cameras, depths)[0]
+        if is_behind.any():
+            camera = cameras[int(is_behind.any(1).nonzero()[0][0])]
             raise errors.InputError(
-                f"the mesh reaches the camera at {self.pose()[:3, 3].round(3).tolist()} or lies "
+                f"the mesh reaches the camera at {camera.pose()[:3, 3].round(3).tolist()} or lies "
                 "behind it: normalize the mesh, increase the distance (by a smaller fov or a "
                 "larger width), or give cameras that have the whole mesh in front of them"
             )
         return depths
 
-    def _limits(self, depths: Any) -> tuple[float, float, float]:
+    @staticmethod
+    def limits(cameras: Sequence[Any], depths: Points) -> tuple[Any, Any, Any]:
         """Return the smallest allowed depth, and the depths of the near and of the far plane."""
-        return MIN_NEAR_RATIO * self.distance, self.near, self.far
+        field = partial(_column, cameras, depths)
+        return MIN_NEAR_RATIO * field("distance"), field("near"), field("far")
+
+
+def project_views(cameras: Sequence[Camera], points: Points) -> Points:
+    """Project points by N cameras, shape (N, V, 3). Those of one class project at once."""
+    if len({type(camera) for camera in cameras}) == 1:
+        return cameras[0].project_views(cameras, points)
+    return _stack([camera.project(points) for camera in cameras])
+
+
+def depths_of_views(cameras: Sequence[Camera], points: Points) -> Points | None:
+    """Compute the depths of points from N cameras, shape (N, V). None without perspective.
+
+    From a camera without perspective among others, all depths are 1.
+    """
+    if not any(camera.has_perspective for camera in cameras):
+        return None
+    if len({type(camera) for camera in cameras}) == 1:
+        return cameras[0].depths_of_views(cameras, points)
+    given = [camera.depths(points) for camera in cameras]
+    return _stack([0 * points[:, 0] + 1 if depths is None else depths for depths in given])
+
+
+def _stack(arrays: Sequence[Points], axis: int = 0) -> Points:
+    """Stack arrays, or tensors."""
+    stack: Any = torch.stack if isinstance(arrays[0], Tensor) else np.stack
+    return stack(arrays, axis)
+
+
+def _from_pivots(cameras: Sequence[Camera], points: Points) -> Points:
+    """Subtract the points about which attacks turn N cameras from other points, (N, V, 3)."""
+    pivots = [[each.center_x, each.center_y, each.center_z] for each in cameras]
+    return points - _like(np.array(pivots)[:, None], points)
+
+
+def _column(cameras: Sequence[Camera], like: Points, name: str) -> Points:
+    """Return a field of N cameras as a column (N, 1)."""
+    return _like(np.array([[getattr(each, name)] for each in cameras]), like)
 
 
 def _as_scalar(name: str, value: Any) -> Any:

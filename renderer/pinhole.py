@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from renderer import errors
-from renderer.camera import PerspectiveCamera
+from renderer.camera import PerspectiveCamera, Points
 from renderer.errors import InputError
 
 # Conventions for the axes of a camera in its view matrix. OpenCV has y down and z forward. OpenGL
@@ -187,10 +188,12 @@ class PinholeCamera(PerspectiveCamera):
         """Return a camera whose image stays the same, and that attacks turn about the origin."""
         return replace(super().normalized(center, scale), center_x=0.0, center_y=0.0, center_z=0.0)
 
-    def _limits(self, depths: Any) -> tuple[float, float, float]:
+    @staticmethod
+    def limits(cameras: Sequence[Any], depths: Points) -> tuple[Any, Any, Any]:
         """Return the smallest allowed depth, and depths just around those of the points."""
-        near, far = depths.min(), depths.max()
-        smallest = MIN_DEPTH_RATIO * max(-near, far)
+        library: Any = torch if isinstance(depths, Tensor) else np
+        near, far = library.amin(depths, 1)[:, None], library.amax(depths, 1)[:, None]
+        smallest = MIN_DEPTH_RATIO * library.maximum(-near, far)
         return smallest, near * (1 - MIN_DEPTH_RATIO), far * (1 + MIN_DEPTH_RATIO)
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 from renderer.errors import require_bounded
 from renderer.image import clamp, decode, encode, to_bytes
 from renderer.mesh import NO_TEXTURE, Mesh
-from renderer.visibility.fragments import BLOCK, Fragments
+from renderer.visibility.fragments import Fragments, split_samples
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def sample_textures(
         reduce(torch.add, [w * texture.look_up(i) for w, i in _surrounding_texels(texture, block)])
         for texture, _, uvs in parts
         # The points are processed in blocks to limit the memory.
-        for block in uvs.split(BLOCK, dim=1)
+        for (block,) in split_samples(uvs)
     ]
     # One row for each channel.
     values = torch.cat(blocks, dim=1)

@@ -45,11 +45,10 @@ from renderer.surface.albedo import of_seen_faces
 from renderer.surface.gloss import SampleGloss, at_samples, toward_camera
 from renderer.surface.lobes import coat_irradiance_factors, roughness_polynomials
 from renderer.vectors import unit, unit_vectors
-from renderer.visibility.fragments import Fragments
+from renderer.visibility.fragments import BLOCK_ON_CPU, Fragments, block_size, split_samples
 
-# Number of normals whose irradiance is computed at once. Their intermediate values fit
-# into the cache of the processor.
-BLOCK = 2**14
+# With gloss, a sample takes so many times the memory.
+GLOSSY_FACTOR = 16
 # Number of color channels.
 COLORS = 3
 
@@ -123,8 +122,9 @@ def glossy_radiance(
     # Albedo of the diffuse layer below the transparent coat, as the camera sees it.
     diffuse_albedo = albedo * gloss.diffuse_factor(shading_normals, to_camera)[:, None]
     specular_blocks = []
-    for first in range(0, len(shading_normals), BLOCK):
-        block = slice(first, first + BLOCK)
+    size = max(BLOCK_ON_CPU, block_size(light.device) // GLOSSY_FACTOR)
+    for first in range(0, len(shading_normals), size):
+        block = slice(first, first + size)
         normals_here, gloss_here = shading_normals[block], gloss.at(block)
         # One row for each SH coefficient, one column for each sample. The reflection of metals
         # (colored) is multiplied by the albedo. All other specular reflection (white) has the
@@ -286,8 +286,7 @@ class _Irradiance(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             degree = math.isqrt(ctx.light_shape[0]) - 1
             light_gradient = directions.new_zeros(ctx.light_shape)
-            blocks = zip(directions.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True)
-            for block_directions, block_upstream in blocks:
+            for block_directions, block_upstream in split_samples(directions, upstream):
                 nonzero, irradiance_per_unit = _diffuse_basis(block_directions, degree)
                 light_gradient[nonzero] += irradiance_per_unit @ block_upstream.T
         return normal_gradient, light_gradient
@@ -313,7 +312,7 @@ def _evaluate_polynomial(
     # harmonic Y_0 = 1 / √(4π).
     constant = light[:1].T * math.sqrt(math.pi / 4)
     values, gradients = [], []
-    for block in directions.split(BLOCK, dim=1):
+    for (block,) in split_samples(directions):
         # A tensor of monomials with a name would stay in memory.
         gradient = torch.addmm(
             linear_gradient, even_gradient, harmonics.monomials(block, degree - 1)

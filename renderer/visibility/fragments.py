@@ -12,7 +12,7 @@ show G of the F faces of the mesh.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,18 +21,19 @@ from jaxtyping import Float, Int, Num, Shaped
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.camera import Camera
+from renderer.camera import Camera, depths_of_views, project_views
 from renderer.errors import require_finite
 from renderer.settings import ImageSettings
 from renderer.visibility import Rasterizer
 
-# Largest number of samples of the views that are shaded at once on a GPU, and on a CPU, into whose
-# cache their values should fit. A larger view is shaded alone.
-SAMPLES_ON_GPU = 2**21
+# Largest number of samples of the views that are shaded at once on a CPU, into whose cache their
+# values should fit. A larger view is shaded alone.
 SAMPLES_ON_CPU = 2**16
-# Number of samples that are interpolated at once on a CPU. Their values fit into the cache of the
-# processor.
-BLOCK = 2**14
+# Number of samples whose values are computed at once on a CPU. They fit into its cache.
+BLOCK_ON_CPU = 2**14
+# Fraction of the memory of a GPU that the samples take which are shaded at once, and bytes of one.
+MEMORY_FRACTION = 1 / 16
+SAMPLE_BYTES = 2**10
 
 
 class PixelGroups(NamedTuple):
@@ -152,7 +153,7 @@ class Fragments:
         reciprocal_depths = None if self.depths is None else self.depths.T.reciprocal()
         weights = face_values.new_empty(3, len(self.sample_to_seen_face))
         # `weight` is a view of some columns of `weights`. Writing to it fills `weights`.
-        for weight, sample_to_seen_face, position in _blocks(
+        for weight, sample_to_seen_face, position in split_samples(
             weights, self.sample_to_seen_face, self.positions().T
         ):
             # `gather` takes a third of the time of `index_select`.
@@ -308,7 +309,7 @@ class _Interpolation(torch.autograd.Function):
         ctx.corner_rows_shape = corner_rows.shape
         values = corner_rows.new_empty(len(corner_rows) // 3, len(sample_to_seen_face))
         # `value` is a view of some columns of `values`. Writing to it fills `values`.
-        for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights):
+        for value, seen_face, weight in split_samples(values, sample_to_seen_face, weights):
             # One column for each sample: the column of the face that the sample shows.
             at_corners = corner_rows.gather(1, seen_face.expand(len(corner_rows), -1))
             # Axes: corner, value, sample.
@@ -333,16 +334,32 @@ def _distribute(
 ) -> Float[Tensor, "_ G"]:
     """Add up values times barycentric weights at corners, in the layout of `corner_rows`."""
     corner_rows = values.new_zeros(corner_rows_shape)
-    for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights.to(values)):
+    for value, seen_face, weight in split_samples(values, sample_to_seen_face, weights.to(values)):
         # Values times weights. Rows are pairs of corner and value, columns are samples.
         weighted = (weight[:, None] * value).flatten(0, 1)
         corner_rows.index_add_(1, seen_face, weighted)
     return corner_rows
 
 
-def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Split several tensors along their last axis into blocks of BLOCK entries."""
-    return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
+def split_samples(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    """Split several tensors along their last axis, the samples, into blocks."""
+    size = block_size(tensors[0].device)
+    return zip(*(tensor.split(size, dim=-1) for tensor in tensors), strict=True)
+
+
+def block_size(device: torch.device) -> int:
+    """Return for how many samples values are computed at once.
+
+    Few samples take a GPU as long as many.
+    """
+    return samples_on_gpu(device) if device.type == "cuda" else BLOCK_ON_CPU
+
+
+@cache
+def samples_on_gpu(device: torch.device) -> int:
+    """Return how many samples a GPU shades at once. The number depends on its memory alone."""
+    memory = torch.cuda.get_device_properties(device).total_memory
+    return int(MEMORY_FRACTION * memory / SAMPLE_BYTES)
 
 
 def views_at_once(settings: ImageSettings, vertices: np.ndarray | Tensor, casts_rays: bool) -> int:
@@ -353,7 +370,7 @@ def views_at_once(settings: ImageSettings, vertices: np.ndarray | Tensor, casts_
     if casts_rays:
         return 1
     is_on_gpu = isinstance(vertices, Tensor) and vertices.is_cuda
-    samples = SAMPLES_ON_GPU if is_on_gpu else SAMPLES_ON_CPU
+    samples = samples_on_gpu(vertices.device) if is_on_gpu else SAMPLES_ON_CPU
     return max(1, samples // (settings.pixel_count * settings.samples**2))
 
 
@@ -380,7 +397,7 @@ def build_fragments(
         points = points.double() if points.is_cuda else points.cpu().double().numpy()
     # Axes: camera, coordinate, vertex. In this order, each coordinate is contiguous in
     # memory.
-    coordinates = torch.stack([torch.as_tensor(c.project(points)).T for c in cameras])
+    coordinates = torch.as_tensor(project_views(cameras, points)).mT
     projected = coordinates.mT
     # The third coordinate is the depth. It is less than -1 in front of the near plane,
     # which would cut the mesh open.
@@ -391,12 +408,8 @@ def build_fragments(
     views = []
     for first in range(0, len(cameras), at_once):
         some = slice(first, first + at_once)
-        depths = None
-        if any(camera.has_perspective for camera in cameras[some]):
-            # If all depths are equal, the result is that of no perspective.
-            given = [camera.depths(points) for camera in cameras[some]]
-            equal = projected.new_ones(projected.shape[1])
-            depths = torch.cat([equal if d is None else torch.as_tensor(d) for d in given])
+        depths = depths_of_views(cameras[some], points)
+        depths = None if depths is None else torch.as_tensor(depths).flatten()
         shown = tuple(cameras[some]), projected[some], depths, face_ids[some], all_faces
         views.append(_fragments_of_views(*shown, settings))
     return views

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from renderer.visibility.fragments import block_size
 from renderer.visibility.numpy import (
     EMPTY_KEY,
     FACE_BITS,
@@ -20,8 +21,8 @@ from renderer.visibility.numpy import (
     next_sample,
 )
 
-# Faces of all views that are prepared at once, and pairs of a face and a sample that are tested at
-# once. A face takes about 300 bytes, and a pair 200.
+# Faces of all views that are prepared at once, and smallest number of pairs of a face and a sample
+# that are tested at once. A face takes about 300 bytes, and a pair 200.
 FACES_PER_TILE = 2**20
 PAIRS_PER_TILE = 2**20
 
@@ -114,13 +115,14 @@ def _draw(
     rows, columns = keys.shape[1:]
     edges, planes, boxes, ends = _triangles(points, faces, (rows, columns), closed)
     pair_count = int(ends[-1:].sum())  # The only wait for a GPU.
-    for begin in range(0, pair_count, PAIRS_PER_TILE):
-        pair = torch.arange(begin, min(begin + PAIRS_PER_TILE, pair_count), device=points.device)
+    step = max(PAIRS_PER_TILE, block_size(points.device))
+    for begin in range(0, pair_count, step):
+        pair = torch.arange(begin, min(begin + step, pair_count), device=points.device)
         # Triangle of each pair, and the sample from the place of the pair in the bounding box.
         triangle = torch.searchsorted(ends, pair, right=True)
         column, row, width, first_pair = boxes[:, triangle]
-        step = pair - first_pair
-        column, row = column + step % width, row + step // width
+        place = pair - first_pair
+        column, row = column + place % width, row + place // width
         by_column, by_row, constant = edges[..., triangle]
         is_inside = (by_column * column + by_row * row + constant >= 0).all(0)
         x, y, depth, slope_x, slope_y = planes[:, triangle]

@@ -4,6 +4,7 @@ Comparisons with Mitsuba are in test_mitsuba.py.
 """
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,13 @@ import pytest
 import torch
 import trimesh
 
-from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
+from renderer.camera import (
+    OrthographicCamera,
+    PerspectiveCamera,
+    depths_of_views,
+    orbit_cameras,
+    project_views,
+)
 from renderer.errors import InputError
 from renderer.mesh import Mesh
 from renderer.operators.rays import Surface
@@ -63,6 +70,32 @@ def test_points_are_projected_as_by_hand(camera, points, expected):
     np.testing.assert_allclose(projected[:, :2], expected, atol=2 * EPS)
     of_tensor = camera.project(torch.tensor(points, dtype=torch.float64))
     np.testing.assert_allclose(of_tensor, projected, rtol=0, atol=4 * EPS)
+
+
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy], ids=["array", "tensor"])
+@pytest.mark.parametrize(
+    "cameras",
+    [ORTHOGRAPHIC, PERSPECTIVE, [SHIFTED_PINHOLE] * 2, [*ORTHOGRAPHIC, SHIFTED_PINHOLE]],
+    ids=["orthographic", "perspective", "pinhole", "mixed"],
+)
+def test_views_that_are_projected_together_are_those_that_are_projected_alone(cameras, kind):
+    points = kind(np.random.default_rng(0).uniform(-1, 1, (40, 3)))
+    alone = np.stack([camera.project(points) for camera in cameras])
+    np.testing.assert_allclose(project_views(cameras, points), alone, rtol=0, atol=4 * EPS)
+    depths = depths_of_views(cameras, points)
+    for index, camera in enumerate(cameras):
+        of_camera = camera.depths(points)
+        assert (of_camera is None) == (not camera.has_perspective)
+        expected = np.ones(40) if of_camera is None else of_camera
+        if depths is not None:
+            np.testing.assert_allclose(depths[index], expected, rtol=0, atol=4 * EPS)
+    assert (depths is None) == (cameras is ORTHOGRAPHIC)
+
+
+def test_the_camera_that_the_mesh_reaches_is_named_among_several():
+    near = replace(PERSPECTIVE[2], distance=0.5)
+    with pytest.raises(InputError, match=re.escape(str(near.pose()[:3, 3].round(3).tolist()))):
+        project_views([PERSPECTIVE[2], near], np.ones((1, 3)) * near.axes()[2])
 
 
 @pytest.mark.parametrize("camera", [*ORTHOGRAPHIC[:2], *PERSPECTIVE])
