@@ -251,11 +251,11 @@ class Camera(ABC):
         Raises:
             InputError: If a perspective camera lies in or behind the points.
         """
-        return self.project_views([self], points)[0]
+        return self._project_views([self], points)[0]
 
     @staticmethod
     @abstractmethod
-    def project_views(cameras: Sequence[Any], points: Points) -> Points:
+    def _project_views(cameras: Sequence[Any], points: Points) -> Points:
         """Project points by N cameras of this class at once, shape (N, V, 3)."""
 
     def homogeneous(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -317,12 +317,7 @@ class Camera(ABC):
             InputError: If a point lies behind a perspective camera or very near
                 to it.
         """
-        return self.depths_of_views([self], points)[0] if self.has_perspective else None
-
-    @staticmethod
-    def depths_of_views(cameras: Sequence[Any], points: Points) -> Points:
-        """Compute the depths of points from N perspective cameras of this class, shape (N, V)."""
-        raise NotImplementedError
+        return None
 
 
 @dataclass(frozen=True)
@@ -344,7 +339,7 @@ class OrthographicCamera(Camera):
         return 2 * self.clip_range
 
     @staticmethod
-    def project_views(cameras: Sequence[Any], points: Points) -> Points:
+    def _project_views(cameras: Sequence[Any], points: Points) -> Points:
         """Project points without perspective, with depths from -1 at `near` to 1 at `far`."""
         scales = [[2 / each.width, 2 / each.width, -1 / each.clip_range] for each in cameras]
         scale = np.array(scales)[..., None]
@@ -380,9 +375,9 @@ class PerspectiveCamera(Camera):
         return math.degrees(2 * math.atan(self.width / 2 / self.distance))
 
     @staticmethod
-    def project_views(cameras: Sequence[Any], points: Points) -> Points:
+    def _project_views(cameras: Sequence[Any], points: Points) -> Points:
         """Project points with perspective, with depths from -1 (near plane) to 1 (far plane)."""
-        depths = PerspectiveCamera.depths_of_views(cameras, points)
+        depths = PerspectiveCamera._depths_of_views(cameras, points)
         field = partial(_column, cameras, points)
         axes = _like(np.stack([each.axes() for each in cameras]), points)
         right, up, back = (axes @ _from_pivots(cameras, points).swapaxes(1, 2)).swapaxes(0, 1)
@@ -390,19 +385,23 @@ class PerspectiveCamera(Camera):
         scale = 2 / field("width") * (distance / depths)
         x = (right + field("right")) * scale + field("principal_right")
         y = (up + field("up")) * scale * field("pixel_aspect") + field("principal_up")
-        _, near, far = cameras[0].limits(cameras, depths)
+        _, near, far = cameras[0]._limits(cameras, depths)
         # The near plane is measured along the axis from the pivot to the camera.
         depth_scale = 2 * far / (far - near)
         normalized_depth = depth_scale * ((distance - near - back) / depths) - 1
         return _stack([x, y, normalized_depth], 1).swapaxes(1, 2)
 
+    def depths(self, points: Points) -> Points:
+        """Compute the depths of points, which must lie in front of the camera."""
+        return self._depths_of_views([self], points)[0]
+
     @staticmethod
-    def depths_of_views(cameras: Sequence[Any], points: Points) -> Points:
+    def _depths_of_views(cameras: Sequence[Any], points: Points) -> Points:
         """Compute the depths (N, V) of points that must lie in front of N cameras."""
         backs = _like(np.stack([each.axes()[2] for each in cameras]), points)
         along = (_from_pivots(cameras, points) @ backs[..., None])[..., 0]
         depths = _column(cameras, points, "distance") - along
-        is_behind = depths < cameras[0].limits(cameras, depths)[0]
+        is_behind = depths < cameras[0]._limits(cameras, depths)[0]
         if is_behind.any():
             camera = cameras[int(is_behind.any(1).nonzero()[0][0])]
             raise errors.InputError(
@@ -413,7 +412,7 @@ class PerspectiveCamera(Camera):
         return depths
 
     @staticmethod
-    def limits(cameras: Sequence[Any], depths: Points) -> tuple[Any, Any, Any]:
+    def _limits(cameras: Sequence[Any], depths: Points) -> tuple[Any, Any, Any]:
         """Return the smallest allowed depth, and the depths of the near and of the far plane."""
         field = partial(_column, cameras, depths)
         return MIN_NEAR_RATIO * field("distance"), field("near"), field("far")
@@ -422,7 +421,7 @@ class PerspectiveCamera(Camera):
 def project_views(cameras: Sequence[Camera], points: Points) -> Points:
     """Project points by N cameras, shape (N, V, 3). Those of one class project at once."""
     if len({type(camera) for camera in cameras}) == 1:
-        return cameras[0].project_views(cameras, points)
+        return cameras[0]._project_views(cameras, points)
     return _stack([camera.project(points) for camera in cameras])
 
 
@@ -433,8 +432,9 @@ def depths_of_views(cameras: Sequence[Camera], points: Points) -> Points | None:
     """
     if not any(camera.has_perspective for camera in cameras):
         return None
-    if len({type(camera) for camera in cameras}) == 1:
-        return cameras[0].depths_of_views(cameras, points)
+    first = cameras[0]
+    if isinstance(first, PerspectiveCamera) and len({type(camera) for camera in cameras}) == 1:
+        return first._depths_of_views(cameras, points)
     given = [camera.depths(points) for camera in cameras]
     return _stack([0 * points[:, 0] + 1 if depths is None else depths for depths in given])
 
