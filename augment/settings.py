@@ -206,7 +206,9 @@ class RendererSettings(Settings):
         checks_type=False,  # A `Rasterizer` is valid, too.
     )
     samples: int | None = setting(
-        None, "Samples per pixel side. null: 2 (8 with silhouettes).", within=(1, base.MAX_SAMPLES)
+        None,
+        "Samples per pixel side. null: 2 (8 with silhouettes and without shadows and bounces).",
+        within=(1, base.MAX_SAMPLES),
     )
     encoding: str = setting_like(ImageSettings, "encoding", "linear")
     normals: str = setting_like(ImageSettings, "normals", "smooth")
@@ -222,7 +224,9 @@ class RendererSettings(Settings):
     def image(self, size: Size) -> ImageSettings:
         """Return the settings of images with a size: pixels per side, or height and width."""
         options = {name: value for name, value in vars(self).items() if name != "rasterizer"}
-        options["samples"] = base.samples_per_side(self.samples, self.silhouettes)
+        # With shadows or bounces, a search takes drafts, which have few samples anyway.
+        needs_many = self.silhouettes and not (self.shadows or self.bounces)
+        options["samples"] = base.samples_per_side(self.samples, needs_many)
         return ImageSettings(size, **options)
 
 
