@@ -96,7 +96,7 @@ class CheckedNetwork(wrappers.Network):
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Any:
         """Compute the outputs of images in the form of the task, and check them."""
         # A network of a task inside has asked its own network already.
-        task = None if isinstance(self.network, TaskNetwork) else self.task
+        task = None if isinstance(self.network, TaskNetwork | Switch) else self.task
         try:
             outputs = self.network(images) if task is None else task.outputs(self.network, images)
         except Exception as error:
@@ -112,7 +112,10 @@ class CheckedNetwork(wrappers.Network):
                 names = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
                 remedy = f"its weights are {names}, convert it with network.to({images.dtype})"
             raise InputError(f"{self.title} fails on {given} ({kind}): {remedy}") from error
-        return outputs if self._read is None else self._read(outputs, images)
+        # Both networks of a switch have read their own outputs.
+        if self._read is None or isinstance(self.network, Switch):
+            return outputs
+        return self._read(outputs, images)
 
 
 class TaskNetwork(CheckedNetwork):

@@ -101,7 +101,8 @@ def as_facts(
     """
     if isinstance(classes, str | Path):
         require_file(classes, "give a text file with the name of a class in each line")
-        lines = Path(classes).read_text(encoding="utf-8").splitlines()
+        with reading(Path(classes), "is no text in UTF-8", "save it as UTF-8"):
+            lines = Path(classes).read_text(encoding="utf-8-sig").splitlines()
         classes = [line.strip() for line in lines if line.strip()]
     names = None if classes is None else classifiers.as_class_names("classes", classes)
     if size is not None:

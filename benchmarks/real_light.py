@@ -39,6 +39,7 @@ import norm_balls as nb
 from augment.classifier import Classifier
 from augment.exposure import IsDim
 from augment.switch import SWITCHES
+from renderer.errors import InputError
 from renderer.image import to_unit
 from renderer.io.images import SUFFIXES, crop_center, read_rgb, write_image
 from train.checkpoints import RUN, is_classifier, load_network, load_run
@@ -317,9 +318,15 @@ def simulate(options: argparse.Namespace) -> None:
     shown = {PLAIN: images}
     for light in options.lights:
         shown[light] = nb.relight_photographs(images, options.seed, lights=[light])
+    written: set[Path] = set()
     for light, relit in shown.items():
         for item, image in zip(photographs, relit, strict=True):
-            path = options.folder / item.label / f"{light}__{item.path.stem}.png"
+            # Photographs in several folders of a class may share a name.
+            name = "_".join(item.path.with_suffix("").parts[1:])
+            path = options.folder / item.label / f"{light}__{name}.png"
+            if path in written:
+                path = path.with_name(f"{light}__{item.path.suffix[1:]}_{name}.png")
+            written.add(path)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_image(path, image.permute(1, 2, 0).numpy())
 
@@ -421,7 +428,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     counting.add_argument("folders", nargs="+", type=Path)
     counting.add_argument("--size", type=int, default=224, help="pixels per side")
     options = parser.parse_args(arguments)
-    options.body(options)
+    try:
+        options.body(options)
+    except InputError as error:
+        parser.exit(2, f"error: {error}\n")
 
 
 if __name__ == "__main__":

@@ -514,10 +514,11 @@ class LowLight(LightModel):
 
 def normal_noise(like: Float[Tensor, "B C H W"], seeds: Sequence[int]) -> Tensor:
     """Draw a normal number for each value of each image, from the seed of the image."""
-    noise = torch.empty_like(like)
+    # The numbers depend on neither the layout nor the type of the images.
+    noise = torch.empty(like.shape, dtype=torch.float32, device=like.device)
     for image, seed in zip(noise, seeds, strict=True):
         image.normal_(generator=torch.Generator(like.device).manual_seed(seed))
-    return noise
+    return noise.to(like.dtype)
 
 
 def _rounded(values: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import nn
 
+from augment.files import as_facts
 from augment.sources import load_classifier
 from renderer.errors import InputError
 
@@ -159,3 +160,13 @@ def test_objects_that_are_no_tensors_are_refused_in_an_exported_network(tmp_path
         archive.writestr(f"network/{name}", pickle.dumps(Payload(tmp_path / "created")))
     with pytest.raises(InputError, match="any code"):
         load_classifier(str(path), size=SIZE, trust_code=True)
+
+
+def test_a_file_of_class_names_of_windows_gives_the_names(tmp_path):
+    """Notepad may write a byte-order mark and UTF-16, and ends lines by two characters."""
+    path = tmp_path / "classes.txt"
+    path.write_bytes(b"\xef\xbb\xbforange\r\ncup\r\n")
+    assert as_facts(path).classes == ("orange", "cup")
+    path.write_bytes("orange\ncup\n".encode("utf-16"))
+    with pytest.raises(InputError, match="UTF-8"):
+        as_facts(path)

@@ -263,6 +263,18 @@ def test_a_batch_keeps_channels_last(dtype):
     assert relit.is_contiguous(memory_format=torch.channels_last)
 
 
+@pytest.mark.parametrize("name", list(MODELS))
+def test_a_drawn_light_depends_on_neither_the_layout_nor_the_precision(name):
+    images = picture(2, 3, 9, 7) / 255
+    transform = nb.RandomLighting(name)
+    drawn = transform.make_params([images])
+    expected = transform.apply(images, drawn)
+    for other in (images.contiguous(memory_format=torch.channels_last), images.double()):
+        torch.testing.assert_close(
+            transform.apply(other, drawn).float(), expected, rtol=0, atol=2e-5
+        )
+
+
 def test_bytes_are_exactly_rounded():
     # All bytes in 300 lights, against the curve in double precision.
     light = torch.rand(300, generator=torch.Generator().manual_seed(0)) * 3

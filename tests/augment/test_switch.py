@@ -7,6 +7,7 @@ from oracles import srgb_of
 from torch import Tensor
 
 import norm_balls as nb
+from augment.classifier import TaskNetwork
 from augment.exposure import IsDim
 from augment.switch import Switch
 from renderer import InputError
@@ -86,6 +87,27 @@ def test_the_candidates_of_a_detector_are_those_of_the_network_that_an_image_get
     for item, own in zip(found, expected, strict=True):
         for key in own:
             torch.testing.assert_close(item[key], own[key], rtol=1e-4, atol=1e-4)
+
+
+def test_a_detector_with_a_function_of_the_user_can_be_shown_dim_images_alone():
+    def decode(outputs):
+        boxes = torch.tensor([[1.0, 1.0, 4.0, 4.0]]).expand(len(outputs), 1, 4)
+        return [
+            {"boxes": box, "scores": row[None, :].sigmoid()}
+            for box, row in zip(boxes, outputs, strict=True)
+        ]
+
+    task = nb.Detection(decode=decode)
+    names = [f"object {number}" for number in range(3)]
+    plain, dim = (
+        TaskNetwork(Constant(number, "tensor").eval(), SIZE, names, task=task)
+        for number in (0.0, 1.0)
+    )
+    images = torch.cat([brightness(0.9), brightness(0.1)]).float()
+    found = plain.with_dim(dim)(images)
+    expected = [plain(images[:1])[0], dim(images[1:])[0]]
+    for item, own in zip(found, expected, strict=True):
+        assert torch.equal(item["scores"], own["scores"])
 
 
 @pytest.mark.parametrize(

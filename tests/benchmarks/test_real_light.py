@@ -53,6 +53,23 @@ def test_each_light_has_its_scores(folder, monkeypatch):
     assert values["never", "plain"][0] == "0.000"
 
 
+def test_simulated_light_keeps_photographs_that_share_a_name(tmp_path):
+    for name in ("a/1.png", "b/1.png", "1.png", "1.jpg"):
+        save(tmp_path / "given/orange" / name, 40)
+    words = ["simulate", str(tmp_path / "given"), str(tmp_path / "out"), "--classes", "orange"]
+    real_light.main([*words, "--lights", "low_light"])
+    for light in ("plain", "low_light"):
+        assert len([*(tmp_path / "out/orange").glob(f"{light}__*.png")]) == 4
+
+
+def test_a_mistake_of_the_user_is_one_sentence(tmp_path, capsys):
+    save(tmp_path / "given/orange/1.png", 40)
+    words = ["simulate", str(tmp_path / "given"), str(tmp_path / "out"), "--classes", "orange"]
+    with pytest.raises(SystemExit, match="2"):
+        real_light.main([*words, "--lights", "lowlight"])
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_a_run_is_loaded_as_network_spells_it():
     one, other = (real_light.load(f"{prefix}pretrained/none") for prefix in ("", "run:"))
     assert all(map(torch.equal, one.state_dict().values(), other.state_dict().values()))
