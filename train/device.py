@@ -23,7 +23,7 @@ from augment import distributed
 from augment.network import Network, plain_outputs
 from augment.progress import progress_message
 from augment.settings import RendererSettings
-from renderer.errors import InputError, as_device, keyed, require_choice
+from renderer.errors import InputError, as_device, keyed, keys_of, require_choice
 from renderer.visibility import Rasterizer, choose
 from train import console
 from train.settings import TrainSettings
@@ -187,8 +187,9 @@ def compiles(choice: str, device: torch.device) -> bool:
 
 
 def choose_rasterizer(settings: RendererSettings) -> Rasterizer:
-    """Start the rasterizer that the settings choose."""
-    with keyed("rasterizer"), progress_message("starting the rasterizer"):
+    """Start the rasterizer that the settings of the renderer choose."""
+    keys = keys_of("renderer", settings)
+    with keyed(**keys), keyed("rasterizer"), progress_message("starting the rasterizer"):
         return choose(settings.rasterizer)
 
 

@@ -72,7 +72,7 @@ def run(settings: AttackExperimentSettings) -> None:
     device = choose_device(settings.device)
     classifier = load_chosen(settings).to(device)
     if adversary is not None:
-        rasterizer = _start_rasterizer(settings)
+        rasterizer = choose_rasterizer(settings.renderer)
         views = format_reloaded(adversary, rasterizer, classifier, settings.attack)
         print("\n".join(shortened(views)))
         if not settings.attack.parameters:
@@ -140,12 +140,6 @@ def _results_of(settings: AttackExperimentSettings, classifier: Classifier) -> I
         write_config(out, settings, command=command_line("attack"), images=images)
 
 
-def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
-    """Create the rasterizer that the settings of the renderer choose."""
-    with keyed(**keys_of("renderer", settings.renderer)):
-        return choose_rasterizer(settings.renderer)
-
-
 def _write_attack(
     name: str,
     scene: AttackSceneSettings,
@@ -206,7 +200,7 @@ def attacks(
         if adversary.pixels is not None:
             raise InputError(f"reload={settings.reload} has changed pixels: give another")
         # The saved adversary has its own scene, which may be misclassified already.
-        scene = adversary.scene(_start_rasterizer(settings), device)
+        scene = adversary.scene(choose_rasterizer(settings.renderer), device)
         yield adversary.shown.name, settings.scene, start(scene, force=True)
         return
     for index, item in enumerate(settings.meshes):
@@ -244,7 +238,7 @@ def build_attacked(
     """
     options: dict[str, Any] = {"attack": settings.attack, "shared": settings.attack.shared}
     options |= {"scene": scene, "renderer": settings.renderer, "device": device}
-    options["rasterizer"] = _start_rasterizer(settings)
+    options["rasterizer"] = choose_rasterizer(settings.renderer)
     with keyed("scene", **keys_of("scene", scene)):
         return build_scene([item], size, scene.views, **options)
 

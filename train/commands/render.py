@@ -59,10 +59,10 @@ def run(settings: RenderSettings) -> None:
     options |= {"first": indices.start, "skip": finished, "views": settings.scene.views}
     # Depth and normals are computed only if files of them are asked for.
     options["maps"] = not {"depth", "normals"}.isdisjoint(settings.maps)
+    options["rasterizer"] = choose_rasterizer(settings.renderer)
     # An error names an argument by its setting, such as scene.views.
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
-        options["rasterizer"] = choose_rasterizer(settings.renderer)
         renders = dataset.render_dataset(objects, settings.size, len(indices), **options)
     data.write(progress(renders, "renders", missing))
     # Of several processes, the one that finishes last writes the files about all renders.

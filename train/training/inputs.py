@@ -361,11 +361,10 @@ def _build_scene(
     settings: ExperimentSettings, size: int, device: torch.device, phases: Phases
 ) -> Scene:
     """Build the scene with meshes and hard negatives, in the first process before the others."""
-    with keyed(**keys_of("renderer", settings.renderer)):
-        rasterizer = choose_rasterizer(settings.renderer)
+    options: dict[str, Any] = {"rasterizer": choose_rasterizer(settings.renderer)}
+    options |= {"attack": settings.augment.attack, "vary": settings.augment.vary}
+    options |= {"scene": settings.scene, "renderer": settings.renderer}
     objects = [*settings.objects.values()]
-    options: dict[str, Any] = {"attack": settings.augment.attack, "vary": settings.augment.vary}
-    options |= {"scene": settings.scene, "renderer": settings.renderer, "rasterizer": rasterizer}
     # An error names an argument by its setting, such as scene.views.
     keys = keys_of("scene", settings.scene)
     # The first process comes first, so that the others find what it downloads or caches.
