@@ -38,11 +38,11 @@ from train.class_names import class_of_meshes
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.device import choose_device, choose_rasterizer
 from train.results import attack_tables
-from train.results.overwrite import remove_attack, require_replaceable
+from train.results.overwrite import output_folder, remove_attack
 from train.results.predictions import RELIT, SWEEP_FIGURE, SWEEP_TABLE, TRANSFERS
 from train.results.tables import Table
 from train.run_config import write_config
-from train.run_folder import sole_writer, writable_folder
+from train.run_folder import sole_writer
 from train.settings import published_folder, read_object, read_objects
 from train.system import command_line, is_verbose, shortened
 
@@ -131,8 +131,7 @@ def _headings(attacked: Sequence[_AttackedMesh]) -> list[str]:
 @contextmanager
 def _results_of(settings: AttackExperimentSettings, classifier: Classifier) -> Iterator[Path]:
     """Yield the empty folder of the results, and write config.yaml at the end of the block."""
-    out = writable_folder(settings.out, "out")
-    require_replaceable(out, "out", settings.overwrite)
+    out = output_folder(settings.out, settings.overwrite)
     with sole_writer("out", out):
         remove_attack(out)
         yield out

@@ -24,10 +24,10 @@ from train.data.photographs import choose_labels, class_folders, require_outside
 from train.device import MixedPrecision, choose_device, choose_precision
 from train.results import annotated_scores, scoring
 from train.results.annotated_scores import AnnotatedScores, evaluate_detector, evaluate_segmenter
-from train.results.overwrite import require_replaceable
+from train.results.overwrite import output_folder
 from train.results.scoring import Predictor, Scores, format_scores
 from train.results.store import trained_labels
-from train.run_folder import sole_writer, writable_folder
+from train.run_folder import sole_writer
 from train.settings import GROUPS, label_names, published_folder
 from train.system import is_verbose
 
@@ -181,8 +181,7 @@ def evaluate(
         # The folder of the results. It is checked before the long computation.
         target = None
         if out is not None:
-            target = writable_folder(str(out), "out")
-            require_replaceable(target, "out", overwrite)
+            target = output_folder(str(out), overwrite)
             if folder.is_dir():
                 require_outside(target, folder)
         with sole_writer("out", target) if target else nullcontext():

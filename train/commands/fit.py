@@ -21,8 +21,7 @@ from renderer.light.files import save_light
 from renderer.photograph import fit_photograph
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings, FitSettings
 from train.commands.attack import build_attacked
-from train.results.overwrite import require_replaceable
-from train.run_folder import writable_folder
+from train.results.overwrite import output_folder
 
 # Width and height of the background image that is written, in pixels.
 BACKGROUND_SIZE = 448
@@ -50,8 +49,7 @@ def run(settings: FitSettings) -> None:
     with explained(f"{settings.photograph} cannot be read", "give an image file"):
         # The full size, because images whose shorter side has more pixels than this may be reduced.
         image = np.asarray(read_rgb(settings.photograph, 10**6))
-    out = writable_folder(settings.out, "out")
-    require_replaceable(out, "out", settings.overwrite)
+    out = output_folder(settings.out, settings.overwrite)
     # The mask is 255 where the object is, shape (H, W).
     if settings.mask:
         mask = read_mask(settings.mask, *image.shape[:2])

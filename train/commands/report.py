@@ -4,21 +4,19 @@ import os
 from pathlib import Path
 
 from train.command_settings import ReportSettings
-from train.results.overwrite import OF_AUDIT, RESULTS, require_replaceable
+from train.results.overwrite import OF_AUDIT, RESULTS, output_folder
 from train.results.page import write_report
-from train.run_folder import writable_folder
 
 
 def run(settings: ReportSettings) -> None:
     """Write a report page about training runs and attacks, and print its path."""
     folders = [Path(run) for run in settings.runs]
     parent = Path(os.path.commonpath([folder.absolute() for folder in folders]))
-    out = writable_folder(settings.out or parent, "out")
+    out = Path(settings.out or parent)
     # An earlier report in the common folder of all runs is replaced, unless it is the
     # report of an audit.
     own_files: list[str] = []
     if out.resolve() == parent.resolve():
         own_files = [pattern for pattern in RESULTS if pattern not in OF_AUDIT]
-    require_replaceable(out, "out", settings.overwrite, own_files)
-    page, _ = write_report(folders, out)
+    page, _ = write_report(folders, output_folder(out, settings.overwrite, own_files))
     print(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")

@@ -14,7 +14,7 @@ from train.results.page import PAGE
 from train.results.predictions import RELIT, SUMMARY, SWEEP_FIGURE, SWEEP_TABLE, TRANSFERS
 from train.results.store import is_finished
 from train.run_config import CONFIG, read_config
-from train.run_folder import BEFORE, METRICS
+from train.run_folder import BEFORE, METRICS, writable_folder
 from train.settings import KEPT_ASIDE, PHOTOGRAPHS_FIRST
 
 # Files of an audit, as patterns of `Path.glob`.
@@ -49,6 +49,13 @@ def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[s
         for found in path.glob(pattern):
             fault = f"{key}={path} holds results of an earlier command ({found.relative_to(path)})"
             raise InputError(f"{fault}: choose another folder, or set overwrite=true")
+
+
+def output_folder(folder: str | Path, overwrite: bool, own: Collection[str] = ()) -> Path:
+    """Check that a command can write to a folder, and would not replace results of another one."""
+    path = writable_folder(folder, "out")
+    require_replaceable(path, "out", overwrite, own)
+    return path
 
 
 def require_new_run(folder: Path, key: str, overwrite: bool, resume: bool) -> None:
