@@ -35,7 +35,7 @@ from hydra import initialize_config_module
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Sweep
+from hydra.core.override_parser.types import Quote, QuotedString, Sweep
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
@@ -398,13 +398,8 @@ def _as_list(value: str, is_text: bool) -> str:
 
 
 def quoted(text: str) -> str:
-    """Put a text between single quotes, so that Hydra reads it unchanged.
-
-    A single quote inside the text gets a backslash before it. Backslashes of the text that stand
-    before a single quote or at the end are doubled.
-    """
-    escaped = re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), text)
-    return f"'{escaped}'"
+    """Put a text between single quotes, so that Hydra reads it unchanged."""
+    return QuotedString(text, Quote.single).with_quotes()
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:
