@@ -236,7 +236,3 @@ class _LossOfLabels(ClassCriterion):
     def gap(self, logits: Tensor) -> Tensor:
         """Return a gap of −∞, with which no attack ends."""
         return torch.full_like(logits[..., 0], -torch.inf)
-
-    def reached_in_views(self, predicted: Tensor) -> Tensor:
-        """Return False for each image."""
-        return torch.zeros_like(predicted, dtype=torch.bool)
