@@ -26,6 +26,7 @@ from train.auditing.lights import BATCH, KINDS, NORMALIZED, RANDOM, Views
 from train.data.annotations import LETTERBOX, Annotations
 from train.results import annotated_scores, detections
 from train.results.detections import Found, Marked, Matches
+from train.results.intervals import Units
 from train.results.pictures import evenly_spaced, plot_curves
 from train.results.predictions import SUMMARY
 from train.results.tables import Estimate, Table, format_interval
@@ -114,13 +115,14 @@ def find_in_lights(
     metrics: dict[str, Any] = {}
     for title, numbered in groups.items():
         # Lights of the same view are no independent units, so the interval is over the views.
-        units, pairs = np.array([unit for unit, _ in numbered]), [pair for _, pair in numbered]
+        units = Units([np.array([unit for unit, _ in numbered])], VIEWS)
+        pairs = [pair for _, pair in numbered]
         if isinstance(task, Detection):
             at_iou, at_half = (_match(pairs, iou) for iou in (task.iou, 0.5))
             measured = at_iou, [label], task.threshold, at_half, units
-            metrics[title] = asdict(detections.score(*measured, over=VIEWS))
+            metrics[title] = asdict(detections.score(*measured))
         else:
-            miou, _ = detections.mean_iou(pairs, 2, units, VIEWS)
+            miou, _ = detections.mean_iou(pairs, 2, units)
             metrics[title] = {"n": len(pairs), "miou": asdict(miou)}
     # Only detections have scores, and so a curve of recall against false detections.
     if not isinstance(task, Detection):
@@ -151,8 +153,8 @@ def _curve(matches: Matches) -> list[tuple[float, ...]]:
 
 def score_photographs(network: TaskNetwork, annotations: Annotations, out: Path) -> None:
     """Score a detector on photographs with boxes. Unreadable ones are left out."""
-    device = device_of(network)
-    scores = annotated_scores.evaluate_detector(network, annotations, None, LETTERBOX, True, device)
+    how = annotated_scores.Showing(LETTERBOX, skip_unreadable=True, device=device_of(network))
+    scores = annotated_scores.evaluate_detector(network, annotations, None, how)
     annotated_scores.write(scores, out)
 
 

@@ -23,7 +23,7 @@ from train.data.annotations import FITS, LETTERBOX, read_annotations
 from train.data.photographs import choose_labels, class_folders, require_outside
 from train.device import MixedPrecision, choose_device, choose_precision
 from train.results import annotated_scores, scoring
-from train.results.annotated_scores import AnnotatedScores, evaluate_detector, evaluate_segmenter
+from train.results.annotated_scores import AnnotatedScores, Showing
 from train.results.overwrite import output_folder
 from train.results.scoring import Predictor, Scores, format_scores
 from train.results.store import trained_labels
@@ -187,12 +187,12 @@ def evaluate(
         with sole_writer("out", target) if target else nullcontext():
             if not isinstance(made, Classifier):
                 found: AnnotatedScores
-                options = fit, skip_unreadable, device
+                how = Showing(fit, skip_unreadable, device)
                 if isinstance(made.task, Detection):
                     chosen = None if label is None else label_names(label)
-                    found = evaluate_detector(made, annotations, chosen, *options)
+                    found = annotated_scores.evaluate_detector(made, annotations, chosen, how)
                 else:
-                    found = evaluate_segmenter(made, folder, *options)
+                    found = annotated_scores.evaluate_segmenter(made, folder, how)
                 if target:
                     annotated_scores.write(found, target)
                 return found

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -45,6 +45,20 @@ SHOWN, COLUMNS = 24, 4
 ALL = "all"
 # File of all detections, in the form of COCO's results.
 DETECTIONS = "detections.json"
+
+
+class Showing(NamedTuple):
+    """How photographs are shown to a network.
+
+    Attributes:
+        fit: How they are brought to its size, "letterbox" or "stretch".
+        skip_unreadable: Whether to leave out photographs that cannot be read.
+        device: Device of the images.
+    """
+
+    fit: str
+    skip_unreadable: bool
+    device: torch.device
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -173,38 +187,28 @@ class SegmentationScores(AnnotatedScores):
 
 
 def _outputs(
-    network: TaskNetwork,
-    photographs: Sequence[Annotated],
-    pictures: dict[str, Tensor],
-    how: str,
-    skip_unreadable: bool,
-    device: torch.device,
+    network: TaskNetwork, photographs: Sequence[Annotated], how: Showing, drawn: dict[str, Tensor]
 ) -> Iterator[tuple[Annotated, Fitted, Any]]:
-    """Yield photographs with the outputs of a network, and draw some of them into `pictures`."""
+    """Yield photographs with the outputs of a network, and put drawings of some into `drawn`."""
     size = height_and_width(network.size)
     # Names of SHOWN photographs, whose pictures are drawn.
     shown = {item.name for item in evenly_spaced(photographs, SHOWN)}
     outputs: Any = None
     # Skipped photographs can leave a batch empty.
-    for batch in filter(None, fit_batches(photographs, size, how, BATCH, skip_unreadable)):
-        images = torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch])).to(device)
+    for batch in filter(None, fit_batches(photographs, size, how.fit, BATCH, how.skip_unreadable)):
+        images = torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch])).to(how.device)
         outputs = compute_outputs(network, images, BATCH)
         for (item, fitted), image, output in zip(batch, images, outputs, strict=True):
             if item.name in shown:
-                drawn = network.task.draw(to_unit(image), output, network.classes)
-                pictures[item.name] = drawn.cpu()
+                picture = network.task.draw(to_unit(image), output, network.classes)
+                drawn[item.name] = picture.cpu()
             yield item, fitted, output
     if outputs is None:
         raise InputError("photos has no photograph that can be read: give others", "photos")
 
 
 def evaluate_detector(
-    network: TaskNetwork,
-    annotations: Annotations,
-    labels: Sequence[str] | None,
-    how: str,
-    skip_unreadable: bool,
-    device: torch.device,
+    network: TaskNetwork, annotations: Annotations, labels: Sequence[str] | None, how: Showing
 ) -> DetectionScores:
     """Detect objects in photographs, and score the detections of some classes, or of all."""
     label_of_class = _choose_labels(annotations, network.classes, labels)
@@ -215,8 +219,7 @@ def evaluate_detector(
     matches: dict[str, list[list[Matches]]] = {}
     listed: list[dict[str, Any]] = []
     pictures: dict[str, Tensor] = {}
-    options = pictures, how, skip_unreadable, device
-    for item, fitted, output in _outputs(network, annotations.photographs, *options):
+    for item, fitted, output in _outputs(network, annotations.photographs, how, pictures):
         boxes, own, scores = (output[key].cpu().numpy() for key in ("boxes", "labels", "scores"))
         # From pixels of the network's image to those of the photograph.
         boxes, scores = fitted.to_photograph(boxes.astype(float)), scores.astype(float)
@@ -242,7 +245,7 @@ def evaluate_detector(
     missing = f" ({len(annotations.missing)} files are missing)" if annotations.missing else ""
     return DetectionScores(
         size=height_and_width(network.size),
-        fit=how,
+        fit=how.fit,
         photograph_count=len(all_matches),
         missing=annotations.missing,
         contents=f"{missing} with {overall.n} objects",
@@ -294,9 +297,7 @@ def _score(
     }
 
 
-def evaluate_segmenter(
-    network: TaskNetwork, folder: Path, how: str, skip_unreadable: bool, device: torch.device
-) -> SegmentationScores:
+def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> SegmentationScores:
     """Segment photographs, and compare the classes of the pixels with those of masks."""
     if len(network.classes) > NO_CLASS_PIXEL:
         reason = f"masks can have at most {NO_CLASS_PIXEL}, as {NO_CLASS_PIXEL} is no class"
@@ -308,8 +309,7 @@ def evaluate_segmenter(
     # Pairs are read one after the other, so that not all masks are in memory.
     def pairs() -> Iterator[tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]]:
         nonlocal count
-        options = pictures, how, skip_unreadable, device
-        for item, fitted, output in _outputs(network, photographs, *options):
+        for item, fitted, output in _outputs(network, photographs, how, pictures):
             count += 1
             mask = fit_mask(masks[item.name], fitted, len(network.classes))
             yield output.argmax(0).cpu().numpy(), mask
@@ -320,7 +320,7 @@ def evaluate_segmenter(
     known = {name: iou for name, iou in named if np.isfinite(iou)}
     return SegmentationScores(
         size=height_and_width(network.size),
-        fit=how,
+        fit=how.fit,
         photograph_count=count,
         missing=missing,
         contents=f" ({len(missing)} others have no mask)" if missing else "",

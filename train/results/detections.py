@@ -201,8 +201,7 @@ def score(
     labels: Sequence[int],
     threshold: float,
     at_half: Matches | None = None,
-    units: Int[np.ndarray, " n"] | None = None,
-    over: str = PHOTOGRAPHS,
+    units: Units | None = None,
 ) -> DetectionMetrics:
     """Score the detections of one class, or of several, with intervals over images.
 
@@ -210,7 +209,8 @@ def score(
     The intervals can be over units that have several images: `units` has that of each image.
     """
     joined = matches.of(labels)
-    units = np.arange(joined.image_count) if units is None else units
+    every_image = np.arange(joined.image_count)
+    units = units or Units([every_image], PHOTOGRAPHS)
     by_label = [(at_half or matches).of([label]) for label in labels]
     # Classes without objects have no average precision.
     shown = [item for item in by_label if len(item.object_score)]
@@ -229,10 +229,10 @@ def score(
     recall, precision = Estimate(), Estimate()
     if shown:
         groups = _groups(joined)
-        recall = estimate(partial(joined.recall, threshold), groups, units, over)
-        precision = estimate(mean_precision, groups, units, over)
+        recall = estimate(partial(joined.recall, threshold), groups, units)
+        precision = estimate(mean_precision, groups, units)
     # The estimate of odds is then turned back into a number per image.
-    odds = estimate(false_odds, [np.arange(joined.image_count)], units, over)
+    odds = estimate(false_odds, [every_image], units)
     value, low, high = (
         None if end is None else end / (1 - end) for end in (odds.value, odds.low, odds.high)
     )
@@ -255,10 +255,7 @@ def _groups(matches: Matches) -> list[np.ndarray]:
 
 
 def estimate(
-    statistic: Callable[[np.ndarray], np.ndarray],
-    groups: Sequence[np.ndarray],
-    units: Int[np.ndarray, " n"],
-    over: str = PHOTOGRAPHS,
+    statistic: Callable[[np.ndarray], np.ndarray], groups: Sequence[np.ndarray], units: Units
 ) -> Estimate:
     """Compute a statistic in [0, 1] with its 95% interval over units of images.
 
@@ -274,8 +271,9 @@ def estimate(
         return statistic(weights)[None]
 
     # Units of a group count from 0.
-    unit_of_image = [np.unique(units[images], return_inverse=True)[1] for images in groups]
-    (result,) = leave_out(of_groups, Units(unit_of_image, over))
+    (every_unit,) = units.groups
+    unit_of_image = [np.unique(every_unit[images], return_inverse=True)[1] for images in groups]
+    (result,) = leave_out(of_groups, Units(unit_of_image, units.over))
     if result.unit_count < 2 or not all(np.isfinite(item).all() for item in result.without):
         return Estimate(float(result.value))
     return result.estimate
@@ -284,8 +282,7 @@ def estimate(
 def mean_iou(
     images: Iterable[tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]],
     class_count: int,
-    units: Int[np.ndarray, " n"] | None = None,
-    over: str = PHOTOGRAPHS,
+    units: Units | None = None,
 ) -> tuple[Estimate, list[float]]:
     """Compute the mean IoU over classes, with its interval over images, and that of each class.
 
@@ -313,5 +310,5 @@ def mean_iou(
         return np.nanmean(by_class(counts), axis=-1)
 
     every_image = np.arange(len(counted))
-    interval = estimate(mean, [every_image], every_image if units is None else units, over)
+    interval = estimate(mean, [every_image], units or Units([every_image], PHOTOGRAPHS))
     return interval, by_class(np.ones((1, len(counted))))[0].tolist()
