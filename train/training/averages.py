@@ -1,6 +1,6 @@
 """Averages of the weights of a network over the training, and the choice of the best network."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, cast
 
 import torch
@@ -14,6 +14,7 @@ from augment.random_streams import stream_seed
 from train import console
 from train.data.sets import Split
 from train.device import MixedPrecision
+from train.results.scoring import Model
 from train.settings import RELIGHT
 from train.training.augmentations import relit
 from train.training.recipe import kl_divergence
@@ -185,11 +186,7 @@ def mix(initial: Weights, trained: Weights, factor: float) -> dict[str, Tensor]:
 
 
 def predict(
-    model: Callable[[Tensor], Tensor],
-    split: Split,
-    device: torch.device,
-    *light_key: int | str,
-    light: str = RELIGHT,
+    model: Model, split: Split, device: torch.device, *light_key: int | str, light: str = RELIGHT
 ) -> Float[Tensor, "N classes"]:
     """Compute the logits of a network for images, as they are or in the light of an augmentation.
 

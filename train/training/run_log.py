@@ -26,13 +26,15 @@ SHOWN = ("attack_success_before", "attack_success", "steps")
 EXAMPLE = 128
 # All renders of an epoch are logged as one image, a grid with this many columns.
 GRID_COLUMNS = 20
+# Metrics or measurements by their names.
+Numbers = Mapping[str, float]
 
 
 @runtime_checkable
 class Logger(Protocol):
     """Anything with a method `log`, such as a run of Weights & Biases."""
 
-    def log(self, values: Mapping[str, float], step: int) -> Any:
+    def log(self, values: Numbers, step: int) -> Any:
         """Record the metrics of an epoch, which counts from 1, by their names."""
 
 
@@ -63,7 +65,7 @@ class RunLog:
             # Events after the checkpoint are removed, since the resumed run writes them again.
             self._board = SummaryWriter(str(folder), purge_step=self._epoch_count + 1)
 
-    def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
+    def scalars(self, values: Numbers, epoch: int | None = None) -> None:
         """Write the metrics of an epoch, or the final scores, to the log.
 
         `epoch` counts from 1, and is None for the final scores, after which nothing is logged.
@@ -129,10 +131,7 @@ class RunLog:
 
 
 def epoch_metrics(
-    trained: Mapping[str, float],
-    validated: Mapping[str, float],
-    diagnostics: list[Mapping[str, float]],
-    seconds: Mapping[str, float],
+    trained: Numbers, validated: Numbers, diagnostics: Sequence[Numbers], seconds: Numbers
 ) -> dict[str, float]:
     """Join the metrics of an epoch under the names that metrics.jsonl and TensorBoard have.
 
@@ -146,7 +145,7 @@ def epoch_metrics(
     return {f"{group}/{key}": value for group, of in groups.items() for key, value in of.items()}
 
 
-def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
+def format_epoch(epoch: int, epochs: int, metrics: Numbers) -> str:
     """Write the line that the console shows after an epoch.
 
     The success of the attack counts only renders that are classified correctly before it.
