@@ -182,17 +182,14 @@ def build_network(
     if not name.startswith((PYTHON, TORCHVISION)):
         choices = f"{WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION"
         raise InputError(f"name={name}: choose {choices}", "name")
-    architecture = name.removeprefix(TORCHVISION)
-    is_own = name.startswith(PYTHON)
-    if not is_own:
-        require_architecture(architecture)
-    network = _call_function(name, classes, size) if is_own else nn.Identity()
     fault = f"name={name} does not give {len(classes)} logits for images of {size} pixels per side"
     # Architectures raise errors of many types if images are too small for them.
     with explained(fault, "choose others", "name"):
-        if not is_own:
+        if name.startswith(PYTHON):
+            network = _call_function(name, classes, size)
+        else:
             # Networks of torchvision take normalized images, so a layer before them normalizes.
-            built = _build_architecture(architecture, len(classes), size)
+            built = _build_architecture(name.removeprefix(TORCHVISION), len(classes), size)
             network = Network(built, [ChannelNormalization(mean, std)])
         with eval_mode(network), torch.no_grad():
             # Two images are tried, since a wrong number of classes is found only here.
@@ -217,6 +214,7 @@ def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Mo
     """Build an architecture of torchvision with random weights."""
     from torchvision import models
 
+    require_architecture(architecture)
     options: dict[str, Any] = {}
     if architecture in WITH_AUXILIARY:
         options = {"aux_logits": False, "init_weights": True}
