@@ -12,9 +12,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from PIL import Image
-
-from renderer.io.images import read_center
 from train.auditing import found
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS
 from train.auditing.network import (
@@ -32,7 +29,7 @@ from train.auditing.relit import relit_sections, screen_of_photographs
 from train.results import compare, first_screen
 from train.results.metrics import Metrics
 from train.results.page import scores_section, write_page
-from train.results.pictures import Picture, encode_picture, plot_by_radius
+from train.results.pictures import Picture, plot_by_radius, read_square
 from train.results.predictions import SUMMARY, Predictions
 from train.results.tables import Estimate, fraction
 from train.run_config import CONFIG, read_config
@@ -320,5 +317,4 @@ def _draw(predictions: Predictions, row: int, folder: Path) -> Picture:
     photograph = predictions.photograph[row]
     text = first_screen.describe_prediction(predictions, row).text
     caption = f"{in_words(photograph.label)}, {photograph.source}: {text}"
-    image = Image.fromarray(read_center(folder / photograph.path, SIDE))
-    return encode_picture(image, caption, caption)
+    return read_square(folder / photograph.path, SIDE, caption, caption)

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image
 
-from renderer.io.images import read_center
 from train.data.photo import DESCRIPTION
 from train.results import compare
 from train.results.compare import Difference
 from train.results.metrics import Pool
-from train.results.pictures import Picture, encode_picture
+from train.results.pictures import Picture, read_square
 from train.results.predictions import Predictions
 from train.results.store import RunSummary
 from train.results.tables import Estimate, Table, describe_intervals, join_words
@@ -329,8 +327,8 @@ def _draw_images(before: Predictions, after: Predictions, images: Path) -> list[
         subject = ", ".join(map(in_words, filter(None, (photograph.label, photograph.source))))
         original, hardened = (describe_prediction(item, row) for item in (before, after))
         alt = f"{subject}; original network: {original.text}; hardened network: {hardened.text}"
-        pixels = Image.fromarray(read_center(images / photograph.path, SIDE))
-        drawn.append(ComparedImage([encode_picture(pixels, alt)], subject, original, hardened))
+        picture = read_square(images / photograph.path, SIDE, alt)
+        drawn.append(ComparedImage([picture], subject, original, hardened))
     return drawn
 
 

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from renderer.io.files import atomic_write
-from renderer.io.images import PAPER, Tile, draw_grid, encode_image, open_image
+from renderer.io.images import PAPER, Tile, draw_grid, encode_image, open_image, read_center
 from train.results.intervals import RATES, auc_and_recalls, roc_curve
 from train.results.predictions import ROC_FIGURE, ROC_TABLE, Predictions
 from train.results.tables import Estimate, write_csv
@@ -226,6 +226,11 @@ def encode_picture(image: Image.Image, alt: str, caption: str = "") -> Picture:
         return Picture(content, "png", alt, image.width, caption)
     content = encode_image(image.convert("RGB"), "JPEG", optimize=True, quality=82)
     return Picture(content, "jpeg", alt, image.width, caption)
+
+
+def read_square(path: Path, side: int, alt: str, caption: str = "") -> Picture:
+    """Read the central square of a photograph from a file, and encode it for a page."""
+    return encode_picture(Image.fromarray(read_center(path, side)), alt, caption)
 
 
 def read_pictures(path: Path, alt: str, widest: int, caption: str = "") -> list[Picture]:

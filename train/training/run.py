@@ -201,9 +201,8 @@ class Run:
         split = self.data.train.to(trainer.device)  # `_score_initial` may have replaced its labels.
         with keyed(**keys_of("train", self.settings.train)):
             trainer.fit(split, self.held_out, log)
-        scores |= self._score() if has_labels else {}
-        if self.settings.train.recognize and checkpoints.RECOGNIZER not in trainer.best:
-            with keyed(**keys_of("train", self.settings.train)):
+            scores |= self._score() if has_labels else {}
+            if self.settings.train.recognize and checkpoints.RECOGNIZER not in trainer.best:
                 self._recognize()
         if log:  # Only the first process has a log.
             scores |= self._score_photographs(trainer.selected, self.folder)
