@@ -235,14 +235,6 @@ def is_found(
     return of_images.predicted(of_images.evidence(outputs)) == of_images.source
 
 
-def norm_ball(kind: str) -> dict[str, Any]:
-    """Return the setting of an attack by a kind of lighting, within the largest radius."""
-    of_sky = kind == "skylight"
-    settings = attack_settings.SkylightSettings if of_sky else attack_settings.StepSettings
-    radius = KINDS[kind].radii[-1]
-    return {kind: settings("linf", radius, "sign", radius / STEPS_PER_RADIUS)}
-
-
 def adversaries(
     classifier: TaskNetwork, views: Views, kind: str, additional: bool = False
 ) -> AttackResult:
@@ -258,10 +250,14 @@ def adversaries(
     further = {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
     first = {"max_steps": STEPS, "margin": 0.0, "noise_margin": attack_settings.NOISE_MARGIN}
     options: dict[str, Any] = further if additional else first
+    radius = KINDS[kind].radii[-1]
+    of_sky = kind == "skylight"
+    ball = attack_settings.SkylightSettings if of_sky else attack_settings.StepSettings
+    options[kind] = ball("linf", radius, "sign", radius / STEPS_PER_RADIUS)
     scene = views.scene(classifier.size, kind)
     if not classifier.is_differentiable(partial(plain_images, views, classifier.size, kind)):
         options |= {"optimizer": attack_settings.RANDOM_SEARCH, "max_queries": QUERIES}
-    settings = AttackSettings(**norm_ball(kind), **options, batch_size=BATCH)
+    settings = AttackSettings(**options, batch_size=BATCH)
     return attack(classifier, scene, settings=settings, seed=views.seed, force=True)
 
 

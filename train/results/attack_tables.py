@@ -12,7 +12,7 @@ from torch import Tensor
 
 from augment.attacks.result import AttackResult, warnings
 from renderer.io.files import atomic_write
-from train.results.pictures import COLORS, write_figure
+from train.results.pictures import COLORS, new_figure, write_figure
 from train.results.predictions import SWEEP_FIGURE, SWEEP_TABLE
 from train.results.tables import Proportion, Table, format_fraction, fraction, write_csv
 
@@ -175,10 +175,7 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
 
 def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: Path) -> None:
     """Draw the success rate of each method against the radius, in a band that is its interval."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5, 3.8), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = new_figure((5, 3.8))
     # The radii of all parameters change in proportion, so the axis shows the first one.
     first, *others = norms
     for method, title in METHODS.items():

@@ -271,16 +271,13 @@ def images_folder(run: RunSummary, name: str) -> Path | None:
     """
     photos = OmegaConf.select(run.config, "photos")
     folder = (photos if isinstance(photos, Mapping) else {PHOTOGRAPHS: photos}).get(name)
-    if not folder:
-        # The run may have rendered the images itself.
-        rendered = run.folder / KEPT_ASIDE
-        return rendered if name == LABORATORY and rendered.is_dir() else None
-    # A relative path is relative to the folder in which the run was started.
-    working_folder = Path(run.config.get("working_folder") or "")
-    for candidate in (published_folder(Path(folder)), working_folder / folder):
-        if candidate.is_dir():
-            return candidate
-    return None
+    # The run may have rendered the images itself.
+    candidates = [run.folder / KEPT_ASIDE] if name == LABORATORY else []
+    if folder:
+        # A relative path is relative to the folder in which the run was started.
+        working_folder = Path(run.config.get("working_folder") or "")
+        candidates = [published_folder(Path(folder)), working_folder / folder]
+    return next(filter(Path.is_dir, candidates), None)
 
 
 def scores_section(title: str, group: Scored) -> dict[str, Any]:

@@ -199,12 +199,10 @@ def plot_by_radius(
 def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
     """Draw a plot as a transparent SVG, which fits light and dark pages."""
     import matplotlib as mpl
-    from matplotlib.figure import Figure
 
     file = io.StringIO()
     with mpl.rc_context(PLOT):  # type: ignore[arg-type]  # Its type wants the keys as literals.
-        figure = Figure(figsize=SIZE, layout="constrained")
-        axes = figure.subplots()
+        figure, axes = new_figure(SIZE)
         draw(axes)
         handles, labels = axes.get_legend_handles_labels()
         if labels:
@@ -315,9 +313,6 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
     is left out if it lacks positives or negatives. A pair has the log-odds of positives and of
     negatives.
     """
-    # This import is here because it takes half a second.
-    from matplotlib.figure import Figure
-
     pairs = {"": overall, **by_name}
     known = {name: pair for name, pair in pairs.items() if all(map(len, pair))}
     # A source or a label can have the name "all", too.
@@ -328,8 +323,7 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
         rows += [[name, *point] for point in zip(*columns, strict=True)]
     write_csv(folder / ROC_TABLE, rows)
 
-    figure = Figure(figsize=(7, 7), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = new_figure((7, 7))
     bold = {title: {"color": "black", "linewidth": 2.5, "zorder": 3}}
     draw_roc(axes, {name or title: [pair] for name, pair in known.items()}, bold)
     axes.set_title(f"ROC: {label}")
@@ -337,6 +331,14 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
     if known:
         axes.legend(loc="lower right")
     write_figure(folder / ROC_FIGURE, figure)
+
+
+def new_figure(size: tuple[float, float]) -> tuple["Figure", "Axes"]:
+    """Make a figure of matplotlib of a size in inches, with one plot."""
+    from matplotlib.figure import Figure  # matplotlib takes half a second.
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots()
 
 
 def write_figure(path: Path, figure: "Figure", **options: Any) -> None:

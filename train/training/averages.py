@@ -128,12 +128,13 @@ class Averages:
         averages = {"ema": self._ema, "soup": self._soup}
         return {name: of.state_dict() if of else None for name, of in averages.items()}
 
-    def load_state_dict(self, state: Mapping[str, Any], accuracies: list[float]) -> None:
-        """Restore the averages from a checkpoint."""
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore the averages, and the best accuracy so far, from a checkpoint."""
         if self._ema:
             self._ema.load_state_dict(state["ema"])
         if self._soup:
             self._soup.load_state_dict(state["soup"])
+        accuracies = [line["validation/accuracy"] for line in state["history"]]
         self._best_accuracy = max(accuracies, default=-1.0)
 
 

@@ -350,10 +350,9 @@ class Trainer:
         """
         self.epoch = state["epoch"]
         self.history = state["history"]
-        accuracies = [line["validation/accuracy"] for line in self.history]
         self.model.network.load_state_dict(state["model"])
         self.step.load_state_dict(state)
-        self.averages.load_state_dict(state, accuracies)
+        self.averages.load_state_dict(state)
         for network in (self.model, self.initial, self.selected):
             if network:
                 network.precision = state["precision"]
