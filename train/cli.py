@@ -12,8 +12,6 @@ Only this layer knows keys of the command line. The library raises an InputError
 Python argument, and `InputError.within` puts the key in front.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

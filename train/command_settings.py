@@ -3,8 +3,6 @@
 This module imports neither torch nor NumPy; see `renderer.settings`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path

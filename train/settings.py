@@ -1,7 +1,5 @@
 """Settings of training. This module imports neither torch nor NumPy; see `renderer.settings`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
