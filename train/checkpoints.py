@@ -32,7 +32,7 @@ from renderer.errors import InputError, as_path, explained, keyed, require_file,
 from renderer.io.files import atomic_write
 from train.networks import DETECTOR, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
-from train.settings import NetworkSettings, TaskSettings, published_folder
+from train.settings import TaskSettings, published_folder
 
 # A name of a classifier that begins with this text names the folder of a training run.
 RUN = "run:"
@@ -171,7 +171,7 @@ def load_network(
     return classifier.normalizing_light(normalize_light)
 
 
-def load_chosen(settings: NetworkSettings) -> Any:
+def load_chosen(settings: TaskSettings) -> Any:
     """Load the network that the settings of a command choose, with its task."""
     names = ("weights", "classes", "size", "normalization", "normalize_light", "prompt")
     given = {name: getattr(settings, name) for name in names}
@@ -179,19 +179,18 @@ def load_chosen(settings: NetworkSettings) -> Any:
     # Error messages about the argument `name` begin with the setting `network` instead.
     with keyed(name="network"):
         network = load_network(str(settings.network), trust_code=settings.trust, task=task, **given)
-    return _with_task(network, settings) if isinstance(settings, TaskSettings) else network
+    return _with_task(network, settings)
 
 
-def _task_that_decodes(settings: NetworkSettings) -> Detection | None:
+def _task_that_decodes(settings: TaskSettings) -> Detection | None:
     """Return the task whose function `decode` the settings name. None if they name none."""
-    name = getattr(settings, "decode", None)
-    if name is None:
+    if settings.decode is None:
         return None
     advice = "give package.module:function, and start the command in the folder of the module"
     # The user's code may raise any exception, and even end the program.
     kinds = (Exception, SystemExit)
-    with explained(f"decode={name} cannot be imported", advice, "decode", *kinds):
-        return Detection(decode=import_function(name))
+    with explained(f"decode={settings.decode} cannot be imported", advice, "decode", *kinds):
+        return Detection(decode=import_function(settings.decode))
 
 
 def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from train.auditing.lights import KINDS, PLAIN, RANDOM, RECOGNIZED, TRANSFER, Pl
 from train.results import tables
 from train.results.compare import ALL, Difference, Evaluation, Evaluations, difference, mean_metric
 from train.results.first_screen import EQUAL_RATE, gain_sentence
-from train.results.intervals import Units, leave_out, weighted_means
+from train.results.intervals import Units, leave_out_of_mean
 from train.results.metrics import METRICS, metric_title
 from train.results.store import RunSummary, ScoredRun, read_summaries
 from train.results.tables import Estimate, Proportion, Table, fraction
@@ -243,8 +243,7 @@ class AuditedNetwork:
             # `hits` has one row for each light and one column for each view.
             hits = np.array([self.recognized[name] for name in sorted(names)], float)
             units = Units([np.tile(np.arange(hits.shape[1]), len(hits))], "views")
-            (rate,) = leave_out(partial(weighted_means, hits.reshape(1, -1)), units)
-            rates[title] = rate.estimate
+            rates[title] = leave_out_of_mean(hits.ravel(), units).estimate
         return rates
 
     @cached_property

@@ -10,7 +10,6 @@ its only test.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +36,7 @@ from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from train.data.photographs import find_unlabeled, load_photographs
 from train.results.first_screen import FirstScreen, ShownMetric
-from train.results.intervals import Units, leave_out, weighted_means
+from train.results.intervals import Units, leave_out_of_mean
 from train.results.pictures import Picture, evenly_spaced, read_pictures
 from train.results.predictions import RELIT
 from train.results.tables import Proportion, Table, format_fraction, fraction, join_words
@@ -157,8 +156,7 @@ class RelitScores(ShortRepr):
         # Each photograph has one prediction, so Wilson's interval holds.
         if self.shown == len(unit):
             return kept
-        mean = partial(weighted_means, is_kept[None])
-        (over,) = leave_out(mean, Units([unit], "photographs"))
+        over = leave_out_of_mean(is_kept, Units([unit], "photographs"))
         return replace(kept, **asdict(over.estimate))
 
     def tables(self) -> list[Table]:

@@ -53,14 +53,17 @@ class ImageFiles:
     workers: int
     skip: bool
 
+    def __len__(self) -> int:
+        return len(self.paths)
+
     @property
     def shape(self) -> tuple[int, int, int, int]:
         """Shape that a tensor of the images would have: (images, 3, size, size)."""
-        return len(self.paths), 3, self.size, self.size
+        return len(self), 3, self.size, self.size
 
     def __getitem__(self, rows: Tensor | slice) -> "ImageFiles":
         """Select images by a slice, an index array or a boolean mask."""
-        indices = torch.arange(len(self.paths))[rows].tolist()
+        indices = torch.arange(len(self))[rows].tolist()
         return replace(self, paths=tuple(self.paths[index] for index in indices))
 
     def to(self, device: torch.device) -> "ImageFiles":

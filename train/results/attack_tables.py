@@ -30,6 +30,8 @@ STYLES = {"adversarial": (COLORS[0], "-", "o"), "random": (COLORS[1], "--", "s")
 # Suffix of the names of results on images without the simulated noise of a sensor.
 WITHOUT_NOISE = "_without_noise"
 
+# A line of attack.jsonl about an example.
+Line = Mapping[str, Any]
 # Result of `nb.success_by_radius`, with a mapping for each radius. It has the radii
 # under "radii", and under the name of each method whether it succeeds on each example,
 # bool, shape (examples,).
@@ -37,10 +39,7 @@ Sweep = Sequence[Mapping[str, Any]]
 
 
 def format_attack(
-    name: str,
-    result: AttackResult,
-    checks: Mapping[str, Any] | None,
-    lines: Sequence[Mapping[str, Any]] = (),
+    name: str, result: AttackResult, checks: Mapping[str, Any] | None, lines: Sequence[Line]
 ) -> list[str]:
     """Describe the attack on one mesh in lines of text for the console. The first is a summary."""
     parameters = "+".join(parameter.name for parameter in result.problem.parameters)
@@ -101,7 +100,7 @@ def _check_lines(checks: Mapping[str, Any], uses_gradients: bool) -> list[str]:
     ]
 
 
-def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]]) -> str:
+def _version_line(version: str, adversaries: Sequence[Line]) -> str:
     """Write how often adversaries still succeed if their images are made in another way."""
     results = [line["versions"][version] for line in adversaries]
     # Adversaries that fooled the classifier by the margin that the settings ask for.

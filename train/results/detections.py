@@ -209,8 +209,6 @@ def score(
     The intervals can be over units that have several images: `units` has that of each image.
     """
     joined = matches.of(labels)
-    every_image = np.arange(joined.image_count)
-    units = units or Units([every_image], PHOTOGRAPHS)
     by_label = [(at_half or matches).of([label]) for label in labels]
     # Classes without objects have no average precision.
     shown = [item for item in by_label if len(item.object_score)]
@@ -232,7 +230,7 @@ def score(
         recall = estimate(partial(joined.recall, threshold), groups, units)
         precision = estimate(mean_precision, groups, units)
     # The estimate of odds is then turned back into a number per image.
-    odds = estimate(false_odds, [every_image], units)
+    odds = estimate(false_odds, [np.arange(joined.image_count)], units)
     value, low, high = (
         None if end is None else end / (1 - end) for end in (odds.value, odds.low, odds.high)
     )
@@ -255,22 +253,25 @@ def _groups(matches: Matches) -> list[np.ndarray]:
 
 
 def estimate(
-    statistic: Callable[[np.ndarray], np.ndarray], groups: Sequence[np.ndarray], units: Units
+    statistic: Callable[[np.ndarray], np.ndarray], groups: Sequence[np.ndarray], units: Units | None
 ) -> Estimate:
-    """Compute a statistic in [0, 1] with its 95% interval over units of images.
+    """Compute a statistic in [0, 1] with its 95% interval over units of images, or over images.
 
     The groups have the indices of all images. The interval is unknown if a group has one unit, or
     if the statistic is unknown without some units.
     """
 
+    image_count = sum(map(len, groups))
+
     def of_groups(*counts: np.ndarray) -> np.ndarray:
         # How often each image counts, shape (k, n). Groups without left-out units count once.
-        weights = np.ones((max(map(len, counts)), sum(map(len, groups))))
+        weights = np.ones((max(map(len, counts)), image_count))
         for images, of_images in zip(groups, counts, strict=True):
             weights[:, images] = of_images
         return statistic(weights)[None]
 
     # Units of a group count from 0.
+    units = units or Units([np.arange(image_count)], PHOTOGRAPHS)
     (every_unit,) = units.groups
     unit_of_image = [np.unique(every_unit[images], return_inverse=True)[1] for images in groups]
     (result,) = leave_out(of_groups, Units(unit_of_image, units.over))
@@ -309,6 +310,5 @@ def mean_iou(
     def mean(counts: np.ndarray) -> np.ndarray:
         return np.nanmean(by_class(counts), axis=-1)
 
-    every_image = np.arange(len(counted))
-    interval = estimate(mean, [every_image], units or Units([every_image], PHOTOGRAPHS))
+    interval = estimate(mean, [np.arange(len(counted))], units)
     return interval, by_class(np.ones((1, len(counted))))[0].tolist()

@@ -10,7 +10,7 @@ from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Num
+from jaxtyping import Bool, Float, Int, Num, Shaped
 
 from train.results.tables import Estimate, fraction, wilson
 
@@ -144,6 +144,12 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
     return [Jackknife(value, others, min(unit_counts), units.over) for value, *others in rows]
 
 
+def leave_out_of_mean(values: Shaped[np.ndarray, " n"], units: Units) -> Jackknife:
+    """Evaluate the mean of values of images, such as 1 for each hit, without each unit."""
+    (mean,) = leave_out(partial(weighted_means, values[None].astype(float)), units)
+    return mean
+
+
 def leave_out_of_roc(
     positives: Num[np.ndarray, " n"], negatives: Num[np.ndarray, " m"], units: Units
 ) -> list[Jackknife]:
@@ -166,7 +172,7 @@ def leave_out_of_roc(
         missing = float(rate) * count - is_above.sum()
         # `hits` says which part of each negative counts as above the threshold.
         hits = is_above + is_tied * missing / is_tied.sum()
-        (rates,) = leave_out(partial(weighted_means, hits[None]), Units(units.groups[1:], ""))
+        rates = leave_out_of_mean(hits, Units(units.groups[1:], ""))
         # Numbers of negatives above both ends of the interval of the threshold, shape (2,).
         exceeding = rates.interval * count
         places = exceeding.astype(int).clip(max=count - 1)

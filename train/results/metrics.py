@@ -175,9 +175,7 @@ class Outcome:
     @cached_property
     def jackknife(self) -> Jackknife:
         """Fraction of hits without each unit."""
-        statistic = partial(intervals.weighted_means, self.hits[None].astype(float))
-        (jackknife,) = leave_out(statistic, choose_units(self.predictions))
-        return jackknife
+        return intervals.leave_out_of_mean(self.hits, choose_units(self.predictions))
 
 
 @dataclass(frozen=True, repr=False)
