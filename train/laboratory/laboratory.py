@@ -232,7 +232,7 @@ def write_laboratory(settings: LabSettings) -> int:
             for group in groups:
                 # Successive shots show successive meshes of a group.
                 subject = group[number % len(group)]
-                path = _write_render(out, settings, subject, shot, number)
+                path = _write_render(settings, subject, shot, number)
                 brightness = f"{shot.brightness:.4f}"
                 # A row of photos.csv. Images of one shot have its number.
                 rows.append((path, shot.lighting, number, subject.mesh, brightness))
@@ -271,20 +271,19 @@ def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[
     return [*groups, negatives] if negatives else groups
 
 
-def _write_render(
-    out: Path, settings: LabSettings, subject: Subject, shot: Shot, number: int
-) -> str:
+def _write_render(settings: LabSettings, subject: Subject, shot: Shot, number: int) -> str:
     """Render a mesh in a random setup (shot), and write the image as an 8-bit sRGB file.
 
-    Return its path in `out`. `number` is part of it, and decides the seed of the path tracer.
+    Return its path in `settings.out`. `number` is part of it, and decides the seed of the paths.
     """
     seed = stream_seed(settings.seed, "samples", number) % SEED_COUNT
     radiance = path_traced(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)
     exposed = torch.from_numpy(settings.exposure * radiance).clamp(0, 1)
     pixels = encode(exposed, "srgb").permute(2, 0, 1)
     path = Path(subject.label) / f"{number:04d}_{shot.lighting}.png"
-    (out / path).parent.mkdir(parents=True, exist_ok=True)
-    write_image(out / path, pixels)
+    file = Path(settings.out, path)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_image(file, pixels)
     return path.as_posix()
 
 

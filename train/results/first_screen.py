@@ -206,7 +206,7 @@ def compare_networks(
     if folder is not None:
         # The pictures are from the first seed.
         one, other = (item[0].pooled.predictions for item in (before, after))
-        rows = choose_disagreements(one, other, folder, labels, subjects)
+        rows = choose_disagreements(one, other, folder, subjects)
     answer = _answer(change, recall, mistaken, auc)
     return FirstScreen(answer, sentences, numbers, names, images, rows, note)
 
@@ -283,11 +283,7 @@ def _rounded(value: float, decimals: int, sign: str = "") -> str:
 
 
 def choose_disagreements(
-    before: Predictions,
-    after: Predictions,
-    images: Path,
-    labels: Sequence[str],
-    subjects: tuple[str, str] = NETWORKS,
+    before: Predictions, after: Predictions, images: Path, subjects: tuple[str, str] = NETWORKS
 ) -> dict[str, list[ComparedImage]]:
     """Choose images that only one of two networks classifies correctly.
 
@@ -296,6 +292,7 @@ def choose_disagreements(
     only the hardened network gets right, the second those that only the original does, at most
     PICTURES each.
     """
+    labels = after.labels
     # One row for each image, about its own class or else about the first one.
     is_positive = np.isin(before.shown, labels)
     is_chosen = before.label == np.where(is_positive, before.shown, labels[0])

@@ -36,7 +36,7 @@ def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predict
         pixels = np.full((8, 8, 3), 20 * number, dtype=np.uint8)
         Image.fromarray(pixels).save(tmp_path / f"{number}.png")
     before, after = predictions_of(BEFORE), predictions_of(AFTER)
-    rows = choose_disagreements(before, after, tmp_path, LABELS)
+    rows = choose_disagreements(before, after, tmp_path)
     gained, lost = rows.values()
     # The third image is wrong twice, and the last one is right twice.
     assert {item.subject for item in gained} == {"banana, source 0", "cup, source 3"}
