@@ -5,7 +5,6 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from difflib import get_close_matches
-from functools import cache
 from math import prod
 from pathlib import Path, PurePosixPath
 from typing import NoReturn
@@ -16,12 +15,12 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from augment.classifier import Label
+from augment.network import say_once
 from augment.progress import progress
 from augment.tasks.classification import class_index, nearest
 from renderer.errors import InputError, composed, explained, require_memory
 from renderer.io.images import SUFFIXES, read_center
 from renderer.settings import Size, height_and_width
-from train import console
 from train.data.photo import DESCRIPTION, TABLE, Photograph, split_sources
 from train.settings import OTHER_PREFIX, label_names
 
@@ -82,7 +81,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
         fault = f"{table} names a missing file in {counts}, such as {missing[0]}"
         if len(missing) == len(rows):
             raise InputError(f"{fault}: give paths in the folder, such as {paths[0]}")
-        _warn_once(fault)
+        say_once(fault)
     photographs = []
     for path in paths:
         # The class is the first folder in the path.
@@ -171,13 +170,6 @@ def _is_image(folder: Path, path: PurePosixPath) -> bool:
     return has_suffix and (os.path.isfile(folder / path) or not os.path.exists(folder / path))
 
 
-# `cache` runs the function only at the first call with each text.
-@cache
-def _warn_once(text: str) -> None:
-    """Log a warning, unless it was logged before."""
-    console.warning(text)
-
-
 def is_hidden(name: str) -> bool:
     """Return whether a file or folder is hidden, or was added by macOS."""
     return name.startswith(".") or name == MACOS_FOLDER
@@ -223,7 +215,7 @@ def _has_class_folders(
             raise InputError(f"{fault}: rename it, hard negatives to {OTHER_PREFIX}{name}")
     if no_classes:
         count = f"{len(no_classes)} of {len(names)} folders in {folder}"
-        _warn_once(f"{count} are no classes and count as negatives: {', '.join(no_classes)}")
+        say_once(f"{count} are no classes and count as negatives: {', '.join(no_classes)}")
     outside = [path for path in paths if len(path.parts) == 1]
     if names and outside:
         raise InputError(f"{folder / outside[0]} lies beside the class folders: move it into one")
