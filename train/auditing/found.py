@@ -4,6 +4,7 @@ Only the class of the meshes counts. On renders of hard negatives, each of its d
 is false.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -90,11 +91,7 @@ def find_in_lights(
     """Score a network in all lights of an audit, after its attacks have been written to `out`."""
     label = network.label(views.objects[0].label)
     # Pairs of what is found and the truth, with the number of their view, by the title of a group.
-    groups: dict[str, list[tuple[int, tuple[Any, Any]]]] = {}
-
-    def add(title: str, first_view: int, pairs: list[tuple[Any, Any]]) -> None:
-        groups.setdefault(title, []).extend(enumerate(pairs, first_view))
-
+    groups: defaultdict[str, list[tuple[int, tuple[Any, Any]]]] = defaultdict(list)
     plain = load_light(views.light).to(views.device) * views.exposure
     unusual = lights.environment_lights(views, environments, random_light_count)
     # The hard negatives have no truth: all that is found in them is false.
@@ -106,11 +103,11 @@ def find_in_lights(
         for name, light in progress({"": plain, **unusual}.items(), "objects in other light"):
             pairs = _find(network, label, lights.render_in(scene, light), truth)
             group = "random light" if name.startswith(RANDOM) else "environments"
-            add(group if name else "plain light", first, pairs)
+            groups[group if name else "plain light"] += enumerate(pairs, first)
     truth = attacked_views.scene(network.size).truth(network.label)
     for kind, light_kind in KINDS.items():
         images = to_unit(torch.from_numpy(np.load(out / f"{kind}.npy"))).to(views.device)
-        add(f"attacked: {light_kind.title}", 0, _find(network, label, images, truth))
+        groups[f"attacked: {light_kind.title}"] += enumerate(_find(network, label, images, truth))
     task = network.task
     metrics: dict[str, Any] = {}
     for title, numbered in groups.items():
