@@ -15,7 +15,7 @@ from train import console
 from train.data.sets import Split
 from train.device import MixedPrecision
 from train.results.scoring import Model
-from train.settings import RELIGHT
+from train.settings import RELIGHT, TrainSettings
 from train.training.augmentations import relit
 from train.training.recipe import kl_divergence
 
@@ -143,9 +143,8 @@ def interpolate(
     selected: MixedPrecision,
     trained: Weights,
     validation: Split,
+    recipe: TrainSettings,
     seed: int,
-    light: str,
-    weights: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[dict[str, Tensor], float]:
     """Interpolate between two sets of weights, by the factor with the lowest loss.
 
@@ -155,10 +154,12 @@ def interpolate(
     The loss is measured on validation images. It is a weighted sum of two
     divergences from the predictions of the initial network for these images:
     that of the predictions of the interpolated network for the same images, and
-    that of its predictions for the images in the `light` of an augmentation. `weights`
-    belong to the unchanged and to the relit images. Return the interpolated weights on
-    the CPU, and the factor, which is the smallest of equally good ones.
+    that of its predictions for the images in the light of the augmentation. Their
+    weights are those of distillation and of consistency in the recipe. Return the interpolated
+    weights on the CPU, and the factor, which is the smallest of equally good ones.
     """
+    # Weights of the losses of unchanged and of relit images.
+    weights = (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0)
     device = next(initial.parameters()).device
     initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
     targets = predict(initial, validation, device)
@@ -168,7 +169,7 @@ def interpolate(
         selected.network.load_state_dict(mix(initial_weights, trained, factor))
         unchanged = predict(selected, validation, device)
         # All factors are tried in the same light, of which these are the keys of random numbers.
-        relit = predict(selected, validation, device, seed, "validation", light=light)
+        relit = predict(selected, validation, device, seed, "validation", light=recipe.augmentation)
         divergences = [kl_divergence(logits, targets).mean() for logits in (unchanged, relit)]
         losses[factor] = weights[0] * float(divergences[0]) + weights[1] * float(divergences[1])
     factor = min(losses, key=losses.__getitem__)

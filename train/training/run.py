@@ -315,13 +315,10 @@ class Run:
         trainer = self.trainer
         if INTERPOLATION in trainer.best or trainer.initial is None:
             return
-        recipe = self.settings.train
         networks = (trainer.initial, trainer.selected, trainer.best["model"])
         validation = self.data.train[self.held_out]
-        # Weights of the losses of unchanged and of relit images.
-        losses = (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0)
-        light = recipe.augmentation
-        weights, factor = interpolate(*networks, validation, self.settings.seed, light, losses)
+        settings = self.settings
+        weights, factor = interpolate(*networks, validation, settings.train, settings.seed)
         self._add_to_best({"model": weights, INTERPOLATION: factor})
 
     def _recognize(self) -> None:
