@@ -77,11 +77,11 @@ NO_PHOTOGRAPHS = (
 FOLDER_KEYS = {LABORATORY: "laboratory", PHOTOGRAPHS: "photos"}
 # When a stopped audit continues, these settings may be set if they were not set before.
 SETTABLE_LATER = ("hardened", "photos", "unlabeled")
+# The networks of an audit, by their keys CLASSIFIER and HARDENED.
+Networks = Mapping[str, Classifier]
 
 
-def run_audit(
-    settings: AuditSettings, networks: Mapping[str, Classifier] | None = None
-) -> page.Audited:
+def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page.Audited:
     """Test networks in unusual lighting, and write a report to the folder `settings.out`.
 
     Results that an earlier, stopped audit wrote to this folder are not measured again. The keys
@@ -153,7 +153,7 @@ def _load_networks(settings: AuditSettings) -> dict[str, Classifier]:
 
 
 def _attack_photographs(
-    settings: AuditSettings, networks: Mapping[str, Classifier], photographs: Path, out: Path
+    settings: AuditSettings, networks: Networks, photographs: Path, out: Path
 ) -> None:
     """Attack the light of photographs without labels, and write the results for each network."""
     attack = RelightingSettings(passes=relit.PASSES)
@@ -165,9 +165,7 @@ def _attack_photographs(
         _write_folder(out / key / relit.RELIT_FOLDER, write)
 
 
-def _caveats(
-    settings: AuditSettings, networks: Mapping[str, Classifier], plan: "_Plan | None"
-) -> list[str]:
+def _caveats(settings: AuditSettings, networks: Networks, plan: "_Plan | None") -> list[str]:
     """Write sentences for the beginning of the report."""
     caveats = []
     sizes = [str(network.size) for network in networks.values()]
@@ -205,9 +203,7 @@ class _Plan:
         attacked_views: Views whose lighting is attacked.
     """
 
-    def __init__(
-        self, settings: AuditSettings, networks: Mapping[str, Classifier], device: torch.device
-    ):
+    def __init__(self, settings: AuditSettings, networks: Networks, device: torch.device):
         self.label = settings.label
         meshes = [*read_objects(settings.meshes, self.label, "meshes").values()]
         hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
@@ -266,7 +262,7 @@ class _Plan:
         return {name: folder for name, folder in self.image_folders.items() if folder.exists()}
 
     def measure(
-        self, networks: Mapping[str, Classifier], out: Path, settings: AuditSettings
+        self, networks: Networks, out: Path, settings: AuditSettings
     ) -> Iterator[tuple[str, dict[str, Path]]]:
         """Test and attack the networks, except for results that exist already.
 
@@ -325,7 +321,7 @@ class _Plan:
             _write_folder(renders, partial(_write_renders, settings, self, size))
             self._score(networks, out)
 
-    def _score(self, networks: Mapping[str, Classifier], out: Path) -> None:
+    def _score(self, networks: Networks, out: Path) -> None:
         """Score the networks on test images, also with the remedy "normalized light"."""
         for key, network in {**networks, **normalizing(networks)}.items():
             for name, images in self.measured_folders().items():
