@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy
 
@@ -30,6 +30,7 @@ from train.data.sets import Split
 from train.device import all_reduce_sum
 from train.results.detections import Found, Marked, match
 from train.settings import TrainSettings
+from train.training.augmentations import Images
 
 # Number of photographs in a pass of the validation.
 BATCH = 32
@@ -40,6 +41,8 @@ FAVOR = 2.0
 MAX_CLASSES = 2**16
 # What a detector takes in training: "boxes", "labels" and "masks" of the objects of an image.
 Target = dict[str, Tensor]
+# Which images of a batch are renders.
+Mask = Bool[Tensor, " B"]
 
 
 def object_maps(targets: Sequence[Target]) -> Int[Tensor, "E 1 H W"]:
@@ -106,11 +109,7 @@ class DetectionLoss:
     task: Detection
 
     def compute(
-        self,
-        images: UInt8[Tensor, "B 3 H W"],
-        labels: Tensor,
-        rendered: Bool[Tensor, " B"],
-        augmented: UInt8[Tensor, "B 3 H W"] | None = None,
+        self, images: Images, labels: Tensor, rendered: Mask, augmented: Images | None = None
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Compute the loss of a batch.
 
@@ -138,9 +137,7 @@ class DetectionLoss:
                 loss = loss + weight * len(shown) / len(images) * self._loss(shown, found, favor)
         return loss, torch.full_like(loss, torch.nan).detach()
 
-    def _loss(
-        self, images: UInt8[Tensor, "N 3 H W"], targets: Any, favor: float
-    ) -> Float[Tensor, ""]:
+    def _loss(self, images: Images, targets: Any, favor: float) -> Float[Tensor, ""]:
         if self.task.decode is None:
             return losses_of(self.model, to_unit(images), targets)
         return candidate_loss(candidates(self.model, images, self.task), targets, favor)
@@ -150,7 +147,7 @@ class DetectionLoss:
 Candidates = list[tuple[Tensor, Tensor]]
 
 
-def candidates(network: nn.Module, images: UInt8[Tensor, "N 3 H W"], task: Detection) -> Candidates:
+def candidates(network: nn.Module, images: Images, task: Detection) -> Candidates:
     """Return boxes (K, 4) in pixels and scores (K, C) of all candidates of a raw network."""
     unit = to_unit(images)
     outputs = task.reader("network")(network(unit), unit)
@@ -189,7 +186,7 @@ def candidate_loss(
 
 
 @torch.no_grad()
-def detected(network: nn.Module, images: UInt8[Tensor, "N 3 H W"], task: Detection) -> list[Target]:
+def detected(network: nn.Module, images: Images, task: Detection) -> list[Target]:
     """Return the objects in images that a network finds with a score of at least the threshold.
 
     They have masks if the network itself returns masks, as those of torchvision (n, 1, H, W).
