@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
 from augment.classifier import TaskNetwork
@@ -32,7 +31,7 @@ from train.data.annotations import (
     read_masks,
 )
 from train.results import detections, tables
-from train.results.detections import DetectionMetrics, Found, Marked, Matches, mean_iou
+from train.results.detections import ClassMap, DetectionMetrics, Found, Marked, Matches, mean_iou
 from train.results.pictures import evenly_spaced
 from train.results.predictions import CONTACT_SHEET, begin_scores, write_summary
 from train.results.tables import Estimate, Table
@@ -307,7 +306,7 @@ def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> Segm
     count = 0
 
     # Pairs are read one after the other, so that not all masks are in memory.
-    def pairs() -> Iterator[tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]]:
+    def pairs() -> Iterator[tuple[ClassMap, ClassMap]]:
         nonlocal count
         for item, fitted, output in _outputs(network, photographs, how, pictures):
             count += 1

@@ -23,6 +23,10 @@ NO_OBJECT, CROWD = -1, -2
 # Fields of `Matches` that have an entry for each detection, and those with one for each object.
 DETECTION_COLUMNS = ("label", "image", "score", "is_right")
 OBJECT_COLUMNS = ("object_label", "object_image", "object_score")
+# Classes of the pixels of an image.
+ClassMap = Int[np.ndarray, "H W"]
+# How often each of n images counts, in k rows.
+Counts = Float[np.ndarray, "k n"]
 # Recalls at which the average precision averages the precision, as COCO does.
 RECALLS = np.linspace(0, 1, 101)
 
@@ -107,7 +111,7 @@ class Matches:
         of_objects = {name: getattr(self, name)[objects] for name in OBJECT_COLUMNS}
         return replace(self, **of_detections, **of_objects)
 
-    def recall(self, threshold: float, counts: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
+    def recall(self, threshold: float, counts: Counts) -> Float[np.ndarray, " k"]:
         """Compute the fraction of the objects that are detected with at least a score.
 
         `counts` says how often each image counts. The recall of no object is NaN.
@@ -116,14 +120,12 @@ class Matches:
         with np.errstate(invalid="ignore"):
             return (weights * (self.object_score >= threshold)).sum(-1) / weights.sum(-1)
 
-    def false_per_image(
-        self, threshold: float, counts: Float[np.ndarray, "k n"]
-    ) -> Float[np.ndarray, " k"]:
+    def false_per_image(self, threshold: float, counts: Counts) -> Float[np.ndarray, " k"]:
         """Compute the number of detections per image that have a score, but no object."""
         is_false = (self.score >= threshold) & ~self.is_right
         return counts[:, self.image[is_false]].sum(-1) / counts.sum(-1)
 
-    def average_precision(self, counts: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
+    def average_precision(self, counts: Counts) -> Float[np.ndarray, " k"]:
         """Compute the average precision of one class, as COCO does. That of no object is NaN."""
         return np.array([self._average_precision(row) for row in counts])
 
@@ -281,9 +283,7 @@ def estimate(
 
 
 def mean_iou(
-    images: Iterable[tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]],
-    class_count: int,
-    units: Units | None = None,
+    images: Iterable[tuple[ClassMap, ClassMap]], class_count: int, units: Units | None = None
 ) -> tuple[Estimate, list[float]]:
     """Compute the mean IoU over classes, with its interval over images, and that of each class.
 
