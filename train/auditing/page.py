@@ -46,6 +46,8 @@ VERDICTS = {
 SLIDER_SCRIPT = (Path(__file__).parent / "slider.js").read_text(encoding="utf-8")
 # Number of images in a gallery of the worst predictions.
 WORST = 10
+# The audited network and the hardened one, if there is one.
+Networks = Sequence[AuditedNetwork]
 
 
 class Audited(NamedTuple):
@@ -155,7 +157,7 @@ def write_audit_page(
     return Audited(path, screen, label, by_key, recommendation)
 
 
-def _slider(networks: Sequence[AuditedNetwork]) -> dict[str, Any]:
+def _slider(networks: Networks) -> dict[str, Any]:
     """Choose the first attack that succeeds for the slider, with titles. Empty if none does."""
     for network in networks:
         for kind, counts in network.counts.items():
@@ -167,7 +169,7 @@ def _slider(networks: Sequence[AuditedNetwork]) -> dict[str, Any]:
 
 
 def _first_screen(
-    networks: Sequence[AuditedNetwork], images: str | None, folders: Mapping[str, Path]
+    networks: Networks, images: str | None, folders: Mapping[str, Path]
 ) -> first_screen.FirstScreen:
     """Make the top of the report from two networks' scores, or else from the first network."""
     if images is None:
@@ -271,7 +273,7 @@ def attack_pictures(network: AuditedNetwork) -> list[first_screen.ComparedImage]
     return compared
 
 
-def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:
+def charts(networks: Networks) -> list[Picture]:
     """Plot the fraction of recognized views against the radius of attacks.
 
     Each network has a line for the attack and one for random draws, unless it recognizes no view
@@ -292,9 +294,7 @@ def charts(networks: Sequence[AuditedNetwork]) -> list[Picture]:
     return pictures
 
 
-def _worst(
-    networks: Sequence[AuditedNetwork], folders: Mapping[str, Path]
-) -> dict[str, list[Picture]]:
+def _worst(networks: Networks, folders: Mapping[str, Path]) -> dict[str, list[Picture]]:
     """Make galleries of each network's WORST misses and false alarms in each folder."""
     galleries = {}
     for network, (images, folder) in product(networks, folders.items()):

@@ -51,6 +51,8 @@ MAX_EULER_ANGLES = (360, 60, 360)
 MAX_WALL_TURN = 30
 # Distance of the wall from the object: range of the random draw, in world units.
 WALL_DISTANCES = (1.8, 3.5)
+# Radiance of an environment map, linear RGB.
+Panorama = Float[np.ndarray, "H W 3"]
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ class Shot:
     scale: float
     roughness: float
     wall: Float[np.ndarray, " 3"] | None = None
-    environment: Float[np.ndarray, "H W 3"] | None = None
+    environment: Panorama | None = None
 
 
 def draw_shots(
@@ -159,9 +161,7 @@ def draw_shots(
         yield Shot(lighting, brightness, *values)
 
 
-def _scale_environment(
-    radiance: Float[np.ndarray, "H W 3"], brightness: float, rng: np.random.Generator
-) -> Float[np.ndarray, "H W 3"]:
+def _scale_environment(radiance: Panorama, brightness: float, rng: np.random.Generator) -> Panorama:
     """Rotate an environment map about the vertical axis by a random angle, and scale it.
 
     `brightness` is the radiance of a white diffuse surface that faces up.

@@ -156,9 +156,7 @@ def candidates(network: nn.Module, images: Images, task: Detection) -> Candidate
     return [(item[detection.CANDIDATE_BOXES], item[detection.CANDIDATE_SCORES]) for item in outputs]
 
 
-def candidate_loss(
-    found: Candidates, expected: Candidates, favor: float = 1.0
-) -> Float[Tensor, ""]:
+def candidate_loss(found: Candidates, expected: Candidates, favor: float) -> Float[Tensor, ""]:
     """Return the mean over images of the change of the candidates since the teacher.
 
     The change of a score is the Kullback-Leibler divergence of its Bernoulli distribution, whose

@@ -162,7 +162,8 @@ def test_the_loss_of_candidates_is_the_divergence_of_scores_and_the_overlap_of_b
     divergence = kl_divergence(Bernoulli(old), Bernoulli(new)).sum()
     # The moved box has 2 of 6 squares in common, and the box around both has 6.
     expected = divergence + 0.8 * (1 - 2 / 6)
-    assert candidate_loss([(moved, new)], [(boxes, old)]).item() == pytest.approx(float(expected))
+    loss = candidate_loss([(moved, new)], [(boxes, old)], favor=1.0)
+    assert loss.item() == pytest.approx(float(expected))
 
 
 def test_favor_multiplies_the_odds_with_the_lowest_loss():
