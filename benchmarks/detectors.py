@@ -25,6 +25,7 @@ from augment.attack_settings import GRADIENT, RANDOM_SEARCH
 from benchmarks.common import machine
 from train.results import tables
 from train.results.detections import estimate
+from train.results.intervals import Units
 from train.results.tables import Estimate
 
 SIZE = 352
@@ -120,7 +121,7 @@ def fraction(counts: Sequence[Counts]) -> Estimate:
         return (weights @ hidden) / (weights @ detected)
 
     objects = np.arange(len(counts))
-    return estimate(of_objects, [objects], objects, tables.OBJECTS)
+    return estimate(of_objects, [objects], Units([objects], tables.OBJECTS))
 
 
 def table(results: Mapping[tuple[str, float], Mapping[str, Sequence[Counts]]]) -> str:
