@@ -156,10 +156,13 @@ class Command:
             settings = read_settings(self.kind, config)
             system.import_function(f"train.commands.{self.name}:run")(settings)
 
-    def compose(self, overrides: Sequence[str] = ()) -> DictConfig:
-        """Compose the configuration of the command without starting it."""
+    def compose(self, overrides: Sequence[str] = (), as_typed: bool = True) -> DictConfig:
+        """Compose the configuration of the command without starting it.
+
+        The overrides are arguments `as_typed` by a user, or are in the form that Hydra reads.
+        """
         self.register()
-        words = self.to_overrides(overrides)
+        words = self.to_overrides(overrides) if as_typed else list(overrides)
         try:
             # While a command runs, Hydra is initialized, and must not be initialized again.
             if GlobalHydra.instance().is_initialized():
@@ -169,9 +172,9 @@ class Command:
         except (HydraException, OmegaConfBaseException, AssertionError) as error:
             raise InputError(explain(error, self.keys, words) or str(error)) from error
 
-    def read(self, overrides: Sequence[str] = ()) -> Any:
-        """Return the settings that the command would have with the given arguments."""
-        return read_settings(self.kind, self.compose(overrides))
+    def read(self, overrides: Sequence[str] = (), as_typed: bool = True) -> Any:
+        """Return the settings that the command would have with the arguments of `compose`."""
+        return read_settings(self.kind, self.compose(overrides, as_typed))
 
     @contextmanager
     def handle_errors(self) -> Iterator[None]:

@@ -54,7 +54,7 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     if "TORCHELASTIC_RUN_ID" in os.environ:
         raise InputError("torchrun cannot start a sweep: start it with pnb-train --multirun")
     runs = _expand([word for word in words if not word.startswith("-")])
-    first_config = main.compose(runs[0])
+    first_config = main.compose(runs[0], as_typed=False)
     if first_config.photographs_first:
         raise InputError("photographs_first=true makes no sweep: start the runs one by one")
     overwrite = bool(first_config.overwrite)
@@ -70,7 +70,7 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     # Settings of the runs that have not begun, by the texts among their settings.
     new_runs: dict[frozenset[str], tuple[Path, ExperimentSettings]] = {}
     for folder, overrides in zip(folders, runs, strict=True):
-        settings = with_label(main.read(overrides))
+        settings = with_label(main.read(overrides, as_typed=False))
         if is_finished(folder) or checkpoints.exists(folder):
             require_same_run(folder, settings, done=True)
         else:

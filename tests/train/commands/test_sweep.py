@@ -100,6 +100,14 @@ def test_a_run_of_a_sweep_is_named_by_the_overrides_that_are_its_own(overrides, 
     assert found == name
 
 
+@pytest.mark.parametrize(
+    ("key", "value"), [("network", "run:pretrained/none"), ("label", "sweet pepper")]
+)
+def test_the_runs_of_a_sweep_get_texts_as_they_are_typed(key, value):
+    (words,) = sweep._expand(command.main.to_overrides([f"{key}={value}", "seed=0"]))
+    assert command.main.compose(words, as_typed=False)[key] == value
+
+
 def test_a_run_keeps_its_folder_when_a_sweep_gets_more_values(tmp_path):
     first = run_name(["augment=none", "seed=0"], ["augment"], str(tmp_path))
     (tmp_path / first).mkdir()
