@@ -48,12 +48,13 @@ class Recognizer:
 
     network: nn.Module = field(repr=False)
     layers: Sequence[str]
-    weights: Float[Tensor, " D"] = field(repr=False)
+    weights: Float[Tensor, " D"] | Sequence[float] = field(repr=False)
     bias: float
 
     def __call__(self, images: Float[Tensor, "N 3 H W"]) -> Bool[Tensor, " N"]:
         values = statistics(self.network, self.layers, images).double()
-        return values @ self.weights.to(values) + self.bias > 0
+        weights = torch.as_tensor(self.weights, dtype=values.dtype, device=values.device)
+        return values @ weights + self.bias > 0
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ import json
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -36,8 +37,13 @@ from train.settings import TaskSettings, published_folder
 
 # A name of a classifier that begins with this text names the folder of a training run.
 RUN = "run:"
+# Entry in best.pt of a run with `train.recognize`: what `Recognizer` needs beside the network.
+RECOGNIZER = "recognizer"
 # Entries in the file of a published network, in addition to the weights.
-PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point")
+PUBLISHED_FACTS = (
+    *("architecture", "settings", "scores", "versions", "operating_point"),
+    RECOGNIZER,
+)
 # Entries in the description of a network that are no arguments of `build_network`.
 FACTS = ("version", "encoding", "validation", "assumed")
 # Entry in the description of a network that lists which facts about its images were assumed: fields
@@ -45,8 +51,6 @@ FACTS = ("version", "encoding", "validation", "assumed")
 ASSUMED = "assumed"
 # Entry in the description of a network that normalizes the light of images, with its settings.
 NORMALIZE_LIGHT = "normalize_light"
-# Entry in best.pt of a run with `train.recognize`: what `Recognizer` needs beside the network.
-RECOGNIZER = "recognizer"
 # If a network normalizes the light of images, the names of its weights begin with this text.
 LIGHT_PREFIX = "network."
 
@@ -228,9 +232,9 @@ def load_run(
         weights: Must be None, because a run has its own weights.
         model: "python:package.module:function" if this function of the user built the network.
             The file of the network names the function, too, but code from a file is never run
-            unless the user names it. None for any other network.
-        trust_code: Whether the run may have hardened a network in a file of TorchScript or
-            `torch.export`, which is then loaded again, and can run any code.
+            unless the user names or trusts it. None for any other network.
+        trust_code: Whether to trust code that the file names: such a function, or a file of
+            TorchScript or `torch.export` that the run hardened, which is then loaded again.
 
     Returns:
         The network.
@@ -251,8 +255,9 @@ def load_run(
     # Arguments of `build_network`, and entries for the wrapper around the network.
     shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
-    if name.startswith(PYTHON) and name != model:
-        raise InputError(f"{path} is built by {name}: give model={name} to run that code")
+    if name.startswith(PYTHON) and name != model and not trust_code:
+        advice = "set trust=true (trust_code=True in Python) to run that code"
+        raise InputError(f"{path} is built by {name}: {advice}")
     with checks_architecture(path):
         size = int(shape.pop("size"))
         classes = tuple(map(str, shape.pop("classes")))
@@ -339,7 +344,9 @@ def write_published(path: Path, state: Mapping[str, Any]) -> None:
     The format is safetensors, with the entries PUBLISHED_FACTS as JSON in its metadata.
     """
     facts = [key for key in PUBLISHED_FACTS if key in state]
-    metadata = {key: json.dumps(state[key], ensure_ascii=False) for key in facts}
+    # The weights of a recognizer are a tensor.
+    as_json = partial(json.dumps, ensure_ascii=False, default=Tensor.tolist)
+    metadata = {key: as_json(state[key]) for key in facts}
     weights = {
         name: value.half().contiguous() if value.is_floating_point() else value
         for name, value in state["model"].items()

@@ -293,16 +293,16 @@ def _format_line(left: str, right: str) -> str:
     return (above + beside + f"\n{' ' * KEY_WIDTH}".join(lines)).rstrip()
 
 
-def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
-    """Convert a configuration of Hydra to an object of a settings class.
+def read_settings(kind: type[Kind], config: DictConfig, *changes: Mapping[str, Any]) -> Kind:
+    """Convert a configuration of Hydra to an object of a settings class, after changes.
 
     Missing fields get their defaults. Messages of InputError begin with the key.
     """
     try:
         # A configuration that was read from a file does not know the types of its
         # values. Merging it into the class checks them.
-        if OmegaConf.get_type(config) is not kind:
-            config = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(kind), config))
+        if changes or OmegaConf.get_type(config) is not kind:
+            config = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(kind), config, *changes))
         return cast(Kind, _read_node(config, ""))
     except OmegaConfBaseException as error:
         raise InputError(explain(error, types_below(kind), ()) or str(error)) from error

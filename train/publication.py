@@ -83,10 +83,11 @@ def load(name: str) -> PublishedNetwork | PublishedDetector:
     if isinstance(loaded, Classifier):
         network = PublishedNetwork(*facts)
         network.operating_points = loaded.operating_points
+        network.inputs, network.recognizer = loaded.inputs, loaded.recognizer
         network.results = _read_results(scores)
         return network
     detector = PublishedDetector(*facts, task=loaded.task)
-    detector.inputs = loaded.inputs
+    detector.inputs, detector.recognizer = loaded.inputs, loaded.recognizer
     detector.results = {
         f"{images}/{metric}": Estimate(**metrics["all"][metric])
         for images, metrics in scores.items()

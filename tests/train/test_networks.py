@@ -216,8 +216,10 @@ def test_other_networks_are_loaded_by_their_name_and_copied_without_their_code(t
     images = torch.rand(2, 3, 16, 16)
     assert torch.equal(load_run(tmp_path / BEST, model=name)(images), network(images))
     if name.startswith("python:"):
-        with pytest.raises(InputError, match=f"model={name}"):
-            load_run(tmp_path)
+        with pytest.raises(InputError, match=f"{name}: set trust=true"):
+            load_network(f"run:{tmp_path}")
+        trusted = load_network(f"run:{tmp_path}", trust_code=True)
+        assert torch.equal(trusted(images), network(images))
     fresh = build_network(CLASSES, 16, name)
     (tmp_path / "own_models.py").write_text("raise SystemExit('code ran')")
     initial_of(tmp_path / BEST).copy_to(fresh, {"classes": [*CLASSES], "size": 16, "name": name})

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from torch import Tensor, nn
 
 from augment import classifier as classifiers
@@ -16,6 +16,7 @@ from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
 from augment.network import device_of, keep_text_vectors, unwrapped
 from augment.settings import NormalizeLight, RendererSettings
+from augment.switch import Recognizer
 from augment.tasks.classification import Classification
 from augment.tasks.detection import Detection
 from augment.tasks.task import Task
@@ -23,6 +24,7 @@ from renderer.errors import InputError, as_path, describe, require_kind
 from renderer.settings import Settings, Size
 from train import class_names, console
 from train.__main__ import main
+from train.checkpoints import RECOGNIZER
 from train.cli import read_settings
 from train.results.overwrite import require_new_run
 from train.results.page import report_of
@@ -174,6 +176,9 @@ def harden(
         sections: dict[str, Any] = {"train": train, "augment": augment, "scene": scene}
         sections |= {"renderer": renderer, "data": data}
         settings = _read_settings(experiment, changes, sections)
+        if settings.train.recognize and not isinstance(network, TaskNetwork):
+            fault = "train.recognize=true needs a network that keeps what recognizes the light"
+            raise InputError(f"{fault}: give an nb.Classifier instead", "train.recognize")
         require_new_run(folder, "out", overwrite, settings.train.resume)
         if meshes or label is not None:
             settings = class_names.with_class_names(settings, classifier.classes)
@@ -197,6 +202,8 @@ def harden(
         target = deepcopy(classifier.network)
         copy = classifier.with_network(target)
     unwrapped(target).load_state_dict(unwrapped(run.trainer.selected.network).state_dict())
+    if isinstance(copy, TaskNetwork) and RECOGNIZER in run.trainer.best:
+        copy.recognizer = Recognizer(copy.network, **run.trainer.best[RECOGNIZER])
     return copy
 
 
@@ -233,5 +240,4 @@ def _read_settings(
         if not isinstance(values, Mapping):
             raise InputError(f"{name} is {describe(section)}: give a mapping, or settings")
         given[name] = values
-    merged = OmegaConf.merge(settings, changes, given)
-    return read_settings(ExperimentSettings, cast(DictConfig, merged))
+    return read_settings(ExperimentSettings, settings, changes, given)

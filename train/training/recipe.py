@@ -84,10 +84,12 @@ def last_layer(network: nn.Module) -> str:
     return _module_of(names[-1])
 
 
-def called_layers(network: nn.Module, size: int) -> tuple[list[tuple[str, Any]], Any]:
+def called_layers(
+    network: nn.Module, size: int, count: int = 1
+) -> tuple[list[tuple[str, Any]], Any]:
     """Return the layers with matrices in the order of their calls, and the outputs of the network.
 
-    Each layer has its name and its output for one gray image. The order of the calls may differ
+    Each layer has its name and its output for so many gray images. The order of the calls may differ
     from the order of the parameters, which is that of the definitions. Normalizations and
     activations with parameters do not count, unless a network has no other layer. A network of
     TorchScript or torch.export calls no modules.
@@ -100,7 +102,7 @@ def called_layers(network: nn.Module, size: int) -> tuple[list[tuple[str, Any]],
         if any(parameter.ndim > 1 for parameter in layer.parameters()):
             matrices.append((name, output))
 
-    image = torch.full((1, 3, size, size), 0.5, device=device_of(network))
+    images = torch.full((count, 3, size, size), 0.5, device=device_of(network))
     with ExitStack() as hooks, eval_mode(network), torch.no_grad():
         for name, module in network.named_modules():
             own = list(module.parameters(recurse=False))
@@ -108,7 +110,7 @@ def called_layers(network: nn.Module, size: int) -> tuple[list[tuple[str, Any]],
             is_layer = own and len(own) == len(list(module.parameters()))
             if is_layer and not isinstance(module, torch.jit.ScriptModule):
                 hooks.enter_context(module.register_forward_hook(partial(note, name)))
-        outputs = plain_outputs(network(image))
+        outputs = plain_outputs(network(images))
     return matrices or called, outputs
 
 

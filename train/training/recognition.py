@@ -26,6 +26,27 @@ DECAY = 0.01
 KEPT = 0.99
 
 
+def recognizing_layers(network: nn.Module, size: int) -> list[str]:
+    """Return the names of up to LAYERS layers that have one row for each image, in their order.
+
+    Outputs for parts of an image, such as windows, have several rows for each image, and outputs
+    for positions have the same rows for any images.
+    """
+    outputs = [dict(called_layers(network, size, count)[0]) for count in (1, 2)]
+    names = [
+        name for name in outputs[0] if [_row_count(each.get(name)) for each in outputs] == [1, 2]
+    ]
+    if not names:
+        fault = "recognize=true needs layers of torch with a row for each image"
+        raise InputError(f"{fault}, which this network lacks: set recognize=false", "recognize")
+    return [names[place] for place in evenly_spaced(len(names), LAYERS).tolist()]
+
+
+def _row_count(output: Any) -> int | None:
+    """Return the number of rows of values. None if the output has no such rows."""
+    return len(output) if isinstance(output, Tensor) and output.ndim > 1 else None
+
+
 def fit_recognizer(
     network: nn.Module, train: Split, validation: Split, seed: int, light: str
 ) -> dict[str, Any]:
@@ -36,13 +57,7 @@ def fit_recognizer(
     """
     device = device_of(network)
     shown, kept_aside = (each[evenly_spaced(len(each), IMAGES)] for each in (train, validation))
-    called, _ = called_layers(network, shown.sample(1).shape[-1])
-    # Outputs for parts of an image, such as windows, have several rows for each image.
-    rows = {name: output for name, output in called if isinstance(output, Tensor)}
-    names = [name for name, output in rows.items() if len(output) == 1]
-    if not names:
-        raise InputError("the network calls no layers of torch: set recognize=false", "recognize")
-    layers = [names[place] for place in evenly_spaced(len(names), LAYERS).tolist()]
+    layers = recognizing_layers(network, shown.sample(1).shape[-1])
     measure = partial(statistics, network, layers)
     # The light is shown as often as other lights.
     others = [other for other in (RELIGHT, LOW_LIGHT, STRIPES) if other not in light]

@@ -34,7 +34,7 @@ from train.training import inputs
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, scale_learning_rate
-from train.training.recognition import fit_recognizer
+from train.training.recognition import fit_recognizer, recognizing_layers
 from train.training.run_log import Logger, RunLog
 
 # If the training images are on disk, the mean and the standard deviation of their color
@@ -95,6 +95,8 @@ class Run:
             self.held_out = held_out_rows(self.data.train, fraction)
         with keyed(**keys_of("train", settings.train)):
             self.trainer = self._build_trainer(record, threads)
+            if settings.train.recognize:
+                recognizing_layers(self.trainer.model.network, self.data.size)
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if earlier is not None:

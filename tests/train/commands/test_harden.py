@@ -97,6 +97,19 @@ def test_a_logger_without_a_method_log_is_refused_before_the_training(network, p
         harden(network, photographs, logger=print)
 
 
+@pytest.mark.parametrize(
+    ("key", "section"),
+    [
+        ("train.epoch", {"train": {"epoch": 1}}),
+        ("train.epochs", {"train": {"epochs": "many"}}),
+        ("scene.views", {"scene": {"views": [1]}}),
+    ],
+)
+def test_a_wrong_setting_is_refused_by_its_key(network, photographs, key, section):
+    with pytest.raises(nb.InputError, match=f"^{key}\\b"):
+        harden(network, photographs, **section)
+
+
 def test_a_hardened_classifier_has_no_threshold_of_the_original(network, photographs):
     classifier = nb.Classifier(network, SIZE, CLASSES, name="mine")
     classifier.operating_points = [OperatingPoint("orange", 0.5, 0.05, "lab", "", 20)]

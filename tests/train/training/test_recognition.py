@@ -16,7 +16,7 @@ from train.__main__ import main as train_command
 from train.checkpoints import load_network
 from train.data.sets import Split
 from train.training.augmentations import relit
-from train.training.recognition import DECAY, fit_recognizer, logistic_weights
+from train.training.recognition import DECAY, fit_recognizer, logistic_weights, recognizing_layers
 
 SIZE = 32
 
@@ -102,9 +102,25 @@ def test_stripes_are_recognized_and_unchanged_images_are_not(network):
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 def test_a_network_without_layers_of_torch_recognizes_no_light(network):
     traced = torch.jit.trace(network, torch.rand(1, 3, SIZE, SIZE))
-    split = Split(photographs(8, 0), torch.zeros(8).long())
-    with pytest.raises(InputError, match="recognize=false"):
-        fit_recognizer(traced, split, split, 0, "stripes")
+    with pytest.raises(InputError, match="^recognize=true .*recognize=false"):
+        recognizing_layers(traced, SIZE)
+
+
+def test_layers_of_positions_and_of_windows_recognize_no_light(network):
+    class Positioned(nn.Module):
+        """Network with a layer that gets positions, and one that gets the quarters of an image."""
+
+        def __init__(self):
+            super().__init__()
+            self.network, self.bias, self.quarter = network, nn.Linear(1, 3), nn.Conv2d(3, 3, 1)
+
+        def forward(self, images):
+            quarters = torch.cat([images[:, :, :16], images[:, :, 16:]])
+            positions = self.bias(torch.ones(1, 1)) + self.quarter(quarters).mean()
+            return self.network(images) + positions
+
+    found = recognizing_layers(Positioned(), SIZE)
+    assert found == [f"network.{name}" for name in recognizing_layers(network, SIZE)]
 
 
 def test_a_run_gets_the_images_in_the_light_of_its_training(weights, tmp_path):
@@ -124,5 +140,32 @@ def test_a_run_gets_the_images_in_the_light_of_its_training(weights, tmp_path):
     assert 0 < is_lit.sum() < len(images)
     expected = torch.where(is_lit[:, None], lit(images), plain(images))
     torch.testing.assert_close(switched(images), expected)
+    # The weights of a published network have 16 bits.
+    nb.publish(run, tmp_path / "published")
+    agrees = nb.load_run(tmp_path / "published").recognizer(images) == is_lit
+    assert agrees.double().mean() > 0.9
     with pytest.raises(InputError, match="recognizes no light"):
         lit.with_lit(plain)
+
+
+def test_a_hardened_classifier_recognizes_the_light_of_its_training(weights, tmp_path):
+    rng = np.random.default_rng(0)
+    for number in range(32):
+        save_noise(tmp_path / "photographs" / f"{number}.png", rng, (40, 36), 0, 250)
+    plain = load_network("torchvision:shufflenet_v2_x0_5", weights, size=SIZE)
+    settings = {"recognize": True, "augmentation": "stripes", "epochs": 1, "batch_size": 8}
+    settings |= {"freeze": None, "eval_mode": False, "ranking_weight": 0.0}
+    options = {"train": settings, "augment": {"mode": "none"}, "device": "cpu"}
+    options |= {"data": {"validation": 0.25}, "out": tmp_path / "run"}
+    for normalize_light in (None, True):
+        network = plain.normalizing_light(normalize_light)
+        lit = nb.harden(network, [], tmp_path / "photographs", overwrite=True, **options)
+        images = to_unit(torch.cat([photographs(9, 5), relit(photographs(9, 6), 7, "stripes")]))
+        expected = nb.load_run(tmp_path / "run").recognizer(images)
+        assert (lit.recognizer(images) == expected).all()
+        switched = plain.with_lit(lit)
+        torch.testing.assert_close(
+            switched(images), torch.where(expected[:, None], lit(images), plain(images))
+        )
+    with pytest.raises(InputError, match=r"^train\.recognize"):
+        nb.harden(plain.network, [], tmp_path / "photographs", size=SIZE, **options)
