@@ -13,13 +13,13 @@ from renderer.io.files import atomic_write
 from train.checkpoints import load_chosen
 from train.class_names import name_of_mesh
 from train.command_settings import RenderSettings
+from train.data.annotations import DATA_SET
 from train.data.formats import FORMATS
 from train.device import choose_device, choose_rasterizer
 from train.run_folder import read_json, writable_folder
 from train.settings import label_names, read_objects
 
-# File with the settings of a data set. Processes that share one differ in CIRCUMSTANCES only.
-DESCRIPTION = "data_set.json"
+# Processes that share a data set differ in these settings only.
 CIRCUMSTANCES = ("out", "shard", "shards", "device", "trust")
 # Folder of files of Hydra and submitit for --multirun, as conf/render.yaml says.
 LAUNCHER = ".launcher"
@@ -82,7 +82,7 @@ def shard_indices(settings: RenderSettings) -> list[range]:
 def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> None:
     """Write the settings to the folder, or check that it holds a data set of the same settings."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / DESCRIPTION
+    path = folder / DATA_SET
     facts = {key: value for key, value in asdict(settings).items() if key not in CIRCUMSTANCES}
     if settings.format == "webdataset":
         facts["shards"] = settings.shards  # A tar file has renders of one shard.
@@ -93,7 +93,7 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
         changed = [key for key in facts if found.get(key) != facts[key]]
         if changed:
             raise InputError(f"out={folder} has another {changed[0]}: choose another folder", "out")
-    elif any(path.name not in (DESCRIPTION, LAUNCHER) for path in folder.iterdir()):
+    elif any(path.name not in (DATA_SET, LAUNCHER) for path in folder.iterdir()):
         raise InputError(f"out={folder} is not empty: choose a new folder", "out")
     else:
         atomic_write(path, json.dumps(facts, indent=1))

@@ -30,6 +30,10 @@ FITS = {LETTERBOX: "fitted into {} pixels with gray borders", STRETCH: "stretche
 BORDER = 114
 # The aspect ratio of a photograph may differ by this factor from that of its annotation.
 MAX_RATIO = 1.02
+# File of the settings of `pnb-render` in the folder of its renders.
+DATA_SET = "data_set.json"
+# Suffixes of the file that Ultralytics reads about a data set.
+YAML = (".yaml", ".yml")
 # Text files that list the names of classes, one on each line.
 CLASS_FILES = ("classes.txt", "obj.names")
 # Folders of photographs and of their masks, the latter as in VOC.
@@ -184,11 +188,12 @@ def read_annotations(photos: Path) -> Annotations:
     A photograph without a label file has no objects. Missing photographs are listed in the result.
     """
     if photos.is_file():
-        is_list_of_images = photos.suffix.lower() in (".yaml", ".yml")
-        return _read_yolo(photos.parent) if is_list_of_images else _read_coco(photos)
+        is_yaml = photos.suffix.lower() in YAML
+        return _read_yolo(photos.parent, photos) if is_yaml else _read_coco(photos)
     if not photos.is_dir():
         raise InputError(f"photos={photos} does not exist: give a COCO file, or a folder", "photos")
-    files = sorted([*photos.glob("*.json"), *photos.glob("annotations/*.json")])
+    found = [*photos.glob("*.json"), *photos.glob("annotations/*.json")]
+    files = sorted(file for file in found if file.name != DATA_SET)
     if len(files) > 1:
         raise InputError(f"photos={photos} has {len(files)} JSON files: give one of them", "photos")
     return _read_coco(files[0]) if files else _read_yolo(photos)
@@ -258,23 +263,27 @@ def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
     return paths
 
 
-def _read_yolo(folder: Path) -> Annotations:
+def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
     """Read a folder of images with label files: beside them, or below labels/ instead of images/.
 
-    A line of a label file has the index of a class, and the center and size of a box, or the
-    corners of a polygon, as fractions of the sides of the image.
+    If a YAML file in the folder, or the given one, has the entry `val`, its images are read. A line
+    of a label file has the index of a class, and the center and size of a box, or the corners of a
+    polygon, as fractions of the sides of the image.
     """
-    classes = _yolo_classes(folder)
+    classes, named = _yolo_classes(folder, file)
+    paths = _validation_images(named) if named.parent == folder else []
+    if paths:
+        console.info("%s: the images of its entry val are read", named)
     photographs = []
     label_count = 0
-    for photograph in find_unlabeled(folder):
-        path = folder / photograph.path
+    for path in paths or [folder / item.path for item in find_unlabeled(folder)]:
         # A photograph can have a label file in several places. The first that exists counts.
-        file = next(filter(Path.is_file, _label_files(path)), None)
-        label_count += file is not None
-        rows = [] if file is None else [*_yolo_rows(file, len(classes))]
+        labels = next(filter(Path.is_file, _label_files(path)), None)
+        label_count += labels is not None
+        rows = [] if labels is None else [*_yolo_rows(labels, len(classes))]
+        name = path.relative_to(folder) if path.is_relative_to(folder) else path
         # Coordinates are fractions, so the image has the width and height 1.
-        photographs.append(_annotated(path, str(photograph.path), (1, 1), rows))
+        photographs.append(_annotated(path, str(name), (1, 1), rows))
     if not label_count:
         first = _label_files(photographs[0].path.absolute())[0]
         fault = f"photos={folder} has neither a COCO file nor label files of YOLO"
@@ -293,23 +302,55 @@ def _label_files(path: Path) -> list[Path]:
     return files
 
 
-def _yolo_classes(folder: Path) -> tuple[str, ...]:
-    """Read the names of the classes from data.yaml or classes.txt in a folder or above it."""
+def _yaml_mapping(file: Path) -> dict[str, Any]:
+    """Read the entries of a YAML file. Empty if it holds anything else."""
+    content = yaml.safe_load(file.read_text(encoding="utf-8-sig"))
+    return content if isinstance(content, dict) else {}
+
+
+def _validation_images(file: Path) -> list[Path]:
+    """List the images of the entry `val` of a YAML file, as Ultralytics finds them.
+
+    The entry is a folder, a file with the path of an image on each line, or a list of these. Empty
+    without images.
+    """
+    content = _yaml_mapping(file) if file.suffix.lower() in YAML else {}
+    given = content.get("val") or []
+    found = []
+    for place in [given] if isinstance(given, str) else given:
+        # Exports of Roboflow name a folder beside data.yaml as if it lay above.
+        names = str(place), str(place).removeprefix("../")
+        bases = file.parent / str(content.get("path") or ""), file.parent
+        path = next((of / name for of in bases for name in names if (of / name).exists()), None)
+        if path is None:
+            continue
+        if path.is_file():
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
+            found += [path.parent / line.strip() for line in lines if line.strip()]
+        else:
+            found += [path / item.path for item in find_unlabeled(path)]
+    return found
+
+
+def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Path]:
+    """Read the names of the classes, and return the file that has them.
+
+    It is the given YAML file, or else data.yaml or classes.txt in the folder or above it.
+    """
     # The folder itself, and the two above it.
     for parent in [folder, *list(folder.absolute().parents)[:2]]:
-        for file in sorted([*parent.glob("*.yaml"), *parent.glob("*.yml")]):
+        for file in [given] if given else sorted(i for e in YAML for i in parent.glob(f"*{e}")):
             with explained(f"{file} cannot be read", "give names as a list, or index: name"):
-                content = yaml.safe_load(file.read_text(encoding="utf-8-sig"))
-                names = content.get("names") if isinstance(content, dict) else None
+                names = _yaml_mapping(file).get("names")
                 # Names are a list, or a mapping from index to name.
                 listed = enumerate(names) if isinstance(names, list) else dict(names or {}).items()
                 known = {int(key): str(name) for key, name in listed}
             if known:  # Some indices may be missing.
-                return tuple(known.get(i, str(i)) for i in range(max(known) + 1))
+                return tuple(known.get(i, str(i)) for i in range(max(known) + 1)), file
         for name in (*CLASS_FILES, *(f"labels/{name}" for name in CLASS_FILES)):
             if (parent / name).is_file():
                 lines = (parent / name).read_text(encoding="utf-8-sig").splitlines()
-                return tuple(line.strip() for line in lines if line.strip())
+                return tuple(line.strip() for line in lines if line.strip()), parent / name
     raise InputError(f"photos={folder} names no classes: add data.yaml or classes.txt", "photos")
 
 

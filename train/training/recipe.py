@@ -89,8 +89,8 @@ def called_layers(
 ) -> tuple[list[tuple[str, Any]], Any]:
     """Return the layers with matrices in the order of their calls, and the outputs of the network.
 
-    Each layer has its name and its output for so many gray images. The order of the calls may differ
-    from the order of the parameters, which is that of the definitions. Normalizations and
+    Each layer has its name and its output for so many gray images. The order of the calls may
+    differ from the order of the parameters, which is that of the definitions. Normalizations and
     activations with parameters do not count, unless a network has no other layer. A network of
     TorchScript or torch.export calls no modules.
     """

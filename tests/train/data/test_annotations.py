@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image, ImageOps
 
 from renderer.errors import InputError
@@ -133,6 +134,34 @@ def test_names_of_yolo_are_a_list_or_a_mapping_of_indices(tmp_path, names, expec
     read = read_annotations(tmp_path)
     assert read.classes == expected
     assert read.photographs[0].labels.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        "val: images/val",
+        "val: ../images/val",
+        "{path: set, val: [images/val]}",
+        "{path: /elsewhere, val: list.txt}",
+    ],
+)
+def test_the_images_of_val_are_read_and_no_others(tmp_path, entries):
+    folder = tmp_path / "set"
+    for name in ("images/val/a", "images/train/b", "details/c"):
+        _draw(folder / f"{name}.png")
+    (folder / "data_set.json").write_text("{}")
+    place = tmp_path if "path: set" in entries else folder
+    content = yaml.safe_load(entries) | {"names": ["cat"]}
+    (place / "mine.yaml").write_text(yaml.safe_dump(content))
+    (folder / "list.txt").write_text("./images/val/a.png\n")
+    (folder / "labels/val").mkdir(parents=True)
+    (folder / "labels/val/a.txt").write_text("0 0.5 0.5 0.1 0.1\n")
+    for photos in (place, place / "mine.yaml"):
+        (photograph,) = read_annotations(photos).photographs
+        assert photograph.path == folder / "images/val/a.png"
+        assert photograph.labels.tolist() == [0]
+    (place / "another.yaml").write_text("names: [dog]")
+    assert read_annotations(place / "mine.yaml").classes == ("cat",)
 
 
 WRONG_LINES = (

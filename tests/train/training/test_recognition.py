@@ -102,7 +102,7 @@ def test_stripes_are_recognized_and_unchanged_images_are_not(network):
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 def test_a_network_without_layers_of_torch_recognizes_no_light(network):
     traced = torch.jit.trace(network, torch.rand(1, 3, SIZE, SIZE))
-    with pytest.raises(InputError, match="^recognize=true .*recognize=false"):
+    with pytest.raises(InputError, match=r"^recognize=true .*recognize=false"):
         recognizing_layers(traced, SIZE)
 
 
