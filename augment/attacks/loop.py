@@ -19,17 +19,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
+from augment.attack_settings import GRADIENT
 from augment.attacks.objective import NOISE_DRAWS, Examples, Images, Objective, Score, Values
-from augment.attacks.optimizers import (
-    CMAES,
-    Evaluation,
-    Gradient,
-    Optimizer,
-    Problem,
-    RandomSearch,
-    chosen,
-)
+from augment.attacks.optimizers import KINDS, Evaluation, Optimizer, Problem, chosen
 from augment.network import frozen_eval_mode
 from augment.progress import progress
 from augment.scene.truth import Rows
@@ -37,8 +29,6 @@ from renderer.errors import Check, ShortRepr, late_checks, raise_first
 
 # Fields of a `Minimum` that belong to the returned candidate: the keys of `Evaluation.found`.
 FOUND = ("values", "images", "success", "cost", "predicted")
-# Optimizers by their names in the settings.
-KINDS: dict[str, type[Optimizer]] = {GRADIENT: Gradient, RANDOM_SEARCH: RandomSearch, CMA_ES: CMAES}
 
 
 def drop_period(device: torch.device) -> int:

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
-from augment.attack_settings import AttackSettings, StepSettings
+from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH, AttackSettings, StepSettings
 from augment.attacks.objective import Examples, Images, Score, Values
 from augment.random_streams import generator, stream_seed
 from augment.scene.truth import Truth
@@ -112,9 +112,7 @@ class NormBalls:
     def __init__(self, settings: StepSettings, start: Tensor, used_mask: Tensor | None = None):
         self.settings = settings
         self.start = start
-        self.used_mask = used_mask
-        if used_mask is not None and used_mask.all():
-            self.used_mask = None
+        self.used_mask = None if used_mask is not None and used_mask.all() else used_mask
 
     def truth(self, values: Values, examples: Examples) -> Truth | None:
         """Return None: objects in images that are not rendered stay where they are."""
@@ -316,8 +314,7 @@ class Gradient(Optimizer):
         """Keep the gradient of accepted candidates."""
         is_accepted = super().tell(rows, evaluation)
         if evaluation.gradient is not None:
-            kept = self.gradient[rows]
-            self.gradient[rows] = chosen(is_accepted, evaluation.gradient, kept)
+            self.gradient[rows] = chosen(is_accepted, evaluation.gradient, self.gradient[rows])
         return is_accepted
 
     def _is_accepted(self, rows: Int[Tensor, " N"], cost: Float[Tensor, " N"]) -> Tensor:
@@ -424,3 +421,7 @@ class CMAES(Optimizer):
             "randn": lambda *shape: draws.standard_normal(shape),
         }
         return cma.CMAEvolutionStrategy(np.zeros(value_count), 1.0, options)
+
+
+# Optimizers by their names in the settings.
+KINDS = {GRADIENT: Gradient, RANDOM_SEARCH: RandomSearch, CMA_ES: CMAES}

@@ -13,18 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from train.auditing import found
+from train.auditing import network as audited
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS
-from train.auditing.network import (
-    CLASSIFIER,
-    HARDENED,
-    HARDENING,
-    IN_WORDS,
-    NEXT_HARDENING,
-    AuditedNetwork,
-    AuditReport,
-    Recommendation,
-    recommend,
-)
+from train.auditing.network import IN_WORDS, AuditedNetwork, AuditReport, Recommendation
 from train.auditing.relit import relit_sections, screen_of_photographs
 from train.results import compare, first_screen
 from train.results.metrics import Metrics
@@ -73,8 +64,8 @@ class Audited(NamedTuple):
         recommended = self.recommendation
         return AuditReport(
             label=self.label,
-            network=networks[CLASSIFIER],
-            hardened=networks.get(HARDENED),
+            network=networks[audited.CLASSIFIER],
+            hardened=networks.get(audited.HARDENED),
             recommendation="" if recommended is None else recommended.sentence,
             page=self.path.read_text(encoding="utf-8"),
         )
@@ -118,14 +109,14 @@ def write_audit_page(
             name: [AuditedNetwork("", name, out / key).evaluation(images)]
             for name, key in remedies.items()
         }
-        recommendation = recommend(evaluations)
+        recommendation = audited.recommend(evaluations)
     advice = []
     if recommendation is not None:
         # The top of the report shows the gain by hardening already.
-        is_shown = recommendation.remedy == HARDENING
+        is_shown = recommendation.remedy == audited.HARDENING
         advice = [recommendation.advice if is_shown else recommendation.sentence]
     elif screen.answer in (VERDICTS["No"], VERDICTS["Perhaps not"]):
-        advice = [NEXT_HARDENING]
+        advice = [audited.NEXT_HARDENING]
     note = [f"These are first results. Not measured yet: {missing}."] if missing else []
     screen = replace(screen, sentences=[*note, *screen.sentences, *advice])
     slider = _slider(networks)

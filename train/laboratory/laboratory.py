@@ -33,19 +33,13 @@ from renderer.mesh import Mesh
 from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
 from renderer.settings import Size
 from renderer.solids import HARD_NEGATIVES, SOLIDS
+from train import settings as common
 from train.command_settings import OTHER_PATTERNS, LabSettings
 from train.data.photo import DESCRIPTION, TABLE
 from train.laboratory.shots import FOV, Shot, draw_shots
 from train.results.tables import write_csv
 from train.run_folder import LOCK, read_json, sole_writer, writable_folder
-from train.settings import (
-    OTHER_PREFIX,
-    ExperimentSettings,
-    label_names,
-    read_object,
-    simplified,
-    solid_name,
-)
+from train.settings import OTHER_PREFIX, ExperimentSettings, label_names, simplified
 
 # Glob pattern of the renders in the folder of the test set. Their paths are
 # LABEL/NUMBER_LIGHTING.png.
@@ -311,9 +305,9 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
     A generated solid without a label gets its own name as its label. A solid
     that serves as a hard negative gets the label "other_NAME".
     """
-    settings = read_object(item, "", f"meshes[{index}]")
+    settings = common.read_object(item, "", f"meshes[{index}]")
     label = str(settings.label)
-    name = solid_name(settings.mesh)
+    name = common.solid_name(settings.mesh)
     if not label and name:
         label = OTHER_PREFIX + name if name in HARD_NEGATIVES else name
     if not label:

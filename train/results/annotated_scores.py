@@ -21,15 +21,8 @@ from renderer.io.images import draw_grid, tiles_of, write_image
 from renderer.settings import height_and_width
 from train import console
 from train.class_names import class_name, class_of_name
-from train.data.annotations import (
-    FITS,
-    Annotated,
-    Annotations,
-    Fitted,
-    fit_batches,
-    fit_mask,
-    read_masks,
-)
+from train.data import annotations as annotated
+from train.data.annotations import Annotated, Annotations, Fitted, fit_batches
 from train.results import detections, tables
 from train.results.detections import ClassMap, DetectionMetrics, Found, Marked, Matches, mean_iou
 from train.results.pictures import evenly_spaced
@@ -84,7 +77,7 @@ class AnnotatedScores(ShortRepr):
     def about(self) -> str:
         """Sentence that says what is scored, and how."""
         height, width = self.size
-        size = FITS[self.fit].format(f"{width} × {height}")
+        size = annotated.FITS[self.fit].format(f"{width} × {height}")
         return f"{self.photograph_count} photographs{self.contents}, {size}"
 
     def table(self) -> Table:
@@ -199,8 +192,7 @@ def _outputs(
         outputs = compute_outputs(network, images, BATCH)
         for (item, fitted), image, output in zip(batch, images, outputs, strict=True):
             if item.name in shown:
-                picture = network.task.draw(to_unit(image), output, network.classes)
-                drawn[item.name] = picture.cpu()
+                drawn[item.name] = network.task.draw(to_unit(image), output, network.classes).cpu()
             yield item, fitted, output
     if outputs is None:
         raise InputError("photos has no photograph that can be read: give others", "photos")
@@ -301,7 +293,7 @@ def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> Segm
     if len(network.classes) > NO_CLASS_PIXEL:
         reason = f"masks can have at most {NO_CLASS_PIXEL}, as {NO_CLASS_PIXEL} is no class"
         raise InputError(f"{network.title} has {len(network.classes)} classes: {reason}")
-    photographs, masks, missing = read_masks(folder)
+    photographs, masks, missing = annotated.read_masks(folder)
     pictures: dict[str, Tensor] = {}
     count = 0
 
@@ -310,7 +302,7 @@ def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> Segm
         nonlocal count
         for item, fitted, output in _outputs(network, photographs, how, pictures):
             count += 1
-            mask = fit_mask(masks[item.name], fitted, len(network.classes))
+            mask = annotated.fit_mask(masks[item.name], fitted, len(network.classes))
             yield output.argmax(0).cpu().numpy(), mask
 
     miou, by_class = mean_iou(pairs(), len(network.classes))

@@ -34,18 +34,11 @@ from train.data.photographs import (
     require_outside,
     unsupported_files,
 )
-from train.results import metrics, tables
+from train.results import metrics, predictions, tables
 from train.results.intervals import thresholds
 from train.results.metrics import Metrics, Outcome, Pooled, metric_title
 from train.results.pictures import contact_sheet, write_roc
-from train.results.predictions import (
-    CONTACT_SHEET,
-    PREDICTIONS,
-    Predictions,
-    begin_scores,
-    write_predictions,
-    write_summary,
-)
+from train.results.predictions import Predictions
 from train.results.tables import Estimate, Proportion, Table
 from train.settings import GROUPS, label_names, published_folder
 
@@ -363,15 +356,16 @@ def write(scores: Scores, out: Path) -> None:
       single label, of each source instead.
     """
     predicted = scores.predicted
-    begin_scores(out)
-    write_predictions(out / PREDICTIONS, predicted.predictions)
-    write_image(out / CONTACT_SHEET, contact_sheet(predicted.predictions, predicted.images.numpy()))
+    predictions.begin_scores(out)
+    predictions.write_predictions(out / predictions.PREDICTIONS, predicted.predictions)
+    sheet = contact_sheet(predicted.predictions, predicted.images.numpy())
+    write_image(out / predictions.CONTACT_SHEET, sheet)
     pooled = scores.pooled
     groups = pooled.by_label if len(predicted.labels) > 1 else pooled.by_source
     # The log-odds of positives and negatives of each group.
     curves = {name: pool.scores for name, pool in groups.items()}
     write_roc(out, pooled.all.scores, curves, scores.label)
-    write_summary(out, scores.to_summary())
+    predictions.write_summary(out, scores.to_summary())
 
 
 def choose_operating_points(
@@ -388,8 +382,8 @@ def choose_operating_points(
     predicted = predictor.predict(folder, label, skip_unreadable)
     exact_rate = Fraction(str(rate))
     points = []
-    for name, predictions in predicted.predictions.by_label.items():
-        log_odds = predictions.log_odds[~predictions.positive]
+    for name, rows in predicted.predictions.by_label.items():
+        log_odds = rows.log_odds[~rows.positive]
         count = len(log_odds)
         # With fewer than 1 / rate negatives, not even one may score above the threshold.
         if count * exact_rate < 1:
