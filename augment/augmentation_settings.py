@@ -100,8 +100,7 @@ class VariationSettings(Settings):
     def moves(self) -> bool:
         """Return whether objects or cameras are random, so that they are rasterized each time."""
         new_objects = self.instances or self.rotation > 0 or any(self.gloss.specular_factor)
-        is_scaled = tuple(self.scale) != UNCHANGED
-        moved = self.shift > 0 or is_scaled or any((self.azimuth, *self.fov))
+        moved = self.shift > 0 or tuple(self.scale) != UNCHANGED or any((self.azimuth, *self.fov))
         return moved or new_objects or self.tables > 0
 
 

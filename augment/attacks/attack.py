@@ -280,8 +280,7 @@ def target_labels(
     if len(names) != view_count:
         advice = f"give one for each of the {view_count} views, in a scene with shared=True"
         raise InputError(f"target={names} names {len(names)} classes: {advice}")
-    classes = classifier.classes
-    indices = [class_index(classes, name, f"target={name}") for name in names]
+    indices = [class_index(classifier.classes, name, f"target={name}") for name in names]
     labels = source.new_tensor(indices).repeat(len(source), 1)
     if torch.eq(labels, source).any():
         raise InputError(f"target={target} is the true class of an example: choose another class")
@@ -383,7 +382,6 @@ def _confidences(
     criterion = classifier.task.criterion(labels[of_group], truth, len(classifier.classes))
     criterion = criterion.map(lambda rows: rows.repeat(groups, *[1] * (rows.ndim - 1)))
     evidence = Objective(classifier, criterion, attack_settings).evidence(images)
-    confidences = classifier.task.confidences(evidence)
-    confidence = confidences.gather(2, labels[..., None])[..., 0]
+    confidence = classifier.task.confidences(evidence).gather(2, labels[..., None])[..., 0]
     is_correct = criterion.predicted(evidence) == labels
     return (confidence * is_correct).view(groups, -1).amin(1)

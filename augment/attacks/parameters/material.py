@@ -74,9 +74,7 @@ class Material(Parameter):
         used_mask = attacked_mask.repeat(len(start), 1)
         # The metallic factor of an object is attacked only if the object is metallic.
         used_mask[:, METALLIC] &= self._average_gloss[:, METALLIC] > 0
-        super().__init__(
-            settings, start=start[scene.object_of], used_mask=used_mask[scene.object_of]
-        )
+        super().__init__(settings, start[scene.object_of], used_mask[scene.object_of])
 
     def _read_materials(self, scene: Scene) -> None:
         """Keep the materials of the objects of a scene before the attack."""
