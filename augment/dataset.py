@@ -217,9 +217,8 @@ def _renders(
 ) -> Iterator[LabeledRender]:
     """Yield the renders of some examples of a problem, with indices from `start`."""
     scene = problem.scene
-    names = [
-        *dict.fromkeys(of for item in scene.objects for of in item.labels if of not in NAMELESS)
-    ]
+    labels_of_scene = (label for item in scene.objects for label in item.labels)
+    names = [*dict.fromkeys(label for label in labels_of_scene if label not in NAMELESS)]
 
     def index_of(label: str | int) -> int:
         return NO_OBJECT if label in NAMELESS else names.index(label)

@@ -351,9 +351,8 @@ def _read_onnx(path: Path) -> Content:
     shape = [size or default for size, default in zip(sizes, (2, 3, 224, 224), strict=True)]
     images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     try:
-        onnx2torch = importlib.import_module("onnx2torch")
         with torch.no_grad():
-            converted = onnx2torch.convert(str(path)).eval()
+            converted = importlib.import_module("onnx2torch").convert(str(path)).eval()
             # Compare all outputs of the converted network with those of onnxruntime.
             both = (tree_leaves(of(images)) for of in (converted, network))
             for output, expected in zip(*both, strict=True):

@@ -159,9 +159,7 @@ def _read_preprocessor(
         size, sizer = height if height == width else (height, width), source
     # The values of black, and of pure red, green and blue, tell the linear map of each channel.
     colors = [prepare(color, PROBED[1]) for color in ((0, 0, 0), *np.eye(3, dtype=int) * 255)]
-    black, *gains = (
-        image[:, image.shape[1] // 2, image.shape[2] // 2].double() for image in colors
-    )
+    black, *gains = (one[:, one.shape[1] // 2, one.shape[2] // 2].double() for one in colors)
     # Rows are channels of the network, and columns are red, green and blue.
     gain = torch.stack(gains, 1) - black[:, None]
     is_bgr = bool(gain[0, 2].abs() > gain[0, 0].abs())

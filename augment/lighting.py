@@ -509,9 +509,7 @@ def _noisy_bytes(
     # Without a compiled loop: look up the coefficients at 256 · image + byte.
     first = 256 * torch.arange(len(colors), device=colors.device, dtype=torch.int32)
     index = (colors.int() + first[:, None, None, None]).flatten()
-    middle, slope, curve = (
-        part.flatten().index_select(0, index).view(colors.shape) for part in response
-    )
+    middle, slope, curve = (part.flatten().index_select(0, index).view_as(z) for part in response)
     signal = curve.mul_(z).add_(slope).mul_(z).add_(middle).clamp_(0, model.levels).round_()
     return encoded.flatten().index_select(0, signal.int().flatten()).view(colors.shape)
 

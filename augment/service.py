@@ -266,8 +266,7 @@ class AugmentationService:
         """Vary the scene at random, and return what an attack on it may change."""
         assert self.scene is not None
         draws = random_streams.generator(self.seed, number, "rows")
-        is_random = self.settings.mode == "random"
-        scene = vary(self.scene, self.settings.vary, draws, once=is_random)
+        scene = vary(self.scene, self.settings.vary, draws, once=self.settings.mode == "random")
         return build_problem(self.settings.attack, scene)
 
     def values(self, model: nn.Module | None, problem: SceneProblem, number: int) -> Tensor:
@@ -462,12 +461,11 @@ class AugmentationService:
         values = values.index_copy(0, attacked, result.values)
         if self.settings.warm_start:
             self._last_values = values
-        max_steps = attack.max_steps * (1 + attack.restarts)
         diagnostics = {
             "attack_success_before": _mean(result.success_before),
             "attack_success": _mean(success),
             "steps": _mean(result.steps),
-            "used_all_steps": _mean(result.steps == max_steps),
+            "used_all_steps": _mean(result.steps == attack.max_steps * (1 + attack.restarts)),
             "loss_before": -_mean(result.cost_before),
             "loss": -_mean(result.cost),
             "zero_gradient": _mean(result.zero_gradient),

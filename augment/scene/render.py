@@ -341,8 +341,7 @@ class DirectRenderer:
                 self._views.clear()
             mesh = self.objects[object_index].mesh
             vertices = torch.as_tensor(mesh.vertices, device=self.like.device)
-            shown = (object_index, cameras, vertices, self.settings)
-            self._views[key] = self._rasterize(*shown)
+            self._views[key] = self._rasterize(object_index, cameras, vertices, self.settings)
         return self._views[key]
 
     def local_view(self, object_index: int, camera: Camera) -> LocalLightView:
@@ -410,8 +409,7 @@ class DirectRenderer:
         seen_face = fragments.sample_to_seen_face[nearest]
         is_smooth = self.settings.normals == "smooth"
         in_world = mesh.corner_normals if is_smooth else mesh.face_normals()[:, None]
-        faces = fragments.faces[seen_face]
-        corner_normals = torch.from_numpy(in_world)[faces] @ pose[:3, :3]
+        corner_normals = torch.from_numpy(in_world)[fragments.faces[seen_face]] @ pose[:3, :3]
         normals = (fragments.barycentric[nearest][:, :, None] * corner_normals).sum(1)
         # `facing` turns the normals of faces that are seen from behind.
         normals = normalize(normals, dim=1) * fragments.facing[seen_face]

@@ -136,8 +136,7 @@ class Scene:
         self.views = len(examples[0].cameras)
         device = lights.device
         self.object_of = torch.tensor([example.object for example in examples], device=device)
-        chosen = [example.background for example in examples]
-        self._background = torch.tensor(chosen, device=device)
+        self._background = torch.tensor([example.background for example in examples], device=device)
         exposures = torch.tensor([example.exposure for example in examples])
         # Two axes of size 1 let the exposures multiply lights of shape (E, coefficients, 3).
         self._exposure = exposures.to(lights)[:, None, None]
@@ -226,8 +225,7 @@ class Scene:
         examples = []
         for index, item in enumerate(objects):
             groups = [*map(item.move_cameras, camera_groups)] if placed else camera_groups
-            pairs = product(groups, range(len(backgrounds)))
-            examples += [Example(index, *pair) for pair in pairs]
+            examples += [Example(index, *pair) for pair in product(groups, range(len(backgrounds)))]
         return cls(objects, examples, backgrounds, *of_scene, **options)
 
     def changed(self, **arguments: Any) -> Scene:
@@ -522,8 +520,7 @@ class Scene:
                 shown = (example.object, example.cameras[view])
                 fragments, albedo = self._direct_renderer.view(*shown)
                 local = self._direct_renderer.local_view(*shown)
-                lit = (albedo, light[row, lamp_rows], positions[row])
-                radiance = local.radiance(lamps, *lit)
+                radiance = local.radiance(lamps, albedo, light[row, lamp_rows], positions[row])
                 # Positions of the pixels that the object covers in the sorted list `pixels`.
                 covered = torch.searchsorted(pixels, fragments.pixels)
                 canvas = radiance.new_zeros(3, len(pixels))
@@ -540,16 +537,14 @@ class Scene:
         """
         at_once = self._direct_renderer.views_at_once()
         # Row of the conditions, and first view, of each group of views that are rendered together.
-        groups: Iterable[tuple[int, int]] = product(
-            range(len(examples)), range(0, self.views, at_once)
-        )
+        first_views = range(0, self.views, at_once)
+        groups: Iterable[tuple[int, int]] = product(range(len(examples)), first_views)
         if len(examples) * self.views > MAX_VIEWS_WITHOUT_PROGRESS:
             groups = progress(list(groups), "rendering views")
         numbers = _on_cpu(examples).tolist()
         for row, first in groups:
             example = self.examples[numbers[row]]
-            all_cameras = self.cameras_under(conditions, row, numbers[row])
-            cameras = all_cameras[first : first + at_once]
+            cameras = self.cameras_under(conditions, row, numbers[row])[first : first + at_once]
             background = self.backgrounds[example.background].flatten(1).repeat(1, len(cameras))
             changed = conditions.row(row, self.mesh(numbers[row]))
             shown = numbers[row], example.object, cameras, changed.light, changed, background
@@ -558,9 +553,7 @@ class Scene:
             behind = background.index_select(1, pixels)
             term = background_term(coverage[None], behind, self.settings.encoding)
             parts = split_views(pixels, len(cameras), self.settings.pixel_count, radiance + term)
-            for image, (pixels_of_view, composite) in enumerate(
-                parts, start=row * self.views + first
-            ):
+            for image, (pixels_of_view, composite) in enumerate(parts, row * self.views + first):
                 yield Layer(slice(image, image + 1), pixels_of_view, composite[None])
 
 

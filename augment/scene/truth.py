@@ -23,8 +23,7 @@ class Rows:
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """Return a copy with changed tensors."""
         tensors = {name: item for name, item in vars(self).items() if isinstance(item, Tensor)}
-        changed = {name: change(tensor) for name, tensor in tensors.items()}
-        return replace(self, **changed)
+        return replace(self, **{name: change(tensor) for name, tensor in tensors.items()})
 
     def select(self, rows: Tensor | slice) -> Self:
         """Return some of the rows."""

@@ -420,8 +420,7 @@ def draw_camera_effects(
         """Apply the effects to images."""
         gained = decode(images, image.encoding) * gains[examples, None]
         blurred = _blur(gained, deviations[examples])
-        encoded = encode(clamp(blurred), image.encoding)
-        return clamp(encoded + noises[examples, None])
+        return clamp(encode(clamp(blurred), image.encoding) + noises[examples, None])
 
     return apply_effects
 
