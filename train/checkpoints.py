@@ -40,10 +40,7 @@ RUN = "run:"
 # Entry in best.pt of a run with `train.recognize`: what `Recognizer` needs beside the network.
 RECOGNIZER = "recognizer"
 # Entries in the file of a published network, in addition to the weights.
-PUBLISHED_FACTS = (
-    *("architecture", "settings", "scores", "versions", "operating_point"),
-    RECOGNIZER,
-)
+PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point", RECOGNIZER)
 # Entries in the description of a network that are no arguments of `build_network`.
 FACTS = ("version", "encoding", "validation", "assumed")
 # Entry in the description of a network that lists which facts about its images were assumed: fields

@@ -344,11 +344,8 @@ def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:
     negatives = settings.hard_negatives
     if not (negatives or settings.laboratory):
         # Solids of the class itself are no negatives.
-        negatives = [
-            f"solid:{name}"
-            for name in NEGATIVE_SOLIDS
-            if class_names.class_of_name(name, [label]) is None
-        ]
+        names = [one for one in NEGATIVE_SOLIDS if class_names.class_of_name(one, [label]) is None]
+        negatives = [f"solid:{name}" for name in names]
     items: dict[str, Any] = {
         key: [class_names.with_class_name(item, classes, key) for item in given]
         for key, given in (("meshes", settings.meshes), ("hard_negatives", negatives))

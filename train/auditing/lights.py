@@ -251,8 +251,7 @@ def adversaries(
     first = {"max_steps": STEPS, "margin": 0.0, "noise_margin": attack_settings.NOISE_MARGIN}
     options: dict[str, Any] = further if additional else first
     radius = KINDS[kind].radii[-1]
-    of_sky = kind == "skylight"
-    ball = attack_settings.SkylightSettings if of_sky else attack_settings.StepSettings
+    ball = attack_settings.SkylightSettings if kind == "skylight" else attack_settings.StepSettings
     options[kind] = ball("linf", radius, "sign", radius / STEPS_PER_RADIUS)
     scene = views.scene(classifier.size, kind)
     if not classifier.is_differentiable(partial(plain_images, views, classifier.size, kind)):

@@ -348,8 +348,7 @@ class AuditedNetwork:
         }
         # `views` says for each view whether it is recognized, so the mean is a fraction.
         recognized = {light: sum(views) / len(views) for light, views in self.recognized.items()}
-        results = (recognized, attacks, scores, self.transfers)
-        return NetworkReport(self.name, self.answer, *results)
+        return NetworkReport(self.name, self.answer, recognized, attacks, scores, self.transfers)
 
 
 @dataclass(frozen=True)

@@ -18,17 +18,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from augment import photographs as relighting
 from augment.attack_settings import RelightingSettings
 from augment.classifier import TaskNetwork
 from augment.network import device_of
-from augment.photographs import (
-    ADVERSARIAL,
-    RANDOM,
-    SLIDE,
-    UNCHANGED,
-    PhotographAttackResult,
-    attack_photographs,
-)
+from augment.photographs import PhotographAttackResult
 from augment.tasks.task import NOTHING
 from renderer.errors import ShortRepr
 from renderer.image import to_unit
@@ -73,9 +67,9 @@ class _Words(NamedTuple):
 
 
 WORDS = {
-    SLIDE: _Words("random slide", "under a random slide"),
-    RANDOM: _Words("random search", "after random search"),
-    ADVERSARIAL: _Words("gradient", "after the gradient attack"),
+    relighting.SLIDE: _Words("random slide", "under a random slide"),
+    relighting.RANDOM: _Words("random search", "after random search"),
+    relighting.ADVERSARIAL: _Words("gradient", "after the gradient attack"),
 }
 
 
@@ -211,7 +205,7 @@ def attack_folder(
     readable, images, unreadable = load_photographs(
         folder, evenly_spaced(found, limit or len(found)), classifier.size, skip_unreadable=True
     )
-    result = attack_photographs(classifier, images, settings, limit=limit, **options)
+    result = relighting.attack_photographs(classifier, images, settings, limit=limit, **options)
     out.mkdir(parents=True, exist_ok=True)
     classes = [*result.classifier.classes, NOTHING]
     photographs = []
@@ -261,7 +255,7 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
     for photograph in order[:PICTURE_COUNT].tolist():
         # The first slide that changes the class in the strongest light, or 0.
         slide = int(changed_in_strongest[photograph].int().argmax())
-        shown = [(UNCHANGED, 0), *((light, slide) for light in result.changed)]
+        shown = [(relighting.UNCHANGED, 0), *((light, slide) for light in result.changed)]
         images = [_drawn(result, result.image(photograph, *item)) for item in shown]
         side_by_side = torch.cat(images, dim=2)
         names[photograph] = f"relit_{photograph:04d}.png"
@@ -289,7 +283,7 @@ def screen_of_photographs(results: Mapping[str, Path]) -> FirstScreen:
             title = f"Kept {WORDS[light].clause}"
             numbers.append(ShownMetric(title, "higher is better", before, last.kept(light)))
     answer = "Random slides seldom change its predictions."
-    kept = last.kept(SLIDE).value
+    kept = last.kept(relighting.SLIDE).value
     if kept is not None and kept < PASS_THRESHOLD:
         answer = "Its predictions depend on the light."
     sentences = [item.sentence(name) for name, item in zip(results, scores, strict=True)]
@@ -320,13 +314,11 @@ def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
             sentences.append(f"{unreadable_count} photographs cannot be read.")
         pictures: list[Picture] = []
         for index, file in scores.pictures.items():
-            photograph = scores.photographs[index]
+            item = scores.photographs[index]
             # The predicted class in each light, from left to right.
-            shown = [f"unchanged: {photograph.predicted}"]
-            shown += [
-                f"{WORDS[key].title}: {names[0]}" for key, names in photograph.becomes.items()
-            ]
-            caption = f"{photograph.path}. {'; '.join(shown)}"
+            shown = [f"unchanged: {item.predicted}"]
+            shown += [f"{WORDS[key].title}: {names[0]}" for key, names in item.becomes.items()]
+            caption = f"{item.path}. {'; '.join(shown)}"
             pictures += read_pictures(folder / file, caption, MAX_PICTURE_WIDTH, caption)
         content = {"sentences": sentences, "tables": scores.tables(), "pictures": pictures}
         sections.append({"name": name, **content})

@@ -193,7 +193,6 @@ def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], 
     axes.set_xticks([], minor=True)
     axes.spines[["top", "right"]].set_visible(False)
     if records:
-        count = records[0]["n"]
-        axes.set_title(f"{count} examples correct before, 95% intervals", fontsize=10)
+        axes.set_title(f"{records[0]['n']} examples correct before, 95% intervals", fontsize=10)
         figure.legend(loc="outside lower center", ncols=2, frameon=False)
     write_figure(path, figure, dpi=150)

@@ -56,11 +56,8 @@ class Evaluation(NamedTuple):
 
     def rows(self, *properties: str) -> list[Subset]:
         """List the rows of a table: all images, several positive classes, and subsets."""
-        labels = ["label"] if len(self.pooled.by_label) > 1 else []
-        subsets = [
-            Subset(by, name) for by in (*labels, *properties) for name in self.pooled.groups(by)
-        ]
-        return [ALL, *subsets]
+        kinds = ("label", *properties) if len(self.pooled.by_label) > 1 else properties
+        return [ALL, *(Subset(by, name) for by in kinds for name in self.pooled.groups(by))]
 
     def find(self, subset: Subset) -> Pool | None:
         """Predictions for a subset. None if there are none."""
@@ -337,9 +334,7 @@ def format_short_comparison(runs: Sequence[RunSummary], by: str = "source") -> s
     methods = store.group_by_method(runs)
     groups = group_by_images(methods)
     # Titles of the groups begin with the sub-folder of the scored images.
-    title = max(
-        groups, key=lambda name: (len(groups[name]), name.startswith(PHOTOGRAPHS)), default=""
-    )
+    title = max(groups, key=lambda one: (len(groups[one]), one.startswith(PHOTOGRAPHS)), default="")
     group = groups.get(title, {})
     evaluations = read_evaluations(group)
     if by != "source" and evaluations:

@@ -136,10 +136,8 @@ def write_page(out: Path, script: str = "", **content: Any) -> Path:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("train.results", ".")
-    whitespace: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True}
-    environment = Environment(
-        loader=loader, undefined=StrictUndefined, autoescape=True, **whitespace
-    )
+    options: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=loader, undefined=StrictUndefined, **options)
     environment.filters.update(as_text=tables.as_text, fraction=tables.fraction)
     environment.filters.update(hits=tables.format_fraction, interval=tables.format_interval)
     environment.filters.update(command=_shell_command, yaml=OmegaConf.to_yaml)
@@ -172,9 +170,7 @@ def _shell_command(config: Mapping[str, Any]) -> str:
     """Return the lines `cd FOLDER` and COMMAND that repeat a run, or "" if none is recorded."""
     folder = config.get("working_folder")
     command = config.get("command") or ""
-    if folder and command:
-        return f"cd {shlex.quote(folder)}\n{command}"
-    return command
+    return f"cd {shlex.quote(folder)}\n{command}" if folder and command else command
 
 
 def _plot_metrics(methods: Methods) -> list[Picture]:
@@ -325,8 +321,7 @@ def _attack_section(attack: store.AttackSummary) -> dict[str, Any]:
         title = f"Example {number}, {label}: {outcome}"
         alt = f"{title}; before, after, their difference and the lights; "
         alt += f"predicted {before}, then {after}"
-        path = attack.folder / f"example_{number:03d}.png"
-        images[title] = read_pictures(path, alt, SHEET_WIDTH)
+        images[title] = read_pictures(attack.folder / f"example_{number:03d}.png", alt, SHEET_WIDTH)
     # The folder of an attack may have no config.yaml.
     config: Mapping[str, Any] = {}
     with suppress(InputError):

@@ -131,7 +131,6 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
     # All labels have the same photographs and the same predicted classes.
     first = next(iter(by_label.values()))
     photographs = first.photograph
-    ranks = first.true_rank.tolist()
     columns: dict[str, Iterable[object]] = {
         "path": [item.path for item in photographs],
         "label": first.shown,
@@ -141,7 +140,7 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
         "predicted": first.predicted,
         "probability": first.probability.tolist(),
         TRUE_PROBABILITY: ["" if np.isnan(p) else p for p in first.true_probability.tolist()],
-        TRUE_RANK: ["" if np.isinf(rank) else int(rank) for rank in ranks],
+        TRUE_RANK: ["" if np.isinf(rank) else int(rank) for rank in first.true_rank.tolist()],
     }
     for label, rows in by_label.items():
         columns[f"{label}_probability"] = rows.label_probability.tolist()

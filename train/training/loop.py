@@ -208,12 +208,11 @@ class Trainer:
             # Number of the steps of this round that were taken before.
             first = state.step - sum(steps[:index])
             shown = Split(to_bytes(state.renders.images), state.renders.labels)
-            images = TrainingImages(split, rows, shown)
             with self.phases("training"):
                 has_losses = self.is_detector and getattr(self.service.task, "decode", None) is None
                 set_training_mode(self.model, settings, has_losses)
                 options = settings.batch_size, self.seed, now, settings.flips, first
-                batches = training_batches(images, *options)
+                batches = training_batches(TrainingImages(split, rows, shown), *options)
                 for batch in progress(batches, title, steps[index], first):
                     # Fraction of the training that is done, on which the learning rate depends.
                     done = state.step / sum(steps)

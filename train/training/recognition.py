@@ -32,10 +32,8 @@ def recognizing_layers(network: nn.Module, size: int) -> list[str]:
     Outputs for parts of an image, such as windows, have several rows for each image, and outputs
     for positions have the same rows for any images.
     """
-    outputs = [dict(called_layers(network, size, count)[0]) for count in (1, 2)]
-    names = [
-        name for name in outputs[0] if [_row_count(each.get(name)) for each in outputs] == [1, 2]
-    ]
+    found = [dict(called_layers(network, size, count)[0]) for count in (1, 2)]
+    names = [name for name in found[0] if [_row_count(each.get(name)) for each in found] == [1, 2]]
     if not names:
         fault = "recognize=true needs layers of torch with a row for each image"
         raise InputError(f"{fault}, which this network lacks: set recognize=false", "recognize")
