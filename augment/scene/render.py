@@ -231,18 +231,14 @@ class FrozenTransport:
         return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
 
     def add(
-        self,
-        view: ViewKey,
-        fragments: Fragments,
-        albedo: Float[Tensor, "S 3"],
-        light: Tensor | None,
+        self, key: ViewKey, fragments: Fragments, albedo: Float[Tensor, "S 3"], light: Tensor | None
     ) -> None:
         """Compute and keep the radiance that shadows and bounces add to a view of the mesh.
 
         With a light, only the radiance in this light is kept.
         """
         # None says that shadows and bounces add nothing to the view.
-        self.views[view] = None
+        self.views[key] = None
         if not self._transport:
             return
         surface = Surface(self.mesh, fragments.to("cpu"), self._settings)
@@ -250,7 +246,7 @@ class FrozenTransport:
             light = light.cpu().double()
         # Added radiance for each of the K harmonic coefficients of the light, or only their sum,
         # in the P pixels that the mesh covers, shape (3, K or 1, P).
-        added_transfer = self._transport.change(surface, albedo.cpu().double(), light, view[2])
+        added_transfer = self._transport.change(surface, albedo.cpu().double(), light, key[2])
         if added_transfer is None:
             return
         # A slightly different shape may cover other pixels, so expand the radiance to all pixels
@@ -259,7 +255,7 @@ class FrozenTransport:
         all_pixels[..., surface.fragments.pixels] = added_transfer
         # The method `radiance` scales the added radiance of a pixel by the ratio of its new albedo
         # to this albedo.
-        self.views[view] = all_pixels.to(albedo), _sum_by_pixel(fragments, albedo)
+        self.views[key] = all_pixels.to(albedo), _sum_by_pixel(fragments, albedo)
 
     def radiance(
         self, view: ViewKey, fragments: Fragments, albedo: Float[Tensor, "S 3"], light: Tensor
