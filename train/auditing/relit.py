@@ -165,9 +165,7 @@ class RelitScores(ShortRepr):
             groups.setdefault(item.predicted, []).append(item)
         rows: list[Any] = []
         for name, group in groups.items():
-            counts = [
-                sum(item.kept[light] == self.slides for item in group) for light in self.lights
-            ]
+            counts = [sum(one.kept[light] == self.slides for one in group) for light in self.lights]
             rows.append([name, len(group), *counts])
         # The class that loses the largest part comes first.
         rows.sort(key=lambda row: sum(row[2:]) / row[1])
