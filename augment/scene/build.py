@@ -19,7 +19,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment import settings as scenes
 from augment.attack_settings import AttackSettings, MaterialSettings
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 from augment.network import say_once
@@ -28,7 +27,13 @@ from augment.scene import objects as placed
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import unlabeled
-from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
+from augment.settings import (
+    AUTO,
+    LOCAL_LIGHT_SETTINGS,
+    ObjectSettings,
+    RendererSettings,
+    SceneSettings,
+)
 from renderer import errors
 from renderer.camera import Camera, orbit_cameras
 from renderer.errors import InputError
@@ -186,7 +191,7 @@ def build_scene(
         basis=basis,
         lights_of_degree=lights_of_degree,
     )
-    return expose(built) if settings.exposure == scenes.AUTO else built
+    return expose(built) if settings.exposure == AUTO else built
 
 
 def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:

@@ -129,7 +129,8 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
         paths, size = self._files.paths, self._files.size
         errors: ReadErrors = {}
         # The files after this one, and then those before it. Only those in its subfolder are tried.
-        for path in (*paths[index:], *paths[:index]):
+        for place in range(index, index + len(paths)):
+            path = paths[place % len(paths)]
             if path.parent != paths[index].parent:
                 continue
             try:

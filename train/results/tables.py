@@ -109,13 +109,13 @@ def write_csv(path: Path, rows: Iterable[Iterable[object]], line_end: str = "\n"
 def as_text(value: object) -> str:
     """Convert a cell of a table to text.
 
-    Integers get thousands separators, such as "1,000". Floats below 1000 get
+    Integers get thousands separators, such as "1,000". Floats that round to less than 1000 get
     three significant digits. None becomes an empty text.
     """
     match value:
         case None:
             return ""
-        case float() if value >= 1000:
+        case float() if abs(value) >= 999.5:
             return f"{value:,.0f}"
         case float():
             return f"{value:.3g}"

@@ -177,6 +177,7 @@ WRONG_LINES = (
     ("file", "content", "message"),
     [
         ("data.yaml", b"names: {cat: 0}", "give names as a list"),
+        ("data.yaml", b"{names: [cat], val: 5}", "has val: 5"),
         ("a.txt", b"\xff\xfe\x00", "no text"),
         *(("a.txt", b"0 0.5 0.5 0.1 0.1\n" + line, r"line 2 of .*a\.txt") for line in WRONG_LINES),
     ],

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from train.results import tables
 from train.results.tables import Proportion, Table, format_fraction, format_interval, fraction
 
 
@@ -21,6 +22,13 @@ def test_a_fraction_of_nothing_is_unknown():
     assert nothing == Proportion(value=None, low=None, high=None, hits=0, n=0)
     assert format_fraction(nothing) == "-"
     assert format_interval(nothing) == "-"
+
+
+@pytest.mark.parametrize("value", [-5000.0, 999.4, 999.7, -999.7, 0.04321, 1234.5])
+def test_a_number_in_a_table_has_three_digits_and_no_exponent(value):
+    found = float(tables.as_text(value).replace(",", ""))
+    assert found == pytest.approx(value, rel=0.005)
+    assert "e" not in tables.as_text(value)
 
 
 def split_cells(line: str) -> list[str]:
