@@ -22,6 +22,7 @@ from augment.tasks.segmentation import BACKGROUND, Segmentation
 from augment.tasks.task import Criterion, Task
 from renderer import errors
 from renderer.errors import InputError
+from renderer.image import require_unit_range
 
 # A step changes each number in [0, 1] by this, divided by the number of steps.
 STEP = 0.5
@@ -101,11 +102,13 @@ class AdversarialLighting:
             Images of the same dtype and size.
 
         Raises:
-            InputError: If images or targets have another shape, or if a label is
-                not that of a class.
+            InputError: If images or targets have another shape, if floats are far
+                from [0, 1], or if a label is not that of a class.
         """
         errors.require_kind("images", images, Tensor, "a tensor (N, 3, H, W)")
         errors.require_shape("images", images, "N", 3, "H", "W")
+        if images.is_floating_point() and images.numel():
+            require_unit_range(images)
         is_inference = torch.is_inference_mode_enabled()
         with torch.inference_mode(False):
             if is_inference:

@@ -18,6 +18,7 @@ from augment.tasks.classification import Classification, class_index, log_odds
 from augment.tasks.task import Task
 from renderer import errors
 from renderer.errors import InputError
+from renderer.image import require_unit_range
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
 # normalization="imagenet" stands for the following mean and standard deviation of red, green and
@@ -39,8 +40,6 @@ ImageFunction = Callable[[Tensor], Any]
 # Name of one positive class, or names of several.
 Label = str | Sequence[str]
 Normalization = str | tuple[Sequence[float], Sequence[float]] | None
-# Image values may exceed the range [0, 1] by at most this much, because of interpolation and noise.
-OVERSHOOT = 0.1
 # Value of the gray image with which a function is called to find out whether it has gradients.
 GRAY = 0.5
 # Number of images of a scene with which a function of another task is called for that.
@@ -178,11 +177,7 @@ class TaskNetwork(CheckedNetwork):
         outputs = super().forward(images)
         # The check may wait until the GPU is idle, so the network is called before.
         if len(images):
-            low, high = images.detach().aminmax()
-            advice = "use RGB in [0, 1], without normalization (divide bytes by 255)"
-            fault = f"images has values from {{:g}} to {{:g}}: {advice}".format
-            is_in_range = (low >= -OVERSHOOT) & (high <= 1 + OVERSHOOT)
-            errors.require(is_in_range, lambda: InputError(fault(low, high)))
+            require_unit_range(images)
         self.task.require_finite(outputs, images, self.title)
         return outputs
 

@@ -8,6 +8,7 @@ rounded. With numba installed, one loop does all of this.
 from __future__ import annotations
 
 import math
+import warnings
 from bisect import bisect
 from collections import UserDict
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,13 +34,15 @@ from augment.scene.loops import BIN_BITS, BINS
 from augment.scene.patterns import draw_projected_light, luminance, require_photographs
 from renderer import errors
 from renderer.errors import InputError
-from renderer.image import decode, encode, to_bytes, to_unit
+from renderer.image import OVERSHOOT, decode, encode, to_bytes, to_unit
 
 # Keys of a sample at which a plain tensor is an image, whatever stands before it.
 IMAGES = ("image", "images", "img", "pixel_values")
 # Modes of Pillow's images that are relit as they are, and those that are converted before.
 MODES = ("L", "LA", "RGB", "RGBA", "F", "I;16", "I;16L", "I;16B", "I;16N")
 CONVERTED = {"1": "L", "P": "RGB", "PA": "RGBA", "CMYK": "RGB", "YCbCr": "RGB", "HSV": "RGB"}
+# Floats above this value are hardly those of an HDR image.
+BRIGHTEST = 100
 
 
 class Light(NamedTuple):
@@ -386,9 +389,17 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
     frames = plain.reshape(-1, *plain.shape[-3:])
     # All frames of a video have the light of their video.
     lights = [light for light in lights for _ in range(len(frames) // count)]
-    if frames.is_floating_point() and not frames.detach().abs().max() <= errors.MAX_MAGNITUDE:
-        limit = f"{errors.MAX_MAGNITUDE:g}"
-        raise InputError(f"the image has values that are NaN or beyond ±{limit}: replace them")
+    if frames.is_floating_point():
+        low, high = frames.detach().aminmax()
+        if not (low >= -errors.MAX_MAGNITUDE and high <= errors.MAX_MAGNITUDE):
+            limit = f"{errors.MAX_MAGNITUDE:g}"
+            raise InputError(f"the image has values that are NaN or beyond ±{limit}: replace them")
+        if low < -OVERSHOOT:
+            advice = "give colors, and put the light before Normalize"
+            raise InputError(f"the image has values down to {low:g}: {advice}")
+        if high > BRIGHTEST:
+            fault = f"an image has values above {BRIGHTEST}, such as those of bytes"
+            warnings.warn(f"{fault}: divide them by 255 unless they are HDR", stacklevel=2)
     depths = None if depth is None else _as_depth(depth, frames, count)
     # Rows of the frames that have the same model and the same strength. Unchanged frames have None.
     groups: dict[Any, list[int]] = {}

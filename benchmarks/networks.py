@@ -31,6 +31,7 @@ from augment.random_streams import generator
 from augment.scene.objects import Conditions, load_object
 from benchmarks import real_light
 from benchmarks.splits import current_commit
+from renderer.errors import InputError
 from renderer.image import to_bytes
 from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS
@@ -177,11 +178,16 @@ def score_photographs(
     return scores
 
 
-def score_network(name: str, renders: Path, real: Path | None) -> Scores:
-    """Score a network in all lights. Projected objects count if it has all of their classes."""
+def load(name: str) -> Classifier:
+    """Load a classifier by its name on the command line."""
     network = real_light.load(name)
     if not isinstance(network, Classifier):
-        raise SystemExit(f"{name} is no classifier: only classifiers are ranked")
+        raise InputError(f"{name} is no classifier: only classifiers are ranked")
+    return network
+
+
+def score_network(network: Classifier, renders: Path, real: Path | None) -> Scores:
+    """Score a network in all lights. Projected objects count if it has all of their classes."""
     scores = score_renders(network, renders)
     folders = {path.name: path for path in real.iterdir()} if real else {}
     if path := folders.get("low_light"):
@@ -241,13 +247,14 @@ def rank(scores: Mapping[str, Sequence[float]]) -> dict[str, tuple[int, int, int
 def add(options: argparse.Namespace) -> None:
     """Score networks, write a file with their rows, and print their ranks."""
     rows = read(options.scores)
+    networks = {name: load(name) for name in options.networks}
     with tempfile.TemporaryDirectory() as temporary:
         renders = options.renders or Path(temporary) / "renders"
         # The table of the last light is written last.
         if not (renders / [*RELIT][-1] / TABLE).exists():
             write_renders(renders)
-        for name in options.networks:
-            rows[name] = rows_of(name, score_network(name, renders, options.real))
+        for name, network in networks.items():
+            rows[name] = rows_of(name, score_network(network, renders, options.real))
             # The scores of a network are kept if a later network cannot be scored.
             write_csv(options.out, [HEADER, *(row for each in rows.values() for row in each)])
     for name in options.networks:
@@ -296,7 +303,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for command in (adding, printing):
         command.add_argument("--scores", type=Path, default=SCORES, help="file of other networks")
     options = parser.parse_args(arguments)
-    options.body(options)
+    real_light.run(options, parser)
 
 
 if __name__ == "__main__":

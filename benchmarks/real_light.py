@@ -14,7 +14,8 @@ with three seeds. The first network and the first light are what others are comp
 
     python -m benchmarks.real_light simulate PHOTOS FOLDER --lights low_light --classes orange apple
 
-writes such a folder with the photographs of PHOTOS as they are ("plain") and in simulated light.
+writes such a folder with the photographs of PHOTOS as they are ("plain") and in simulated light. It
+has no photos.csv, so intervals are over photographs, for these objects.
 
     python -m benchmarks.real_light rank real=REAL.csv simulated=SIMULATED.csv --label orange
 
@@ -24,11 +25,11 @@ A row of another network may stand in a further file of the same title.
 
 import argparse
 import csv
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -39,9 +40,10 @@ import norm_balls as nb
 from augment.classifier import Classifier
 from augment.exposure import IsDim
 from augment.switch import SWITCHES
-from renderer.errors import InputError
+from renderer.errors import InputError, require_whole
 from renderer.image import to_unit
 from renderer.io.images import SUFFIXES, crop_center, read_rgb, write_image
+from renderer.settings import MAX_SIZE
 from train.checkpoints import RUN, is_classifier, load_network, load_run
 from train.data.photo import Photograph
 from train.data.photographs import find_photographs, load_photographs
@@ -298,13 +300,14 @@ def choose_lights(folder: Folder, words: Sequence[str]) -> Mapping[str, np.ndarr
 
     Without words, these are all lights, of which "plain" is the first.
     """
-    known = sorted({*folder.lights}, key=lambda name: (name != PLAIN, name))
+    known = sorted({*map(str, folder.lights)}, key=lambda name: (name != PLAIN, name))
     groups = {}
     for word in words or known:
         title, separator, joined = word.partition("=")
         lights = joined.split("+") if separator else [title]
         if unknown := {*lights} - {*known}:
-            raise SystemExit(f"no photograph is in the light {min(unknown)}: choose among {known}")
+            fault = f"no photograph is in the light {min(unknown)}"
+            raise InputError(f"{fault}: choose among {', '.join(known)}")
         groups[str(title)] = np.isin(folder.lights, lights)
     return groups
 
@@ -314,19 +317,22 @@ def simulate(options: argparse.Namespace) -> None:
     found = find_photographs(options.photos, options.classes, options.classes[0])
     names = {*options.classes, *(f"{OTHER_PREFIX}{name}" for name in options.classes)}
     chosen = [item for item in found if item.label in names and item.source not in options.exclude]
+    require_whole("size", options.size, 1, MAX_SIZE)
+    if options.folder.is_dir() and any(options.folder.iterdir()):
+        raise InputError(f"{options.folder} is not empty: choose a new folder")
     photographs, images, _ = load_photographs(options.photos, chosen, options.size)
     shown = {PLAIN: images}
     for light in options.lights:
         shown[light] = nb.relight_photographs(images, options.seed, lights=[light])
-    written: set[Path] = set()
     for light, relit in shown.items():
         for item, image in zip(photographs, relit, strict=True):
+            # Without the folder of the class, if there is one. Two underscores end a light.
+            parts = item.path.with_suffix("").parts
+            name = f"{light}__" + "_".join(parts[1:] or parts).replace("__", "_")
             # Photographs in several folders of a class may share a name.
-            name = "_".join(item.path.with_suffix("").parts[1:])
-            path = options.folder / item.label / f"{light}__{name}.png"
-            if path in written:
-                path = path.with_name(f"{light}__{item.path.suffix[1:]}_{name}.png")
-            written.add(path)
+            path = options.folder / item.label / f"{name}.png"
+            while path.exists():
+                path = path.with_stem(f"{path.stem}_")
             path.parent.mkdir(parents=True, exist_ok=True)
             write_image(path, image.permute(1, 2, 0).numpy())
 
@@ -364,7 +370,7 @@ def rank(options: argparse.Namespace) -> None:
     """Print the metric of all networks in all lights, best first, and the rank correlations."""
     scores = read_scores(options.scores, options.label, options.metric)
     if not scores:
-        raise SystemExit(f"no file has {options.metric} for the label {options.label}")
+        raise InputError(f"no file has {options.metric} for the label {options.label}")
     first = next(iter(scores.values()))
     networks = dict.fromkeys(name for column in scores.values() for name in column)
     ordered = sorted(networks, key=lambda name: -first.get(name, -1.0))
@@ -374,7 +380,7 @@ def rank(options: argparse.Namespace) -> None:
     ]
     print(Table(f"{options.metric}, {options.label}", ["network", *scores], lines), end="\n\n")
     pairs = []
-    for one, other in combinations(scores, 2):
+    for one, other in itertools.combinations(scores, 2):
         count = len(scores[one].keys() & scores[other].keys())
         correlation = rank_correlation(scores[one], scores[other])
         pairs.append([one, other, str(count), format_interval(correlation)])
@@ -384,6 +390,9 @@ def rank(options: argparse.Namespace) -> None:
 
 def count_dim(options: argparse.Namespace) -> None:
     """Count the photographs of folders that `Classifier.with_dim` shows to the network for them."""
+    for folder in options.folders:
+        if not folder.is_dir():
+            raise InputError(f"{folder} is not a folder: give folders of photographs")
     paths = sorted(path for folder in options.folders for path in folder.rglob("*.*"))
     counts = [0, 0]
     for path in paths:
@@ -393,6 +402,17 @@ def count_dim(options: argparse.Namespace) -> None:
             counts[0] += bool(IsDim()(image[None]))
             counts[1] += 1
     print(f"{counts[0]} of {counts[1]} photographs are dim")
+
+
+def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Run the function `body` of the options. A mistake of the user is one sentence."""
+    out = getattr(options, "out", None)
+    try:
+        if out and not out.parent.is_dir():
+            raise InputError(f"--out: {out.parent} is not a folder: make it first")
+        options.body(options)
+    except (InputError, OSError) as error:
+        parser.exit(2, f"error: {error}\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -428,10 +448,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     counting.add_argument("folders", nargs="+", type=Path)
     counting.add_argument("--size", type=int, default=224, help="pixels per side")
     options = parser.parse_args(arguments)
-    try:
-        options.body(options)
-    except InputError as error:
-        parser.exit(2, f"error: {error}\n")
+    run(options, parser)
 
 
 if __name__ == "__main__":

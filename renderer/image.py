@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, as_tensor, require_bounded, require_choice
+from renderer.errors import InputError, as_tensor, require, require_bounded, require_choice
 from renderer.settings import ENCODINGS, REC_709, Size, height_and_width
 
 # Linear value at which the sRGB curve changes
@@ -27,6 +27,8 @@ SRGB_ENCODED_KNEE = 0.04045
 # Weights of the linear red, green and blue
 # in the luminance (Rec. 709, IEC 61966-2-1).
 LUMINANCE = (0.2126, 0.7152, 0.0722)
+# Image values may exceed the range [0, 1] by at most this much, because of interpolation and noise.
+OVERSHOOT = 0.1
 
 
 def tonemap(
@@ -168,6 +170,15 @@ def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
     """Convert image values in [0, 1] to 8-bit values."""
     # `round_` rounds in place, which saves the memory of a copy.
     return (image * 255).round_().to(torch.uint8)
+
+
+def require_unit_range(images: Float[Tensor, " ..."]) -> None:
+    """Check that image values are in [0, 1], up to OVERSHOOT."""
+    low, high = images.detach().aminmax()
+    advice = "use RGB in [0, 1], without normalization (divide bytes by 255)"
+    fault = f"images has values from {{:g}} to {{:g}}: {advice}".format
+    is_in_range = (low >= -OVERSHOOT) & (high <= 1 + OVERSHOOT)
+    require(is_in_range, lambda: InputError(fault(low, high)))
 
 
 def to_unit(images: UInt8[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:

@@ -207,7 +207,9 @@ class LabSettings(Settings):
             raise self.wrong("patterns", "need image files: set slides to them")
         # Each pattern and each environment lights the same number of setups, and names files.
         sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
-        if not sources or self.setups % len(sources):
+        if not sources:
+            raise InputError("patterns and environments are empty: give one of them", "patterns")
+        if self.setups % len(sources):
             advice = f"must be a multiple of the {len(sources)} patterns and environments"
             raise self.wrong("setups", advice)
         if len(set(sources)) < len(sources):

@@ -126,6 +126,12 @@ def segment(images, targets):
     return lighting(images, targets)
 
 
+@pytest.mark.parametrize("change", [lambda x: x.float(), lambda x: (x / 255 - 0.5) / 0.2])
+def test_floats_of_bytes_and_normalized_images_are_refused(images, change):
+    with pytest.raises(InputError, match="images has values from"):
+        nb.AdversarialLighting(Mean())(change(images), torch.zeros(8, dtype=torch.int64))
+
+
 @pytest.mark.parametrize("label", [255, -1, -100])
 def test_pixels_without_a_class_count_as_background(images, label):
     targets = torch.ones(8, 16, 16, dtype=torch.int64)

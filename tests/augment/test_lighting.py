@@ -192,9 +192,10 @@ def test_default_types_and_devices_change_nothing(name):
         assert all(map(torch.equal, found, expected))
 
 
+@pytest.mark.filterwarnings("ignore:an image has values above")
 @pytest.mark.parametrize("name", MODELS)
 def test_the_limits_of_half_precision_stay_finite(name):
-    for value in (-65504.0, 65504.0, 6e-8):
+    for value in (-0.1, 65504.0, 6e-8):
         image = torch.full((3, 4, 4), value, dtype=torch.float16)
         assert nb.RandomLighting(name)(image).isfinite().all()
 
@@ -469,3 +470,11 @@ def test_albumentations_keeps_lights_in_dictionaries_and_random_numbers_in_pickl
     copy, array = pickle.loads(pickle.dumps(compose)), picture(6, 8, 3).numpy()
     for _ in range(3):
         assert np.array_equal(compose(image=array)["image"], copy(image=array)["image"])
+
+
+def test_normalized_images_are_refused_and_floats_of_bytes_give_a_warning():
+    images = picture(2, 3, 8, 8)
+    with pytest.raises(nb.InputError, match="before Normalize"):
+        nb.RandomLighting("linear")((images / 255 - 0.5) / 0.2)
+    with pytest.warns(UserWarning, match="divide them by 255"):
+        nb.RandomLighting("linear")(images.float())

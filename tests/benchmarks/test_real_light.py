@@ -54,20 +54,39 @@ def test_each_light_has_its_scores(folder, monkeypatch):
 
 
 def test_simulated_light_keeps_photographs_that_share_a_name(tmp_path):
-    for name in ("a/1.png", "b/1.png", "1.png", "1.jpg"):
+    names = ("a/b_1.png", "a_b/1.png", "a_b_1.png", "a_b_1.jpg", "dim__1.png")
+    for name in names:
         save(tmp_path / "given/orange" / name, 40)
-    words = ["simulate", str(tmp_path / "given"), str(tmp_path / "out"), "--classes", "orange"]
-    real_light.main([*words, "--lights", "low_light"])
-    for light in ("plain", "low_light"):
-        assert len([*(tmp_path / "out/orange").glob(f"{light}__*.png")]) == 4
+        save(tmp_path / "flat" / name.replace("/", "+"), 40)
+    for given in ("given", "flat"):
+        words = ["simulate", str(tmp_path / given), str(tmp_path / f"of_{given}")]
+        real_light.main([*words, "--classes", "orange", "--lights", "low_light"])
+        found = real_light.find_photographs(tmp_path / f"of_{given}", ["orange"], "orange")
+        lights = [*map(real_light.light_of, found)]
+        assert lights.count("plain") == lights.count("low_light") == len(names)
 
 
-def test_a_mistake_of_the_user_is_one_sentence(tmp_path, capsys):
+@pytest.mark.parametrize(
+    "words",
+    [
+        "simulate given out --classes orange --lights lowlight",
+        "simulate given out --classes orange --lights low_light --size 0",
+        "simulate given given --classes orange --lights low_light",
+        "score given pretrained/none --label orange --lights dim",
+        "score given pretrained/none --label orange --out missing/a.csv",
+        "rank a=missing.csv --label orange",
+        "dim missing",
+        "dim broken",
+    ],
+)
+def test_a_mistake_of_the_user_is_one_sentence(tmp_path, capsys, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
     save(tmp_path / "given/orange/1.png", 40)
-    words = ["simulate", str(tmp_path / "given"), str(tmp_path / "out"), "--classes", "orange"]
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken/1.png").write_bytes(b"no image")
     with pytest.raises(SystemExit, match="2"):
-        real_light.main([*words, "--lights", "lowlight"])
-    assert capsys.readouterr().err.count("\n") == 1
+        real_light.main(words.split())
+    assert "error: " in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_run_is_loaded_as_network_spells_it():

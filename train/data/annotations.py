@@ -317,7 +317,7 @@ def _validation_images(file: Path) -> list[Path]:
     content = _yaml_mapping(file) if file.suffix.lower() in YAML else {}
     given = content.get("val") or []
     if not isinstance(given, str | list):
-        raise InputError(f"{file} has val: {given}: give a folder or a text file, or a list", "photos")
+        raise InputError(f"{file} has val: {given}: give folders or text files", "photos")
     found = []
     for place in [given] if isinstance(given, str) else given:
         # Exports of Roboflow name a folder beside data.yaml as if it lay above.

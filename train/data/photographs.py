@@ -233,7 +233,10 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
         if not table.is_file():
             raise OSError("it is not a regular file")
         with table.open(newline="", encoding="utf-8-sig") as file:
-            for line in csv.DictReader(map(composed, file), restval="", strict=True):
+            for cells in csv.DictReader(map(composed, file), restval="", strict=True):
+                if None in cells:
+                    raise ValueError(f"the row of {cells['path']} has more cells than columns")
+                line = {key: cell.strip() for key, cell in cells.items()}
                 path = PurePosixPath(line["path"].replace("\\", "/"))
                 hard_negatives = split_sources(line.get("hard_negatives", ""))
                 row = (line["source_tag"] or None, hard_negatives, line.get("mesh") or None)
