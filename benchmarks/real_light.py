@@ -156,7 +156,7 @@ class Folder:
 
 def predict(network: Classifier, folder: Folder, labels: Sequence[str]) -> Predictions:
     """Predict the classes of all photographs, of which other_CLASS may show a CLASS."""
-    photographs, images, _ = load_photographs(folder.path, folder.photographs, network.size)
+    photographs, images, _ = load_photographs(folder.path, folder.photographs, network.size, None)
     shown = []
     for item in photographs:
         name = item.label.removeprefix(OTHER_PREFIX)
@@ -320,7 +320,7 @@ def simulate(options: argparse.Namespace) -> None:
     require_whole("size", options.size, 1, MAX_SIZE)
     if options.folder.is_dir() and any(options.folder.iterdir()):
         raise InputError(f"{options.folder} is not empty: choose a new folder")
-    photographs, images, _ = load_photographs(options.photos, chosen, options.size)
+    photographs, images, _ = load_photographs(options.photos, chosen, options.size, None)
     shown = {PLAIN: images}
     for light in options.lights:
         shown[light] = nb.relight_photographs(images, options.seed, lights=[light])

@@ -246,7 +246,10 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
 
 
 def load_photographs(
-    folder: Path, photographs: Sequence[Photograph], size: Size = 32, skip_unreadable: bool = False
+    folder: Path,
+    photographs: Sequence[Photograph],
+    size: Size = 32,
+    skip_unreadable: bool | None = False,
 ) -> tuple[list[Photograph], Tensor, list[str]]:
     """Read photographs at the size of the input of a network.
 
@@ -255,7 +258,8 @@ def load_photographs(
     channels are converted to 8 bits. The largest central part of the shape of `size`
     is reduced with Pillow's Lanczos filter. The filter is wider for a larger
     reduction, which prevents aliasing. Return the photographs that could be read,
-    their uint8 sRGB images, and the paths of the others.
+    their uint8 sRGB images, and the paths of the others. `skip_unreadable` is None if the caller
+    has no such setting.
     """
     height, width = height_and_width(size)
     count = len(photographs)
@@ -279,7 +283,8 @@ def load_photographs(
     if not (readable and skip_unreadable):
         first = unreadable[0]
         fault = f"{len(unreadable)} of {count} photographs cannot be read"
-        advice = ", or set skip_unreadable=True to skip them" if readable else ""
+        can_skip = readable and skip_unreadable is not None
+        advice = ", or set skip_unreadable=True to skip them" if can_skip else ""
         example = f"the first being {paths[first]} ({errors[first]})"
         raise InputError(f"{fault}, {example}: replace them{advice}")
     unreadable_paths = [str(photographs[index].path) for index in unreadable]
