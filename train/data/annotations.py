@@ -325,8 +325,8 @@ def _validation_images(file: Path) -> list[Path]:
         bases = file.parent / str(content.get("path") or ""), file.parent
         path = next((of / name for of in bases for name in names if (of / name).exists()), None)
         if path is None:
-            continue
-        if path.is_file():
+            console.warning("%s: its entry val names %s, which does not exist", file, place)
+        elif path.is_file():
             lines = path.read_text(encoding="utf-8-sig").splitlines()
             found += [path.parent / line.strip() for line in lines if line.strip()]
         else:
