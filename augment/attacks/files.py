@@ -30,8 +30,15 @@ RENDERERS = ("reload", MITSUBA)
 
 # Entries of attack.jsonl that are attributes of `AttackResult`.
 NUMBERS = (
-    *("clean_correct", "success_before", "success", "success_without_noise"),
-    *("success_with_margin", "success_in_views", "steps", "queries", "backward_passes"),
+    "clean_correct",
+    "success_before",
+    "success",
+    "success_without_noise",
+    "success_with_margin",
+    "success_in_views",
+    "steps",
+    "queries",
+    "backward_passes",
 )
 # Smallest width in pixels of an image in the figure of an example. Smaller images are enlarged by
 # a whole factor.

@@ -148,8 +148,9 @@ class LightModel:
         mean = light._replace(field=light.field.mean((2, 3), keepdim=True)).total()
         gray = patterns.luminance(mean) if mean.shape[1] == 3 else mean
         # The last number is the exposure in stops. After it, the mean luminance is 2^stops.
-        gain = torch.exp2(strength * drawn.numbers[-1]) / gray.clamp(min=patterns.DARKEST)
-        return light.scaled(gain)
+        return light.scaled(
+            torch.exp2(strength * drawn.numbers[-1]) / gray.clamp(min=patterns.DARKEST)
+        )
 
     def camera(
         self, radiance: Float[Tensor, "B C H W"], drawn: Drawn, strength: float, white: Tensor
@@ -346,8 +347,12 @@ class CastShadow(LightModel):
     # Position, turn and scale of the shape, radius of the penumbra, and amount and blueness of the
     # light of the sky.
     ranges = (
-        *(Range(-0.8, 0.8), Range(-0.8, 0.8), TURN, Range(0.3, 1.2, True)),
-        *(Range(0.005, 0.15, True), Range(0.08, 0.5), Range(0, 1)),
+        *[Range(-0.8, 0.8)] * 2,
+        TURN,
+        Range(0.3, 1.2, True),
+        Range(0.005, 0.15, True),
+        Range(0.08, 0.5),
+        Range(0, 1),
     )
     constants = 1 + 2 * nodes**2
 

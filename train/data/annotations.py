@@ -341,7 +341,8 @@ def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Pa
     """
     # The folder itself, and the two above it.
     for parent in [folder, *list(folder.absolute().parents)[:2]]:
-        for file in [given] if given else sorted(i for e in YAML for i in parent.glob(f"*{e}")):
+        files = [file for suffix in YAML for file in parent.glob(f"*{suffix}")]
+        for file in [given] if given else sorted(files):
             with explained(f"{file} cannot be read", "give names as a list, or index: name"):
                 names = _yaml_mapping(file).get("names")
                 # Names are a list, or a mapping from index to name.

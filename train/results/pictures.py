@@ -118,18 +118,21 @@ def plot_curves(
     None if the metric is constant in each line.
     """
     # Epochs in which the metric is unknown are left out.
-    by_method = {
+    lines_of_method = {
         method: [[(x, y) for x, y in points if y is not None] for points in seeds]
         for method, seeds in methods.items()
     }
-    if all(len({y for _, y in line}) < 2 for line in chain(*by_method.values())):
+    every_line = chain(*lines_of_method.values())
+    if all(len({y for _, y in line}) < 2 for line in every_line):
         return None
     # The last value of each line, whose mean the description states.
-    ends = {method: [line[-1][1] for line in lines if line] for method, lines in by_method.items()}
+    ends = {
+        method: [line[-1][1] for line in lines if line] for method, lines in lines_of_method.items()
+    }
     means = [f"{method} {np.mean(values):.2f}" for method, values in ends.items() if values]
 
     def draw(axes: "Axes") -> None:
-        for index, (method, lines) in enumerate(by_method.items()):
+        for index, (method, lines) in enumerate(lines_of_method.items()):
             for line in lines:
                 if len(line) > 1:
                     axes.plot(*np.array(line).T, label=method, **style(index))
@@ -146,7 +149,9 @@ def plot_roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | Non
     both.
     """
     # Seeds of each method that have both positive and negative images.
-    known = {name: [one for one in pairs if all(map(len, one))] for name, pairs in methods.items()}
+    known = {
+        method: [pair for pair in pairs if all(map(len, pair))] for method, pairs in methods.items()
+    }
     if not any(known.values()):
         return None
     # A single network gets the second color, which is the color of a hardened network.

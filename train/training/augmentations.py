@@ -56,9 +56,12 @@ def darken(images: Images, seed: int) -> Images:
     with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
         torch.manual_seed(seed)
         # Only a CPU writes JPEG.
-        developed = [to_unit(camera(image))[None] for image in images.cpu()]
+        developed = [to_unit(camera(image)) for image in images.cpu()]
         qualities = torch.randint(60, 98, (len(images),)).tolist()
-    return to_bytes(torch.cat([*map(as_jpeg, developed, qualities)])).to(images.device)
+    shown = [
+        as_jpeg(image[None], quality) for image, quality in zip(developed, qualities, strict=True)
+    ]
+    return to_bytes(torch.cat(shown)).to(images.device)
 
 
 def relit(images: Images, seed: int, augmentation: str) -> Images:

@@ -138,14 +138,18 @@ class Skylight(Parameter):
         self._rows, self._basis = environment_light(scene)
         initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
         sky_luminance = mean_luminance(initial_sky)
-        scales = [mean_luminance(light) / sky_luminance for light in scene.lights[:, self._rows]]
+        replaced_lights = scene.lights[:, self._rows]
+        scales = [mean_luminance(light) / sky_luminance for light in replaced_lights]
         # Factor by which the sky is multiplied in each example, shape (E,).
         self._scale = torch.tensor(scales, dtype=torch.float64, device=scene.lights.device)
 
         self._window = nonnegative_window(HARMONICS.degree) if nonnegative else None
         self._sun = settings.sun
-        angles = settings.zenith / settings.sun, settings.azimuth / settings.sun
-        values = [*angles, settings.turbidity / TURBIDITY_UNIT]
+        values = [
+            settings.zenith / settings.sun,
+            settings.azimuth / settings.sun,
+            settings.turbidity / TURBIDITY_UNIT,
+        ]
         start = torch.tensor(values, dtype=torch.float64).to(scene.lights)
         super().__init__(settings, start=start.expand(len(scene), -1))
 
@@ -171,10 +175,13 @@ class Skylight(Parameter):
         """Find the nearest values for which the sky model is defined."""
         # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
         # The order of the values is zenith angle, azimuth, turbidity.
-        ends = zip(ZENITH, (-math.inf, math.inf), TURBIDITY, strict=True)
-        low, high = (
-            values.new_tensor([zenith / self._sun, azimuth, turbidity / TURBIDITY_UNIT])
-            for zenith, azimuth, turbidity in ends
+        lowest_zenith, highest_zenith = ZENITH
+        lowest_turbidity, highest_turbidity = TURBIDITY
+        low = values.new_tensor(
+            [lowest_zenith / self._sun, -math.inf, lowest_turbidity / TURBIDITY_UNIT]
+        )
+        high = values.new_tensor(
+            [highest_zenith / self._sun, math.inf, highest_turbidity / TURBIDITY_UNIT]
         )
         return nearest_in_box(values, low, high, within)
 

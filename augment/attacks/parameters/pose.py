@@ -97,9 +97,12 @@ class Pose(Parameter):
         """
         objects = self._object_of[examples]
         changes = values * self._unit
-        vertices = self._vertices[objects] if conditions.vertices is None else conditions.vertices
-        rows = zip(objects.tolist(), vertices, changes, strict=True)
-        moved_vertices = [self._movable_objects[index].move(*row) for index, *row in rows]
+        vertices = conditions.vertices
+        if vertices is None:
+            vertices = self._vertices[objects]
+        moved_vertices = []
+        for index, unmoved, change in zip(objects.tolist(), vertices, changes, strict=True):
+            moved_vertices.append(self._movable_objects[index].move(unmoved, change))
         # `stack` refuses an empty list, as there is without examples.
         if moved_vertices:
             vertices = torch.stack(moved_vertices)
@@ -117,9 +120,12 @@ def _pose_units(settings: PoseSettings) -> Float[Tensor, " 9"]:
     logarithm of the scale (1), polar angle and azimuth of the cameras in degrees (2), and the
     logarithm of their distance (1).
     """
-    of_object = [*[settings.rotation] * 3, *[settings.shift] * 2, math.log1p(settings.scale)]
-    of_camera = [*[settings.view] * 2, math.log1p(settings.distance)]
-    return torch.tensor([*of_object, *of_camera], dtype=torch.float64)
+    units = [settings.rotation, settings.rotation, settings.rotation]
+    units += [settings.shift, settings.shift]
+    units += [math.log1p(settings.scale)]
+    units += [settings.view, settings.view]
+    units += [math.log1p(settings.distance)]
+    return torch.tensor(units, dtype=torch.float64)
 
 
 def _movable_objects(scene: Scene) -> list[_MovableObject]:
@@ -127,9 +133,12 @@ def _movable_objects(scene: Scene) -> list[_MovableObject]:
     masks = [torch.from_numpy(item.own_vertices) for item in scene.objects]
     # One row for each object, one column for each of the N vertices of the largest mesh.
     object_masks = pad_sequence(masks, batch_first=True).to(scene.lights.device)
-    # `item.own` is None if the mesh contains the object only, without props or table.
-    ground_heights = [None if item.own is None else item.lowest for item in scene.objects]
-    return [*map(_MovableObject, object_masks, ground_heights)]
+    movable_objects = []
+    for item, object_mask in zip(scene.objects, object_masks, strict=True):
+        # `item.own` is None if the mesh contains the object only, without props or table.
+        ground_height = None if item.own is None else item.lowest
+        movable_objects.append(_MovableObject(object_mask, ground_height))
+    return movable_objects
 
 
 @dataclass(frozen=True)
