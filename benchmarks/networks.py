@@ -173,7 +173,8 @@ def score_photographs(
     words = [f"{title}={light}" for title, light in lights.items()]
     for title, rows in real_light.choose_lights(folder, words).items():
         draws = real_light.measure(predictions, folder.objects, counts, rows)
-        estimates = [real_light.estimate(each, len({*units[rows]})) for each in draws]
+        units_of_metrics = real_light.count_units(units[rows], predictions.positive[rows])
+        estimates = list(map(real_light.estimate, draws, units_of_metrics))
         scores[title] = dict(zip(real_light.METRICS, estimates, strict=True))
     return scores
 

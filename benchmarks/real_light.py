@@ -45,8 +45,9 @@ from renderer.image import to_unit
 from renderer.io.images import SUFFIXES, crop_center, read_rgb, write_image
 from renderer.settings import MAX_SIZE
 from train.checkpoints import RUN, is_classifier, load_network, load_run
+from train.class_names import class_name
 from train.data.photo import Photograph
-from train.data.photographs import find_photographs, load_photographs
+from train.data.photographs import find_photographs, load_photographs, unsupported_files
 from train.results.intervals import auc_and_recalls, class_means, weighted_means
 from train.results.metrics import MIN_OBJECTS
 from train.results.predictions import Predictions
@@ -110,13 +111,16 @@ class Folder:
     @cached_property
     def objects(self) -> np.ndarray:
         """Object of each photograph, or its class if photos.csv does not name it."""
-        return np.array([item.mesh or item.label for item in self.photographs])
+        named = [(item.label, item.mesh) for item in self.photographs]
+        return np.array([f"{label}: {mesh}" if mesh else label for label, mesh in named])
 
     def has_objects(self, label: str) -> bool:
-        """Return whether there are MIN_OBJECTS objects of a class, and of other classes."""
-        shown = np.array([item.label.removeprefix(OTHER_PREFIX) for item in self.photographs])
-        sides = [self.objects[shown == label], self.objects[shown != label]]
-        return min(len({*side}) for side in sides) >= MIN_OBJECTS
+        """Return whether each light shows MIN_OBJECTS objects of a class, and of other classes."""
+        named: dict[tuple[str, bool], set[str]] = {}
+        for item, light in zip(self.photographs, self.lights, strict=True):
+            side = str(light), item.label.removeprefix(OTHER_PREFIX) == label
+            named.setdefault(side, set()).update([item.mesh] if item.mesh else [])
+        return min(map(len, named.values())) >= MIN_OBJECTS
 
     @cached_property
     def names(self) -> np.ndarray:
@@ -126,26 +130,34 @@ class Folder:
             name = item.path.stem.partition("__")[2] or item.path.stem
             # Crops of a photograph may lie in folders of several classes.
             photograph = re.sub(r"_\d+$", "", name) if self.has_crops else f"{item.label}/{name}"
-            names.append(photograph)
+            names.append("/".join([*item.path.parts[1:-1], photograph]))
         return np.array(names)
 
     def units(self, label: str) -> np.ndarray:
         """Return the unit of each photograph: its object, or else the photograph with its crops."""
-        return self.objects if self.has_objects(label) else self.names
+        is_named = [self.has_objects(label) and bool(item.mesh) for item in self.photographs]
+        return np.where(is_named, self.objects, self.names)
 
     def draw(self, label: str) -> np.ndarray:
         """Draw how often each photograph counts, shape (1 + DRAWS, N); first, each counts once.
 
         Units of the same objects that occur in the same lights are drawn together, so each light
-        keeps its number of photographs of each object. Objects as units differ in the lights alone.
+        keeps its number of photographs of each object. Objects with a single photograph are drawn
+        with others of their class. Objects as units differ in the lights alone.
         """
         unit_of_photograph = self.units(label)
         units = np.unique(unit_of_photograph)
-        kinds: dict[object, list[int]] = {}
+        has_objects = self.has_objects(label)
+        of_objects: dict[tuple[frozenset, frozenset], list[int]] = {}
         for index, unit in enumerate(units):
             is_unit = unit_of_photograph == unit
-            objects = frozenset(() if self.has_objects(label) else self.objects[is_unit])
-            kinds.setdefault((frozenset(self.lights[is_unit]), objects), []).append(index)
+            objects = frozenset(() if has_objects else self.objects[is_unit])
+            of_objects.setdefault((frozenset(self.lights[is_unit]), objects), []).append(index)
+        kinds: dict[object, list[int]] = {}
+        for (lights, objects), members in of_objects.items():
+            classes = frozenset(name.partition(": ")[0] for name in objects)
+            kind = lights, classes if len(members) == 1 else objects
+            kinds.setdefault(kind, []).extend(members)
         counts = np.zeros((DRAWS, len(units)), int)
         generator = np.random.default_rng(0)
         for members in kinds.values():
@@ -156,6 +168,7 @@ class Folder:
 
 def predict(network: Classifier, folder: Folder, labels: Sequence[str]) -> Predictions:
     """Predict the classes of all photographs, of which other_CLASS may show a CLASS."""
+    labels = [class_name(network.classes, label, f"{network.title}: --label") for label in labels]
     photographs, images, _ = load_photographs(folder.path, folder.photographs, network.size, None)
     shown = []
     for item in photographs:
@@ -202,16 +215,24 @@ def over_seeds(seeds: Sequence[Statistics]) -> Statistics:
     return np.stack(seeds)[drawn, :, columns].mean(axis=1).T
 
 
+def count_units(units: np.ndarray, is_positive: np.ndarray) -> list[int]:
+    """Count the units that decide each of METRICS. Both sides decide the AUC."""
+    every, positives, negatives = (
+        len({*units[rows]}) for rows in (slice(None), is_positive, ~is_positive)
+    )
+    return [every, positives, positives, negatives, min(positives, negatives)]
+
+
 def estimate(draws: np.ndarray, units: int, is_change: bool = False) -> Estimate:
     """Return the first value with the 95% interval of the other values, which may be NaN.
 
-    If no draw differs from it, the interval is Wilson's for so many units, or that of no change.
+    If hardly a draw differs, the interval is Wilson's for so many units, or that of no change.
     """
     value = float(draws[0])
     if np.isnan(value):
         return Estimate()
     low, high = np.nanquantile(draws[1:], [0.025, 0.975])
-    if np.nanmax(np.abs(draws - value)) < 1e-9:
+    if high - low < 1e-9:
         margin = wilson(0.0, units, NORMAL_QUANTILE)[1]
         low, high = wilson(value, units, NORMAL_QUANTILE)
         if is_change:
@@ -222,17 +243,22 @@ def estimate(draws: np.ndarray, units: int, is_change: bool = False) -> Estimate
 def score(options: argparse.Namespace) -> None:
     """Print the tables of each label, and write one file of the scores."""
     networks = dict(map(split_title, options.networks))
+    if len(networks) < len(options.networks):
+        raise InputError("two networks have the same title: give each its own, TITLE=NETWORK")
     loaded = {name: load(name) for names in networks.values() for name in names}
     classes = next(iter(loaded.values())).classes
-    found = find_photographs(options.folder, classes, options.label[0])
+    labels = [class_name(classes, label, "--label") for label in options.label]
+    found = find_photographs(options.folder, classes, labels[0])
+    if others := unsupported_files(options.folder):
+        print(f"{len(others)} files are left out, of kinds that are not read, such as {others[0]}")
     folder = Folder(options.folder, found, options.crops)
     groups = choose_lights(folder, options.lights)
     predictions = {
-        title: [predict(loaded[name], folder, options.label).by_label for name in names]
+        title: [predict(loaded[name], folder, labels).by_label for name in names]
         for title, names in networks.items()
     }
     scores = [["label", *HEADER]]
-    for label in options.label:
+    for label in labels:
         of_label = {title: [one[label] for one in each] for title, each in predictions.items()}
         scores += [[label, *row] for row in print_tables(label, of_label, folder, groups)]
     if options.out:
@@ -256,28 +282,41 @@ def print_tables(
     Returns:
         Rows of the first table.
     """
-    counts = folder.draw(label)
-    results: dict[tuple[str, str], Statistics] = {}
-    for title, each in predictions.items():
-        for light, rows in groups.items():
-            measured = [measure(one, folder.objects, counts, rows) for one in each]
-            results[title, light] = over_seeds(measured)
-    first_network, first_light = next(iter(results))
+    counts, units = folder.draw(label), folder.units(label)
+    first_network, *_ = predictions
+    first_light, *_ = groups
+
+    def statistics(title: str, rows: np.ndarray) -> Statistics:
+        measured = [measure(one, folder.objects, counts, rows) for one in predictions[title]]
+        return over_seeds(measured)
+
+    results = {
+        (title, light): statistics(title, rows)
+        for title in predictions
+        for light, rows in groups.items()
+    }
     gains, changes = {}, {}
     for (title, light), values in results.items():
         if title != first_network:
             gains[title, light] = values - results[first_network, light]
         if light != first_light:
-            changes[title, light] = values - results[title, first_light]
-    units = folder.units(label)
+            # Photographs of the objects that both lights show.
+            pair = groups[light], groups[first_light]
+            both = np.isin(folder.objects, np.intersect1d(*(folder.objects[rows] for rows in pair)))
+            now, before = (statistics(title, rows & both) for rows in pair)
+            changes[title, light] = now - before
     what = "objects" if folder.has_objects(label) else "photographs, for these objects"
-    unit_counts = {light: len({*units[rows]}) for light, rows in groups.items()}
+    is_positive = predictions[first_network][0].positive
+    unit_counts = {
+        light: count_units(units[rows], is_positive[rows]) for light, rows in groups.items()
+    }
     absolute: list[list[str]] = []
     kinds = {"": results, f" minus {first_network}": gains, f" minus {first_light}": changes}
     for suffix, table in kinds.items():
         lines = []
         for (title, light), values in table.items():
-            estimates = [estimate(row, unit_counts[light], bool(suffix)) for row in values]
+            shown = zip(values, unit_counts[light], strict=True)
+            estimates = [estimate(row, count, bool(suffix)) for row, count in shown]
             cells = [format_interval(item, "+" if suffix else "") for item in estimates]
             lines.append([title, light, *cells])
         if lines:
@@ -285,7 +324,8 @@ def print_tables(
             print(Table(heading, HEADER, lines), end="\n\n", flush=True)
         absolute = absolute or lines
     for light, rows in groups.items():
-        print(f"{light}: {rows.sum()} images, {unit_counts[light]} {what}")
+        every, positives, *_ = unit_counts[light]
+        print(f"{light}: {rows.sum()} images, {every} {what}, {positives} of them with {label}")
     return absolute
 
 

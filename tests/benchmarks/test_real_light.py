@@ -1,13 +1,16 @@
 import csv
 import math
+from pathlib import PurePosixPath
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.stats import binomtest
 
 from benchmarks import real_light
 from tests.helpers import darker_than
+from train.data.photo import Photograph
 
 
 def save(path, level):
@@ -163,3 +166,69 @@ def test_the_interval_of_a_rank_correlation_is_that_of_bonett_and_wright():
     assert estimate.value == pytest.approx(expected)
     assert estimate.low == pytest.approx(math.tanh(math.atanh(expected) - half), abs=1e-6)
     assert estimate.high == pytest.approx(math.tanh(math.atanh(expected) + half), abs=1e-6)
+
+
+def folder_of(*rows):
+    """Return a folder of photographs, each with a path and an object."""
+    shown = [
+        Photograph(path=PurePosixPath(path), label=path.split("/")[0], source=None, mesh=mesh)
+        for path, mesh in rows
+    ]
+    return real_light.Folder(None, shown)
+
+
+def test_objects_of_two_classes_may_have_the_same_name():
+    sides = ("orange", "other_ball")
+    folder = folder_of(
+        *((f"{side}/{n}_{k}.png", f"{n}") for side in sides for n in "12345" for k in "ab")
+    )
+    assert folder.has_objects("orange")
+    assert len({*folder.units("orange")}) == 10
+
+
+def test_objects_without_a_name_are_no_units():
+    named = [(f"{side}/{n}.png", n) for side in ("orange", "other_ball") for n in "1234"]
+    unnamed = [(f"{side}/{n}.png", None) for side in ("orange", "other_ball") for n in "5678"]
+    assert not folder_of(*named, *unnamed).has_objects("orange")
+
+
+def test_intervals_are_over_objects_only_if_each_light_shows_enough():
+    plain = [(f"{side}/plain__{n}.png", n) for side in ("orange", "other_ball") for n in "12345"]
+    dim = [(f"other_ball/dim__{n}.png", n) for n in "12345"]
+    assert folder_of(*plain, *dim).has_objects("orange")
+    assert not folder_of(*plain, *dim, ("orange/dim__1.png", "1")).has_objects("orange")
+
+
+def test_an_object_with_one_photograph_is_drawn_with_others_of_its_class():
+    folder = folder_of(*((f"{side}/{n}.png", n) for side in ("orange", "pear") for n in "1234"))
+    counts = folder.draw("orange")
+    assert (counts[:, :4].sum(1) == 4).all()
+    assert counts[1:, 0].var() > 0
+
+
+def test_photographs_of_nested_folders_are_different_photographs():
+    rows = [
+        (f"orange/{folder}/{light}__1.png", None) for folder in "ab" for light in ("plain", "dim")
+    ]
+    assert [*folder_of(*rows).names] == ["a/orange/1", "a/orange/1", "b/orange/1", "b/orange/1"]
+
+
+def test_changes_between_lights_are_those_of_the_objects_in_both(tmp_path, monkeypatch, capsys):
+    """Only oranges are recognized, and low light shows no other object."""
+    for number in range(3):
+        save(tmp_path / f"orange/plain__{number}.png", 40)
+        save(tmp_path / f"other/plain__{number}.png", 40)
+        save(tmp_path / f"orange/low_light__{number}.png", 40)
+    score(tmp_path, monkeypatch, "half")
+    change = capsys.readouterr().out.partition("minus plain")[2].partition("half")[2]
+    assert change.split("|")[2].split()[0] == "+0.000"
+
+
+def test_the_interval_of_hardly_varying_draws_is_that_of_the_units_that_decide():
+    units, is_positive = np.arange(42), np.arange(42) < 2
+    assert real_light.count_units(units, is_positive) == [42, 2, 2, 40, 2]
+    draws = np.ones(2001)
+    draws[7] = 0.9
+    found = real_light.estimate(draws, 2)
+    expected = binomtest(2, 2).proportion_ci(method="wilson")
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
