@@ -102,8 +102,7 @@ def times_in_turn(
             break
         for key, timer in timers.items():
             # Each measurement begins with calls that warm up and do not count.
-            seconds = timer.timeit(repeats[key]).median
-            times[key].append(1e3 * seconds)
+            times[key].append(1e3 * timer.timeit(repeats[key]).median)
     return times
 
 
@@ -226,13 +225,12 @@ def format_cell(value: object) -> object:
 def record(rows: Iterable[Row], path: Path | None, device: str = "cpu") -> list[Row]:
     """Print the machine and each row as soon as it is measured, and write a file.
 
-    The file is written anew after every row, so that a benchmark that is
-    stopped leaves the rows that it finished.
+    A benchmark that is stopped leaves the rows that it finished.
 
     Args:
         rows: Rows, which are measured while they are iterated over.
-        path: A .jsonl file with a line of JSON for each row, or a CSV file.
-            None writes no file.
+        path: A .jsonl file, to which a line of JSON is added for each row, or a
+            CSV file, which is written anew. None writes no file.
         device: Device that the benchmark uses, "cpu" or "cuda".
 
     Returns:
@@ -246,8 +244,9 @@ def record(rows: Iterable[Row], path: Path | None, device: str = "cpu") -> list[
         if path is None:
             continue
         if path.suffix == ".jsonl":
-            lines = [json.dumps(row) + "\n" for row in measured]
-            path.write_text("".join(lines), encoding="utf-8")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
         else:
             write_csv(path, measured)
     return measured

@@ -17,6 +17,7 @@ A machine without access to a package index installs wheels that
 """
 
 import argparse
+import json
 import multiprocessing
 import subprocess
 import sys
@@ -36,6 +37,7 @@ import torch
 import renderer
 from augment import AugmentationService, AugmentationSettings, StepSettings
 from augment.augmentation_settings import TrainingAttackSettings
+from augment.dataset import render_dataset
 from augment.lighting import RandomLighting
 from augment.scene.lights import MODELS
 from benchmarks.common import Row, machine, medians, record
@@ -55,6 +57,8 @@ FEWER_STEPS = 2
 MORE_STEPS = 6
 # Rounds in which the ways of a question take turns.
 ROUNDS = 5
+# Labeled renders of 224² of the question `labels`.
+LABELED_COUNT = 10_000
 # Samples per side of the images that the question `rasterizers` draws.
 SAMPLES_PER_SIDE = (64, 512, 2048)
 # An attack ends when its margin is reached. No logit reaches this margin, so
@@ -185,9 +189,10 @@ def tests(device: str) -> Iterator[Row]:
 
 
 def rasterizers(device: str) -> Iterator[Row]:
-    """Ask whether rasterizer=auto should choose OpenGL instead of numba.
+    """Ask whether rasterizer=auto should choose OpenGL or torch instead of numba.
 
-    Each call of OpenGL makes a context of its own.
+    Each call of OpenGL makes a context of its own. Numba and OpenGL give face
+    indices on the CPU, and torch on the device.
 
     Args:
         device: Device of the clock.
@@ -203,6 +208,8 @@ def rasterizers(device: str) -> Iterator[Row]:
             name: partial(choose(name).rasterize, points, mesh.faces, side, True)
             for name in ("numba", "opengl")
         }
+        on_device = torch.from_numpy(points).to(device)
+        calls["torch"] = partial(choose("torch").rasterize, on_device, mesh.faces, side, True)
         yield from compare_calls(f"rasterize {side}² samples", calls, device)
 
 
@@ -215,7 +222,8 @@ def attack(device: str) -> Iterator[Row]:
     Yields:
         A row for each way.
     """
-    service = make_service(device, STEPS)
+    steps = STEPS if device != "cpu" else 1
+    service = make_service(device, steps)
     network = load_on(device)
     # The network and the attack ask torch for channels last by this name.
     channels_first = patch.object(torch, "channels_last", torch.contiguous_format)
@@ -226,7 +234,7 @@ def attack(device: str) -> Iterator[Row]:
         "eager": partial(service.regenerate, network, 0),
         "eager, channels first": channels_first(regenerate_channels_first),
     }
-    yield from compare_calls(f"attack of {STEPS} steps", calls, device)
+    yield from compare_calls(f"attack of {steps} steps", calls, device)
 
 
 def shrinking(device: str) -> Iterator[Row]:
@@ -259,7 +267,7 @@ def time_first_rounds(device: str, is_benchmark: bool) -> list[float]:
     """
     set_deterministic(False)
     torch.backends.cudnn.benchmark = is_benchmark
-    service = make_service(device, STEPS, margin=0.0)
+    service = make_service(device, STEPS if device != "cpu" else 2, margin=0.0)
     network = load_on(device)
     precompute(service.scene)
     seconds = []
@@ -427,6 +435,24 @@ def regeneration(device: str) -> Iterator[Row]:
     yield row | {"equal_bits": torch.equal(first, second)}
 
 
+def labels(device: str) -> Iterator[Row]:
+    """Ask how many labeled renders of 224² a second are made in memory.
+
+    Args:
+        device: Device of the renders.
+
+    Yields:
+        A row with the seconds of all renders.
+    """
+    count = LABELED_COUNT if device != "cpu" else 10
+    meshes = [(f"solid:orange:{seed}", "orange") for seed in range(MESH_COUNT)]
+    renders = render_dataset(meshes, 224, count, maps=False, device=device)
+    start = time.perf_counter()
+    made = sum(1 for _ in renders)
+    seconds = time.perf_counter() - start
+    yield {"question": "labels", "way": f"{made} renders", "value": seconds}
+
+
 def light_on_images(device: str) -> Iterator[Row]:
     """Ask how many images of 256² a second each light model of `nb.RandomLighting` transforms.
 
@@ -512,6 +538,7 @@ QUESTIONS: dict[str, Callable[[str], Iterator[Row]]] = {
     "tests": tests,
     "rates": rates,
     "regeneration": regeneration,
+    "labels": labels,
     "transforms": light_on_images,
     "peak": peak,
     "rasterizers": rasterizers,
@@ -527,27 +554,42 @@ NEED_CUDA = ("tests", "synchronizations")
 # ---------------------------------------------------------------------------- command
 
 
-def answers(questions: Sequence[str], device: str) -> Iterator[Row]:
+def answers(questions: Sequence[str], device: str, minutes: float) -> Iterator[Row]:
     """Answer questions one after the other.
 
     Args:
         questions: Keys of `QUESTIONS`.
         device: Device. On "cpu", the questions that need CUDA are left out.
+        minutes: Time after which no other question begins.
 
     Yields:
-        A row that describes the machine, and the rows of the questions. If a
-        question fails, its last row has the error.
+        A row that describes the machine, and the rows of the questions. The last row of
+        a question has its seconds. If it fails, the row before it has the error.
     """
     yield {"machine": machine(device)}
+    start = time.monotonic()
     for name in questions:
         if device == "cpu" and name in NEED_CUDA:
+            continue
+        begin = time.monotonic()
+        if begin - start > 60 * minutes:
+            yield {"left": name}
             continue
         try:
             yield from QUESTIONS[name](device)
         except Exception as error:
-            # An error in one question must not end an hour on a GPU.
+            # An error in one question must not end a session on a GPU.
             message = f"{type(error).__name__}: {error}"
             yield {"question": name, "error": message[:MAX_TEXT]}
+        yield {"answered": name, "seconds": round(time.monotonic() - begin)}
+
+
+def answered(path: Path | None) -> set[str]:
+    """Read which questions a file answers already."""
+    if path is None or not path.exists():
+        return set()
+    rows = map(json.loads, path.read_text(encoding="utf-8").splitlines())
+    return {row["answered"] for row in rows if "answered" in row}
 
 
 def main(arguments: Sequence[str] | None = None) -> list[Row]:
@@ -564,14 +606,20 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     )
     parser.add_argument("--device", default="cuda", help="cpu: a rehearsal")
     parser.add_argument("--questions", nargs="+", choices=QUESTIONS, default=list(QUESTIONS))
-    parser.add_argument("--out", type=Path, help="a .jsonl or .csv file")
+    parser.add_argument("--minutes", type=float, default=9.0, help="no question begins later")
+    parser.add_argument("--out", type=Path, help="a .jsonl file, to which lines are added")
     options = parser.parse_args(arguments)
+    if options.out and options.out.suffix != ".jsonl":
+        parser.error(f"--out={options.out} is no .jsonl file: give one")
     if options.device != "cpu" and not torch.cuda.is_available():
         parser.error(
             "torch finds no GPU here, which this benchmark needs: "
             "--device cpu rehearses what needs none"
         )
-    return record(answers(options.questions, options.device), options.out, options.device)
+    known = answered(options.out)
+    questions = [name for name in options.questions if name not in known]
+    rows = answers(questions, options.device, options.minutes)
+    return record(rows, options.out, options.device)
 
 
 if __name__ == "__main__":

@@ -187,10 +187,20 @@ def load(name: str) -> Classifier:
     return network
 
 
+def real_folders(real: Path | None) -> dict[str, Path]:
+    """Find the folders of real photographs that are scored, by their names."""
+    if real is None:
+        return {}
+    paths = [real / name for name in ("low_light", "projector")]
+    if not any(path.is_dir() for path in paths):
+        raise InputError(f"--real: {real} has neither a folder low_light nor a folder projector")
+    return {path.name: path for path in paths if path.is_dir()}
+
+
 def score_network(network: Classifier, renders: Path, real: Path | None) -> Scores:
     """Score a network in all lights. Projected objects count if it has all of their classes."""
     scores = score_renders(network, renders)
-    folders = {path.name: path for path in real.iterdir()} if real else {}
+    folders = real_folders(real)
     if path := folders.get("low_light"):
         scores |= score_photographs(network, path, LABEL, REAL, True)
     if path := folders.get("projector"):
@@ -248,6 +258,7 @@ def rank(scores: Mapping[str, Sequence[float]]) -> dict[str, tuple[int, int, int
 def add(options: argparse.Namespace) -> None:
     """Score networks, write a file with their rows, and print their ranks."""
     rows = read(options.scores)
+    real_folders(options.real)
     networks = {name: load(name) for name in options.networks}
     with tempfile.TemporaryDirectory() as temporary:
         renders = options.renders or Path(temporary) / "renders"
@@ -268,6 +279,8 @@ def add(options: argparse.Namespace) -> None:
                 of_all = f"{position} of {len(scores)}, {first} to {last} within the intervals"
                 lines.append([light, interval, of_all])
         print(Table(name, ["light", "score", "rank"], lines))
+    if options.real:
+        print("Ranks in real light compare only networks that saw the same photographs.")
 
 
 def table(options: argparse.Namespace) -> None:

@@ -88,12 +88,14 @@ def last_epoch(run: Path, *overrides: str, launcher: Sequence[str] = ()) -> dict
         Metrics of the second epoch.
 
     Raises:
-        subprocess.CalledProcessError: If the training fails.
+        RuntimeError: If the training fails, with the end of what it said.
     """
     command = [sys.executable, *launcher, "-m", "train"]
     command += ["experiment=paper", "train.epochs=2", f"out={run}"]
     command += overrides
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)} failed: {done.stderr[-1000:]}")
     epochs = [line for line in read_metrics(run) if "epoch" in line]
     return epochs[-1]
 

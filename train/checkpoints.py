@@ -144,6 +144,10 @@ def load_network(
     if name.startswith(SWITCHES):
         prefix, _, names = name.partition(":")
         plain, plus, other = names.rpartition("+")
+        if f"+{RUN}" in names and not is_classifier(other):
+            # The name of the folder of a run in a sweep may have a "+".
+            plain, _, folder_name = names.rpartition(f"+{RUN}")
+            other = RUN + folder_name
         if not plus:
             reason = f"name={name} names one network: give {prefix}:NETWORK+OTHER_NETWORK"
             raise InputError(reason, "name")

@@ -83,7 +83,9 @@ def test_the_candidates_of_a_detector_are_those_of_the_network_that_an_image_get
     shown = torch.rand(3, 3, plain.size, plain.size, generator=torch.Generator().manual_seed(0))
     shown[1] *= 0.1
     found = plain.with_dim(dim)(shown)
-    expected = [plain(shown[:1])[0], dim(shown[1:2])[0], plain(shown[2:])[0]]
+    # In a batch of another size, candidates with nearly equal scores may change places.
+    first, last = plain(shown[[0, 2]])
+    expected = [first, dim(shown[1:2])[0], last]
     for item, own in zip(found, expected, strict=True):
         for key in own:
             torch.testing.assert_close(item[key], own[key], rtol=1e-4, atol=1e-4)

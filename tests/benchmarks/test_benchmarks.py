@@ -1,6 +1,7 @@
 """Each benchmark runs at a tiny size and writes the rows that it promises."""
 
 import csv
+import json
 import math
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import torch
 
 from benchmarks import (
     common,
+    gpu,
     gradient_free,
     lights,
     relit_photographs,
@@ -152,3 +154,27 @@ def test_the_intervals_of_relit_photographs_contain_the_variation_between_seeds(
     expected = ttest_1samp(means.numpy() - 0.5, 0).confidence_interval()
     assert found.low == pytest.approx(expected.low, abs=1e-3)
     assert found.high == pytest.approx(expected.high, abs=1e-3)
+
+
+def test_calls_take_turns_as_often_as_asked(monkeypatch):
+    monkeypatch.setattr(common, "MIN_TIMED_SECONDS", 0.0)
+    times = common.times_in_turn({"one": lambda: sum(range(1000)), "two": lambda: None}, 7)
+    assert [*map(len, times.values())] == [7, 7]
+
+
+def test_questions_about_a_gpu_are_answered_over_several_runs(tmp_path, monkeypatch):
+    def fails(device):
+        yield {"question": "fails", "value": 1}
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(gpu, "QUESTIONS", {"fails": fails, "works": lambda device: [{"value": 2}]})
+    out = tmp_path / "new" / "gpu.jsonl"
+    words = ["--device", "cpu", "--out", str(out), "--questions"]
+    gpu.main([*words, "fails", "works", "--minutes", "-1"])
+    gpu.main([*words, "fails"])
+    gpu.main([*words, "fails", "works"])
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["left"] for row in rows if "left" in row] == ["fails", "works"]
+    assert [row["answered"] for row in rows if "answered" in row] == ["fails", "works"]
+    assert [row["value"] for row in rows if "value" in row] == [1, 2]
+    assert [row["error"] for row in rows if "error" in row] == ["RuntimeError: out of memory"]

@@ -70,8 +70,8 @@ NO_HARD_NEGATIVES = (
     "name meshes of what the classifier may confuse with the class."
 )
 NO_PHOTOGRAPHS = (
-    "photos is not set, and a hardened network may take similar objects on real photographs for "
-    "the class, which renders do not show: give a folder with photographs of similar objects."
+    "photos shows no objects of other classes, and a hardened network may take similar objects on "
+    "real photographs for the class, which renders do not show: give photographs of such objects."
 )
 # Settings of pnb-audit that name the folders of test images, by the name of the images.
 FOLDER_KEYS = {LABORATORY: "laboratory", PHOTOGRAPHS: "photos"}
@@ -174,7 +174,7 @@ def _caveats(settings: AuditSettings, networks: Networks, plan: "_Plan | None") 
         caveats.append(f"The networks take images of {listed} pixels, and differ by that, too.")
     if settings.meshes and not (settings.hard_negatives or settings.laboratory):
         caveats.append(NO_HARD_NEGATIVES)
-    if settings.meshes and HARDENED in networks and not settings.photos:
+    if plan is not None and HARDENED in networks and not plan.has_other_photographs:
         caveats.append(NO_PHOTOGRAPHS)
     for network in networks.values():
         if plan is None and not isinstance(network, Classifier):
@@ -234,6 +234,8 @@ class _Plan:
         self.image_folders = {
             name: published_folder(Path(folder)) for name, folder in folders.items() if folder
         }
+        # A detector scores photographs without boxes of the label, too.
+        self.has_other_photographs = self.annotations is not None
         # A network that lacks a class raises an InputError.
         labels = {of.label for of in self.items if not str(of.label).startswith(OTHER_PREFIX)}
         for network in networks.values():
@@ -241,7 +243,9 @@ class _Plan:
                 network.label(name)
             for name, folder in self.image_folders.items():
                 with keyed(FOLDER_KEYS[name]):
-                    find_photographs(folder, network.classes, self.label)
+                    found = find_photographs(folder, network.classes, self.label)
+                if name == PHOTOGRAPHS:
+                    self.has_other_photographs = bool({item.label for item in found} - {self.label})
         # Hard negatives and lights are loaded only to report a file that cannot be read
         # before the audit begins.
         objects = [load_object(item) for item in self.items]

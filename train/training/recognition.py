@@ -1,5 +1,6 @@
 """Recognition of the light of an augmentation, for a network that gets only images in it."""
 
+import math
 from functools import partial
 from typing import Any
 
@@ -71,6 +72,15 @@ def fit_recognizer(
         scores = predict(measure, kept_aside, device).double() @ weights
     threshold = scores.quantile(KEPT, interpolation="higher").item()
     return {"layers": layers, "weights": weights, "bias": -threshold}
+
+
+def expected_errors(count: int) -> float:
+    """Return the fraction of unchanged images that are taken for lit ones, by theory.
+
+    The threshold is a quantile of `count` images, and is exceeded by this fraction of further ones.
+    """
+    rank = math.ceil(KEPT * (count - 1))
+    return (count - rank) / (count + 1)
 
 
 def logistic_weights(

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import augment
+from renderer.io.images import write_image
 from tests.helpers import darker_than
 from train.auditing import audit
 from train.auditing.network import (
@@ -92,9 +93,13 @@ def test_a_network_that_normalizes_light_itself_gets_no_second_normalization():
     assert name_remedies(networks) == names | {BOTH: "hardened"}
 
 
-@pytest.mark.parametrize("photos", [None, "photographs"])
-def test_an_audit_of_a_hardened_network_warns_without_photographs(photos):
-    network = darker_than(0.5)
+@pytest.mark.parametrize("shown", [(), ("orange",), ("orange", "other_apple")])
+def test_an_audit_of_a_hardened_network_warns_without_photographs_of_others(tmp_path, shown):
+    for name in shown:
+        (tmp_path / name).mkdir()
+        write_image(tmp_path / name / "1.png", np.zeros((8, 8, 3), np.uint8))
+    given = {audit.CLASSIFIER: darker_than(0.5), audit.HARDENED: darker_than(0.5)}
+    photos = str(tmp_path) if shown else None
     settings = AuditSettings(network="x", label="orange", meshes=["solid:orange"], photos=photos)
-    given = {audit.CLASSIFIER: network, audit.HARDENED: network}
-    assert (audit.NO_PHOTOGRAPHS in audit._caveats(settings, given, None)) == (photos is None)
+    plan = audit._Plan(settings, given, torch.device("cpu"))
+    assert (audit.NO_PHOTOGRAPHS in audit._caveats(settings, given, plan)) == (len(shown) < 2)
