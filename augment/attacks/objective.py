@@ -12,7 +12,7 @@ noise of a sensor.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
@@ -101,13 +101,19 @@ class Objective:
         self.settings = settings
         self.seed = seed
         self.phases = phases or Phases()
-        self._transformations = generator(seed, "expectation")
+        # Each example has its own random transformations, whichever others are attacked with it.
+        count = len(criterion.source) if settings.eot.draws else 0
+        self._transformations = [generator(seed, "expectation", row) for row in range(count)]
         self._batch_size = BatchSize(settings.batch_size)
 
     def select(self, examples: Tensor | slice) -> Objective:
         """Return the objective of some of the examples, with the same random numbers."""
         selected = copy(self)
         selected.criterion = self.criterion.select(examples)
+        if self._transformations:
+            given = examples.cpu() if isinstance(examples, Tensor) else examples
+            rows = torch.arange(len(self._transformations))[given]
+            selected._transformations = [self._transformations[row] for row in rows.tolist()]
         return selected
 
     def moved(self, problem: Any, values: Values, examples: Examples) -> Objective:
@@ -139,7 +145,10 @@ class Objective:
 
         def score_batch(rows: slice) -> Score:
             batch_gradients = None if gradients is None else gradients[rows]
-            return self._score_batch(all_images[rows], criterion.select(rows), batch_gradients)
+            # The views of an example follow each other.
+            draws = [each for each in self._transformations for _ in range(images.shape[1])][rows]
+            of_batch = all_images[rows], criterion.select(rows), draws
+            return self._score_batch(*of_batch, batch_gradients)
 
         with self.phases("attack_classifier"), torch.set_grad_enabled(needs_gradient):
             batches = list(self._batch_size.map(score_batch, len(all_images)))
@@ -147,7 +156,13 @@ class Objective:
             gradients = gradients.unflatten(0, images.shape[:2])
         return Score.join(batches).of_examples(images.shape[1]), gradients
 
-    def _score_batch(self, batch: Tensor, criterion: Criterion, gradients: Tensor | None) -> Score:
+    def _score_batch(
+        self,
+        batch: Tensor,
+        criterion: Criterion,
+        draws: Sequence[Generator],
+        gradients: Tensor | None,
+    ) -> Score:
         """Score single images, and write the gradients of their costs if a tensor is given."""
         batch = batch.detach().requires_grad_(gradients is not None)
         outputs = self._outputs(batch)
@@ -155,8 +170,7 @@ class Objective:
         # The success is that of the image as it is.
         expected = outputs
         if self.settings.eot.draws:
-            averaged = (batch, outputs, self.settings.eot, self._transformations)
-            expected = average_transformed(self.model, *averaged)
+            expected = average_transformed(self.model, batch, outputs, self.settings.eot, draws)
         cost = criterion.cost(expected)
         if gradients is not None:
             # The network may return its gradient in another memory layout. The copy has the
@@ -321,7 +335,7 @@ def average_transformed(
     images: SingleImages,
     logits: Float[Tensor, "N C"],
     settings: EOTSettings,
-    draws: Generator,
+    draws: Sequence[Generator],
 ) -> Float[Tensor, "N C"]:
     """Average predictions over random transformations of images (EOT, Athalye et al. 2018).
 
@@ -333,35 +347,40 @@ def average_transformed(
     return torch.stack([version.log_softmax(1) for version in versions]).mean(0)
 
 
-def _transformed(images: SingleImages, settings: EOTSettings, draws: Generator) -> SingleImages:
-    """Transform each image at random.
+def _transformed(
+    images: SingleImages, settings: EOTSettings, draws: Sequence[Generator]
+) -> SingleImages:
+    """Transform each image at random, with its own generator.
 
     A transformation shifts, rotates and scales the image, changes the exposure, adds noise and
-    compresses the image as JPEG. The quality of the compression is the same for all images of a
-    call. Everything else differs between images.
+    compresses the image as JPEG.
     """
 
     def uniform(*shape: int) -> Tensor:
-        return 2 * torch.rand(*shape, generator=draws) - 1
+        return 2 * torch.stack([torch.rand(shape, generator=each) for each in draws]) - 1
 
     # Two shifts, a rotation and a relative change of size for each image, shape (N, 4).
-    moved = _moved(images, (settings.jitter * uniform(len(images), 4)).to(images))
+    moved = _moved(images, (settings.jitter * uniform(4)).to(images))
     # Change of the exposure in stops. One stop doubles the exposure.
-    stops = settings.exposure * uniform(len(images), 1, 1, 1)
+    stops = settings.exposure * uniform(1, 1, 1)
     exposed = clamp(moved * (2**stops).to(images))
-    noise = settings.noise * torch.randn(images.shape, generator=draws)
-    noisy = clamp(exposed + noise.to(images))
-    quality = int(torch.randint(settings.jpeg, 101, (), generator=draws))
-    return straight_through(noisy, lambda exact: as_jpeg(exact.cpu(), quality).to(exact))
+    noise = torch.stack([torch.randn(images.shape[1:], generator=each) for each in draws])
+    noisy = clamp(exposed + (settings.noise * noise).to(images))
+    qualities = [int(torch.randint(settings.jpeg, 101, (), generator=each)) for each in draws]
+    return straight_through(noisy, lambda exact: as_jpeg(exact.cpu(), qualities).to(exact))
 
 
-def as_jpeg(images: Float[Tensor, "... 3 H W"], quality: int) -> Float[Tensor, "... 3 H W"]:
-    """Compress images as JPEG and decompress them. The quality is from 1 to 100."""
+def as_jpeg(
+    images: Float[Tensor, "... 3 H W"], quality: int | Sequence[int]
+) -> Float[Tensor, "... 3 H W"]:
+    """Compress images as JPEG and decompress them. A quality is from 1 to 100, of all or of each."""
     decompressed = []
-    for image in to_bytes(images).flatten(0, -4):
+    given = to_bytes(images).flatten(0, -4)
+    qualities = [quality] * len(given) if isinstance(quality, int) else quality
+    for image, chosen in zip(given, qualities, strict=True):
         file = io.BytesIO()
         # pillow has the channels last.
-        Image.fromarray(image.permute(1, 2, 0).numpy()).save(file, "JPEG", quality=quality)
+        Image.fromarray(image.permute(1, 2, 0).numpy()).save(file, "JPEG", quality=chosen)
         with Image.open(file) as read:
             decompressed.append(torch.from_numpy(np.array(read)).permute(2, 0, 1))
     return to_unit(torch.stack(decompressed)).view(images.shape)

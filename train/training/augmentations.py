@@ -56,12 +56,9 @@ def darken(images: Images, seed: int) -> Images:
     with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
         torch.manual_seed(seed)
         # Only a CPU writes JPEG.
-        developed = [to_unit(camera(image)) for image in images.cpu()]
+        developed = torch.stack([to_unit(camera(image)) for image in images.cpu()])
         qualities = torch.randint(60, 98, (len(images),)).tolist()
-    shown = [
-        as_jpeg(image[None], quality) for image, quality in zip(developed, qualities, strict=True)
-    ]
-    return to_bytes(torch.cat(shown)).to(images.device)
+    return to_bytes(as_jpeg(developed, qualities)).to(images.device)
 
 
 def relit(images: Images, seed: int, augmentation: str) -> Images:

@@ -12,7 +12,14 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from augment.attack_settings import NORMS, OPTIMIZERS, STEPS, AttackSettings, StepSettings
+from augment.attack_settings import (
+    NORMS,
+    OPTIMIZERS,
+    STEPS,
+    AttackSettings,
+    EOTSettings,
+    StepSettings,
+)
 from augment.attacks import loop
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Objective
@@ -346,11 +353,13 @@ def test_every_example_is_attacked_as_if_alone_and_alike_with_the_same_seed(opti
     assert torch.equal(other.values, together.values) == ("optimizer" not in options)
 
 
-@pytest.mark.parametrize("backtracking", [False, True])
-def test_finished_examples_that_stay_in_the_batch_change_no_result(backtracking, monkeypatch):
-    at_once = attack_nine(2, backtracking=backtracking)
+@pytest.mark.parametrize(
+    "options", [{}, {"backtracking": True}, {"eot": EOTSettings(draws=2, jitter=0.3)}], ids=str
+)
+def test_finished_examples_that_stay_in_the_batch_change_no_result(options, monkeypatch):
+    at_once = attack_nine(2, **options)
     monkeypatch.setattr(loop, "drop_period", lambda device: 4)
-    later = attack_nine(2, backtracking=backtracking)
+    later = attack_nine(2, **options)
     assert len(at_once.steps[at_once.success].unique()) > 2
     for name in FIELDS:
         found = getattr(later, name)

@@ -159,7 +159,8 @@ def transformed(images: Tensor, seed: int = 0, **settings) -> tuple[Tensor, list
     nothing = {"draws": 1, "jitter": 0.0, "exposure": 0.0, "noise": 0.0, "jpeg": 100}
     chosen = EOTSettings(**nothing | settings)
     means = Means()
-    mean = average_transformed(means, images, means(images), chosen, generator(seed))
+    draws = [generator(seed, index) for index in range(len(images))]
+    mean = average_transformed(means, images, means(images), chosen, draws)
     return mean, means.seen
 
 
