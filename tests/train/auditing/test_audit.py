@@ -258,6 +258,7 @@ ORANGE_PEAR = {"mesh": "solid:pear", "label": "orange"}
         ({"hard_negatives": [ORANGE_PEAR]}, r"hard_negatives\[0\] is solid:pear"),
         ({"hard_negatives": ["pear.glb"]}, "pear.glb"),
         ({"photos": "nowhere"}, "nowhere is not a folder"),
+        ({"meshes": [{"msh": "a.glb"}]}, "msh"),
         ({"environments": ["nowhere.hdr"]}, "nowhere.hdr"),
         ({"laboratory": "nowhere"}, "laboratory=nowhere"),
     ],
