@@ -373,7 +373,7 @@ def _transformed(
 def as_jpeg(
     images: Float[Tensor, "... 3 H W"], quality: int | Sequence[int]
 ) -> Float[Tensor, "... 3 H W"]:
-    """Compress images as JPEG and decompress them. There may be one quality, from 1 to 100, or many."""
+    """Compress images as JPEG and decompress them. A quality is from 1 to 100."""
     decompressed = []
     given = to_bytes(images).flatten(0, -4)
     qualities = [quality] * len(given) if isinstance(quality, int) else quality
