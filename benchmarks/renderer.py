@@ -314,6 +314,9 @@ PANELS = {
     "random light": Panel(random_lights, has_front=False),
 }
 
+# Panels of `benchmarks.rivals` that are drawn. Its attacks change all images in two steps.
+RIVAL_PANELS = ("spherical harmonics",)
+
 # Names of the contenders that pnb-train uses by default, with SAMPLES per side
 # of a pixel. nb.render has fewer samples.
 TRAINING_SETTINGS = {
@@ -438,10 +441,19 @@ def read_rows(path: Path) -> list[Row]:
     return [{name: text for name, text in row.items() if text} for row in rows]
 
 
+def write_panels(folder: Path, measured: Sequence[Row]) -> None:
+    """Write the rows of some panels, keep those of all others, and draw the figure anew."""
+    path = folder / "renderer_pareto.csv"
+    replaced = {row["panel"] for row in measured}
+    kept = [row for row in read_rows(path) if row["panel"] not in replaced]
+    write_csv(path, [*kept, *measured])
+    draw(path.with_suffix(".png"), read_rows(path))
+
+
 def draw(path: Path, rows: Sequence[Row]) -> None:
     """Draw the time and the error of all settings, with axes for each panel and size."""
     panels: list[list[Row]] = []
-    for title in PANELS:
+    for title in (*PANELS, *RIVAL_PANELS):
         of_title = [row for row in rows if row["panel"].rpartition(", ")[0] == title]
         for size in dict.fromkeys(row["panel"] for row in of_title):
             panels.append([parse_row(row) for row in of_title if row["panel"] == size])
@@ -574,13 +586,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             measured += measure(title, view, options.rounds, options.mitsuba, options.seconds)
         if not options.panels:
             saving_rows += measure_savings(view, options.rounds)
-    path = options.out / "renderer_pareto.csv"
-    kept = []
-    if options.panels:
-        replaced = {row["panel"] for row in measured}
-        kept = [row for row in read_rows(path) if row["panel"] not in replaced]
-    write_csv(path, [*kept, *measured, *saving_rows, *step_rows])
-    draw(path.with_suffix(".png"), read_rows(path))
+    write_panels(options.out, [*measured, *saving_rows, *step_rows])
 
 
 if __name__ == "__main__":

@@ -3,8 +3,9 @@
     pip install sphericart-torch foolbox
     python -m benchmarks.rivals
 
-writes rivals.csv. Both parts take some minutes on one thread. Times are medians over rounds in
-which all calls take turns.
+writes the panels "spherical harmonics" and "attack on pixels" of docs/renderer_pareto.csv and of
+its figure. Both take some minutes on one thread. Times are medians over rounds in which all calls
+take turns, and ratios are to the other library.
 
 Harmonics: values at 10,000 unit vectors, and values with the gradient of a random linear function
 of them, from autograd. Both libraries get the same vectors. Errors are relative to a third
@@ -13,7 +14,8 @@ implementation (`benchmarks.reference`) in float64.
 Attack: the same network, images, L∞ norm-ball, step size and number of steps of projected gradient
 descent from the images. `nb.attack` renders the images first, stops an example once it is
 misclassified, and checks it. The time of foolbox is that of the attack alone. `no early stop` is
-our attack with a margin that no example reaches, so that it takes all steps.
+our attack with a margin that no example reaches, so that it takes all steps. The error is the
+fraction of the images whose prediction has not changed.
 """
 
 import argparse
@@ -28,20 +30,14 @@ from torch import Tensor
 
 import norm_balls as nb
 from benchmarks import reference
-from benchmarks.common import (
-    Row,
-    machine,
-    quartiles_of_ratio,
-    relative_error,
-    times_in_turn,
-    write_csv,
-)
+from benchmarks.common import Row, machine, quartiles_of_ratio, relative_error, times_in_turn
+from benchmarks.renderer import write_panels
 from renderer.light.harmonics import basis
 
 DEGREES = (6, 17, 39)
 POINTS = 10_000
 EPSILON, STEP_SIZE = 8 / 255, 1 / 255
-STEPS = (1, 5, 10)
+STEPS = (1, 2, 3, 5, 10)
 UNREACHED_MARGIN = 1e4
 
 
@@ -53,20 +49,20 @@ def gradient(evaluate: Callable[[Tensor], Tensor], points: Tensor, weights: Tens
 
 
 def compare(
-    part: str,
+    panel: str,
     setting: str,
     calls: Mapping[str, Callable[[], object]],
     rounds: int,
-    results: Mapping[str, Row],
+    errors: Mapping[str, float],
 ) -> list[Row]:
     """Time the calls of all libraries in turn, relative to the first one.
 
     Args:
-        part: What is compared.
+        panel: What is compared.
         setting: Setting of the comparison.
         calls: Call of each library. The first library is the one to compare with.
         rounds: Number of rounds.
-        results: Columns "error" and "changed" of each library.
+        errors: Error of each library.
 
     Returns:
         A row for each library.
@@ -75,9 +71,9 @@ def compare(
     rows: list[Row] = []
     for name, of_call in times.items():
         low, middle, high = quartiles_of_ratio(of_call, times[next(iter(calls))])
-        row = {"part": part, "setting": setting, "library": name}
+        row = {"panel": panel, "setting": f"{name} ({setting})", "image_error": errors[name]}
         row |= {"time_ms": statistics.median(of_call), "ratio": middle}
-        row |= {"ratio_low": low, "ratio_high": high} | results[name]
+        row |= {"ratio_low": low, "ratio_high": high}
         print(row, flush=True)
         rows.append(row)
     return rows
@@ -102,16 +98,14 @@ def harmonics(rounds: int) -> list[Row]:
         for dtype in (torch.float32, torch.float64):
             points, weights = exact_points.to(dtype), torch.randn_like(exact, dtype=dtype)
             setting = f"degree {degree}, {str(dtype).removeprefix('torch.')}"
-            results: dict[str, Row] = {}
-            values_of, gradients_of = {}, {}
+            errors, values_of, gradients_of = {}, {}, {}
             for name, evaluate in contenders.items():
                 # Libraries may differ in the signs of harmonics.
-                error = relative_error(evaluate(points).abs(), exact.abs())
-                results[name] = {"error": error, "changed": None}
+                errors[name] = relative_error(evaluate(points).abs(), exact.abs())
                 values_of[name] = partial(evaluate, points)
                 gradients_of[name] = partial(gradient, evaluate, points, weights)
-            rows += compare("value", setting, values_of, rounds, results)
-            rows += compare("gradient", setting, gradients_of, rounds, results)
+            rows += compare("spherical harmonics, values", setting, values_of, rounds, errors)
+            rows += compare("spherical harmonics, gradients", setting, gradients_of, rounds, errors)
     return rows
 
 
@@ -147,28 +141,28 @@ def attacks(rounds: int, count: int) -> list[Row]:
         for name, margin in (("norm_balls", 0.0), ("no early stop", UNREACHED_MARGIN)):
             attack = partial(our_attack, scene, max_steps=steps, margin=margin)
             calls[name] = lambda attack=attack: attack().images
-        results: dict[str, Row] = {}
-        for name, call in calls.items():
-            is_changed = classifier(call()).argmax(1) != labels
-            results[name] = {"error": None, "changed": is_changed.float().mean().item()}
+        errors = {
+            name: (classifier(call()).argmax(1) == labels).float().mean().item()
+            for name, call in calls.items()
+        }
         setting = f"{steps} steps, {len(images)} images"
-        rows += compare("attack on pixels", setting, calls, rounds, results)
+        rows += compare("attack on pixels, 32²", setting, calls, rounds, errors)
     return rows
 
 
 def main() -> None:
-    """Measure both parts, and write rivals.csv."""
+    """Measure both parts, and write their panels."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, default=Path("."), help="folder of rivals.csv")
+    parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of the figure")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--objects", type=int, default=12, help="oranges that are attacked")
     options = parser.parse_args()
     torch.set_num_threads(1)
     print(machine())
     rows = harmonics(options.rounds) + attacks(options.rounds, options.objects)
-    write_csv(options.out / "rivals.csv", rows)
+    write_panels(options.out, rows)
 
 
 if __name__ == "__main__":
