@@ -193,8 +193,7 @@ def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tens
     """Apply a function, which need not be differentiable, with the gradient of the identity."""
     # The difference is computed from detached images, so it has no gradient.
     detached = images.detach()
-    difference = change(detached) - detached
-    return images + difference
+    return images + (change(detached) - detached)
 
 
 class Function(nn.Module):

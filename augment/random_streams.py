@@ -13,8 +13,7 @@ def stream_seed(*key: int | str) -> int:
     keys give independent numbers.
     """
     words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
-    state = np.random.SeedSequence(words).generate_state(1, np.uint64)
-    return int(state[0] >> 1)
+    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> 1)
 
 
 def generator(*key: int | str) -> torch.Generator:

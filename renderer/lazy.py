@@ -40,7 +40,6 @@ def attach(
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         # If `name` is a submodule, `fromlist` makes __import__ import it, too.
-        module = __import__(modules[name], fromlist=[name])
-        return getattr(module, name)
+        return getattr(__import__(modules[name], fromlist=[name]), name)
 
     return get_attribute, lambda: names, names

@@ -101,19 +101,17 @@ class Objective:
         self.settings = settings
         self.seed = seed
         self.phases = phases or Phases()
+        self._rows = torch.arange(len(criterion.source), device=criterion.source.device)
         # Each example has its own random transformations, whichever others are attacked with it.
-        count = len(criterion.source) if settings.eot.draws else 0
-        self._transformations = [generator(seed, "expectation", row) for row in range(count)]
+        rows = self._rows.tolist() if settings.eot.draws else []
+        self._transformations = [generator(seed, "expectation", row) for row in rows]
         self._batch_size = BatchSize(settings.batch_size)
 
     def select(self, examples: Tensor | slice) -> Objective:
         """Return the objective of some of the examples, with the same random numbers."""
         selected = copy(self)
         selected.criterion = self.criterion.select(examples)
-        if self._transformations:
-            given = examples.cpu() if isinstance(examples, Tensor) else examples
-            rows = torch.arange(len(self._transformations))[given]
-            selected._transformations = [self._transformations[row] for row in rows.tolist()]
+        selected._rows = self._rows[examples]
         return selected
 
     def moved(self, problem: Any, values: Values, examples: Examples) -> Objective:
@@ -142,12 +140,13 @@ class Objective:
         all_images = images.flatten(0, 1)
         criterion = self.criterion.map(of_single_images)
         gradients = torch.empty_like(all_images) if needs_gradient else None
+        shown = self._rows.tolist() if self._transformations else []
+        # The views of an example follow each other.
+        draws = [self._transformations[row] for row in shown for _ in range(images.shape[1])]
 
         def score_batch(rows: slice) -> Score:
             batch_gradients = None if gradients is None else gradients[rows]
-            # The views of an example follow each other.
-            draws = [each for each in self._transformations for _ in range(images.shape[1])][rows]
-            of_batch = all_images[rows], criterion.select(rows), draws
+            of_batch = all_images[rows], criterion.select(rows), draws[rows]
             return self._score_batch(*of_batch, batch_gradients)
 
         with self.phases("attack_classifier"), torch.set_grad_enabled(needs_gradient):

@@ -354,10 +354,6 @@ class FaceMaterials:
         """Return whether all faces belong to the object and have the same material."""
         return bool(self.object_mask.all() and (self.face_gloss == self.face_gloss[0]).all())
 
-    def first_face(self) -> FaceMaterials:
-        """Return the material of the first face only. In a uniform mesh, it is that of all."""
-        return FaceMaterials(face_gloss=self.face_gloss[:1], object_mask=self.object_mask[:1])
-
 
 def initial_materials(item: SceneObject) -> FaceMaterials:
     """Return the materials with which an attack on the material of an object starts.

@@ -223,8 +223,7 @@ def irradiance_weights(degree: int) -> Tensor:
     # Also compute the factor of degree + 1, because it may be the smallest positive factor.
     factors = lambertian_factors(degree + 1).abs()
     smallest = factors[factors > 0].min()
-    weights = factors.clamp(min=smallest / 2) / factors[0]
-    return weights[: (degree + 1) ** 2]
+    return (factors.clamp(min=smallest / 2) / factors[0])[: (degree + 1) ** 2]
 
 
 @cache
@@ -287,8 +286,7 @@ def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
     irradiance = lambertian_factors(degree)[first_of_degree].numpy() / math.pi
     # The squared errors of the highlight and of the irradiance add up, so the squared weights do,
     # too.
-    weight = np.hypot(highlight, IRRADIANCE_WEIGHT * irradiance)
-    return best_window(highlight, weight)
+    return best_window(highlight, np.hypot(highlight, IRRADIANCE_WEIGHT * irradiance))
 
 
 def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degrees"]:

@@ -34,7 +34,7 @@ from train.training import inputs
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, scale_learning_rate
-from train.training.recognition import IMAGES, expected_errors, fit_recognizer, recognizing_layers
+from train.training.recognition import fit_recognizer, recognizing_layers
 from train.training.run_log import Logger, RunLog
 
 # If the training images are on disk, the mean and the standard deviation of their color
@@ -333,10 +333,6 @@ class Run:
         self._add_to_best({checkpoints.RECOGNIZER: fitted})
         name = f"{LIT_NAME}ORIGINAL+{checkpoints.RUN}{self.folder}"
         console.info("network=%s shows this network images in the light of its training", name)
-        count = min(int(self.held_out.sum()), IMAGES)
-        fraction = expected_errors(count)
-        message = "of other images, about %.0f%% go there, too, as %d images for validation tell"
-        console.info(message, 100 * fraction, count)
 
     def _add_to_best(self, entries: dict[str, Any]) -> None:
         """Add entries to the selected network, and write best.pt in the first process."""

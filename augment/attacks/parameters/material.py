@@ -83,13 +83,12 @@ class Material(Parameter):
         averages = [material.average() for material in materials]
         # Average roughness, metallic and specular factor of each object, shape (objects, 3).
         self._average_gloss = torch.stack(averages).to(scene.lights)
-        if all(material.is_uniform() for material in materials):
-            # Save memory: keep the material of one face only, which is that of all faces.
-            materials = [material.first_face() for material in materials]
+        # Save memory: of faces that are alike, keep one only.
+        kept = slice(1 if all(material.is_uniform() for material in materials) else None)
         # F is the number of faces of the largest mesh, or 1 if the faces of each object are
         # alike. The shapes are (objects, F, 3) and (objects, F).
-        face_gloss = pad_sequence([each.face_gloss for each in materials], batch_first=True)
-        object_mask = pad_sequence([each.object_mask for each in materials], batch_first=True)
+        face_gloss = pad_sequence([each.face_gloss[kept] for each in materials], batch_first=True)
+        object_mask = pad_sequence([each.object_mask[kept] for each in materials], batch_first=True)
         self._face_gloss = face_gloss.to(scene.lights)
         self._object_mask = object_mask.to(scene.lights)
 
