@@ -30,6 +30,7 @@ from typing import Any, TypeVar, cast, get_args, get_origin
 
 import hydra
 from hydra import initialize_config_module
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -76,8 +77,9 @@ class Command:
             of conf/ with a file for each choice. "attack@augment.attack" is the folder conf/attack,
             whose files set augment.attack.
         rewrite: Function that changes the arguments of the command line before Hydra reads them.
-        sweep: Function that starts several runs for --multirun, as "module:function". If it is
-            empty, Hydra starts them. A command without the group "launcher" has no --multirun.
+        sweep: Function that starts several runs for --multirun, as "module:function", and takes
+            the list of `expand`. If it is empty, Hydra starts them. A command without the group
+            "launcher" has no --multirun.
     """
 
     name: str
@@ -137,7 +139,10 @@ class Command:
             if SWEEP_FLAGS.isdisjoint(words) or not self.sweep:
                 start()
             else:
-                system.import_function(self.sweep)(start, sys.argv[1:])
+                runs = expand(sys.argv[1:])
+                # A mistyped key is answered before the import of torch.
+                self.compose(runs[0], as_typed=False)
+                system.import_function(self.sweep)(start, runs)
 
     def to_overrides(self, arguments: Sequence[str]) -> list[str]:
         """Convert the arguments of the command line to overrides that Hydra reads."""
@@ -223,6 +228,18 @@ class Command:
         }
         texts = ["\n".join([title, *rows]) for title, rows in sections.items() if rows]
         return "\n\n".join([self.about.strip(), *texts])
+
+
+def expand(words: Sequence[str]) -> list[list[str]]:
+    """List the settings of each run of a sweep, in the order in which Hydra starts them.
+
+    "seed=0,1" and "train.epochs=3" become a list of overrides for each combination. Options such as
+    --multirun are left out.
+    """
+    overrides = [word for word in words if not word.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    [runs] = BasicSweeper.split_arguments(parsed, max_batch_size=None)
+    return runs
 
 
 def types_below(kind: type, prefix: str = "") -> dict[str, Any]:

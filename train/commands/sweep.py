@@ -16,9 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 from renderer.errors import InputError
@@ -44,7 +42,7 @@ MAX_TABLE_LINES = 10
 MAX_UNFINISHED = 3
 
 
-def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
+def sweep(start: Callable[[], None], runs: Sequence[Sequence[str]]) -> None:
     """Train all runs of a sweep, print a table of their results, and write a report.
 
     Wrong settings, and folders of other runs, are found before any training. The exit status is 1
@@ -53,7 +51,10 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     # torchrun sets this variable in the processes that it starts.
     if "TORCHELASTIC_RUN_ID" in os.environ:
         raise InputError("torchrun cannot start a sweep: start it with pnb-train --multirun")
-    runs = _expand([word for word in words if not word.startswith("-")])
+    if any(override.startswith("out=") for override in runs[0]):
+        raise InputError("out= is the folder of a single run: name that of a sweep with sweep=")
+    if "launcher=slurm" in runs[0] and not shutil.which("sbatch"):
+        raise InputError("launcher=slurm needs the command sbatch: start on the cluster")
     first_config = main.compose(runs[0], as_typed=False)
     if first_config.photographs_first:
         raise InputError("photographs_first=true makes no sweep: start the runs one by one")
@@ -92,22 +93,6 @@ def sweep(start: Callable[[], None], words: Sequence[str]) -> None:
     print(report_of([folder for folder in folders if folder.exists()], parent))
     if not all(map(is_finished, folders)):
         sys.exit(1)
-
-
-def _expand(overrides: Sequence[str]) -> list[list[str]]:
-    """List the settings of each run of a sweep, in the order in which Hydra starts them.
-
-    "seed=0,1" and "train.epochs=3" become a list of overrides for each combination.
-    """
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    for override in parsed:
-        key = override.get_key_element()
-        if key == "out":
-            raise InputError("out= is the folder of a single run: name that of a sweep with sweep=")
-        if key == "launcher" and override.value() == "slurm" and not shutil.which("sbatch"):
-            raise InputError("launcher=slurm needs the command sbatch: start on the cluster")
-    (runs,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
-    return runs
 
 
 def run_in_sweep(config: DictConfig) -> None:

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from scripts.attack import main as attack
 from train.__main__ import main as train
+from train.cli import USER_ERROR
 from train.run_config import format_command
 from train.settings import dotted
 
@@ -22,14 +23,27 @@ def test_help_shows_each_setting(command):
     assert {key for key, _ in dotted(OmegaConf.to_container(command.compose()))} <= shown
 
 
-def test_help_shows_the_values_that_the_given_choices_have_where_torch_cannot_be_imported():
+def start_without_torch(*words: str) -> subprocess.CompletedProcess:
+    """Start pnb-train in a process in which torch and numpy cannot be imported."""
     code = (
         "import runpy, sys; sys.modules['torch'] = sys.modules['numpy'] = None; "
         "runpy.run_module('train', run_name='__main__')"
     )
-    command = [sys.executable, "-c", code, "--help", "experiment=cpu"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert "  train.epochs=8 " in done.stdout
+    command = [sys.executable, "-c", code, *words]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+def test_help_shows_the_values_that_the_given_choices_have_where_torch_cannot_be_imported():
+    assert "  train.epochs=8 " in start_without_torch("--help", "experiment=cpu").stdout
+
+
+@pytest.mark.parametrize(
+    "words", [["train.epohcs=3"], ["--multirun", "train.epohcs=1,2"], ["-m", "seed=1,2", "sedd=1"]]
+)
+def test_a_mistyped_key_is_named_where_torch_cannot_be_imported(words):
+    done = start_without_torch(*words)
+    assert done.returncode == USER_ERROR
+    assert f"error: {words[-1].partition('=')[0]} is not a setting" in done.stderr
 
 
 def test_a_shell_completes_a_command_beside_a_train_py_of_the_user(tmp_path):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from tests.train.helpers import read_markdown
 from train import __main__ as command
 from train.__main__ import run_name
-from train.cli import USER_ERROR
+from train.cli import USER_ERROR, expand
 from train.commands import sweep
 from train.commands.sweep import format_sweep
 from train.run_config import write_config
@@ -104,7 +104,7 @@ def test_a_run_of_a_sweep_is_named_by_the_overrides_that_are_its_own(overrides, 
     ("key", "value"), [("network", "run:pretrained/none"), ("label", "sweet pepper")]
 )
 def test_the_runs_of_a_sweep_get_texts_as_they_are_typed(key, value):
-    (words,) = sweep._expand(command.main.to_overrides([f"{key}={value}", "seed=0"]))
+    (words,) = expand(command.main.to_overrides([f"{key}={value}", "seed=0"]))
     assert command.main.compose(words, as_typed=False)[key] == value
 
 
