@@ -164,7 +164,7 @@ def load_network(
     path = Path(name)
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path
-    if (folder / BEST).is_file():
+    if (folder / BEST).is_file() or (published_folder(folder) / PUBLISHED).is_file():
         raise InputError(f"name={name} is a training run: give name={RUN}{folder} instead", "name")
     if not name.startswith(RUN):
         return load_classifier(name, weights, **options, **facts)
@@ -184,7 +184,7 @@ def load_chosen(settings: TaskSettings) -> Any:
     # Error messages about the argument `name` begin with the setting `network` instead.
     with keyed(name="network"):
         network = load_network(str(settings.network), trust_code=settings.trust, task=task, **given)
-    return _with_task(network, settings)
+    return with_task(network, settings)
 
 
 def _task_that_decodes(settings: TaskSettings) -> Detection | None:
@@ -198,7 +198,7 @@ def _task_that_decodes(settings: TaskSettings) -> Detection | None:
         return Detection(decode=import_function(settings.decode))
 
 
-def _with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
+def with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
     """Return a network with the settings of its task that are given."""
     own: Any = network.task
     if settings.task not in (None, own.name):

@@ -5,20 +5,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import train.settings
 from augment.scene.objects import MESHES_IN_MEMORY, name_mesh
 from augment.settings import ObjectSettings
 from augment.tasks.classification import class_index, nearest
 from renderer.errors import InputError, as_list, describe
 from renderer.mesh import Mesh
 from renderer.solids import HARD_NEGATIVES, SOLIDS
-from train.settings import (
-    ExperimentSettings,
-    is_of_no_class,
-    label_names,
-    read_objects,
-    simplified,
-    solid_name,
-)
+from train.settings import ExperimentSettings, is_of_no_class, label_names, simplified, solid_name
 
 # File of a mesh, solid:NAME, or the mesh itself.
 MeshSource = str | Path | Mesh
@@ -79,7 +73,7 @@ def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) ->
     An unknown class raises InputError, whose message names `key`.
     """
     # A mistyped key is named first.
-    read_objects(items, "", key)
+    train.settings.read_objects(items, "", key)
     found = []
     for index, item in enumerate(items):
         values = item if isinstance(item, dict) else {"mesh": item}

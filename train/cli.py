@@ -35,7 +35,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString, Sweep
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
@@ -359,6 +359,8 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     key, equals, value = argument.partition("=")
     if not key.lstrip("+").startswith("hydra"):
         key = key.lstrip("+")
+    # A shell expands "~" in few of these places.
+    value = re.sub(r"(?<![^\[{,:\s'\"])~(?=/)", lambda _: os.path.expanduser("~"), value)
     kind = without_none(keys.get(key))
     # A key such as attack@augment.attack chooses a file of the folder conf/attack.
     choices = key.partition("@")[0]
@@ -447,6 +449,9 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
     if isinstance(wrong, MissingConfigException) and wrong.missing_cfg_file:
         group, _, choice = wrong.missing_cfg_file.rpartition("/")
         return _explain_choice(group, choice)
+    if isinstance(wrong, OverrideParseException):
+        advice = "put texts with umlauts, spaces or brackets in quotes, as in meshes=['a b.glb']"
+        return f"{wrong.override} cannot be read: {advice}"
     if isinstance(wrong, OmegaConfBaseException | HydraException):
         text = re.split(r"\n *(?:full_key|Config search path|See https)", str(wrong))[0]
         sentence = " ".join(text.split())

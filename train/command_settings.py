@@ -12,8 +12,9 @@ from augment import augmentation_settings as augmentation
 from augment import settings as scenes
 from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.settings import LampsSettings, RendererSettings, SceneSettings
+from renderer import errors
 from renderer import settings as base
-from renderer.errors import MAX_SCALE, MAX_SEED, InputError, is_number, require_choice
+from renderer.errors import MAX_SCALE, MAX_SEED, InputError, is_number
 from renderer.settings import REQUIRED, Settings, pair, setting, setting_like
 from train import settings as common
 from train.settings import LABEL, MESHES, NETWORKS, PROBABILITY, TIME_FOLDER, TaskSettings, text
@@ -202,7 +203,7 @@ class LabSettings(Settings):
         # A pattern such as "leaves+text" needs two projectors, with a family of patterns each.
         families = {family for pattern in self.patterns for family in pattern.split("+")}
         for family in sorted(families):
-            require_choice("patterns", family, PATTERNS)
+            errors.require_choice("patterns", family, PATTERNS)
         if SLIDES in families and not self.slides:
             raise self.wrong("patterns", "need image files: set slides to them")
         # Each pattern and each environment lights the same number of setups, and names files.
@@ -305,6 +306,7 @@ def require_calibration(rate: float | None, calibrate: str | None) -> None:
     folder of photographs is above it. `rate` is this fraction, and both arguments must be set, or
     none.
     """
+    errors.require_range("false_positive_rate", rate, *PROBABILITY)
     if (rate is None) != (calibrate is None):
         raise InputError(f"false_positive_rate={rate}, calibrate={calibrate}: give both or none")
 

@@ -81,6 +81,9 @@ def test_two_methods_end_with_their_table_and_the_command(
         (["out=file/run"], "out=PATH/file/run cannot be written to"),
         (["out=odd"], "PATH/odd/train.log cannot be read or written"),
         (["network=none"], "network=none"),
+        (["photos=~/none"], "photos: HOME/none is not a folder"),
+        (["meshes=[{mesh: ~/none.glb, label: orange}]"], "scene: HOME/none.glb does not exist"),
+        (["meshes=[{mesh: Öl (1).glb}]"], "meshes=[{mesh: Öl (1).glb}] cannot be read: put"),
         (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs the command sbatch"),
         (["--multirun", "seed=0,0"], "the sweep has two runs with the same settings"),
         (["--multirun", "out=a", "seed=0,1"], "out="),
@@ -92,6 +95,7 @@ def test_two_methods_end_with_their_table_and_the_command(
 )
 def test_a_mistake_is_an_error_in_one_line(call, capsys, monkeypatch, tmp_path, arguments, start):
     monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("HOME", "HOME")
     (tmp_path / "file").touch()
     for name in ("attack", "damaged", "odd/train.log"):
         (tmp_path / name).mkdir(parents=True)

@@ -1,4 +1,5 @@
 import json
+import math
 from pathlib import Path
 from shutil import copytree
 
@@ -100,6 +101,14 @@ def test_all_pretrained_networks_are_scored_on_the_same_photographs():
         assert state["architecture"]["validation"]["fraction"] == 0.02
         images.add(summarize(Path("pretrained", name)).photographs["photographs"].images)
     assert len(images) == 1
+
+
+@pytest.mark.parametrize("rate", [0, 5, -0.1, math.nan, "5%"], ids=str)
+def test_a_false_positive_rate_is_a_fraction(tmp_path, rate):
+    with pytest.raises(InputError, match="false_positive_rate"):
+        nb.publish("best", tmp_path / "a", calibrate=tmp_path, false_positive_rate=rate)
+    with pytest.raises(InputError, match="false_positive_rate"):
+        nb.evaluate(nb.load("best"), tmp_path, calibrate=tmp_path, false_positive_rate=rate)
 
 
 @pytest.mark.parametrize("name", PRETRAINED)

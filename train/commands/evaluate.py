@@ -17,7 +17,7 @@ from augment.tasks.segmentation import Segmentation
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_folder, as_path, keyed, require_choice
 from renderer.settings import Size
-from train.checkpoints import load_chosen, load_run
+from train.checkpoints import load_chosen, load_run, with_task
 from train.command_settings import EvaluateSettings, require_calibration
 from train.data.annotations import FITS, LETTERBOX, read_annotations
 from train.data.photographs import choose_labels, class_folders, require_outside
@@ -44,7 +44,7 @@ def run(settings: EvaluateSettings) -> None:
         require_no_facts(f"run={settings.run}", as_facts(*facts))
         loaded = load_run(settings.run, settings.weights, settings.network, settings.trust)
         # The returned copy normalizes the light of each image, unless the setting is None.
-        network = loaded.normalizing_light(settings.normalize_light)
+        network = with_task(loaded.normalizing_light(settings.normalize_light), settings)
         photos = published_folder(Path(settings.photos))
         # The run is scored on the positive classes of its training, if the folder has classes.
         if label is None and class_folders(photos, network.classes):

@@ -19,6 +19,7 @@ from renderer.image import decode, encode
 from renderer.io.images import eight_bits, open_image, read_image, read_rgb, write_image
 from renderer.light.files import save_light
 from renderer.photograph import fit_photograph
+from train.cli import quoted
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings, FitSettings
 from train.commands.attack import build_attacked
 from train.results.overwrite import output_folder
@@ -87,8 +88,9 @@ def run(settings: FitSettings) -> None:
     words = ["pnb-attack", "attack=lighting"]
     if settings.label is not None:
         words.append(f"label={settings.label}")
-    words.append(f"meshes=[{{mesh: '{settings.mesh}', albedo_scale: {settings.albedo_scale:g}}}]")
-    shown = scene | {"backgrounds": f"[{out / 'background.png'}]"}
+    given = quoted(str(settings.mesh))
+    words.append(f"meshes=[{{mesh: {given}, albedo_scale: {settings.albedo_scale:g}}}]")
+    shown = scene | {"backgrounds": f"[{quoted(str(out / 'background.png'))}]"}
     words += [f"scene.{key}={value}" for key, value in shown.items()]
     words += [f"renderer.{key}={value}" for key, value in renderer.items()]
     print(shlex.join(words))

@@ -37,7 +37,7 @@ def test_camera_and_light_are_found_and_attacked_by_the_printed_command(call, tm
     rows, columns = ((share[0] > 0.5).any(axis).nonzero() for axis in (1, 0))
     width = float(max(rows.max() - rows.min(), columns.max() - columns.min())) / SIZE
     tangent = MARGIN * width * math.tan(math.radians(camera.angle) / 2)
-    files = "mesh=solid:mushroom", "photograph=photo.png", "mask=mask.png", "out=fitted"
+    files = "mesh=solid:mushroom", "photograph=photo.png", "mask=mask.png", "out=fitted ü"
     capsys.readouterr()
     words = "label=orange", "encoding=srgb", f"fov={2 * math.degrees(math.atan(tangent))}"
     assert call("fit", *files, *words) == 0
@@ -48,13 +48,13 @@ def test_camera_and_light_are_found_and_attacked_by_the_printed_command(call, tm
     assert call("attack", *command[1:], *quick) == 0
     [file] = (tmp_path / "a").glob("**/before.npy")
     shown = torch.from_numpy(np.load(file))[0].double()
-    background = read_image(tmp_path / "fitted" / "background.png", shown.shape[-1]).double()
-    inside = read_image(tmp_path / "fitted" / "mask.png", shown.shape[-1])[0] > WHOLE
+    background = read_image(tmp_path / "fitted ü" / "background.png", shown.shape[-1]).double()
+    inside = read_image(tmp_path / "fitted ü" / "mask.png", shown.shape[-1])[0] > WHOLE
     expected = decode(background, "srgb")[:, inside]
     real = float((decode(shown, "srgb")[:, inside] - expected).norm() / expected.norm())
     assert printed == pytest.approx(real, abs=1.01 * ROUNDING)
     assert real < 0.05
-    found = load_light(str(tmp_path / "fitted" / "light.json"), None)
+    found = load_light(str(tmp_path / "fitted ü" / "light.json"), None)
     assert float(to_map(found, 256).min()) >= 0
     scene = attack_command.read(command[1:]).scene
     toward = torch.from_numpy(camera.eye()[:3])
