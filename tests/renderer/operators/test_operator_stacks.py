@@ -19,16 +19,18 @@ from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss
 from renderer.visibility import choose
 
-VIEW_COUNT = 5
+# More than FEWEST_STACKED, so that the views are rendered as a stack.
+VIEW_COUNT = 9
 SIZE = 8
 CAMERAS = orbit_cameras(VIEW_COUNT, 2.2)
-PEAR = renderer.solid("pear")
+# Its views cover different pixels.
+CUP = renderer.solid("cup")
 # The operators of a mesh with one color have one channel.
-PLAIN = Mesh.plain(PEAR.vertices, PEAR.faces, (0.8, 0.4, 0.1))
+PLAIN = Mesh.plain(CUP.vertices, CUP.faces, (0.8, 0.4, 0.1))
 
 
 def operators_of(
-    mesh=PEAR, basis=HARMONICS, dtype=torch.float64, size=SIZE, gloss=None, encoding="linear"
+    mesh=CUP, basis=HARMONICS, dtype=torch.float64, size=SIZE, gloss=None, encoding="linear"
 ):
     settings = ImageSettings(size, 2, encoding)
     operators = build_operators(
@@ -116,7 +118,7 @@ def test_images_are_differentiable_in_the_background(size):
 
 
 def test_operators_are_a_sequence():
-    operators = renderer.precompute_transfer(PEAR, CAMERAS, 8, rasterizer="numpy")
+    operators = renderer.precompute_transfer(CUP, CAMERAS, 8, rasterizer="numpy")
     first, *others = operators
     assert len(operators) == VIEW_COUNT
     assert operators[0] is first
