@@ -135,6 +135,7 @@ ROWS = [
         (0.5, 0.0, 0.0),
     ),
     ("map_Kd without vt", obj(mtl="map_Kd red.png"), REFUSED),
+    ("Tr 0", obj(mtl="Tr 0"), WHITE),
     ("d 1, Tr 0", obj(mtl="d 1\nTr 0"), WHITE),
     ("map_Kd with alpha", obj(mtl="map_Kd clear.png", face=TEXTURED), IGNORED),
     *(

@@ -210,12 +210,13 @@ def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_
 
 
 @dataclass(frozen=True)
-class WhiteSurface:
-    """Reference for a white surface with gloss, after Kulla and Conty (2017)."""
+class GraySurface:
+    """Reference for a gray or white surface with gloss, after Kulla and Conty (2017)."""
 
     roughness: float
     metallic: float
     specular_factor: float
+    albedo: float = 1.0
 
     def transmitted(self, cosine: float) -> float:
         return 1 - self.specular_factor * coat_albedo(cosine, self.roughness)
@@ -229,10 +230,10 @@ class WhiteSurface:
     def reflectance(self, cosine: float, light: np.ndarray) -> np.ndarray:
         heights, ring_of_light = np.unique(light[:, 2], return_inverse=True)
         entering = np.array([self.transmitted(height) for height in heights])[ring_of_light]
-        diffuse = self.transmitted(cosine) * entering / self.mean_transmitted()
+        passed = self.transmitted(cosine) * entering / self.mean_transmitted()
         coat = self.specular_factor * Lobe(self.roughness).reflectance(cosine, light)
-        metal = Lobe(self.roughness, 1.0).reflectance(cosine, light)
-        return self.metallic * metal + (1 - self.metallic) * (coat + diffuse)
+        metal = Lobe(self.roughness, self.albedo).reflectance(cosine, light)
+        return self.metallic * metal + (1 - self.metallic) * (coat + self.albedo * passed)
 
 
 # A white floor that fills the image from every side above it.
@@ -255,9 +256,11 @@ class FloorView:
     lit: float
     azimuth: float
 
-    def reflectance(self, light: LocalBasis, coefficient: float, gloss: Gloss) -> float:
+    def reflectance(
+        self, light: LocalBasis, coefficient: float, gloss: Gloss, floor: Mesh
+    ) -> float:
         camera = OrthographicCamera(math.degrees(self.seen), 0.0, 1e-3)
-        [operator] = operators_of(FLOOR, [camera], ImageSettings(1, 1), light, gloss)
+        [operator] = operators_of(floor, [camera], ImageSettings(1, 1), light, gloss)
         coefficients = UP.new_full((light.size, 3), coefficient)
         return float(operator.radiance(coefficients)[0, 0]) / math.cos(self.lit)
 
@@ -268,12 +271,13 @@ FLOOR_VIEWS += [FloorView(view.lit, view.seen, view.azimuth) for view in FLOOR_V
 
 
 @pytest.mark.parametrize(
-    ("roughness", "metallic", "specular_factor"),
-    [(0.2, 0.0, 1.0), (1.0, 0.0, 0.4), (0.2, 1.0, 1.0), (1.0, 0.5, 0.7)],
+    "material", [(0.2, 0.0, 1.0), (1.0, 0.0, 0.4), (0.2, 1.0, 1.0), (1.0, 0.5, 0.7)], ids=str
 )
-def test_local_lights_are_reflected_as_by_kulla_and_conty(roughness, metallic, specular_factor):
-    gloss = Gloss(roughness, metallic, specular_factor)
-    surface = WhiteSurface(roughness, metallic, specular_factor)
+@pytest.mark.parametrize("albedo", [0.0, 0.4, 1.0])
+def test_local_lights_are_reflected_as_by_kulla_and_conty(material, albedo):
+    gloss = Gloss(*material)
+    surface = GraySurface(*material, albedo)
+    floor = Mesh.plain(FLOOR.vertices, FLOOR.faces, np.full(3, albedo))
     for view in FLOOR_VIEWS:
         # The reference looks from -x, and the camera from +x.
         light = unit_vector(view.lit, view.azimuth + math.pi)
@@ -281,8 +285,8 @@ def test_local_lights_are_reflected_as_by_kulla_and_conty(roughness, metallic, s
         lamp = Lamps((tuple(4 * unit_vector(view.lit, view.azimuth)),))
         projector = Projector(1, math.degrees(view.lit), math.degrees(view.azimuth), 4.0)
         # A lamp of power 16 has the irradiance 1 at a distance of 4.
-        assert view.reflectance(lamp, 16.0, gloss) == pytest.approx(expected, rel=2e-3)
-        assert view.reflectance(projector, 1.0, gloss) == pytest.approx(expected, rel=2e-3)
+        assert view.reflectance(lamp, 16.0, gloss, floor) == pytest.approx(expected, rel=2e-3)
+        assert view.reflectance(projector, 1.0, gloss, floor) == pytest.approx(expected, rel=2e-3)
 
 
 class FloorUnderSky:
@@ -319,23 +323,27 @@ def test_a_sky_is_reflected_reciprocally_without_gain(roughness, metallic, specu
         torch.testing.assert_close(reflected, irradiance, rtol=0, atol=2e-3)
 
 
-def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty():
-    """At the foot of a very high wall, half of an even sky is hidden."""
+@pytest.mark.parametrize(("polar", "lean"), [(40.1, 90.0), (70.0, 30.0)])
+def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty(polar, lean):
+    """At the foot of a very high wall, half of an even sky is hidden, or more if it leans over."""
     specular_factor = 0.5
-    corners = [[0.05, -99.0, 0], [0.05, 99, 0], [0.05, 99, 99], [0.05, -99, 99]]
+    along, up = -math.cos(math.radians(lean)), math.sin(math.radians(lean))
+    top = 0.05 + 99 * along
+    corners = [[0.05, -99.0, 0], [0.05, 99, 0], [top, 99, 99 * up], [top, -99, 99 * up]]
     wall = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.ones(3))
     corner = concatenate([FLOOR, wall])
-    camera = OrthographicCamera(40.1, 180.0, 1e-3)
-    settings = ImageSettings(1, 1, shadows=True)
+    camera = OrthographicCamera(polar, 180.0, 1e-3)
+    settings = ImageSettings(1, 8, shadows=True)
     gloss = Gloss(1.0, 0.0, specular_factor)
     [operator] = operators_of(corner, [camera], settings, Harmonics(6), gloss)
     even_sky = load_light("uniform", 6).double() * math.pi
     found = float(operator.radiance(even_sky)[0, 0])
 
-    light, solid_angles = hemisphere(24)
-    surface = WhiteSurface(1.0, 0.0, specular_factor)
-    radiance = surface.reflectance(math.cos(math.radians(40.1)), light) * light[:, 2] * solid_angles
-    is_visible = light[:, 0] < 0
+    light, solid_angles = hemisphere(48)
+    surface = GraySurface(1.0, 0.0, specular_factor)
+    reflected = surface.reflectance(math.cos(math.radians(polar)), light)
+    radiance = reflected * light[:, 2] * solid_angles
+    is_visible = light[:, 0] * up < light[:, 2] * along
     assert found == pytest.approx(radiance[is_visible].sum(), rel=0.02)
 
 
