@@ -10,7 +10,7 @@ import torch
 from oracles import draw
 
 from renderer.errors import InputError
-from renderer.light.environment import negative_fraction, read_map, to_map, write_map
+from renderer.light.environment import negative_fraction, read_map, read_panorama, to_map, write_map
 from renderer.light.files import load_light
 from renderer.light.harmonics import project
 
@@ -50,6 +50,20 @@ def test_the_negative_fraction_is_a_share_of_the_magnitude_over_the_sphere(above
     radiance = torch.full((10, 7, 3), below)
     radiance[:5] = above
     assert negative_fraction(radiance) == pytest.approx(fraction, abs=210 * EPS)
+
+
+def test_the_negative_fraction_counts_solid_angles():
+    """A cap around the pole with a radius of 45° has the share (1 - cos 45°) / 2 of the sphere."""
+    radiance = torch.ones(128, 4, 3)
+    radiance[:32] = -1
+    assert negative_fraction(radiance) == pytest.approx((1 - math.sqrt(0.5)) / 2, rel=1e-12)
+
+
+def test_slightly_negative_radiance_of_a_panorama_becomes_0(tmp_path):
+    radiance = torch.ones(8, 16, 3)
+    radiance[2, 3] = -1e-5
+    write_map(tmp_path / "map.npy", radiance)
+    assert torch.equal(read_panorama(tmp_path / "map.npy"), radiance.clamp(min=0))
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".exr", ".NPY", ".EXR"])

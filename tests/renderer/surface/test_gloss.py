@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.polynomial import legendre
-from oracles import Lobe, coat_albedo, directions_of, draw, draw_uniform, image_of, toward
+from oracles import Lobe, coat_albedo, directions_of, draw, draw_uniform, image_of, textured, toward
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
@@ -34,7 +34,7 @@ from renderer.rendering import precompute_transfer, render
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shaded_view import ShadedView
 from renderer.solids import solid, sphere
-from renderer.surface.gloss import Gloss, SampleGloss
+from renderer.surface.gloss import Gloss, SampleGloss, smallest_roughness
 from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
 
@@ -540,3 +540,28 @@ def test_a_matte_part_of_a_glossy_mesh_is_rendered_as_a_matte_mesh():
     matte = np.tile(np.float32([1, 0, 0]), (len(mesh.faces), 1))
     found = render(replace(mesh, gloss=matte), CAMERA, light, 16)
     torch.testing.assert_close(found, render(mesh, CAMERA, light, 16), rtol=0, atol=1e-12)
+
+
+def with_gloss_texture(mesh: Mesh, texels: np.ndarray) -> Mesh:
+    white = np.full((1, 1, 3), 255, dtype=np.uint8)
+    covered = textured(mesh, np.zeros((len(mesh.faces), 3, 2)), white)
+    return replace(covered, gloss_textures=(np.uint8(texels),))
+
+
+def test_only_a_textured_gloss_is_multiplied_by_the_gloss_textures():
+    mesh = with_gloss_texture(FLOOR, np.full((2, 2, 2), [102, 51]))
+    light = positive_light(2)
+    plain, given = Gloss(0.9 * 0.4, 0.2, 0.6), Gloss(0.9, 1.0, 0.6)
+    pairs = [(replace(given, textured=True), plain), (given, given)]
+    for gloss, expected in pairs:
+        found = render(mesh, CAMERA, light, 2, gloss=gloss)
+        without_texture = render(FLOOR, CAMERA, light, 2, gloss=expected)
+        torch.testing.assert_close(found, without_texture, rtol=0, atol=1e-6)
+
+
+def test_the_smoothest_hundredth_of_a_texture_does_not_count():
+    """Of 201 texels with all roughnesses from 0 to 200, the two smallest do not count."""
+    roughness = np.random.default_rng(0).permutation(201)
+    texels = np.stack([roughness, roughness], axis=1)[None]
+    mesh = with_gloss_texture(Gloss(0.5).on(solid("pear")), texels)
+    assert smallest_roughness(mesh) == pytest.approx(0.5 * 2 / 255)
