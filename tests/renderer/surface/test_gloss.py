@@ -15,6 +15,7 @@ import pytest
 import torch
 from numpy.polynomial import legendre
 from oracles import Lobe, coat_albedo, directions_of, draw, draw_uniform, image_of, textured, toward
+from scipy import optimize
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
@@ -189,6 +190,23 @@ def test_a_highlight_under_its_window_is_nowhere_negative(roughness):
     radiance = legendre.legval(cosines, (2 * np.arange(degree + 1) + 1) * amplitudes * window)
     assert window[0] == 1
     assert radiance.min() >= -1e-3 * radiance.max()
+
+
+def test_the_window_of_a_highlight_keeps_the_irradiance_with_ten_times_the_weight():
+    """SciPy minimizes the squared errors, for a highlight that is not negative on a grid."""
+    highlight = zonal_amplitudes(0.3, 4, rings=120)
+    energies = 2 * np.arange(5) + 1
+    # The clamped cosine has the coefficients π, 2π/3, π/4, 0 and -π/24.
+    irradiance = np.array([1, 2 / 3, 1 / 4, 0, -1 / 24])
+    weights = energies * ((highlight / highlight[0]) ** 2 + (10 * irradiance) ** 2)
+    lobe = legendre.legvander(np.cos(np.linspace(0, math.pi, 300)), 4) * energies * highlight
+    limits = [
+        {"type": "ineq", "fun": lambda w: lobe @ w},
+        {"type": "eq", "fun": lambda w: w[0] - 1},
+    ]
+    best = optimize.minimize(lambda w: weights @ (w - 1) ** 2, np.eye(5)[0], constraints=limits)
+    found = highlight_window(4, 0.3, 1.0)[torch.arange(5) ** 2]
+    np.testing.assert_allclose(found, best.x, atol=1e-3)
 
 
 def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_it():
