@@ -86,6 +86,16 @@ def test_photographs_are_attacked_alike_in_any_batch(result, photographs):
         torch.testing.assert_close(again.log_gain[light], result.log_gain[light])
 
 
+def test_a_photograph_has_the_same_light_if_others_are_left_out(photographs):
+    # Slides may show any attacked photograph. So all are the same.
+    network, same = HueNetwork().eval(), photographs[:1].expand(5, -1, -1, -1)
+    whole, few = (attack_photographs(network, same, SETTINGS, limit=limit) for limit in (None, 2))
+    assert few.index.tolist() == [0, 4]
+    for row, slide in product(range(2), range(SETTINGS.slides)):
+        expected = whole.image(4 * row, "slide", slide)
+        assert torch.equal(few.image(row, "slide", slide), expected)
+
+
 def test_the_random_search_and_the_gradient_have_as_many_passes(photographs):
     calls = {"forward": 0, "backward": 0}
 

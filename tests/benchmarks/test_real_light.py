@@ -11,6 +11,7 @@ from scipy.stats import binomtest
 from benchmarks import real_light
 from tests.helpers import darker_than
 from train.data.photo import Photograph
+from train.results.scoring import rank_classes
 
 
 def save(path, level):
@@ -56,6 +57,19 @@ def test_each_light_has_its_scores(folder, monkeypatch):
     assert values["never", "plain"][0] == "0.000"
 
 
+def test_scores_are_the_counted_ones():
+    # At 5% FPR, two pears of 40 exceed the threshold of -0.5. At 10% FPR, it would be -2.5.
+    scores = [-2, -1, -0.25, 3, *(number - 37.5 for number in range(40))]
+    names = np.repeat(["orange", "pear"], [4, 40])
+    shown = [Photograph(PurePosixPath(name), str(name), None) for name in names]
+    logits = torch.tensor([[score, 0.0] for score in scores])
+    predictions = rank_classes(shown, logits, ["orange", "pear"], ["orange"])
+    found = real_light.measure(predictions, names, np.ones((1, 44), int), np.arange(44))
+    top1 = (1 / 4 + 38 / 40) / 2
+    auc = (36 + 37 + 38 + 40) / 160
+    assert found[:, 0] == pytest.approx([top1, 1 / 4, 2 / 4, 2 / 40, auc])
+
+
 def test_simulated_light_keeps_photographs_that_share_a_name(tmp_path):
     names = ("a/b_1.png", "a_b/1.png", "a_b_1.png", "a_b_1.jpg", "dim__1.png")
     for name in names:
@@ -67,6 +81,17 @@ def test_simulated_light_keeps_photographs_that_share_a_name(tmp_path):
         found = real_light.find_photographs(tmp_path / f"of_{given}", ["orange"], "orange")
         lights = [*map(real_light.light_of, found)]
         assert lights.count("plain") == lights.count("low_light") == len(names)
+
+
+def test_photographs_of_an_excluded_source_are_not_simulated(tmp_path):
+    for name in "ab":
+        save(tmp_path / f"given/orange/{name}.png", 40)
+    table = "path,source_tag\norange/a.png,web\norange/b.png,lab\n"
+    (tmp_path / "given/photos.csv").write_text(table)
+    words = ["simulate", str(tmp_path / "given"), str(tmp_path / "out"), "--classes", "orange"]
+    real_light.main([*words, "--lights", "low_light", "--exclude", "web", "--size", "8"])
+    found = sorted(path.name for path in (tmp_path / "out/orange").iterdir())
+    assert [name[-5:] for name in found] == ["b.png", "b.png"]
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,15 @@ def test_a_success_is_an_iou_within_the_box_below_the_limit():
     assert outcomes == {True, False}
 
 
+def test_an_object_that_leaves_the_view_is_no_success():
+    empty = torch.zeros(1, 1, 1, SIZE, SIZE, dtype=torch.bool)
+    gone = Truth(torch.zeros(1, 1), torch.zeros(1, 1, 4), empty[0], torch.ones(1, 1))
+    rule = criterion().at(gone)
+    for label in range(3):
+        logits = 9 * F.one_hot(torch.full((1, SIZE, SIZE), label), 3).movedim(-1, 1).double()
+        assert not rule.reached_in_views(rule.predicted(rule.evidence(logits)))
+
+
 def test_the_gradient_of_the_cost_is_that_of_finite_differences():
     draws = torch.Generator().manual_seed(0)
     logits = torch.randn(1, 3, SIZE, SIZE, generator=draws, dtype=torch.float64)

@@ -58,6 +58,14 @@ def test_images_of_coco_are_found_in_subfolders(tmp_path, file, image, name):
     assert (read.classes, photograph.labels.tolist()) == (("cat", "dog"), [1])
 
 
+def test_classes_of_coco_are_in_the_order_of_their_ids(tmp_path):
+    _draw(tmp_path / "a.png")
+    descending = [{"id": 90, "name": "dog"}, {"id": 3, "name": "cat"}]
+    _write_coco(tmp_path / "a.json", categories=descending)
+    read = read_annotations(tmp_path)
+    assert (read.classes, read.photographs[0].labels.tolist()) == (("cat", "dog"), [1])
+
+
 def test_missing_images_of_coco_are_named_and_ambiguous_ones_refused(tmp_path):
     _draw(tmp_path / "a.png")
     _write_coco(tmp_path / "a.json", ["a.png", "b.png"])
@@ -69,7 +77,10 @@ def test_missing_images_of_coco_are_named_and_ambiguous_ones_refused(tmp_path):
         read_annotations(tmp_path / "a.json")
 
 
-@pytest.mark.parametrize(("orientation", "is_stored"), [(3, False), (6, False), (6, True)])
+@pytest.mark.parametrize(
+    ("orientation", "is_stored"),
+    [(3, False), (6, False), (5, True), (6, True), (7, True), (8, True)],
+)
 def test_boxes_fit_photographs_that_a_camera_has_turned(tmp_path, orientation, is_stored):
     _draw(tmp_path / "a.png", orientation=orientation)
     with Image.open(tmp_path / "a.png") as image:

@@ -11,7 +11,7 @@ import torch
 from tests.train.helpers import read_markdown
 from train.data.photo import Photograph
 from train.results import compare as comparison
-from train.results.metrics import Pool
+from train.results.metrics import Pool, Pooled
 from train.results.page import write_report
 from train.results.predictions import Predictions, write_predictions
 from train.results.scoring import rank_classes
@@ -185,6 +185,23 @@ class TestAHardenedNetwork:
         config.write_text(text.replace("\nweights: null", "\nweights: other.pth", 1))
         names = [row[0] for row in compare(hardened)[""] if row[0].startswith("the initial")]
         assert len(names) == 2 and "weights=other.pth" in "".join(names)
+
+
+def test_without_the_metric_of_one_seed_there_is_no_difference(scored_run):
+    def evaluations(method: str, *others: list[int]) -> list[comparison.Evaluation]:
+        """Evaluate seeds by their scores of other things. An orange has a score of 1."""
+        found = []
+        for seed, negatives in enumerate(others):
+            scores = {"web": ([1, 1], negatives)}
+            run = summarize(scored_run(method, scores, f"seed={seed}"))
+            found.append(comparison.Evaluation(run, Pooled(predictions_of(rows_of(scores)))))
+        return found
+
+    lacking, whole = evaluations("random", [2, 0], []), evaluations("none", [2, 2], [2, 2])
+    for pair in ((lacking, whole), (whole, lacking)):
+        assert comparison.difference(*pair, comparison.ALL, "auc") is None
+    first = comparison.difference(lacking[:1], whole[:1], comparison.ALL, "auc")
+    assert (first.before, first.value, first.after) == (0, 0.5, 0.5)
 
 
 def test_a_difference_of_three_seeds_is_that_of_their_means_and_paired(scored_run):

@@ -104,6 +104,16 @@ def test_an_object_has_at_most_one_detection_of_its_class(boxes, labels, scores,
     assert detections.match(_found(boxes, labels, scores), marked, 0.5).tolist() == expected
 
 
+def test_ap50_is_at_an_iou_of_one_half_whatever_that_of_the_recall():
+    # The IoU is 20 · 20 / (20 · 33), which is 0.606.
+    found, marked = _found([[10, 10, 30, 43]], [0], [0.9]), _marked(BOX, [0])
+    strict, at_half = (
+        detections.join([detections.match_image(found, marked, iou)]) for iou in (0.75, 0.5)
+    )
+    metrics = detections.score(strict, [0], 0.4, at_half)
+    assert (metrics.recall.value, metrics.ap50.value) == (0, 1)
+
+
 def test_objects_of_the_same_photograph_add_nothing_to_its_interval():
     def recall(copies):
         shifts = 50 * np.arange(copies)[:, None]

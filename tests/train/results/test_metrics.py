@@ -13,7 +13,7 @@ from scipy.stats import t as student_t
 from benchmarks.coverage import Setup, heavy_tails, measure
 from train.data.photo import Photograph
 from train.results import intervals
-from train.results.metrics import Pool
+from train.results.metrics import AT_THRESHOLD, Pool
 from train.results.scoring import rank_classes
 from train.results.tables import OBJECTS, THESE_OBJECTS
 
@@ -222,6 +222,17 @@ def test_top_k_is_that_of_torch_for_images_of_known_classes(labels):
             by_class.append(hits.float().mean().item())
         assert metric.value == pytest.approx(np.mean(by_class))
         assert metric.low < metric.value < metric.high
+
+
+def test_a_prediction_is_held_against_the_threshold_of_its_own_label():
+    # The log-odds of pear are those of orange with the opposite sign.
+    shown = [("orange", 1.0), ("orange", -2.0), ("pear", -3.0), ("pear", -6.0)]
+    photographs = [Photograph(PurePosixPath(name), name, None) for name, _ in shown]
+    logits = torch.tensor([[score, 0.0] for _, score in shown])
+    predictions = rank_classes(photographs, logits, ["orange", "pear"], ["orange", "pear"])
+    outcomes = Pool(predictions, {"orange": 0.0, "pear": 5.0}).outcomes
+    # The first orange exceeds 0, and the last pear 5. No other object exceeds either.
+    assert [outcomes[name].hits.sum() for name in AT_THRESHOLD] == [2, 0]
 
 
 def test_a_recall_of_1_has_wilsons_interval_for_the_objects_with_students_quantile():

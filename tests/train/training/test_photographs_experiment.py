@@ -14,16 +14,18 @@ from train.__main__ import main as train_command
 from train.checkpoints import load
 from train.commands.experiment import train
 from train.data.sets import Split
+from train.device import MixedPrecision
 from train.results.page import PAGE
 from train.run_folder import BEST, LAST, read_metrics
 from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
 from train.training import run
-from train.training.augmentations import Augmentation
-from train.training.averages import FACTORS, INTERPOLATION, predict
+from train.training.augmentations import Augmentation, relit
+from train.training.averages import FACTORS, INTERPOLATION, interpolate, predict
 from train.training.recipe import TrainingLoss
 
 NAME = "shufflenet_v2_x0_5"
 SIZE = 32
+GRAY = Split(torch.full((64, 3, 24, 24), 180, dtype=torch.uint8), torch.zeros(64).long())
 
 
 @pytest.fixture(scope="module")
@@ -133,15 +135,37 @@ def test_a_command_stopped_in_its_first_training_ends_the_same(chain, tmp_path, 
 
 
 def test_weights_are_interpolated_by_predictions_in_the_light_of_the_training():
-    gray = Split(torch.full((64, 3, 24, 24), 180, dtype=torch.uint8), torch.zeros(64).long())
-
     def brightness(light: str) -> float:
         shown = predict(
-            lambda x: x.mean((1, 2, 3))[:, None], gray, torch.device("cpu"), 0, light=light
+            lambda x: x.mean((1, 2, 3))[:, None], GRAY, torch.device("cpu"), 0, light=light
         )
         return float(shown.median())
 
     assert brightness("low_light") < 0.6 * 180 / 255 < brightness("relight")
+
+
+def test_stripes_are_gray_in_two_of_five_images():
+    red = torch.tensor([200, 60, 60], dtype=torch.uint8).view(1, 3, 1, 1).expand(1000, 3, 8, 8)
+    shown = relit(red, 0, "stripes")
+    is_gray = (shown == shown[:, :1]).flatten(1).all(1)
+    # Four standard errors.
+    assert is_gray.double().mean() == pytest.approx(0.4, abs=4 * (0.4 * 0.6 / 1000) ** 0.5)
+
+
+@pytest.mark.parametrize(("weights", "expected"), [((1, 1e-6), 0), ((1e-6, 1), 1)])
+def test_the_interpolation_minimizes_the_loss_with_the_larger_weight(weights, expected):
+    def network(scale: float) -> MixedPrecision:
+        linear = torch.nn.Linear(3, 2, bias=False)
+        linear.weight.data = torch.tensor([[scale] * 3, [0.0] * 3])
+        layers = torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), linear
+        return MixedPrecision(torch.nn.Sequential(*layers), "float32")
+
+    # Larger logits make up for low light, and are too large in the light as it is.
+    initial, trained = network(2.0), network(4.0).network.state_dict()
+    names = ("distillation_weight", "consistency_weight")
+    recipe = TrainSettings(augmentation="low_light", **dict(zip(names, weights, strict=True)))
+    _, factor = interpolate(initial, network(0.0), trained, GRAY, recipe, 0)
+    assert factor == expected
 
 
 @pytest.mark.parametrize("weight", [2.0, 0.0])

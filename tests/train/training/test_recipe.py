@@ -173,6 +173,13 @@ def test_an_image_has_the_same_draws_in_any_number_of_processes(name, images, mo
     assert torch.equal(second_half, whole[3:])
 
 
+def test_half_of_a_batch_is_relit_and_half_in_low_light(images, model):
+    names = ("relight+low_light", "relight", "low_light")
+    both, relit, dark = (augmentation(name, model, 3).apply(images, LABELS, 7) for name in names)
+    assert torch.equal(both[::2], relit[::2])
+    assert torch.equal(both[1::2], dark[1::2])
+
+
 def test_pgd_stays_within_its_radius_and_raises_the_loss(images, model):
     adversarial = augmentation("pgd", model, 0).apply(images, LABELS, 0)
     changes = to_unit(adversarial) - to_unit(images)
