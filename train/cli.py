@@ -388,8 +388,8 @@ def _as_text(value: str) -> str:
 
     The members of a list and of a sweep are texts, too: classes can be named true or 007.
     """
-    # A value that begins with "~" is a path in the home folder. The error of Hydra
-    # about it is better than a quoted path that does not exist.
+    # A value that still begins with "~" names the home folder of a user. The error of
+    # Hydra about it is better than a quoted path that does not exist.
     if not value or value[0] in (*QUOTES, "~"):
         return value
     try:
