@@ -76,6 +76,8 @@ def test_a_shift_moves_the_outline_and_a_scale_magnifies_it_about_its_middle(sce
     offsets = (shifted_middles - middles).abs()
     assert (offsets <= 0.3 + 1 / SIZE).all()
     assert (offsets.amax(0) > 0.2).all()
+    # The shifts to the right and up are drawn independently.
+    assert (offsets[:, 0] - offsets[:, 1]).abs().max() > 0.1
     torch.testing.assert_close(shifted_extents, extents, rtol=0, atol=2 / SIZE)
     scaled_middles, scaled_extents = outlines(drawn(scene, scale=[0.5, 1.5]))
     factors = scaled_extents / extents
