@@ -436,7 +436,7 @@ def regeneration(device: str) -> Iterator[Row]:
 
 
 def labels(device: str) -> Iterator[Row]:
-    """Ask how many labeled renders of 224² a second are made in memory.
+    """Ask how long it takes to make labeled renders of 224², without files.
 
     Args:
         device: Device of the renders.

@@ -197,10 +197,9 @@ def real_folders(real: Path | None) -> dict[str, Path]:
     return {path.name: path for path in paths if path.is_dir()}
 
 
-def score_network(network: Classifier, renders: Path, real: Path | None) -> Scores:
+def score_network(network: Classifier, renders: Path, folders: Mapping[str, Path]) -> Scores:
     """Score a network in all lights. Projected objects count if it has all of their classes."""
     scores = score_renders(network, renders)
-    folders = real_folders(real)
     if path := folders.get("low_light"):
         scores |= score_photographs(network, path, LABEL, REAL, True)
     if path := folders.get("projector"):
@@ -258,7 +257,7 @@ def rank(scores: Mapping[str, Sequence[float]]) -> dict[str, tuple[int, int, int
 def add(options: argparse.Namespace) -> None:
     """Score networks, write a file with their rows, and print their ranks."""
     rows = read(options.scores)
-    real_folders(options.real)
+    folders = real_folders(options.real)
     networks = {name: load(name) for name in options.networks}
     with tempfile.TemporaryDirectory() as temporary:
         renders = options.renders or Path(temporary) / "renders"
@@ -266,7 +265,7 @@ def add(options: argparse.Namespace) -> None:
         if not (renders / [*RELIT][-1] / TABLE).exists():
             write_renders(renders)
         for name, network in networks.items():
-            rows[name] = rows_of(name, score_network(network, renders, options.real))
+            rows[name] = rows_of(name, score_network(network, renders, folders))
             # The scores of a network are kept if a later network cannot be scored.
             write_csv(options.out, [HEADER, *(row for each in rows.values() for row in each)])
     for name in options.networks:

@@ -119,7 +119,7 @@ class Folder:
         named: dict[tuple[str, bool], set[str]] = {}
         for item, light in zip(self.photographs, self.lights, strict=True):
             side = str(light), item.label.removeprefix(OTHER_PREFIX) == label
-            named.setdefault(side, set()).update([item.mesh] if item.mesh else [])
+            named.setdefault(side, set()).update({item.mesh} - {None})
         return min(map(len, named.values())) >= MIN_OBJECTS
 
     @cached_property
@@ -135,7 +135,9 @@ class Folder:
 
     def units(self, label: str) -> np.ndarray:
         """Return the unit of each photograph: its object, or else the photograph with its crops."""
-        is_named = [self.has_objects(label) and bool(item.mesh) for item in self.photographs]
+        if not self.has_objects(label):
+            return self.names
+        is_named = [bool(item.mesh) for item in self.photographs]
         return np.where(is_named, self.objects, self.names)
 
     def draw(self, label: str) -> np.ndarray:
@@ -303,7 +305,9 @@ def print_tables(
             # Photographs of the objects that both lights show.
             pair = groups[light], groups[first_light]
             both = np.isin(folder.objects, np.intersect1d(*(folder.objects[rows] for rows in pair)))
-            now, before = (statistics(title, rows & both) for rows in pair)
+            now, before = values, results[title, first_light]
+            if not both[pair[0] | pair[1]].all():
+                now, before = (statistics(title, rows & both) for rows in pair)
             changes[title, light] = now - before
     what = "objects" if folder.has_objects(label) else "photographs, for these objects"
     is_positive = predictions[first_network][0].positive

@@ -3,9 +3,9 @@
     pip install sphericart-torch foolbox
     python -m benchmarks.rivals
 
-writes the panels "spherical harmonics" and "attack on pixels" of docs/renderer_pareto.csv and of
-its figure. Both take some minutes on one thread. Times are medians over rounds in which all calls
-take turns, and ratios are to the other library.
+writes the panels "spherical harmonics" and "attack on pixels" of docs/renderer_pareto.csv, and
+draws the first of them in its figure. Both take some minutes on one thread. Times are medians over
+rounds in which all calls take turns, and ratios are to the other library.
 
 Harmonics: values at 10,000 unit vectors, and values with the gradient of a random linear function
 of them, from autograd. Both libraries get the same vectors. Errors are relative to a third

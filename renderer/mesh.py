@@ -266,7 +266,8 @@ class Mesh:
         # Six times the volume of the tetrahedron of each face and the mesh center, shape (F,). It
         # is negative if the face is turned toward the center.
         sixfold_volumes = np.einsum("fi,fi->f", first_corners, doubled_vectors)
-        return bool((np.bincount(part_of_face, sixfold_volumes) > 0).all())
+        volume_of_part = np.bincount(part_of_face, sixfold_volumes)
+        return bool((volume_of_part > 0).all())
 
 
 # The result for the last mesh is cached. The next mesh often has the same

@@ -354,4 +354,5 @@ def _cancels(groups: np.ndarray, area_vectors: np.ndarray, lengths: np.ndarray) 
     flat_groups = groups.ravel()
     sums = [np.bincount(flat_groups, component.repeat(3)) for component in area_vectors.T]
     length_sums = np.bincount(flat_groups, lengths.repeat(3))
-    return (np.linalg.norm(sums, axis=0) <= CANCELLATION * length_sums)[groups]
+    is_canceled = np.linalg.norm(sums, axis=0) <= CANCELLATION * length_sums
+    return is_canceled[groups]

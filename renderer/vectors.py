@@ -74,7 +74,8 @@ def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:
     a = -1 / (sign + z)
     b = x * y * a
     first = [1 + sign * x * x * a, sign * b, -sign * x]
-    return [first, [b, sign + y * y * a, -y]]
+    second = [b, sign + y * y * a, -y]
+    return [first, second]
 
 
 def rotation_matrices(vectors: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:

@@ -145,7 +145,7 @@ def load_network(
         prefix, _, names = name.partition(":")
         plain, plus, other = names.rpartition("+")
         if f"+{RUN}" in names and not is_classifier(other):
-            # The name of the folder of a run in a sweep may have a "+".
+            # A folder that a sweep has named may have a "+" in its name.
             plain, _, folder_name = names.rpartition(f"+{RUN}")
             other = RUN + folder_name
         if not plus:

@@ -5,13 +5,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import train.settings
 from augment.scene.objects import MESHES_IN_MEMORY, name_mesh
 from augment.settings import ObjectSettings
 from augment.tasks.classification import class_index, nearest
 from renderer.errors import InputError, as_list, describe
 from renderer.mesh import Mesh
 from renderer.solids import HARD_NEGATIVES, SOLIDS
+from train import settings as common
 from train.settings import ExperimentSettings, is_of_no_class, label_names, simplified, solid_name
 
 # File of a mesh, solid:NAME, or the mesh itself.
@@ -72,19 +72,15 @@ def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) ->
     Without a label, the file "banana.glb" and the solid "solid:banana" are of the class "banana".
     An unknown class raises InputError, whose message names `key`.
     """
-    # A mistyped key is named first.
-    train.settings.read_objects(items, "", key)
     found = []
-    for index, item in enumerate(items):
-        values = item if isinstance(item, dict) else {"mesh": item}
-        mesh, label = str(values.get("mesh")), values.get("label")
-        if label in (None, ""):
+    for place, item in common.read_objects(items, "", key).items():
+        if item.label in (None, ""):
             # None if no class has this name.
-            name = class_of_name(name_of_mesh(mesh), classes)
+            name = class_of_name(name_of_mesh(item.mesh), classes)
         else:
-            name = class_name(classes, label, f"{key}[{index}].label")
+            name = class_name(classes, item.label, f"{place}.label")
         if name is None:
-            raise _unknown_class_error(mesh, classes)
+            raise _unknown_class_error(item.mesh, classes)
         found.append(name)
     return found
 

@@ -77,9 +77,10 @@ class Command:
             of conf/ with a file for each choice. "attack@augment.attack" is the folder conf/attack,
             whose files set augment.attack.
         rewrite: Function that changes the arguments of the command line before Hydra reads them.
-        sweep: Function that starts several runs for --multirun, as "module:function", and takes
-            the list of `expand`. If it is empty, Hydra starts them. A command without the group
-            "launcher" has no --multirun.
+        sweep: Function that starts several runs for --multirun, as "module:function". It takes
+            the function that starts Hydra, the list of `expand` and the first configuration. If
+            it is empty, Hydra starts the runs. A command without the group "launcher" has no
+            --multirun.
     """
 
     name: str
@@ -141,8 +142,8 @@ class Command:
             else:
                 runs = expand(sys.argv[1:])
                 # A mistyped key is answered before the import of torch.
-                self.compose(runs[0], as_typed=False)
-                system.import_function(self.sweep)(start, runs)
+                first_config = self.compose(runs[0], as_typed=False)
+                system.import_function(self.sweep)(start, runs, first_config)
 
     def to_overrides(self, arguments: Sequence[str]) -> list[str]:
         """Convert the arguments of the command line to overrides that Hydra reads."""
@@ -359,7 +360,7 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     key, equals, value = argument.partition("=")
     if not key.lstrip("+").startswith("hydra"):
         key = key.lstrip("+")
-    # A shell expands "~" in few of these places.
+    # A shell leaves "~/" as it is between quotes and in lists.
     value = re.sub(r"(?<![^\[{,:\s'\"])~(?=/)", lambda _: os.path.expanduser("~"), value)
     kind = without_none(keys.get(key))
     # A key such as attack@augment.attack chooses a file of the folder conf/attack.

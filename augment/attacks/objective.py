@@ -145,9 +145,8 @@ class Objective:
         draws = [self._transformations[row] for row in shown for _ in range(images.shape[1])]
 
         def score_batch(rows: slice) -> Score:
-            batch_gradients = None if gradients is None else gradients[rows]
-            of_batch = all_images[rows], criterion.select(rows), draws[rows]
-            return self._score_batch(*of_batch, batch_gradients)
+            part = None if gradients is None else gradients[rows]
+            return self._score_batch(all_images[rows], criterion.select(rows), draws[rows], part)
 
         with self.phases("attack_classifier"), torch.set_grad_enabled(needs_gradient):
             batches = list(self._batch_size.map(score_batch, len(all_images)))

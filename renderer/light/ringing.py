@@ -223,7 +223,8 @@ def irradiance_weights(degree: int) -> Tensor:
     # Also compute the factor of degree + 1, because it may be the smallest positive factor.
     factors = lambertian_factors(degree + 1).abs()
     smallest = factors[factors > 0].min()
-    return (factors.clamp(min=smallest / 2) / factors[0])[: (degree + 1) ** 2]
+    weights = factors.clamp(min=smallest / 2) / factors[0]
+    return weights[: (degree + 1) ** 2]
 
 
 @cache

@@ -262,7 +262,8 @@ def lobe_functions(
     in_cosine = _cosine_polynomials(cosine, coefficients.shape[-1])
     in_roughness = roughness_polynomials(roughness)
     if len(roughness) == 1:
-        return torch.einsum("tmrc,r->tmc", coefficients, in_roughness[:, 0]) @ in_cosine
+        cosine_coefficients = torch.einsum("tmrc,r->tmc", coefficients, in_roughness[:, 0])
+        return cosine_coefficients @ in_cosine
     # Axes: polynomial in the roughness, polynomial in the cosine, sample.
     products = in_roughness[:, None] * in_cosine
     return coefficients.flatten(2) @ products.flatten(0, 1)

@@ -135,6 +135,7 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, resume: 
         except (Interrupted, KeyboardInterrupt) as stop:
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
             advice = "no checkpoint yet: start again"
+            # The first training on photographs may have ended before the main one.
             if any(map(checkpoints.exists, [*settings_of_runs, folder / PHOTOGRAPHS_FIRST])):
                 advice = f"to go on: {shlex.join(resume)}"
             console.info("%s%s", cause, advice)

@@ -42,7 +42,9 @@ MAX_TABLE_LINES = 10
 MAX_UNFINISHED = 3
 
 
-def sweep(start: Callable[[], None], runs: Sequence[Sequence[str]]) -> None:
+def sweep(
+    start: Callable[[], None], runs: Sequence[Sequence[str]], first_config: DictConfig
+) -> None:
     """Train all runs of a sweep, print a table of their results, and write a report.
 
     Wrong settings, and folders of other runs, are found before any training. The exit status is 1
@@ -55,7 +57,6 @@ def sweep(start: Callable[[], None], runs: Sequence[Sequence[str]]) -> None:
         raise InputError("out= is the folder of a single run: name that of a sweep with sweep=")
     if "launcher=slurm" in runs[0] and not shutil.which("sbatch"):
         raise InputError("launcher=slurm needs the command sbatch: start on the cluster")
-    first_config = main.compose(runs[0], as_typed=False)
     if first_config.photographs_first:
         raise InputError("photographs_first=true makes no sweep: start the runs one by one")
     overwrite = bool(first_config.overwrite)

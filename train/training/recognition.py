@@ -73,15 +73,16 @@ def fit_recognizer(
         scores = predict(measure, kept_aside, device).double() @ weights
     threshold = scores.quantile(KEPT, interpolation="higher").item()
     percent = 100 * expected_errors(len(scores))
-    message = "about %.0f%% of other images are recognized, too, since %d of them set the threshold"
+    message = "about %.0f%% of other images are recognized by mistake (threshold from %d images)"
     console.info(message, percent, len(scores))
     return {"layers": layers, "weights": weights, "bias": -threshold}
 
 
 def expected_errors(count: int) -> float:
-    """Return the fraction of unchanged images that are taken for lit ones, by theory.
+    """Return the expected fraction of unchanged images that are taken for lit ones.
 
-    The threshold is a quantile of `count` images, and is exceeded by this fraction of further ones.
+    The threshold is the quantile KEPT of the scores of `count` unchanged images. A further one
+    exceeds it with this probability.
     """
     rank = math.ceil(KEPT * (count - 1))
     return (count - rank) / (count + 1)
