@@ -21,6 +21,7 @@ from augment.classifier import TaskNetwork
 from augment.progress import Phases
 from augment.scene.build import MeshItem, build_scene, warn_of_exposure
 from augment.scene.objects import SceneObject
+from augment.scene.render import KEPT_SAMPLES
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT
 from augment.service import AugmentationService
@@ -223,23 +224,28 @@ def _renders(
     def index_of(label: str | int) -> int:
         return NO_OBJECT if label in NAMELESS else names.index(label)
 
-    # One after another, so that image, truth and maps are of the same rasterized view.
-    for example in rows.tolist():
-        row = torch.tensor([example], device=values.device)
-        conditions = problem.conditions(values[row], row)
-        image = to_bytes(problem.images(values, row)[0, 0]).cpu()
-        # Labels, boxes, masks and visible fractions in the one view of the one example.
-        truth = [part[0, 0].cpu() for part in vars(scene.truth(index_of, row, conditions)).values()]
-        classes, boxes, masks, visible = (part[truth[0] != NO_OBJECT] for part in truth)
-        [camera] = scene.cameras_under(conditions, 0, example)
-        facts = describe_camera(camera.fixed(), scene.settings.shape)
-        labels = [names[index] for index in classes.tolist()]
-        depth, normals = scene.surface_maps(conditions, 0, example) if maps else (None, None)
-        seen = labels, boxes, masks, visible, depth, normals
-        shown = scene.examples[example]
-        light = conditions.light[0].cpu() * shown.exposure
-        name = scene.objects[shown.object].name
-        yield LabeledRender(start + example, image, *seen, facts, light, name)
+    # So many at once that image, truth and maps are of the same rasterized views. With operators,
+    # the last bits of an image depend on which others are rendered with it.
+    kept = KEPT_SAMPLES // (scene.settings.pixel_count * scene.settings.samples**2)
+    for some in rows.split(max(1, kept) if scene.one_light else 1):
+        conditions = problem.conditions(values[some], some)
+        images = to_bytes(problem.images(values, some)[:, 0]).cpu()
+        truths = scene.truth(index_of, some, conditions).map(Tensor.cpu)
+        maps_of = scene.surface_maps(conditions, some)[:, 0] if maps else None
+        for row, example in enumerate(some.tolist()):
+            # Labels, boxes, masks and visible fractions in the one view of the example.
+            truth = [part[row, 0] for part in vars(truths).values()]
+            classes, boxes, masks, visible = (part[truth[0] != NO_OBJECT] for part in truth)
+            [camera] = scene.cameras_under(conditions, row, example)
+            facts = describe_camera(camera.fixed(), scene.settings.shape)
+            labels = [names[index] for index in classes.tolist()]
+            depth = None if maps_of is None else maps_of[row, 0]
+            normals = None if maps_of is None else maps_of[row, 1:]
+            seen = labels, boxes, masks, visible, depth, normals
+            shown = scene.examples[example]
+            light = conditions.light[row].cpu() * shown.exposure
+            name = scene.objects[shown.object].name
+            yield LabeledRender(start + example, images[row], *seen, facts, light, name)
 
 
 def describe_camera(camera: Camera, shape: tuple[int, int]) -> dict[str, Any]:

@@ -207,6 +207,24 @@ FrozenView = tuple[Float[Tensor, "3 K P"], Float[Tensor, "3 P"]]
 ViewKey = tuple[int | None, Camera, bool]
 
 
+class Group(NamedTuple):
+    """N views that are rasterized together.
+
+    Attributes:
+        rows: Row of the conditions of each view.
+        views: Number of each view among those of its example.
+        object: Index of the object.
+        cameras: Camera of each view.
+        changed: Conditions of the first row, which differ from the others in the light only.
+    """
+
+    rows: tuple[int, ...]
+    views: tuple[int, ...]
+    object: int
+    cameras: tuple[Camera, ...]
+    changed: Conditions
+
+
 class FrozenTransport:
     """Radiance that shadows and bounces of environment light add to views of a mesh.
 
@@ -352,51 +370,45 @@ class DirectRenderer:
             self._local_views[key] = LocalLightView(self._rays[object_index], surface)
         return self._local_views[key]
 
-    def masks(
-        self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"] | None = None
-    ) -> tuple[Bool[Tensor, "O height width"], Float[Tensor, " O"]]:
+    def masks(self, group: Group) -> tuple[Bool[Tensor, "N O height width"], Float[Tensor, "N O"]]:
         """Find the pixels of which the visible part of each object covers COVERED or more.
 
         Return also the fraction of each object that nothing hides. It is 0 outside of the view.
-        `vertices` None are those of the unmoved objects.
         """
-        item = self.objects[object_index]
-        mesh, seen = self._seen(object_index, camera, vertices)
-        pixel_count = self.settings.pixel_count
+        item = self.objects[group.object]
+        mesh, seen, cameras = self._seen(group)
         # `item.ends` has the index after the last face of each object.
         # Index of the object that each sample shows. The table comes after the objects.
-        owner_of_face = np.searchsorted(item.ends, seen.faces.numpy(), side="right")
-        owner = torch.from_numpy(owner_of_face)[seen.sample_to_seen_face]
-        # Count the samples of each pair of an object and a pixel, shape (O, height, width).
-        keys = owner * pixel_count + seen.pixels[seen.sample_to_pixel]
-        owner_count = len(item.ends)
-        counts = torch.bincount(keys, minlength=(owner_count + 1) * pixel_count)
-        counts = counts.view(-1, *self.settings.shape)[:owner_count]
-        visible_counts = counts.sum((1, 2))
-        # Rasterize each object by itself, to count its samples if nothing hides it.
-        ends = zip([0, *item.ends[:-1]], item.ends, strict=True)
-        parts = [mesh.faces[start:end] for start, end in ends]
-        shown = [camera], self.settings, self.rasterizer
-        alone = [seen]  # All samples show the only object.
+        ends = torch.tensor(item.ends, device=seen.faces.device)
+        owner = torch.searchsorted(ends, seen.faces, right=True)[seen.sample_to_seen_face]
+        # Count the samples of each pair of an object and a pixel, shape (O, N, height, width).
+        shape = len(ends) + 1, len(cameras), *self.settings.shape
+        keys = owner * math.prod(shape[1:]) + seen.pixels[seen.sample_to_pixel]
+        counts = torch.bincount(keys, minlength=math.prod(shape)).view(shape)[:-1]
+        visible_counts = counts.sum((2, 3))
+        counts_alone = visible_counts  # All samples show the only object.
         if item.own is not None:
-            alone = [build_fragments(mesh.vertices, faces, *shown)[0] for faces in parts]
-        counts_alone = torch.tensor([len(each.sample_numbers) for each in alone])
-        visible = visible_counts / counts_alone.clamp(min=1)
-        return counts >= COVERED * self.settings.samples**2, visible
+            # Rasterize each object by itself, to count its samples if nothing hides it.
+            parts = np.split(mesh.faces, item.ends)[:-1]
+            shown = cameras, self.settings, self.rasterizer
+            alone = [build_fragments(mesh.vertices, faces, *shown) for faces in parts]
+            counts_alone = torch.tensor([[len(each.sample_numbers) for each in of] for of in alone])
+        visible = visible_counts / counts_alone.to(ends.device).clamp(min=1)
+        return (counts >= COVERED * self.settings.samples**2).transpose(0, 1), visible.T
 
-    def surface_maps(
-        self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"] | None = None
-    ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "3 height width"]]:
+    def surface_maps(self, group: Group) -> Float[Tensor, "N 4 height width"]:
         """Find depth and unit normal of the nearest sample in pixels of coverage >= COVERED.
 
         The depth is the distance from the camera along the viewing direction in world units, and
         normals are along the axes right, up and back of the camera. Both are 0 in other pixels.
         """
-        mesh, fragments = self._seen(object_index, camera, vertices)
-        # Columns of the pose are the axes right, up and back of the camera, and its position.
-        pose = torch.from_numpy(camera.pose())
-        from_camera = pose[:3, 3] - torch.from_numpy(mesh.vertices)[fragments.corners]
-        depths = fragments.interpolate((from_camera @ pose[:3, 2])[:, :, None])[:, 0]
+        mesh, seen, cameras = self._seen(group)
+        fragments = seen.to("cpu")
+        # Columns of a pose are the axes right, up and back of the camera, and its position.
+        poses = torch.from_numpy(np.stack([camera.pose()[:3] for camera in cameras]))
+        pose = poses[fragments.view_of_face]
+        from_camera = pose[:, None, :, 3] - torch.from_numpy(mesh.vertices)[fragments.corners]
+        depths = fragments.interpolate(from_camera @ pose[:, :, 2:3])[:, 0]
         # The nearest sample of each pixel, and the first of equally near ones.
         pixel, count = fragments.sample_to_pixel, len(fragments.pixels)
         depth = depths.new_full((count,), math.inf).scatter_reduce_(0, pixel, depths, "amin")
@@ -405,27 +417,27 @@ class DirectRenderer:
         seen_face = fragments.sample_to_seen_face[nearest]
         is_smooth = self.settings.normals == "smooth"
         in_world = mesh.corner_normals if is_smooth else mesh.face_normals()[:, None]
-        corner_normals = torch.from_numpy(in_world)[fragments.faces[seen_face]] @ pose[:3, :3]
+        corner_normals = torch.from_numpy(in_world)[fragments.faces[seen_face]]
+        corner_normals = corner_normals @ pose[seen_face, :, :3]
         normals = (fragments.barycentric[nearest][:, :, None] * corner_normals).sum(1)
         # `facing` turns the normals of faces that are seen from behind.
         normals = normalize(normals, dim=1) * fragments.facing[seen_face]
         # Depth and the three components of the normal, shape (4, P).
         at_pixels = torch.cat([depth[None], normals.T])
-        maps = torch.zeros(4, math.prod(fragments.shape))
+        maps = torch.zeros(4, len(cameras) * self.settings.pixel_count)
         is_covered = fragments.coverage >= COVERED
         maps[:, fragments.pixels[is_covered]] = at_pixels[:, is_covered].float()
-        maps = maps.unflatten(1, fragments.shape)
-        return maps[0], maps[1:]
+        return maps.view(4, -1, *self.settings.shape).transpose(0, 1)
 
-    def _seen(
-        self, object_index: int, camera: Camera, vertices: Float[Tensor, "V 3"] | None
-    ) -> tuple[Mesh, Fragments]:
-        """Return the mesh of an object with other vertices, if given, and what a camera sees."""
-        mesh = self.objects[object_index].mesh
+    def _seen(self, group: Group) -> tuple[Mesh, Fragments, tuple[Camera, ...]]:
+        """Return the mesh of a group, what its cameras see, and the cameras as numbers."""
+        vertices = group.changed.vertices
+        mesh = _moved(self.objects[group.object].mesh, vertices)
+        cameras = tuple(camera.fixed() for camera in group.cameras)
         if vertices is None:
-            return mesh, self.view(object_index, camera)[0].to("cpu")
-        fragments, _ = self._rasterize(object_index, [camera], vertices, self.settings)
-        return _moved(mesh, vertices), fragments.to("cpu")
+            return mesh, self.view(group.object, *cameras)[0], cameras
+        fragments, _ = self._rasterize(group.object, cameras, vertices, self.settings)
+        return mesh, fragments, cameras
 
     def views_at_once(self) -> int:
         """Return how many views `radiance` renders at once. Rays and silhouettes need one."""
@@ -437,19 +449,19 @@ class DirectRenderer:
     def radiance(
         self,
         example: int,
-        object_index: int,
-        cameras: Sequence[Camera],
-        light: Float[Tensor, "K 3"],
-        changed: Conditions,
+        group: Group,
+        light: Float[Tensor, "*views K 3"],
         background: Float[Tensor, "_ pixels"],
         is_draft: bool = False,
     ) -> PixelRadiance:
         """Render `views_at_once` views of an object with changed shape, colors, gloss or lamps.
 
-        Their images are one tall image. The result is differentiable in the light and in all
+        Their images are one tall image, in one light or in one for each view, for which the object
+        must be matte. The result is differentiable in the light and in all
         changes. With `settings.silhouettes`, it is also differentiable in fields of the camera that
         are tensors. A draft of moved vertices with shadows or bounces has fewer samples and rays.
         """
+        _, _, object_index, cameras, changed = group
         item = self.objects[object_index]
         fixed_cameras = tuple(camera.fixed() for camera in cameras)
         # Only views that are rendered alone need their camera.

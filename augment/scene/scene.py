@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from inspect import signature
-from itertools import cycle, islice, product
+from itertools import cycle, groupby, islice, product
 from typing import Any
 
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 from augment.network import say_once
 from augment.progress import progress
 from augment.scene.objects import Conditions, Example, SceneObject
-from augment.scene.render import DirectRenderer, Layer, OperatorRenderer
+from augment.scene.render import DirectRenderer, Group, Layer, OperatorRenderer
 from augment.scene.truth import LEAST_VISIBLE, NO_OBJECT, Truth, boxes_of
 from renderer import errors
 from renderer.camera import Camera
@@ -404,18 +404,19 @@ class Scene:
         # Largest number of objects in an example. Examples with fewer are padded with NO_OBJECT.
         most = max(map(len, kept))
         labels = torch.full((len(rows), self.views, most), NO_OBJECT)
-        masks = torch.zeros((*labels.shape, *self.settings.shape), dtype=torch.bool)
-        visible = torch.zeros(labels.shape)
-        for row, (example, item) in enumerate(zip(rows.tolist(), items, strict=True)):
-            index = self.examples[example].object
-            vertices = conditions.row(row, item.mesh).vertices
-            count = len(kept[row])
-            labels[row, :, :count] = torch.tensor([index_of(item.labels[i]) for i in kept[row]])
-            for view, camera in enumerate(self.cameras_under(conditions, row, example)):
-                # Masks and visible fractions of all objects of the example, of which some are kept.
-                all_objects = self._direct_renderer.masks(index, camera.fixed(), vertices)
-                mask, fraction = (part[kept[row]] for part in all_objects)
-                masks[row, view, :count], visible[row, view, :count] = mask, fraction
+        size, device = self.settings.shape, self.lights.device
+        masks = torch.zeros((*labels.shape, *size), dtype=torch.bool, device=device)
+        visible = torch.zeros(labels.shape, device=device)
+        for row, item in enumerate(items):
+            names = [item.labels[i] for i in kept[row]]
+            labels[row, :, : len(names)] = torch.tensor([*map(index_of, names)])
+        for group in self._groups(conditions, rows.tolist()):
+            # Masks and visible fractions of all objects of the views, of which some are kept.
+            all_objects = self._direct_renderer.masks(group)
+            of_group = kept[group.rows[0]]
+            places = list(group.rows), list(group.views), slice(len(of_group))
+            masks[places], visible[places] = (part[:, of_group] for part in all_objects)
+        labels = labels.to(device)
         is_hidden = (labels != NO_OBJECT) & (visible < LEAST_VISIBLE)
         if is_hidden.any():
             row, _, kept_index = is_hidden.nonzero()[0].tolist()
@@ -424,24 +425,23 @@ class Scene:
             say_once(f"objects are left out of the truth of {reason}, such as {hidden}")
         labels[is_hidden] = NO_OBJECT
         masks[is_hidden] = False
-        truth = (labels, boxes_of(masks), masks, visible)
-        return Truth(*(part.to(self.lights.device) for part in truth))
+        return Truth(labels, boxes_of(masks), masks, visible)
 
     @torch.no_grad()
     def surface_maps(
-        self, conditions: Conditions, row: int, example: int
-    ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "3 height width"]]:
-        """Return depth and normals in the first view of an example (`DirectRenderer`).
+        self, conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A V 4 height width"]:
+        """Return the depth and the three components of normals in the views of examples.
 
         Args:
-            conditions: Conditions of some examples.
-            row: Index of the example in the first dimension of the conditions.
-            example: Index of the example in the scene.
+            conditions: Shape and pose of the A examples.
+            examples: Indices of the A examples.
         """
-        index = self.examples[example].object
-        camera = self.cameras_under(conditions, row, example)[0].fixed()
-        vertices = conditions.row(row, self.objects[index].mesh).vertices
-        return self._direct_renderer.surface_maps(index, camera, vertices)
+        maps = torch.zeros(len(examples), self.views, 4, *self.settings.shape)
+        for group in self._groups(conditions, examples.tolist()):
+            of_views = self._direct_renderer.surface_maps(group)
+            maps[list(group.rows), list(group.views)] = of_views
+        return maps
 
     def _as_examples(self, examples: object, count: int | None = None) -> Int[Tensor, " A"]:
         """Convert indices of examples to an integer tensor on the device of the lights.
@@ -535,26 +535,51 @@ class Scene:
         The light of the conditions is multiplied by the exposure already. There is one layer for
         each of the A · V images.
         """
-        at_once = self._direct_renderer.views_at_once()
-        # Row of the conditions, and first view, of each group of views that are rendered together.
-        first_views = range(0, self.views, at_once)
-        groups: Iterable[tuple[int, int]] = product(range(len(examples)), first_views)
+        numbers = _on_cpu(examples).tolist()
+        groups: Iterable[Group] = self._groups(conditions, numbers)
         if len(examples) * self.views > MAX_VIEWS_WITHOUT_PROGRESS:
             groups = progress(list(groups), "rendering views")
-        numbers = _on_cpu(examples).tolist()
-        for row, first in groups:
-            example = self.examples[numbers[row]]
-            cameras = self.cameras_under(conditions, row, numbers[row])[first : first + at_once]
-            background = self.backgrounds[example.background].flatten(1).repeat(1, len(cameras))
-            changed = conditions.row(row, self.mesh(numbers[row]))
-            shown = numbers[row], example.object, cameras, changed.light, changed, background
-            pixels, coverage, radiance = self._direct_renderer.radiance(*shown, is_draft)
+        for group in groups:
+            rows = group.rows
+            numbers_behind = [self.examples[numbers[row]].background for row in rows]
+            behind = torch.cat([self.backgrounds[each] for each in numbers_behind], dim=1)
+            background = behind.flatten(1)
+            light = group.changed.light
+            if rows[0] != rows[-1]:
+                light = torch.stack([conditions.light[row] for row in rows])
+            shown = numbers[rows[0]], group, light, background, is_draft
+            pixels, coverage, radiance = self._direct_renderer.radiance(*shown)
             # Pixels at the border of the object show a part of the background.
-            behind = background.index_select(1, pixels)
-            term = background_term(coverage[None], behind, self.settings.encoding)
-            parts = split_views(pixels, len(cameras), self.settings.pixel_count, radiance + term)
-            for image, (pixels_of_view, composite) in enumerate(parts, row * self.views + first):
+            seen_background = background.index_select(1, pixels)
+            term = background_term(coverage[None], seen_background, self.settings.encoding)
+            parts = split_views(pixels, len(rows), self.settings.pixel_count, radiance + term)
+            for row, view, part in zip(rows, group.views, parts, strict=True):
+                image, (pixels_of_view, composite) = row * self.views + view, part
                 yield Layer(slice(image, image + 1), pixels_of_view, composite[None])
+
+    def _groups(self, conditions: Conditions, numbers: Sequence[int]) -> Iterator[Group]:
+        """Yield groups of views that are rasterized together.
+
+        `numbers` are the examples of the rows. Rows share a group if they show the same matte mesh
+        and if nothing but their light changes.
+        """
+        changes = (conditions.vertices, conditions.albedo, conditions.gloss, conditions.cameras)
+        is_unchanged = all(values is None for values in changes)
+        cameras = [self.cameras_under(conditions, *each) for each in enumerate(numbers)]
+
+        def shown(image: tuple[int, int]) -> tuple[int, int]:
+            row, _ = image
+            index = self.examples[numbers[row]].object
+            is_shared = is_unchanged and self.objects[index].mesh.gloss is None
+            return index, -1 if is_shared else row
+
+        images = product(range(len(numbers)), range(self.views))
+        for (index, _), of_mesh in groupby(sorted(images, key=shown), key=shown):
+            while group := list(islice(of_mesh, self._direct_renderer.views_at_once())):
+                rows, views = zip(*group, strict=True)
+                changed = conditions.row(rows[0], self.objects[index].mesh)
+                of_views = tuple(cameras[row][view] for row, view in group)
+                yield Group(rows, views, index, of_views, changed)
 
 
 def _on_cpu(indices: Tensor) -> Tensor:

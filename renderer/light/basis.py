@@ -389,12 +389,12 @@ class SplitLight(NamedTuple):
         return SumBasis(tuple(bases))
 
 
-def split_light(basis: Basis, coefficients: Float[Tensor, "size 3"]) -> SplitLight:
+def split_light(basis: Basis, coefficients: Float[Tensor, "*views size 3"]) -> SplitLight:
     """Divide the coefficients of a basis into environment light and local lights."""
     environment = basis.environment
     return SplitLight(
-        environment=None if environment is None else coefficients[environment.rows],
-        local_lights=[(part.basis, coefficients[part.rows]) for part in basis.local_lights],
+        environment=None if environment is None else coefficients[..., environment.rows, :],
+        local_lights=[(part.basis, coefficients[..., part.rows, :]) for part in basis.local_lights],
     )
 
 

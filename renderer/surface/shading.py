@@ -33,7 +33,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -56,7 +56,7 @@ COLORS = 3
 def radiance(
     fragments: Fragments,
     vertices: Float[Tensor, "V 3"],
-    light: Float[Tensor, "coefficients 3"],
+    light: Float[Tensor, "*views coefficients 3"],
     albedo: Float[Tensor, "S 3"],
     normals: Float[Tensor, "G 3 3"] | None = None,
 ) -> Float[Tensor, "3 P"]:
@@ -64,7 +64,8 @@ def radiance(
 
     The result is differentiable with respect to the vertices, the light and the
     albedo. The radiance is multiplied by the covered fraction of each pixel. `normals`
-    come from `normals_in_sight`, or are None for flat shading.
+    come from `normals_in_sight`, or are None for flat shading. All views have the same light,
+    or each has one of its own.
     """
     # Only the albedo is checked here. `area_vectors` checks the vertices, and `irradiance`
     # checks the light.
@@ -79,13 +80,15 @@ def radiance(
         weights = fragments.merge(albedo)
         pixel = fragments.groups.group_to_pixel
         face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
-        incoming = irradiance(face_normals, light, wide)
+        view = fragments.view_of_face if light.ndim > 2 else None
+        incoming = irradiance(face_normals, light, wide, view)
         incoming = incoming.index_select(1, fragments.groups.group_to_seen_face)
     else:
         pixel = fragments.sample_to_pixel
         weights = albedo / fragments.samples**2
         shading_normals = smooth_normals(fragments, normals.to(wide))
-        incoming = irradiance(shading_normals.T, light, wide)
+        view = fragments.view_of_sample if light.ndim > 2 else None
+        incoming = irradiance(shading_normals.T, light, wide, view)
     reflected = incoming * weights.T
     # Each column of `reflected` is a pixel already if a pixel has one sample.
     if fragments.samples > 1:
@@ -223,7 +226,10 @@ class _HarmonicSum(torch.autograd.Function):
 
 
 def irradiance(
-    normals: Float[Tensor, "3 N"], light: Float[Tensor, "coefficients 3"], dtype: torch.dtype
+    normals: Float[Tensor, "3 N"],
+    light: Float[Tensor, "*views coefficients 3"],
+    dtype: torch.dtype,
+    view: Int[Tensor, " N"] | None = None,
 ) -> Float[Tensor, "3 N"]:
     """Compute the irradiance of environment light on surfaces with N normals.
 
@@ -231,12 +237,16 @@ def irradiance(
     irradiance is the function R in appendix B.2 of Liu et al. 2019. Appendix D has
     its derivative. Both are evaluated as polynomials of the normal. The normals have any
     length. Coefficients of odd degrees from 3 on change nothing, and their gradient is
-    exactly 0.
+    exactly 0. If each view has its own light, `view` is the view of each normal, ascending.
     """
     require_bounded(light=light)
+    light = light.to(dtype)
     # `degree_of` raises InputError if K is not (degree + 1)².
-    harmonics.degree_of(light)
-    return _Irradiance.apply(normals, light.to(dtype))
+    harmonics.degree_of(light[0] if view is not None else light)
+    if view is None:
+        return _Irradiance.apply(normals, light)
+    of_views = normals.split(view.bincount(minlength=len(light)).tolist(), dim=1)
+    return torch.cat([_Irradiance.apply(*each) for each in zip(of_views, light, strict=True)], 1)
 
 
 class _Irradiance(torch.autograd.Function):

@@ -121,8 +121,18 @@ class Fragments:
         eyes = torch.stack([camera.differentiable_eye() for camera in self.cameras])
         if len(eyes) == 1:
             return eyes
-        view = self.sample_numbers.div(math.prod(self.sample_shape), rounding_mode="floor")
-        return eyes.to(view.device).index_select(0, view)
+        return eyes.to(self.pixels.device).index_select(0, self.view_of_sample)
+
+    @property
+    def view_of_sample(self) -> Int[Tensor, " S"]:
+        """Index of the view of each sample, ascending."""
+        return self.sample_numbers.div(math.prod(self.sample_shape), rounding_mode="floor")
+
+    @property
+    def view_of_face(self) -> Int[Tensor, " G"]:
+        """Index of the view of each seen face, ascending."""
+        view = torch.zeros_like(self.faces)
+        return view.index_copy_(0, self.sample_to_seen_face, self.view_of_sample)
 
     @cached_property
     def barycentric(self) -> Tensor:

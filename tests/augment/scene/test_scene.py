@@ -15,13 +15,14 @@ from augment.attack_settings import SkylightSettings, StepSettings
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.parameters import make_parameter
 from augment.attacks.problem import SceneProblem
-from augment.augmentation_settings import views_of
+from augment.augmentation_settings import VariationSettings, views_of
 from augment.network import say_once
 from augment.scene import render
 from augment.scene.build import build_scene, warn_of_exposure
 from augment.scene.objects import Conditions, Example, load_object
 from augment.scene.render import NEAR
 from augment.scene.scene import Scene
+from augment.scene.vary import vary
 from augment.settings import ObjectSettings
 from renderer.camera import orbit_cameras
 from renderer.light.environment import to_map, write_map
@@ -319,6 +320,31 @@ def test_shadows_of_unmoved_vertices_and_colors_are_those_of_the_operators(names
     for shown, change in ((scene, {}), (scene, unmoved), (scene, unpainted), (in_one_light, {})):
         images = shown.render(Conditions(lights, **change), rows)[:, 0]
         torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=1000 * EPS32)
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+@pytest.mark.parametrize("rasterizer", ["numba", "torch"])
+def test_examples_that_are_rendered_together_have_the_bits_and_the_truth_of_each_alone(
+    normals, rasterizer
+):
+    pairs = [(f"solid:{name}", name) for name in ("orange", "cup")]
+    scene = build_scene([pairs, pairs[1], pairs[0]], 12, 6, normals=normals, rasterizer=rasterizer)
+    settings = VariationSettings(fov=[20.0, 40.0], shift=0.3, exposure=[0.5, 2.0])
+    scene = vary(scene, settings, torch.Generator().manual_seed(0), once=True)
+    conditions = Conditions(random_lights(len(scene)))
+    rows = torch.arange(len(scene)).flip(0)
+    shown = replace(conditions, light=conditions.light[rows])
+    images, maps = scene.render(shown, rows), scene.surface_maps(shown, rows)
+    truth = scene.truth(hash, rows, shown)
+    assert scene.one_light and len({example.exposure for example in scene.examples}) == len(scene)
+    for place, row in enumerate(rows[:, None]):
+        alone = Conditions(shown.light[place : place + 1])
+        assert torch.equal(images[place], scene.render(alone, row)[0])
+        assert torch.equal(maps[place], scene.surface_maps(alone, row)[0])
+        of_row = scene.truth(hash, row, alone)
+        count = of_row.labels.shape[-1]
+        for name, values in vars(of_row).items():
+            assert torch.equal(getattr(truth, name)[place, :, :count], values[0])
 
 
 def test_shadows_in_light_of_degree_0_grow_with_the_light():
