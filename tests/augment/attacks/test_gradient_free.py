@@ -7,6 +7,7 @@ from torch import nn
 import augment
 from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.problem import SceneProblem
+from renderer.camera import OrthographicCamera
 from renderer.light.files import load_light
 from renderer.light.nonnegative import project_nonnegative
 
@@ -50,9 +51,10 @@ def logits_of_means(images: np.ndarray) -> np.ndarray:
     return 30 * np.stack([images[:, 0].mean((1, 2)), images[:, 2].mean((1, 2))], axis=1)
 
 
+@pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize(("optimizer", "noise"), [("random_search", 1.0), ("cma_es", 0.0)])
 @pytest.mark.filterwarnings("ignore:the light is negative")
-def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, noise):
+def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, noise, shared):
     pytest.importorskip("cma")
     seen = []
 
@@ -61,7 +63,10 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
         seen.extend(image.tobytes() for image in images)
         return scores
 
-    scene = augment.build_scene([("solid:orange", 0)], 8, views=2, rasterizer="numpy")
+    options = {"shared": shared, "rasterizer": "numpy"}
+    if shared:  # Similar views are fooled together.
+        options["cameras"] = [OrthographicCamera(60.0, azimuth, 2.2) for azimuth in (0.0, 2.0)]
+    scene = augment.build_scene([("solid:orange", 0)], 8, views=2, **options)
     lighting = augment.StepSettings("linf", 0.2)
     options = {"max_queries": 40, "allow_negative": True, "quantized": False, "noise_margin": 1.0}
     options |= {"optimizer": optimizer, "sensor_noise": noise}

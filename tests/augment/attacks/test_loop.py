@@ -275,6 +275,51 @@ def test_of_several_successes_the_one_of_the_lowest_cost_is_kept():
     assert result.values.tolist() == [[-0.5]]
 
 
+def test_points_of_cma_es_outside_of_the_ball_are_told_with_a_penalty(monkeypatch):
+    """It is the interquartile range of the costs times the mean squared distance from the ball."""
+    cma = pytest.importorskip("cma")
+    told = []
+    monkeypatch.setattr(
+        cma.CMAEvolutionStrategy, "tell", lambda self, points, costs: told.append((points, costs))
+    )
+    radius = 0.5
+    problem = LinearScene(torch.zeros(1, VALUE_COUNT).double(), StepSettings("linf", radius))
+    attack(Linear(), problem, torch.zeros(1).long(), 2, optimizer="cma_es", max_queries=20)
+    points, costs = map(np.array, told[0])
+    values = torch.from_numpy(points * radius / 2).clamp(-radius, radius)
+    images = problem.render(values, torch.zeros(len(values)).long())[:, 0]
+    expected = Linear()(images).log_softmax(1)[:, 0].detach().numpy()
+    outside = np.maximum(np.abs(points) - 2, 0)  # in units of half the radius
+    assert outside.any()
+    penalties = np.subtract(*np.quantile(expected, [0.75, 0.25])) * (outside**2).mean(1)
+    np.testing.assert_allclose(costs, expected + penalties, atol=1e-6)
+
+
+def test_of_several_candidates_the_success_of_the_lowest_cost_is_taken():
+    """The first costs least and is none, and the last is one that costs more than the second."""
+    costs = torch.tensor([-3.0, -1.0, 1.0])
+    is_success = torch.tensor([False, True, True])
+
+    class Scored(Objective):
+        def select(self, rows):
+            return self
+
+        def moved(self, problem, values, examples):
+            return self
+
+        def score(self, images, needs_gradient):
+            score, _ = super().score(images, False)
+            return dataclasses.replace(score, cost=costs.double(), is_success=is_success), None
+
+    problem = LinearScene(torch.zeros(1, VALUE_COUNT, dtype=torch.float64))
+    criterion = ClassCriterion(torch.zeros(3, 1, dtype=torch.int64))
+    candidates = random(1, 3, VALUE_COUNT, seed=4)
+    objective = Scored(Linear(), criterion, settings_of())
+    result = loop.evaluate(problem, objective, candidates, torch.zeros(1, dtype=torch.int64), False)
+    assert torch.equal(result.values, candidates[:, 1])
+    assert result.costs.tolist() == [costs.tolist()]
+
+
 class ClampedScene(LinearScene):
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
         return values.view(-1, 1, *IMAGE_SHAPE).clamp(0, 1)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 import augment
 from augment.attack_settings import EOTSettings
 from augment.attacks import objective
-from augment.attacks.objective import as_jpeg, average_transformed
+from augment.attacks.objective import _moved, as_jpeg, average_transformed
 from augment.network import Network, Quantization
 from augment.random_streams import generator
 from augment.tasks.classification import (
@@ -217,6 +217,16 @@ def test_shifts_reach_the_jitter_as_a_fraction_of_the_width(without_jpeg):
     changes = (moved - ramp)[..., 15:17, 15:17].mean((1, 2, 3))
     shift = changes.abs().max() * 31 / 32  # The ramp is 31 of 32 pixels long.
     assert 0.095 < shift < 0.105
+
+
+def test_turns_are_those_of_square_pixels_in_images_of_any_shape():
+    """A turn by 90 degrees about the center moves pixels to pixels."""
+    images = random_images(1, 3, 9, 15)
+    turned = _moved(images, torch.tensor([[0.0, 0.0, torch.pi / 2, 0.0]]))
+    square = images[..., 3:12]  # in the middle of the image
+    found = turned[..., 3:12]
+    errors = [(found - square.rot90(count, (2, 3))).abs().max() for count in (1, -1)]
+    assert min(errors) < 1e-4
 
 
 def test_jpeg_is_pillows():

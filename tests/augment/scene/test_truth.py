@@ -77,6 +77,17 @@ def test_a_hidden_object_and_one_outside_of_the_view_are_left_out_and_said(caplo
     assert "left out of the truth of views" in caplog.text
 
 
+@pytest.mark.parametrize("visible", [0.08, 0.12])
+def test_an_object_of_which_a_tenth_is_visible_is_labeled(visible):
+    """Seen from +x, the disc of a ball of radius 1 lies in that of a larger one behind it."""
+    radius = (1 - visible) ** -0.5
+    behind = nb.ObjectSettings("solid:ball", "behind", at=[-3.0, 0.0], scale=radius)
+    scene = nb.build_scene([[("solid:ball", "ball"), behind]], 64, width=4.0, polar=90.0, samples=4)
+    truth = scene.truth(["ball", "behind"].index)
+    assert truth.visible[0, 0, 1].item() == pytest.approx(visible, abs=0.01)
+    assert truth.labels[0, 0, 1] == (1 if visible > 0.1 else NO_OBJECT)
+
+
 def test_objects_without_a_position_do_not_touch_and_stand_on_one_ground():
     kinds = ["pear", "cup", "ball", "table", "orange"]
     scene = nb.build_scene([[(f"solid:{kind}", kind) for kind in kinds]], 8)

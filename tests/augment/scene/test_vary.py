@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -16,7 +16,7 @@ import augment
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 from augment.random_streams import generator
 from augment.scene.objects import Conditions
-from augment.scene.patterns import draw_patterns
+from augment.scene.patterns import MAX_ZOOM, draw_patterns, draw_photograph_patterns, pixel_centers
 from augment.scene.scene import Scene
 from augment.scene.vary import draw_camera_effects, vary
 from augment.settings import LampsSettings, ObjectSettings, ProjectorSettings
@@ -263,6 +263,13 @@ def test_a_white_table_is_seen_from_above_darkened_below_the_object_and_lights_i
     assert (irradiance - 0.2 * math.pi).abs().max() < 0.01
 
 
+def test_a_table_is_as_bright_as_the_exposure_makes_the_object():
+    white = built("solid:plate", views=3, backgrounds=[1.0])
+    given, darker = (drawn(white, tables=1.0, exposure=[each] * 2) for each in (1.0, 0.25))
+    assert given.backgrounds.amax() < 1  # Clipped values would hide the factor.
+    torch.testing.assert_close(darker.backgrounds, 0.25 * given.backgrounds)
+
+
 @pytest.mark.parametrize("options", [{"ground": [0, 0, 0]}, {"views": 2, "shared": True}])
 def test_tables_are_refused_in_scenes_where_they_would_be_wrong(options):
     with pytest.raises(InputError, match=r"^tables"):
@@ -485,6 +492,25 @@ def test_a_pattern_has_at_most_two_colors_and_its_brighter_one_is_full():
     assert color_counts == {1, 2}
     # A pattern of two halves may leave its bright half out of the image.
     assert (patterns.amax((1, 2, 3)) == 1).double().mean() > 0.9
+
+
+def test_photographs_of_any_shape_are_turned_without_distortion_and_mirrored_beyond_the_border():
+    height, width = 18, 30
+    photograph = torch.rand(1, 1, height, width, generator=generator(2)).expand(-1, 3, -1, -1)
+    points = pixel_centers((height, width))
+    shown = draw_photograph_patterns(photograph, points, generator(3))[0, 0]
+    turn, zoom, _ = torch.rand(3, 1, 1, 1, generator=generator(3)).flatten().tolist()
+    scale = MAX_ZOOM ** (2 * zoom - 1)
+    errors = []
+    # Either direction is as good.
+    for angle in (2 * np.pi * turn, -2 * np.pi * turn):
+        turned = Rotation.from_euler("z", angle).as_matrix()[:2, :2] @ points.flatten(1).numpy()
+        # Pixels are square, and the image is 2 wide.
+        column, row = (scale * width * turned + [[width - 1], [height - 1]]) / 2
+        place = [row.reshape(height, width), column.reshape(height, width)]
+        expected = map_coordinates(photograph[0, 0].numpy(), place, order=1, mode="reflect")
+        errors.append(np.abs(shown.numpy() - expected).max())
+    assert min(errors) < 1e-4
 
 
 def test_half_of_the_patterns_show_photographs_of_a_folder(tmp_path):

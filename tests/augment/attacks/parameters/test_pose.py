@@ -57,10 +57,10 @@ def test_values_are_a_rotation_vector_a_shift_and_a_scale(ground):
 def test_the_camera_moves_to_the_place_of_another_scenes_camera(fov):
     scene = scene_of(fov=fov, polar=60.0, azimuth=20.0)
     values = torch.tensor([[0.0] * 6 + [0.5, -1.5, 2.0]], dtype=torch.float64)
-    other = scene_of(fov=fov, polar=65.0, azimuth=5.0, width=2.6 * 1.1**2)
+    other = scene_of(fov=fov, polar=65.0, azimuth=5.0, width=2.6 * 1.15**2)
     conditions = replace(other.conditions(FIRST), vertices=other.vertices)
     expected = other.render(conditions, FIRST)
-    rendered = problem_of(scene).render(values, FIRST)
+    rendered = problem_of(scene, distance=0.15).render(values, FIRST)
     torch.testing.assert_close(rendered, expected, rtol=0, atol=1e-9)
 
 
