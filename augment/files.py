@@ -29,7 +29,17 @@ from torch.utils._pytree import tree_leaves
 
 from augment import classifier as classifiers
 from augment.classifier import Classifier, TaskNetwork
-from augment.network import ARRAYS, FILE, YOU, Function, Network, plain_outputs, say_once, unwrapped
+from augment.network import (
+    ARRAYS,
+    FILE,
+    YOU,
+    Function,
+    Network,
+    log_probabilities,
+    plain_outputs,
+    say_once,
+    unwrapped,
+)
 from augment.tasks.task import Task
 from renderer.errors import InputError, explained, reading, require_file, require_kind, single_line
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
@@ -346,17 +356,20 @@ class InBatches(Network):
 
 def _read_onnx(path: Path) -> Content:
     """Read a file of ONNX, with gradients if onnx2torch is installed and converts it exactly."""
-    network, sizes = read_onnx(path)
+    network, sizes, is_last = read_onnx(path)
     # Dimensions without a size get a default: two images of 224 × 224 pixels.
     shape = [size or default for size, default in zip(sizes, (2, 3, 224, 224), strict=True)]
     images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    expected = network(images)
     try:
         with torch.no_grad():
             converted = importlib.import_module("onnx2torch").convert(str(path)).eval()
+            converted = ChannelsLast(converted) if is_last else converted
+            # `network` turns probabilities into logits.
+            converted = Logarithm(converted) if network.has_probabilities else converted
             # Compare all outputs of the converted network with those of onnxruntime.
-            both = (tree_leaves(of(images)) for of in (converted, network))
-            for output, expected in zip(*both, strict=True):
-                torch.testing.assert_close(output, expected, rtol=1e-3, atol=1e-3)
+            for pair in zip(tree_leaves(converted(images)), tree_leaves(expected), strict=True):
+                torch.testing.assert_close(*pair, rtol=1e-3, atol=1e-3)
     # onnx2torch may be absent. It lacks some operations, and fails in many ways.
     except Exception as error:
         reason = single_line(error)
@@ -365,10 +378,28 @@ def _read_onnx(path: Path) -> Content:
     return converted, sizes
 
 
-def read_onnx(path: Path) -> Content:
+class ChannelsLast(Network):
+    """Give a network images with channels last, (N, H, W, 3)."""
+
+    def forward(self, images: Tensor) -> Any:
+        """Compute the outputs of images (N, 3, H, W)."""
+        return self.network(images.permute(0, 2, 3, 1))
+
+
+class Logarithm(Network):
+    """Turn the probabilities of a network into logits."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Compute the logits of images."""
+        return log_probabilities(self.network(images))
+
+
+def read_onnx(path: Path) -> tuple[Function, list[int | None], bool]:
     """Read a file of ONNX with onnxruntime, on the CPU.
 
     The network has no gradients. Its one input is images of float32. Several outputs are a tuple.
+    Return also the sizes of images (N, 3, H, W), and whether the file has channels last, as those
+    of TensorFlow have.
     """
     onnxruntime = import_package("onnxruntime", str(path), '"parametric-norm-balls[onnx]"')
     options = onnxruntime.SessionOptions()
@@ -376,12 +407,16 @@ def read_onnx(path: Path) -> Content:
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     [images] = session.get_inputs()
     sizes = [size if isinstance(size, int) else None for size in images.shape]
+    is_last = sizes[3] == 3 != sizes[1]
+    if is_last:
+        sizes = [sizes[axis] for axis in (0, 3, 1, 2)]
 
     def outputs(batch: np.ndarray) -> Any:
+        batch = batch.transpose(0, 2, 3, 1) if is_last else batch
         found = session.run(None, {images.name: batch.astype(np.float32)})
         return found[0] if len(found) == 1 else tuple(map(torch.from_numpy, found))
 
-    return Function(outputs, ARRAYS), sizes
+    return Function(outputs, ARRAYS), sizes, is_last
 
 
 def read_weights(path: Path) -> State:

@@ -270,10 +270,12 @@ class Function(nn.Module):
         scores = torch.as_tensor(np.asarray(outputs)).to(images)
         if self.has_probabilities is None and scores.ndim == 2:
             self.has_probabilities = are_probabilities(scores)
-        if self.has_probabilities:
-            # Replace 0 by the smallest positive number, because the logarithm of 0 is infinite.
-            return scores.clamp(min=torch.finfo(scores.dtype).tiny).log()
-        return scores
+        return log_probabilities(scores) if self.has_probabilities else scores
+
+
+def log_probabilities(probabilities: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+    """Compute logarithms, where 0 is replaced by the smallest positive number."""
+    return probabilities.clamp(min=torch.finfo(probabilities.dtype).tiny).log()
 
 
 def _is_structured(outputs: Any) -> bool:

@@ -8,6 +8,7 @@ pixels from the top left corner of the image.
 import json
 import math
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,7 @@ from torch import Tensor
 from renderer import errors
 from renderer.camera import PerspectiveCamera, Points
 from renderer.errors import InputError
+from renderer.io.images import SUFFIXES, open_image
 
 # Conventions for the axes of a camera in its view matrix. OpenCV has y down and z forward. OpenGL
 # has y up and z backward.
@@ -184,6 +186,11 @@ class PinholeCamera(PerspectiveCamera):
             pixel_aspect=focal_y / focal_x,
         )
 
+    def translated(self, offset: np.ndarray) -> Self:
+        """Return a camera whose image stays the same if the mesh is moved by an offset (3,)."""
+        centers = zip(("center_x", "center_y", "center_z"), offset.tolist(), strict=True)
+        return replace(self, **{name: getattr(self, name) + by for name, by in centers})
+
     def normalized(self, center: np.ndarray, scale: float) -> Self:
         """Return a camera whose image stays the same, and that attacks turn about the origin."""
         return replace(super().normalized(center, scale), center_x=0.0, center_y=0.0, center_z=0.0)
@@ -230,7 +237,7 @@ def load_cameras(path: str | Path, whole: bool = False) -> dict[str, PinholeCame
         >>> import norm_balls as nb
         >>> pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
         >>> frames = [{"file_path": "front.png", "transform_matrix": pose}]
-        >>> scene = {"camera_angle_x": 0.6, "frames": frames}
+        >>> scene = {"camera_angle_x": 0.6, "w": 640, "h": 480, "frames": frames}
         >>> _ = Path("transforms.json").write_text(json.dumps(scene))
         >>> cameras = nb.load_cameras("transforms.json")
         >>> [*cameras], round(cameras["front.png"].distance, 3)
@@ -316,13 +323,25 @@ def _read_transforms(path: Path, whole: bool) -> dict[str, PinholeCamera]:
         scene = json.loads(text)
         for frame in scene["frames"]:
             # A frame is an image of the scene. Its entries override those of the scene.
-            intrinsics, size = _transforms_intrinsics({**scene, **frame})
-            view = np.linalg.inv(np.array(frame["transform_matrix"], dtype=float))
-            camera = PinholeCamera.from_matrix(view, intrinsics, size, "opengl", whole)
             if not isinstance(frame["file_path"], str):
                 raise TypeError(f"file_path is {frame['file_path']}")
+            entries = {**scene, **frame}
+            if not {"w", "h", "fl_x", "fl_y", "cx", "cy"} & entries.keys():
+                entries |= _size_of_image(path.parent / frame["file_path"])
+            intrinsics, size = _transforms_intrinsics(entries)
+            view = np.linalg.inv(np.array(frame["transform_matrix"], dtype=float))
+            camera = PinholeCamera.from_matrix(view, intrinsics, size, "opengl", whole)
             _add(cameras, frame["file_path"], camera)
     return cameras
+
+
+def _size_of_image(path: Path) -> dict[str, int]:
+    """Read the entries w and h from an image, whose name may lack its suffix. Empty without one."""
+    for file in (path, *(path.parent / f"{path.name}{suffix}" for suffix in SUFFIXES)):
+        if file.is_file():
+            with open_image(file) as image:
+                return {"w": image.width, "h": image.height}
+    return {}
 
 
 def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
@@ -342,10 +361,13 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
         raise InputError(f"{fault}, which is not supported: {UNDISTORT}")
     if not {"w", "h"} <= entries.keys() and {"fl_x", "fl_y", "cx", "cy"} & entries.keys():
         raise InputError("the focal length is in pixels, but the image size w and h is missing")
-    # A file with square images may have a field of view, but no image size. The focal length and
-    # the principal point are then computed for an image of one pixel.
-    width = int(entries.get("w", 1))
-    height = int(entries.get("h", width))
+    # Files with fields of view need no image size. One field of view is that of square images.
+    tangents = [math.tan(float(entries.get(f"camera_angle_{axis}", 0)) / 2) for axis in "xy"]
+    ratio = tangents[1] / tangents[0] if all(tangents) else 1
+    width = int(entries.get("w", errors.MAX_SCALE))
+    height = int(entries.get("h", round(width * ratio)))
+    if not {"w", "h", "camera_angle_y"} & entries.keys():
+        warnings.warn("the cameras have no image size w and h: images are square", stacklevel=4)
     focal_lengths = []
     for axis, side in (("x", width), ("y", height)):
         if f"fl_{axis}" in entries:

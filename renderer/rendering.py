@@ -29,6 +29,7 @@ from renderer.operators.build import build_operators
 from renderer.operators.rays import LocalLightView, Rays, Surface
 from renderer.operators.shadows import build_transport
 from renderer.operators.stack import TransferOperators
+from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings, Size, samples_per_side
 from renderer.shaded_view import ShadedView
 from renderer.solids import sphere
@@ -42,6 +43,8 @@ from renderer.visibility.fragments import Fragments, build_fragments, views_at_o
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]
 # Largest albedo that `render` accepts: 1 and a margin for rounding errors.
 MAX_ALBEDO = 1 + 1e-4
+# A mesh is moved to the origin if its center is farther away than its size times this factor.
+FAR = 10
 # Words with which errors ask for the argument `lights` of `render`.
 _LOCAL_LIGHTS = "a list of lamps and projectors, alone or in pairs (basis, coefficients)"
 # Default camera for pictures of lights. It looks from the same direction as the first camera of
@@ -158,7 +161,16 @@ def render(
     split = SplitLight(light, [(basis, values.to(like)) for basis, values in local_lights])
 
     is_moved = vertices is not None
-    vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
+    vertices = torch.from_numpy(mesh.vertices) if vertices is None else vertices
+    center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    is_far = np.abs(center).max() > FAR * np.ptp(mesh.vertices, axis=0).max()
+    pinholes = [camera for camera in all_cameras if isinstance(camera, PinholeCamera)]
+    if is_far and not local_lights and len(pinholes) == len(all_cameras):
+        # In coordinates of the earth, float32 would round vertices to meters.
+        mesh = replace(mesh, vertices=mesh.vertices - center)
+        vertices = vertices.double() - torch.from_numpy(center).to(vertices.device)
+        all_cameras = [camera.translated(-center) for camera in pinholes]
+    vertices = vertices.to(like)
     # Rasterizing and ray tracing have no gradients, so they take a mesh and cameras with plain
     # numbers instead of tensors.
     moved_mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())

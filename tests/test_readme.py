@@ -160,6 +160,12 @@ def test_render_block_has_a_gradient_by_light(monkeypatch):
     assert names["light"].grad.any()
 
 
+def test_many_meshes_block_has_gradients_by_all_lights():
+    names = run("Many meshes")
+    names["images"].mean().backward()
+    assert names["lights"].grad.flatten(1).any(1).all()
+
+
 def test_many_views_block_renders_each_view_and_light():
     names = run("Many lights and views")
     assert names["images"].shape == (100, 2, 3, 32, 32)

@@ -413,14 +413,14 @@ def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:
 def _specular_factor(extensions: dict[str, Any]) -> float:
     """Compute the specular factor, which is 1 for a reflectance of 4%, by its two extensions."""
     specular = extensions.get(SPECULAR, {})
-    colors = _factor(specular, "specularColorFactor", 3)
+    colors = np.array(specular.get("specularColorFactor", [1.0] * 3))
     textures = {"specularTexture", "specularColorTexture"} & specular.keys()
     if textures or np.ptp(colors) > 0:
         raise ValueError("a material has a specular color or texture: read it without gloss")
     ior = extensions.get(IOR, {}).get("ior", 1.5)
     # Reflectance at normal incidence (Fresnel) for the index of refraction, 1.5 by default.
     reflectance = ((ior - 1) / (ior + 1)) ** 2
-    return float(specular.get("specularFactor", 1.0) * colors[0] * reflectance / DIELECTRIC)
+    return float(specular.get("specularFactor", 1.0) * min(colors[0] * reflectance, 1) / DIELECTRIC)
 
 
 def _specular_glossiness(

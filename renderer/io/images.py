@@ -36,12 +36,16 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 # Suffixes of the files in a folder that count as images.
-SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
+_AVIF = [".avif"] if "avif" in features.modules else []
+SUFFIXES = (
+    *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif"),
+    *(".jp2", ".ppm", ".pgm", *_AVIF),
+)
 # Formats of Pillow that are read, whatever the name of the file. Others can run programs:
 # Pillow passes an EPS file to Ghostscript. "TGA" is last, because it has no signature.
 FORMATS = [
     *("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "JPEG2000", "PPM"),
-    *(["AVIF"] if "avif" in features.modules else []),
+    *(["AVIF"] if _AVIF else []),
     "TGA",
 ]
 # A large JPEG file is decoded at a reduced size before it is

@@ -14,7 +14,7 @@ import mapbox_earcut
 import numpy as np
 import torch
 from jaxtyping import Float, Int, Num
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from renderer.errors import MAX_MAGNITUDE, require_memory
 from renderer.image import decode, encode
@@ -106,7 +106,7 @@ class MeshFile:
         """Read an image file as a texture, uint8, shape (H, W, 3)."""
         key = folder + name
         if key not in self._textures:
-            pixels = np.array(decode_image(self.read(name, folder)).convert("RGBA"))
+            pixels = np.array(decode_image(self.read(name, folder), name).convert("RGBA"))
             if pixels[..., 3].min() < 255:
                 self.assume(f"the alpha of {name} is ignored")
             self._textures[key] = np.ascontiguousarray(pixels[..., :3])
@@ -131,9 +131,12 @@ class MeshFile:
             warn_once(text, stacklevel + 1)
 
 
-def decode_image(content: bytes | memoryview) -> Image.Image:
+def decode_image(content: bytes | memoryview, name: str = "a texture") -> Image.Image:
     """Decode an image file with 8 bits per channel, if it fits into memory as a texture."""
-    image = identify(io.BytesIO(content))
+    try:
+        image = identify(io.BytesIO(content))
+    except UnidentifiedImageError as error:
+        raise ValueError(f"{name} is no image that can be read: save it as PNG or JPEG") from error
     require_memory("textures", TEXEL_BYTES * image.width * image.height, CPU)
     return eight_bits(image)
 

@@ -306,8 +306,10 @@ def read_stl(file: MeshFile) -> list[Part]:
         coordinates = faces["corners"].astype(np.float64)
     if has_colors:
         raise ValueError("colors in .stl files are not supported: export the mesh as .ply")
+    if not face_count:
+        return []
     vertices = coordinates.reshape(-1, 3)
     mesh_file.require_bounded(coordinates=vertices)
     # Files have no shared vertices: each face has three of its own.
     vertex_ids = np.arange(len(vertices)).reshape(-1, 3)
-    return [Part(mesh_file.colored_mesh(vertices, vertex_ids, np.ones((1, 3))))][:face_count]
+    return [Part(mesh_file.colored_mesh(vertices, vertex_ids, np.ones((1, 3))))]

@@ -289,6 +289,31 @@ def test_onnx_gives_the_scores_of_its_graph_and_a_size_that_it_tells_is_not_assu
     assert "224 × 224 pixels, assumed; not normalized, assumed" in free
 
 
+@pytest.mark.parametrize("is_last", [False, True])
+def test_onnx_of_channels_last_and_with_probabilities_has_gradients_of_its_logits(tmp_path, is_last):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx2torch")
+    onnx = pytest.importorskip("onnx")
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    axes = [1, 2] if is_last else [2, 3]
+    nodes = [helper.make_node("ReduceMean", ["x"], ["m"], axes=axes, keepdims=0)]
+    nodes.append(helper.make_node("Softmax", ["m"], ["y"], axis=1))
+    sizes = {"x": ["n", 40, 48, 3] if is_last else ["n", 3, 40, 48], "y": ["n", 3]}
+    x, y = (helper.make_tensor_value_info(name, kind, sizes[name]) for name in sizes)
+    graph = helper.make_graph(nodes, "graph", [x], [y])
+    opsets = [helper.make_opsetid("", 13)]
+    path = tmp_path / "network.onnx"
+    onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
+    classifier = nb.load_classifier(str(path))
+    assert classifier.size == (40, 48)
+    images = torch.rand(4, 3, 40, 48, requires_grad=True)
+    expected = images.mean((2, 3)).log_softmax(1)
+    found = classifier(images)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+    gradients = [torch.autograd.grad(each[:, 0].sum(), images)[0] for each in (found, expected)]
+    torch.testing.assert_close(*gradients)
+
+
 def test_timm_tells_the_size_of_a_network_in_memory_which_is_assumed(said, warned):
     timm = pytest.importorskip("timm")
     # timm records the size of the images in the configuration of a network.

@@ -4,10 +4,11 @@ A photograph is shown upright, as its EXIF orientation says, and brought to the 
 """
 
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -169,6 +170,7 @@ def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, 
         advice = f"give a gray or palette image of {width:g} × {height:g} indices of classes"
         raise InputError(f"{path} has the shape {labels.shape}: {advice}")
     highest = int(labels[labels != NO_CLASS_PIXEL].max(initial=0))
+    class_count = min(class_count, NO_CLASS_PIXEL)
     if highest >= class_count:
         advice = f"use 0 to {class_count - 1}, and {NO_CLASS_PIXEL} for pixels that do not count"
         raise InputError(f"{path} has the value {highest}: {advice}")
@@ -251,16 +253,30 @@ def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
     # Other images in the folder, by name without folder. Most files need no search.
     others: dict[str, list[Path]] = defaultdict(list)
     for path in visible_files(folders[0]) if len(paths) < len(names) else ():
-        if path.suffix.lower() in SUFFIXES:
+        if path.suffix.lower() in SUFFIXES and folders[0] / path not in paths.values():
             others[path.name].append(folders[0] / path)
+    uses = Counter(PurePosixPath(name).name for name in names)
     for name in [name for name in names if name not in paths]:
-        found = others[PurePosixPath(name).name]
+        parts = PurePosixPath(name).parts
+        found = others[parts[-1]]
+        # An image is in the same folders as its name says, from the last one on. Of images in other
+        # folders, the name alone must tell.
+        most = max((_equal_ends(path.parts, parts) for path in found), default=0)
+        found = [path for path in found if _equal_ends(path.parts, parts) == most]
+        if most == 1 and uses[parts[-1]] > 1:
+            continue
         if len(found) > 1:
             listed = " and ".join(map(str, found[:2]))
             raise InputError(f"{file} names the image {name}, which may be {listed}")
         if found:
             paths[name] = found[0]
     return paths
+
+
+def _equal_ends(*parts: Sequence[str]) -> int:
+    """Count the equal parts at the ends of two paths."""
+    pairs = zip(*(reversed(each) for each in parts), strict=False)
+    return len([*takewhile(lambda pair: pair[0] == pair[1], pairs)])
 
 
 def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
@@ -271,24 +287,34 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
     polygon, as fractions of the sides of the image.
     """
     classes, named = _yolo_classes(folder, file)
+    # Labels of poses have keypoints after the box.
+    has_keypoints = named.suffix.lower() in YAML and "kpt_shape" in _yaml_mapping(named)
     paths = _validation_images(named) if named.parent == folder else []
     if paths:
         console.info("%s: the images of its entry val are read", named)
     photographs = []
-    label_count = 0
+    read = []
     for path in paths or [folder / item.path for item in find_unlabeled(folder)]:
         # A photograph can have a label file in several places. The first that exists counts.
         labels = next(filter(Path.is_file, _label_files(path)), None)
-        label_count += labels is not None
-        rows = [] if labels is None else [*_yolo_rows(labels, len(classes))]
+        rows = []
+        if labels is not None:
+            read.append(labels)
+            rows = [*_yolo_rows(labels, len(classes), has_keypoints)]
         name = path.relative_to(folder) if path.is_relative_to(folder) else path
         # Coordinates are fractions, so the image has the width and height 1.
         photographs.append(_annotated(path, str(name), (1, 1), rows))
-    if not label_count:
+    if not read:
         first = _label_files(photographs[0].path.absolute())[0]
         fault = f"photos={folder} has neither a COCO file nor label files of YOLO"
         raise InputError(f"{fault}: add some, such as {first}", "photos")
-    return Annotations(folder, photographs, classes, [])
+    # Label files without an image. Images of an entry val may share their folder with others.
+    every = [item.path for item in photographs]
+    every += [folder / item.path for item in find_unlabeled(folder)]
+    known = {file for image in every for file in _label_files(image)}
+    found = {file.absolute() for of in {file.parent for file in read} for file in of.glob("*.txt")}
+    missing = [str(file) for file in sorted(found - known) if file.name not in CLASS_FILES]
+    return Annotations(folder, photographs, classes, missing)
 
 
 def _label_files(path: Path) -> list[Path]:
@@ -342,7 +368,9 @@ def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Pa
     # The folder itself, and the two above it.
     for parent in [folder, *list(folder.absolute().parents)[:2]]:
         files = [file for suffix in YAML for file in parent.glob(f"*{suffix}")]
-        for file in [given] if given else sorted(files):
+        for file in (
+            [given] if given else sorted(files, key=lambda file: (file.stem != "data", file))
+        ):
             with explained(f"{file} cannot be read", "give names as a list, or index: name"):
                 names = _yaml_mapping(file).get("names")
                 # Names are a list, or a mapping from index to name.
@@ -357,7 +385,7 @@ def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Pa
     raise InputError(f"photos={folder} names no classes: add data.yaml or classes.txt", "photos")
 
 
-def _yolo_rows(file: Path, class_count: int) -> Iterator[Sequence[float]]:
+def _yolo_rows(file: Path, class_count: int, has_keypoints: bool) -> Iterator[Sequence[float]]:
     """Yield the row of each line of a label file, as `_annotated` takes it."""
     with explained(f"{file} is no text", "write it again"):
         lines = file.read_text(encoding="utf-8-sig").splitlines()
@@ -365,7 +393,7 @@ def _yolo_rows(file: Path, class_count: int) -> Iterator[Sequence[float]]:
         if not line.strip():
             continue
         with explained(f"line {number} of {file} is no box", "write class x y width height"):
-            label, *values = map(float, line.split())
+            label, *values = map(float, line.split()[: 5 if has_keypoints else None])
             # Four numbers are a box, and at least three pairs are a polygon.
             if len(values) != 4 and (len(values) < 6 or len(values) % 2):
                 raise ValueError(f"it has {1 + len(values)} numbers")

@@ -26,6 +26,8 @@ from train.settings import OTHER_PREFIX, label_names
 
 # macOS adds a folder of this name to zip archives. It has no photographs.
 MACOS_FOLDER = "__MACOSX"
+# Suffixes of photographs that are not read.
+UNREAD = {".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw"} - {*SUFFIXES}
 # Largest number of classes that are positive because they have a sub-folder. The scores of each
 # class take as much time and memory as all photographs.
 MAX_LABELS = 50
@@ -130,8 +132,16 @@ def folder_names(folder: Path) -> list[str]:
 
 
 def find_unlabeled(folder: Path) -> list[Photograph]:
-    """Find all images of a folder and its subfolders, without their classes."""
-    return [Photograph(path, label="", source=None) for path in _image_files(folder)[0]]
+    """Find all images of a folder and its subfolders, without their classes.
+
+    Photographs of types that are not read are named in a warning.
+    """
+    paths, all_paths = _image_files(folder)
+    unread = [path for path in all_paths if path.suffix.lower() in UNREAD]
+    if unread:
+        fault = f"{len(unread)} photographs of {folder} are left out, such as {unread[0]}"
+        say_once(f"{fault}: save them as JPEG or PNG")
+    return [Photograph(path, label="", source=None) for path in paths]
 
 
 def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]]:

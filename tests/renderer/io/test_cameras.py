@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import renderer
@@ -138,6 +139,32 @@ def test_points_are_where_cameras_of_nerfstudio_see_them(tmp_path):
     angle = 2 * math.atan(WIDTH / 2 / FOCAL_X)
     write_transforms(tmp_path / "a.json", camera_angle_x=angle, **center)
     require_expected(tmp_path / "a.json", focal_y=FOCAL_X)
+
+
+@pytest.mark.parametrize("suffix", [".png", ""])
+def test_without_a_size_that_of_the_images_counts_or_that_of_both_angles(tmp_path, suffix):
+    """Without both, images are square. A camera of an image shows its central square."""
+    angle_x = 2 * math.atan(WIDTH / 2 / FOCAL_X)
+    angle_y = 2 * math.atan(HEIGHT / 2 / FOCAL_X)
+    sized, other = tmp_path / "sized.json", tmp_path / "other.json"
+    write_transforms(sized, camera_angle_x=angle_x)
+    expected = [*renderer.load_cameras(sized).values()]
+    scene = json.loads(sized.read_text())
+    del scene["w"], scene["h"]
+    for frame in scene["frames"]:
+        frame["file_path"] = frame["file_path"].removesuffix(".png") + suffix
+
+    def project() -> list[np.ndarray]:
+        return [camera.project(POINTS) for camera in renderer.load_cameras(other).values()]
+
+    other.write_text(json.dumps(scene | {"camera_angle_y": angle_y}))
+    np.testing.assert_allclose(project(), [each.project(POINTS) for each in expected], atol=1e-5)
+    other.write_text(json.dumps(scene))
+    with pytest.warns(UserWarning, match="images are square"):
+        assert not np.allclose(project()[0], expected[0].project(POINTS), atol=0.1)
+    for name in NAMES:
+        Image.new("L", (WIDTH, HEIGHT)).save(tmp_path / name)
+    np.testing.assert_allclose(project(), [each.project(POINTS) for each in expected], atol=1e-9)
 
 
 def test_distorted_cameras_are_refused(tmp_path):

@@ -615,11 +615,12 @@ def test_what_would_change_shape_or_color_is_refused(tmp_path, reason):
         REFUSED[reason].load(tmp_path, gloss=True)
 
 
-def test_the_reflectance_follows_from_the_refractive_index(tmp_path):
+@pytest.mark.parametrize("color", [0.8, 1.6])
+def test_the_reflectance_follows_from_the_refractive_index(tmp_path, color):
     """((1.2 - 1) / (1.2 + 1))² = .0083, and .04 is the specular factor 1."""
     extensions = {
         "KHR_materials_ior": {"ior": 1.2},
-        "KHR_materials_specular": {"specularFactor": 0.5, "specularColorFactor": [0.8] * 3},
+        "KHR_materials_specular": {"specularFactor": 0.5, "specularColorFactor": [color] * 3},
     }
     mesh = plain(extensions=extensions).load(tmp_path, gloss=True)
-    assert mesh.gloss[0, 2] == pytest.approx(0.4 * (0.2 / 2.2) ** 2 / 0.04)
+    assert mesh.gloss[0, 2] == pytest.approx(0.5 * color * (0.2 / 2.2) ** 2 / 0.04)

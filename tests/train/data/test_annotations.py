@@ -108,6 +108,47 @@ def test_boxes_follow_the_pixels_to_the_size_of_the_network(tmp_path, how, size,
     assert gray == pytest.approx(border if how == LETTERBOX else 0, abs=0.01)
 
 
+def test_an_image_of_coco_stands_for_no_other_of_the_same_name_in_another_folder(tmp_path):
+    names = ["cam1/1.png", "cam2/1.png", "cam3/2.png"]
+    _write_coco(tmp_path / "a.json", names)
+    _draw(tmp_path / "cam1" / "1.png")
+    read = read_annotations(tmp_path)
+    assert [item.name for item in read.photographs] == names[:1]
+    assert read.missing == names[1:]
+    # Folders that the file names tell images of one name apart, wherever they lie.
+    for folder in ("images/cam2", "images/cam4"):
+        _draw(tmp_path / folder / "1.png")
+    _draw(tmp_path / "images/2.png")
+    paths = [item.path.relative_to(tmp_path) for item in read_annotations(tmp_path).photographs]
+    assert [*map(str, paths)] == ["cam1/1.png", "images/cam2/1.png", "images/2.png"]
+
+
+@pytest.mark.parametrize("val", ["", "val: images\n", "val: list.txt\n"])
+def test_labels_of_yolo_without_an_image_are_counted(tmp_path, val):
+    for name in ("1", "2"):
+        _draw(tmp_path / "images" / f"{name}.png")
+    for name in ("1", "2", "3"):
+        (tmp_path / "labels").mkdir(exist_ok=True)
+        (tmp_path / "labels" / f"{name}.txt").write_text("0 0.5 0.5 0.2 0.2\n")
+    (tmp_path / "labels" / "classes.txt").write_text("cat\n")
+    (tmp_path / "list.txt").write_text("images/1.png\n")
+    (tmp_path / "data.yaml").write_text(f"names: [cat]\n{val}")
+    (tmp_path / "another.yaml").write_text("names: [person]\n")
+    read = read_annotations(tmp_path)
+    assert (read.classes, len(read.photographs)) == (("cat",), 1 if "list" in val else 2)
+    assert read.missing == [str(tmp_path / "labels" / "3.txt")]
+
+
+@pytest.mark.parametrize("shape", [[2, 2], [2, 3]])
+def test_a_pose_of_yolo_has_keypoints_after_its_box(tmp_path, shape):
+    _draw(tmp_path / "a.png")
+    keypoints = "0.1 0.2 2 0.3 0.4 1" if shape[1] == 3 else "0.1 0.2 0.3 0.4"
+    (tmp_path / "a.txt").write_text(f"0 0.5 0.4 0.5 0.4 {keypoints}\n")
+    (tmp_path / "data.yaml").write_text(f"names: [cat]\nkpt_shape: {shape}\n")
+    (marked,) = read_annotations(tmp_path).photographs
+    assert fit(marked, (40, 80), LETTERBOX).boxes == pytest.approx(np.array([BOX]))
+
+
 @pytest.mark.parametrize(
     ("image", "label", "names"),
     [

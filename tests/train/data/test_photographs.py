@@ -76,12 +76,18 @@ def test_links_to_folders_and_files_are_followed_but_not_in_circles(tmp_path):
 
 
 def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
-    others = ["notes.txt", "orange/b.HEIC", "orange/c.avif"]
+    others = ["notes.txt", "orange/b.HEIC", "orange/c.jxl"]
     touch(tmp_path, "orange/a.jpg", "orange/.d.heic", "lab.json", *others)
     (tmp_path / "orange" / "folder.jpg").mkdir()
     (tmp_path / "photos.csv").write_text("path,source_tag\n")
     assert find(tmp_path) == [("orange/a.jpg", "orange")]
     assert [*map(str, photographs.unsupported_files(tmp_path))] == others
+
+
+def test_photographs_without_labels_of_types_that_are_not_read_are_named(tmp_path, caplog):
+    touch(tmp_path, "a.jpg", "b.JPEG", "notes.txt", "c.HEIC", "deep/d.cr2")
+    assert len(photographs.find_unlabeled(tmp_path)) == 2
+    assert "2 photographs" in caplog.text and "c.HEIC" in caplog.text
 
 
 @pytest.mark.parametrize(("of_classes", "of_files"), [("NFC", "NFD"), ("NFD", "NFC")])
