@@ -11,8 +11,7 @@ import math
 import warnings
 from bisect import bisect
 from collections import UserDict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cache
 from itertools import accumulate
@@ -35,6 +34,7 @@ from augment.scene.patterns import draw_projected_light, luminance, require_phot
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import OVERSHOOT, decode, encode, to_bytes, to_unit
+from renderer.modes import usual_defaults
 
 # Keys of a sample at which a plain tensor is an image, whatever stands before it.
 IMAGES = ("image", "images", "img", "pixel_values")
@@ -148,7 +148,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         count = max([math.prod(_batch_shape(image)) for image in flat_inputs], default=1)
         models, weights = [*self.lights], [*self.lights.values()]
         lights: list[Light | None] = []
-        with _usual_defaults("cpu"):
+        with usual_defaults("cpu"):
             seeds = torch.randint(2**62, (count,)).tolist()
             for seed, (chance, choice) in zip(seeds, torch.rand(count, 2).tolist(), strict=True):
                 # Draw a model with a probability in proportion to its weight.
@@ -297,24 +297,9 @@ def relight_photographs(
         require_photographs("slides", slides)
     count, _, *shape = photographs.shape
     # Photographs stand for the albedo, and the light of the projector multiplies it.
-    with _usual_defaults(photographs.device.type):
+    with usual_defaults(photographs.device.type):
         light = draw_projected_light(count, shape, generator(seed, "relight"), slides)
         return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
-
-
-@contextmanager
-def _usual_defaults(kind: str) -> Iterator[None]:
-    """Create tensors on the CPU in 32 bits, and compute without autocast, in a `with` block."""
-    with ExitStack() as stack:
-        if torch.is_autocast_enabled(kind):
-            stack.enter_context(torch.autocast(kind, enabled=False))
-        made = torch.empty(0)  # Ten times as fast as `torch.get_default_device`.
-        if made.device.type != "cpu":
-            stack.enter_context(torch.device("cpu"))
-        if made.dtype != torch.float32:
-            stack.callback(torch.set_default_dtype, made.dtype)
-            torch.set_default_dtype(torch.float32)
-        yield
 
 
 def _key_of(path: Sequence[Any]) -> Any:
@@ -410,7 +395,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         chosen = [light for light in (lights[row] for row in rows) if light is not None]
         part = frames if len(rows) == len(frames) else frames[rows]
         depth_of_rows = None if depths is None else depths[rows]
-        with _usual_defaults(plain.device.type):
+        with usual_defaults(plain.device.type):
             parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
     relit = parts[0]
     if len(parts) > 1:

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, as_tensor, require, require_bounded, require_choice
+from renderer.modes import once_differentiable
 from renderer.settings import ENCODINGS, REC_709, Size, height_and_width
 
 # Linear value at which the sRGB curve changes

@@ -116,6 +116,9 @@ class Mesh:
             if getattr(self, name) is None and name in ("gloss", "normal_ids"):
                 continue
             array = errors.as_array(name, getattr(self, name), kinds)
+            if array.dtype.kind in "iu":
+                # Small and unsigned integers would overflow.
+                array = array.astype(np.int64 if kinds == "iu" else np.float64, copy=False)
             # A frozen dataclass forbids assignments, so fields are set by object.__setattr__.
             object.__setattr__(self, name, array)
             # Arrays per face have as many rows as `faces`. Other arrays may have any number of

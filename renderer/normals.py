@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int, Num
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_bounded
+from renderer.modes import once_differentiable
 from renderer.vectors import unit
 
 # `vertex_normals` adds up the area vectors of the faces around a vertex.

@@ -80,7 +80,7 @@ class PinholeCamera(PerspectiveCamera):
         principal_right: Distance of the principal point to the right of the image
             center, in halves of the image width.
         principal_up: Distance of the principal point above the image center, in
-            halves of the image height.
+            halves of the image width.
         pixel_aspect: Vertical focal length divided by the horizontal one, both in
             pixels.
 

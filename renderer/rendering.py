@@ -24,6 +24,7 @@ from renderer.image import as_background, composite, encode
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
 from renderer.mesh import NO_TEXTURE, Mesh, require_mesh
+from renderer.modes import without_autocast
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.operators.rays import LocalLightView, Rays, Surface
@@ -57,6 +58,7 @@ _choose = cache(choose)
 _white_ball = cache(lambda: Mesh.plain(*sphere(5)))
 
 
+@without_autocast
 def render(
     mesh: Mesh,
     cameras: Camera | Sequence[Camera],

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+
+from renderer.modes import once_differentiable
 
 # Type for the x, y and z components of S vectors, shape (S,) each.
 Components = tuple[Tensor, Tensor, Tensor]

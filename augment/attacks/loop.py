@@ -26,6 +26,7 @@ from augment.network import frozen_eval_mode
 from augment.progress import progress
 from augment.scene.truth import Rows
 from renderer.errors import Check, ShortRepr, late_checks, raise_first
+from renderer.modes import without_autocast
 
 # Fields of a `Minimum` that belong to the returned candidate: the keys of `Evaluation.found`.
 FOUND = ("values", "images", "success", "cost", "predicted")
@@ -297,7 +298,7 @@ def evaluate(
         if needs_gradient:
             # Chain rule: the gradient with respect to the images gives the gradient with respect
             # to the values.
-            gradients += torch.autograd.grad(rendered, part, image_gradient)
+            gradients += without_autocast(torch.autograd.grad)(rendered, part, image_gradient)
     score = Score.join(scores)
     # One row for each example, one column for each of its candidates.
     costs = score.cost.unflatten(0, (-1, count))

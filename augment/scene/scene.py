@@ -23,6 +23,7 @@ from renderer.camera import Camera
 from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
 from renderer.mesh import Mesh
+from renderer.modes import without_autocast
 from renderer.operators.build import build_operators
 from renderer.operators.stack import ScatterLayers
 from renderer.settings import ImageSettings
@@ -337,6 +338,7 @@ class Scene:
         """
         return Conditions(self.lights[self._as_examples(examples)])
 
+    @without_autocast
     def render(
         self, conditions: Conditions, examples: Int[Tensor, " A"], is_draft: bool = False
     ) -> Float[Tensor, "A V 3 height width"]:
@@ -396,8 +398,7 @@ class Scene:
             logged.
         """
         rows = torch.arange(len(self)) if examples is None else self._as_examples(examples)
-        if conditions is None:
-            conditions = self.conditions(rows)
+        conditions = conditions or self.conditions(rows)
         items = [self.objects[self.examples[example].object] for example in rows.tolist()]
         # Indices among the objects of each example of those in the truth.
         kept = [[0, *(i for i, of in enumerate(item.labels) if i and of != "")] for item in items]

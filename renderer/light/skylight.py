@@ -25,10 +25,10 @@ import torch
 from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, as_tensor, require_finite
 from renderer.light.basis import HARMONICS
+from renderer.modes import once_differentiable
 from renderer.settings import TURBIDITY
 
 # Smallest and largest zenith angle of the sun in degrees: from overhead to the horizon.

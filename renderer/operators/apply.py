@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
 from renderer import errors
 from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light.basis import HARMONICS, Basis
+from renderer.modes import once_differentiable, without_autocast
 from renderer.settings import ImageSettings
 
 # Number of color channels.
@@ -249,6 +249,7 @@ class TransferOperator:
         errors.require_shape("radiance_gradient", radiance_gradient, "...", *self.albedo.shape)
         return self._light_gradient(radiance_gradient)
 
+    @without_autocast
     def _images(
         self, lights: Lights, background: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -272,6 +273,7 @@ class TransferOperator:
         image_shape = (*batch_shape, COLORS, *self.settings.shape)
         return images.view(image_shape), is_unclamped, clamped_values
 
+    @without_autocast
     def _gradient_of_images(
         self,
         image_gradient: Float[Tensor, "... 3 height width"],
@@ -313,6 +315,7 @@ class TransferOperator:
             errors.require_bounded(lights=lights)
         return lights
 
+    @without_autocast
     def _radiance(self, lights: Lights) -> PixelValues:
         """Compute `radiance` without checks."""
         # Coefficients that change a pixel. All other coefficients have no row in the matrix.
@@ -333,6 +336,7 @@ class TransferOperator:
             radiance = radiance.index_add(-1, self.sparse.pixel, contributions.mT)
         return radiance.to(lights.dtype)
 
+    @without_autocast
     def _light_gradient(self, radiance_gradient: PixelValues) -> Lights:
         """Compute `light_gradient` without checks."""
         upstream = radiance_gradient.to(self.transfer.dtype)
@@ -447,6 +451,7 @@ class _Image(torch.autograd.Function):
     ) -> Float[Tensor, "... 3 height width"]:
         """Render one image under each light."""
         images, is_unclamped, clamped_values = operator._images(lights, background)
+        ctx.save_for_backward(lights)  # so that `once_differentiable` finds it
         ctx.operator = operator
         ctx.is_unclamped = is_unclamped
         ctx.clamped_values = clamped_values

@@ -105,7 +105,7 @@ class Patches:
         # a cubic grid, if the normals are equal after each component is rounded to -1, 0 or 1, and
         # if both sides are fronts or both are backs.
         centers = pieces.vertices[pieces.faces].mean(axis=1)
-        cells = np.floor(centers / math.sqrt(patch_area))
+        cells = np.floor((centers - mesh.vertices.min(0)) / math.sqrt(patch_area))
         keys = np.hstack([cells, np.rint(pieces.face_normals())])[piece_of_side]
         _, patch_of_side = np.unique(np.hstack([keys, facing]), axis=0, return_inverse=True)
         # NumPy 2.0.0 returns the shape (S, 1), other versions return (S,).

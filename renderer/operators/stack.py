@@ -10,10 +10,10 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, explained
 from renderer.image import as_background, background_term, clamp, encode
+from renderer.modes import once_differentiable, without_autocast
 from renderer.operators import apply
 from renderer.operators.apply import COLORS, SparseTransfer, TransferOperator
 
@@ -357,6 +357,7 @@ class OperatorStack:
         self.coverage = coverage.to(device)
         self._coefficients = coefficients.to(device)
 
+    @without_autocast
     def radiance(
         self, lights: Float[Tensor, "A coefficients 3"], images: Int[Tensor, " A"]
     ) -> Float[Tensor, "A 3 P"]:

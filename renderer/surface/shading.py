@@ -35,11 +35,11 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_bounded
 from renderer.light import harmonics
 from renderer.mesh import Mesh
+from renderer.modes import once_differentiable
 from renderer.normals import area_vectors, vertex_normals
 from renderer.surface.albedo import of_seen_faces
 from renderer.surface.gloss import SampleGloss, at_samples, toward_camera

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, Num, Shaped
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from renderer.camera import Camera, depths_of_views, project_views
 from renderer.errors import require_finite
+from renderer.modes import once_differentiable, without_autocast
 from renderer.settings import ImageSettings
 from renderer.visibility import Rasterizer
 
@@ -384,6 +384,7 @@ def views_at_once(settings: ImageSettings, vertices: np.ndarray | Tensor, casts_
     return max(1, samples // (settings.pixel_count * settings.samples**2))
 
 
+@without_autocast
 def build_fragments(
     vertices: Float[np.ndarray, "V 3"] | Float[Tensor, "V 3"],
     faces: Int[np.ndarray, "F 3"],

@@ -41,10 +41,10 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from renderer.camera import Camera
 from renderer.mesh import EDGES, shared_edges
+from renderer.modes import once_differentiable
 from renderer.visibility.fragments import Fragments
 from renderer.visibility.numpy import SUBSAMPLES, doubled_areas
 from renderer.visibility.torch import to_fixed_point

@@ -290,7 +290,7 @@ def test_onnx_gives_the_scores_of_its_graph_and_a_size_that_it_tells_is_not_assu
 
 
 @pytest.mark.parametrize("is_last", [False, True])
-def test_onnx_of_channels_last_and_with_probabilities_has_gradients_of_its_logits(tmp_path, is_last):
+def test_onnx_of_channels_last_and_of_probabilities_has_gradients_of_logits(tmp_path, is_last):
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx2torch")
     onnx = pytest.importorskip("onnx")

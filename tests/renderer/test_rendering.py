@@ -56,6 +56,90 @@ def test_an_operators_image_is_the_rendered_one(stone, light, encoding, normals)
         torch.testing.assert_close(operator.image(light, 0.3), image, rtol=0, atol=13 * 8 * EPS32)
 
 
+@pytest.mark.parametrize("name", ["light", "roughness", "vertices", "polar", "linear", "operator"])
+def test_second_derivatives_of_images_are_refused_whatever_they_are_asked_for(stone, light, name):
+    """`torch.autograd.functional.hessian` leaves out what has no gradient, and gives zeros."""
+    camera = renderer.PerspectiveCamera(60.0, 20.0, 2.4, distance=5.0)
+    operator = renderer.precompute_transfer(stone, camera, encoding="srgb", **SMALL)
+
+    def loss(value: Tensor) -> Tensor:
+        if name == "operator":
+            return operator.image(value).sum()
+        changed = {name: value} if name == "vertices" else {}
+        if name == "roughness":
+            changed["gloss"] = renderer.Gloss(value, 0.5)
+        shown = replace(camera, polar=value) if name == "polar" else camera
+        lit = value if name in ("light", "linear") else light
+        options = SMALL | {"silhouettes": name in ("vertices", "polar")} | changed
+        if name == "linear":  # in the image, but not the image in the light
+            return renderer.render(stone, shown, lit, encoding="srgb", **options).sum()
+        return renderer.render(stone, shown, lit, **options).square().sum()
+
+    start = {
+        "roughness": torch.tensor([0.4]).double(),
+        "vertices": torch.from_numpy(stone.vertices),
+        "polar": torch.tensor(60.0).double(),
+    }
+    with pytest.raises(RuntimeError, match="second derivatives"):
+        torch.autograd.functional.hessian(loss, start.get(name, light))
+
+
+def test_autocast_changes_no_bit_of_images_operators_and_gradients(stone):
+    light, sharp = load_light("grace").requires_grad_(), load_light("grace", 20)
+    gloss = renderer.Gloss(torch.tensor([0.3]), 1.0)
+    operators = renderer.precompute_transfer(stone, CAMERAS, gloss=gloss, **SMALL)
+    scene = renderer.precompute_transfer(stone, CAMERAS[0], **SMALL)
+
+    def compute() -> tuple[Tensor, ...]:
+        images = renderer.render(stone, CAMERAS, light, **SMALL)
+        glossy = renderer.render(stone, CAMERAS, sharp, gloss=gloss, **SMALL)
+        image, gradient = scene.image_and_gradient(light.detach(), lambda image: 2 * image)
+        return images, glossy, operators.image(light), scene.radiance(light), image, gradient
+
+    expected = compute()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = compute()
+    for pair in zip(found, expected, strict=True):
+        assert torch.equal(*pair)
+    # A backward pass outside of autocast is that of a training.
+    gradients = [torch.autograd.grad(of[0].square().sum(), light)[0] for of in (found, expected)]
+    assert torch.equal(*gradients)
+
+
+OFFSETS = [1e3, 5e5]
+
+
+@pytest.mark.parametrize("offset", OFFSETS)
+@pytest.mark.parametrize("options", [{}, {"normals": "flat"}, {"shadows": True}, {"bounces": 1}])
+def test_a_mesh_in_coordinates_of_the_earth_is_rendered_as_at_the_origin(offset, options):
+    cup, light = renderer.solid("cup"), load_light("grace")
+    place = offset * np.array([0.5, -1.0, 0.25])
+    axes = renderer.PerspectiveCamera(50.0, 30.0, 2.6, distance=5.0).axes() * [[1], [-1], [-1]]
+
+    def camera_at(place: np.ndarray) -> renderer.PinholeCamera:
+        view = np.eye(4)
+        view[:3, :3], view[:3, 3] = axes, [0, 0, 5.0] - axes @ place
+        return renderer.PinholeCamera.from_matrix(view, [[60, 0, 12], [0, 60, 12], [0, 0, 1]], 24)
+
+    moved = replace(cup, vertices=cup.vertices + place)
+    expected = renderer.render(cup, camera_at(np.zeros(3)), light, 24, **options)
+    found = renderer.render(moved, camera_at(place), light, 24, **options)
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-5)
+    operator = renderer.precompute_transfer(moved, camera_at(place), 24, **options)
+    torch.testing.assert_close(operator.image(light, 0.5), expected, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16])
+def test_vertices_and_faces_can_be_small_integers(dtype):
+    cup, light = renderer.solid("cup"), load_light("grace")
+    vertices = np.rint(60 * (cup.vertices + 1))
+    plain = renderer.Mesh.plain(vertices, cup.faces)
+    small = replace(plain, vertices=vertices.astype(dtype), normal_ids=None)
+    camera = renderer.OrthographicCamera(60.0, 20.0, 150.0, clip_range=300.0)
+    images = [renderer.render(mesh, camera, light, **SMALL) for mesh in (small, plain)]
+    assert torch.equal(*images)
+
+
 @pytest.fixture
 def variables(stone, light) -> dict[str, Tensor]:
     albedo = torch.full((FACE_COUNT, 3), 0.5, dtype=torch.float64)

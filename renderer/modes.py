@@ -1,0 +1,79 @@
+"""Modes of torch in which renders are computed: without autocast and second derivatives."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a function that computes in the precision of its tensors, also in autocast."""
+
+    @wraps(function)
+    def called(*args: P.args, **options: P.kwargs) -> R:
+        kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
+        with ExitStack() as stack:
+            for kind in kinds:
+                stack.enter_context(torch.autocast(kind, enabled=False))
+            return function(*args, **options)
+
+    return called
+
+
+@contextmanager
+def usual_defaults(kind: str) -> Iterator[None]:
+    """Create tensors on the CPU in 32 bits, and compute without autocast, in a `with` block."""
+    with ExitStack() as stack:
+        if torch.is_autocast_enabled(kind):
+            stack.enter_context(torch.autocast(kind, enabled=False))
+        made = torch.empty(0)  # Ten times as fast as `torch.get_default_device`.
+        if made.device.type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        if made.dtype != torch.float32:
+            stack.callback(torch.set_default_dtype, made.dtype)
+            torch.set_default_dtype(torch.float32)
+        yield
+
+
+def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate the backward pass of a function whose gradient has no gradient itself.
+
+    The decorator of this name in torch returns zeros instead of an error if a gradient is asked for
+    with respect to inputs by name, or if the incoming gradient has none.
+    """
+
+    @wraps(backward)
+    @without_autocast
+    def called(ctx: Any, *upstream: Any) -> Any:
+        with torch.no_grad():
+            gradients = backward(ctx, *upstream)
+        if not torch.is_grad_enabled():
+            return gradients
+        given = [value for value in (*upstream, *ctx.saved_tensors) if isinstance(value, Tensor)]
+        inputs = [value for value in given if value.requires_grad]
+        if isinstance(gradients, Tensor):
+            return _Refusal.apply(gradients, *inputs)
+        return tuple(each if each is None else _Refusal.apply(each, *inputs) for each in gradients)
+
+    return called
+
+
+class _Refusal(torch.autograd.Function):
+    """The first argument, whose gradient with respect to the others is an error."""
+
+    @staticmethod
+    def forward(_: Any, gradient: Tensor, *inputs: Tensor) -> Tensor:
+        """Return the gradient."""
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def backward(_: Any, *upstream: Tensor) -> Any:
+        """Refuse to compute second derivatives."""
+        advice = "use finite differences of gradients"
+        raise RuntimeError(f"renders have no second derivatives: {advice}")
