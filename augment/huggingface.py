@@ -74,7 +74,7 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
     auto = library.models.auto.modeling_auto
     zero_shot = auto.MODEL_FOR_ZERO_SHOT_IMAGE_CLASSIFICATION_MAPPING_NAMES.values()
     is_zero_shot = architecture in zero_shot
-    if not is_zero_shot and architecture not in _architectures(auto, _TASKS):
+    if not is_zero_shot and architecture not in _architectures(auto):
         kinds = "image classification, zero-shot classification, detection or segmentation"
         found = architecture or config.model_type
         raise name_error(name, f"is {found}: give a network for {kinds}")
@@ -103,9 +103,9 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
     return made
 
 
-def _architectures(auto: Any, tasks: Sequence[str]) -> set[str]:
-    """Return the names of the classes of transformers for some tasks."""
-    mappings = [getattr(auto, f"MODEL_FOR_{task}_MAPPING_NAMES").values() for task in tasks]
+def _architectures(auto: Any) -> set[str]:
+    """Return the names of the classes of transformers for `_TASKS`."""
+    mappings = [getattr(auto, f"MODEL_FOR_{task}_MAPPING_NAMES").values() for task in _TASKS]
     entries = [entry for mapping in mappings for entry in mapping]
     return {name for entry in entries for name in ([entry] if isinstance(entry, str) else entry)}
 

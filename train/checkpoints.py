@@ -344,10 +344,9 @@ def write_published(path: Path, state: Mapping[str, Any]) -> None:
 
     The format is safetensors, with the entries PUBLISHED_FACTS as JSON in its metadata.
     """
-    facts = [key for key in PUBLISHED_FACTS if key in state]
     # The weights of a recognizer are a tensor.
     as_json = partial(json.dumps, ensure_ascii=False, default=Tensor.tolist)
-    metadata = {key: as_json(state[key]) for key in facts}
+    metadata = {key: as_json(state[key]) for key in PUBLISHED_FACTS if key in state}
     weights = {
         name: value.half().contiguous() if value.is_floating_point() else value
         for name, value in state["model"].items()

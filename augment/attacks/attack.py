@@ -209,9 +209,8 @@ def _attack(
     has_gradient = settings.uses_gradients and not minimum.zero_gradient.all()
     may_be_constant = not has_gradient and torch.equal(evidence, evidence_before)
     black_and_white = (torch.full_like(images, shade) for shade in (0.0, 1.0))
-    if may_be_constant and all(
-        torch.equal(objective.evidence(shown), evidence) for shown in black_and_white
-    ):
+    is_constant = (torch.equal(objective.evidence(shown), evidence) for shown in black_and_white)
+    if may_be_constant and all(is_constant):
         advice = "an attack finds no direction in constant scores"
         reason = "scores black and white images exactly like the renders"
         warnings.warn(f"{classifier.title} {reason}: {advice}", stacklevel=3)

@@ -283,9 +283,8 @@ class DetectionCriterion(ObjectCriterion):
         columns = torch.arange(self.class_count, device=self.source.device)
         targets = self.source if self.target is None else self.target
         costs = []
-        for item, box, source, target in zip(
-            outputs, self.boxes, self.source, targets, strict=True
-        ):
+        rows = zip(outputs, self.boxes, self.source, targets, strict=True)
+        for item, box, source, target in rows:
             # Without candidates, the final boxes stand for them.
             boxes = item.get(CANDIDATE_BOXES, item["boxes"])
             scores = item.get(CANDIDATE_SCORES, item["scores"])

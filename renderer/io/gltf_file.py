@@ -292,11 +292,8 @@ class Material:
         # Transform texture coordinates by the matrix (2, 3) of the file.
         matrix = np.array(self.placement.transform)
         uvs = uvs @ matrix[:, :2].T + matrix[:, 2]
-        textures: dict[str, Any] = {
-            name: getattr(self, name)
-            for name in ("texture", "alpha", "gloss_texture")
-            if getattr(self, name) is not None
-        }
+        planes = {name: getattr(self, name) for name in ("texture", "alpha", "gloss_texture")}
+        textures = {name: texels for name, texels in planes.items() if texels is not None}
         # Axis 0 is u, which runs along columns, and axis 1 is v, which runs along rows.
         for axis, wrap in enumerate(self.placement.wraps):
             shape = textures["texture"].shape[:2]

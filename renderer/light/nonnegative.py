@@ -130,9 +130,8 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
     # only once.
     channels = _split_channels(coefficients)[:, 0]
     unique_channels, unique_index = np.unique(channels, axis=0, return_inverse=True)
-    light_of_minimum, _ = _find_negative_minima(
-        unique_channels, _rounding_radiance(unique_channels), _LOWEST_STARTS
-    )
+    rounding_radiance = _rounding_radiance(unique_channels)
+    light_of_minimum, _ = _find_negative_minima(unique_channels, rounding_radiance, _LOWEST_STARTS)
     # One row for each channel of each light, shape (lights · C, K).
     rows = coefficients.detach().mT.flatten(0, -2).clone()
     for index in np.unique(light_of_minimum):
@@ -233,9 +232,8 @@ def _exchange(programs: "list[_QuadraticProgram]", starts: float) -> None:
         # Channels of all programs that are still negative somewhere, one below the other.
         nearest = np.concatenate([program.nearest for program in programs])
         original = np.concatenate([program.original for program in programs])
-        channel_of_minimum, harmonics = _find_negative_minima(
-            nearest, _rounding_radiance(original), starts
-        )
+        rounding_radiance = _rounding_radiance(original)
+        channel_of_minimum, harmonics = _find_negative_minima(nearest, rounding_radiance, starts)
         # Each quadratic program has the same number of channels.
         channels_per_program = len(nearest) // len(programs)
         still_negative = np.unique(channel_of_minimum // channels_per_program)

@@ -170,7 +170,6 @@ def _as_parameters(
         dtype = None if is_floating else torch.float64
         tensors[name] = torch.as_tensor(value, dtype=dtype, device=like.device)
     require_finite(azimuth=tensors["azimuth"])
-    tensors["turbidity"] = tensors["turbidity"].to(like.dtype)
     ranges = {
         "zenith": (*ZENITH, "0 to 90 degrees, with the sun above the horizon"),
         "turbidity": (*TURBIDITY, "2 to 10"),
@@ -185,7 +184,7 @@ def _as_parameters(
             first = value[is_outside][0].item()
             raise InputError(f"{name}={first:.9g} is out of the sky model's range: give {expected}")
     angles = (torch.deg2rad(tensors[name]).to(like.dtype) for name in ("zenith", "azimuth"))
-    return [*angles, tensors["turbidity"]]
+    return [*angles, tensors["turbidity"].to(like.dtype)]
 
 
 def _chebyshev(

@@ -354,9 +354,8 @@ def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:
         key: [class_names.with_class_name(item, classes, key) for item in given]
         for key, given in (("meshes", settings.meshes), ("hard_negatives", negatives))
     }
-    class_names.require_others(
-        read_objects(items["hard_negatives"], "", "hard_negatives"), [label], classes
-    )
+    others = read_objects(items["hard_negatives"], "", "hard_negatives")
+    class_names.require_others(others, [label], classes)
     return replace(settings, label=label, **items)
 
 

@@ -183,9 +183,8 @@ def environment_lights(
 ) -> dict[str, Float[Tensor, "C K"]]:
     """Return the environment lights of an audit by name, at the exposure of the views."""
     noise = generator(views.seed, "lights")
-    random_lights = perturb(
-        load_light(LIGHT), random_light_count, AMPLITUDE, radius=None, generator=noise
-    )
+    center = load_light(LIGHT)
+    random_lights = perturb(center, random_light_count, AMPLITUDE, radius=None, generator=noise)
     lights = {Path(name).stem: load_light(name) for name in environments}
     for number, light in enumerate(HARMONICS.project_nonnegative(random_lights), 1):
         lights[f"{RANDOM}{number}"] = light
@@ -318,13 +317,11 @@ def transfer_success(
     counts = {}
     for kind in progress(KINDS, "transfer"):
         result = adversaries(attacked, views, kind, additional=True)
-        counts[kind] = [0, 0, 0]
-        # Without a success, there is no lighting to test.
-        if (result.clean_correct & result.success).any():
-            (row,) = transfer(result, [other])
-            is_tested = np.array(row["clean_correct"])
-            masks = (row["success"], is_tested, row["success_without_noise"])
-            counts[kind] = [int((is_tested & mask).sum()) for mask in masks]
+        (row,) = transfer(result, [other])
+        # Without a success, there is no lighting to test, and all masks are empty.
+        is_tested = np.array(row["clean_correct"], bool)
+        masks = (row["success"], is_tested, row["success_without_noise"])
+        counts[kind] = (is_tested & np.array(masks, bool)).sum(axis=1).tolist()
     return counts
 
 

@@ -233,15 +233,12 @@ class AuditedNetwork:
 
         The intervals are over views.
         """
-        random_names = {name for name in self.recognized if name.startswith(RANDOM)}
-        names_of_title = {
-            "renders in environments": self.recognized.keys() - random_names,
-            "renders in random light": random_names,
-        }
         rates: dict[str, Estimate] = {}
-        for title, names in names_of_title.items():
+        titles = {"renders in environments": False, "renders in random light": True}
+        for title, is_random in titles.items():
+            names = sorted(name for name in self.recognized if name.startswith(RANDOM) == is_random)
             # `hits` has one row for each light and one column for each view.
-            hits = np.array([self.recognized[name] for name in sorted(names)], float)
+            hits = np.array([self.recognized[name] for name in names], float)
             units = Units([np.tile(np.arange(hits.shape[1]), len(hits))], "views")
             rates[title] = leave_out_of_mean(hits.ravel(), units).estimate
         return rates

@@ -101,7 +101,7 @@ def write_audit_page(
     networks = [*by_key.values()]
     # The first kind of test images decides the top of the page and the recommendation.
     images = next(iter(folders), None)
-    screen = _first_screen(networks, images, folders)
+    screen = _first_screen(networks, folders)
     recommendation = None
     if images is not None and len(remedies) > 1:
         # One evaluation of each remedy, since an audit has no seeds.
@@ -159,15 +159,13 @@ def _slider(networks: Networks) -> dict[str, Any]:
     return {}
 
 
-def _first_screen(
-    networks: Networks, images: str | None, folders: Mapping[str, Path]
-) -> first_screen.FirstScreen:
+def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_screen.FirstScreen:
     """Make the top of the report from two networks' scores, or else from the first network."""
-    if images is None:
+    if not folders:
         return screen_of_one(networks[0], Metrics())
+    images, folder = next(iter(folders.items()))
     evaluations = [network.evaluation(images) for network in networks]
     if len(networks) > 1:
-        folder = folders[images]
         names = (f"before: {networks[0].name}", f"after: {networks[1].name}")
         # Each side of the comparison is a list of evaluations, one for each seed.
         before, after = ([evaluation] for evaluation in evaluations)

@@ -179,9 +179,8 @@ def _draw_sweep(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], 
     first, *others = norms
     for method, title in METHODS.items():
         rows = [record for record in records if record["method"] == method]
-        radii, values, low, high = (
-            [row[name] for row in rows] for name in (first, "value", "low", "high")
-        )
+        columns = (first, "value", "low", "high")
+        radii, values, low, high = ([row[name] for row in rows] for name in columns)
         color, line, marker = STYLES[method]
         axes.plot(radii, values, color=color, linestyle=line, marker=marker, label=title)
         axes.fill_between(radii, low, high, color=color, alpha=0.15)

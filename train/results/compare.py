@@ -254,11 +254,9 @@ def run_tables(methods: Methods) -> list[Table]:
     heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
     # Titles of the settings in which the runs differ, by their keys.
     varied = store.varied_settings([*heads.values()])
-    rows = [
-        [method, *(str(head.settings.get(key)) for key in varied)]
-        for method, head in heads.items()
-        if varied
-    ]
+    rows = []
+    for method, head in heads.items() if varied else ():
+        rows.append([method, *(str(head.settings.get(key)) for key in varied)])
     header = ["network", *varied.values()]
     return [*tables, Table("settings in which the methods differ", header, rows)]
 

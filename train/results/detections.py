@@ -233,9 +233,8 @@ def score(
         precision = estimate(mean_precision, groups, units)
     # The estimate of odds is then turned back into a number per image.
     odds = estimate(false_odds, [np.arange(joined.image_count)], units)
-    value, low, high = (
-        None if end is None else end / (1 - end) for end in (odds.value, odds.low, odds.high)
-    )
+    ends = (odds.value, odds.low, odds.high)
+    value, low, high = (None if end is None else end / (1 - end) for end in ends)
     false_detections = Estimate(value, low, high, odds.over)
     return DetectionMetrics(len(joined.object_score), recall, precision, false_detections)
 

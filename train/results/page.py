@@ -281,12 +281,10 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
 
     The keys are those that the macro `scores` of page.html.jinja reads.
     """
-    sheets = {
-        method: read_pictures(
-            scored[0].folder / CONTACT_SHEET, f"predictions of {method} on {title}", SHEET_WIDTH
-        )
-        for method, scored in group.items()
-    }
+    sheets = {}
+    for method, scored in group.items():
+        alt = f"predictions of {method} on {title}"
+        sheets[method] = read_pictures(scored[0].folder / CONTACT_SHEET, alt, SHEET_WIDTH)
     shown = [compare.score_table("", group)]
     rocs: list[Picture | None] = []
     problem = ""

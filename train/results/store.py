@@ -242,13 +242,9 @@ def _read_run(folder: Path) -> RunSummary:
 
 def read_summaries(folder: Path) -> dict[str, StoredScores]:
     """Read the scores of a classifier on photographs in all sub-folders of a folder."""
-    paths = sorted(folder.glob(f"*/{SUMMARY}"))
+    found = {path.parent.name: read_json(path) for path in sorted(folder.glob(f"*/{SUMMARY}"))}
     # Scores of a detector tell their task.
-    return {
-        path.parent.name: StoredScores.read(content)
-        for path in paths
-        if "task" not in (content := read_json(path))
-    }
+    return {name: StoredScores.read(item) for name, item in found.items() if "task" not in item}
 
 
 def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
@@ -362,8 +358,6 @@ def read_attack(folder: Path) -> AttackSummary:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         # A line has the key "example" or, if it is about the whole attack, "checks".
         examples = [line for line in lines if "example" in line]
-        if len({line["example"] for line in examples}) < len(examples):
-            raise ValueError("it has an example twice")
         checks = [dict(line["checks"]) for line in lines if "checks" in line]
         # Examples that were classified correctly before the attack.
         correct = [line for line in examples if not line["success_before"]]

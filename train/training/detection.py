@@ -219,9 +219,8 @@ def validate(
     for images in split.squares(own_rows.split(BATCH)):
         pair = (detected(one, images.to(device), task) for one in (teacher, network))
         for expected, found in zip(*pair, strict=True):
-            boxes, labels, old_boxes, old_labels = (
-                item[key].cpu().numpy() for item in (found, expected) for key in ("boxes", "labels")
-            )
+            boxes, labels = (found[key].cpu().numpy() for key in ("boxes", "labels"))
+            old_boxes, old_labels = (expected[key].cpu().numpy() for key in ("boxes", "labels"))
             # The labels of a teacher are never below 0, so no box is a crowd.
             marked = Marked(old_boxes, old_labels, is_crowd=old_labels < 0)
             # The scores are 0 for all, since only the overlap with a box of the teacher decides.

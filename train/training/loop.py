@@ -36,7 +36,7 @@ from train.training.averages import Averages
 from train.training.detection import object_maps, validate
 from train.training.recipe import set_training_mode
 from train.training.run_log import RunLog, epoch_metrics, format_epoch
-from train.training.step import TrainingStep, fitting_batch_size, require_equal_shares
+from train.training.step import TrainingStep, fitting_batch_size
 
 # Number of images in a pass of the validation.
 EVALUATION_BATCH = 512
@@ -107,7 +107,10 @@ class Trainer:
     def __post_init__(self) -> None:
         """Check the settings, and build the optimizer."""
         settings, model, service = self.settings, self.model, self.service
-        require_equal_shares(settings)
+        # Each process gets an equal share of a batch.
+        if settings.batch_size % distributed.world_size():
+            advice = f"set a multiple of {distributed.world_size()}, the number of processes"
+            raise InputError(f"batch_size={settings.batch_size}: {advice}", "batch_size")
         if settings.ranking_weight and not service.positive_classes:
             raise InputError("ranking_weight requires hard negatives: add some", "ranking_weight")
         # Largest numbers of images of the data set in an epoch and in a round.

@@ -36,6 +36,8 @@ WARMUP = 0.2
 RANDOM = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._DropoutNd)
 
 Logits = Float[Tensor, "N classes"]
+# Names of layers with their outputs.
+Outputs = list[tuple[str, Any]]
 
 
 def learning_rate(settings: TrainSettings, done: float) -> float:
@@ -84,9 +86,7 @@ def last_layer(network: nn.Module) -> str:
     return _module_of(names[-1])
 
 
-def called_layers(
-    network: nn.Module, size: int, count: int = 1
-) -> tuple[list[tuple[str, Any]], Any]:
+def called_layers(network: nn.Module, size: int, count: int = 1) -> tuple[Outputs, Any]:
     """Return the layers with matrices in the order of their calls, and the outputs of the network.
 
     Each layer has its name and its output for so many gray images. The order of the calls may
@@ -94,8 +94,8 @@ def called_layers(
     activations with parameters do not count, unless a network has no other layer. A network of
     TorchScript or torch.export calls no modules.
     """
-    called: list[tuple[str, Any]] = []
-    matrices: list[tuple[str, Any]] = []
+    called: Outputs = []
+    matrices: Outputs = []
 
     def note(name: str, layer: nn.Module, _: Any, output: Any) -> None:
         called.append((name, output))

@@ -111,13 +111,6 @@ class TrainingStep:
         self.scaler.load_state_dict(state["scaler"])
 
 
-def require_equal_shares(settings: TrainSettings) -> None:
-    """Raise InputError if a batch cannot be divided equally among the processes."""
-    if settings.batch_size % distributed.world_size():
-        advice = f"set a multiple of {distributed.world_size()}, the number of processes"
-        raise InputError(f"batch_size={settings.batch_size}: {advice}", "batch_size")
-
-
 def fitting_batch_size(settings: TrainSettings, model: nn.Module, in_round: int, size: int) -> int:
     """Limit the batch size to the images of a round, and check that a batch fits in memory.
 
