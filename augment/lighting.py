@@ -148,7 +148,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         count = max([math.prod(_batch_shape(image)) for image in flat_inputs], default=1)
         models, weights = [*self.lights], [*self.lights.values()]
         lights: list[Light | None] = []
-        with usual_defaults("cpu"):
+        with usual_defaults():
             seeds = torch.randint(2**62, (count,)).tolist()
             for seed, (chance, choice) in zip(seeds, torch.rand(count, 2).tolist(), strict=True):
                 # Draw a model with a probability in proportion to its weight.
@@ -297,7 +297,7 @@ def relight_photographs(
         require_photographs("slides", slides)
     count, _, *shape = photographs.shape
     # Photographs stand for the albedo, and the light of the projector multiplies it.
-    with usual_defaults(photographs.device.type):
+    with usual_defaults():
         light = draw_projected_light(count, shape, generator(seed, "relight"), slides)
         return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
 
@@ -395,7 +395,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         chosen = [light for light in (lights[row] for row in rows) if light is not None]
         part = frames if len(rows) == len(frames) else frames[rows]
         depth_of_rows = None if depths is None else depths[rows]
-        with usual_defaults(plain.device.type):
+        with usual_defaults():
             parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
     relit = parts[0]
     if len(parts) > 1:

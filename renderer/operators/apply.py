@@ -249,7 +249,6 @@ class TransferOperator:
         errors.require_shape("radiance_gradient", radiance_gradient, "...", *self.albedo.shape)
         return self._light_gradient(radiance_gradient)
 
-    @without_autocast
     def _images(
         self, lights: Lights, background: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -273,7 +272,6 @@ class TransferOperator:
         image_shape = (*batch_shape, COLORS, *self.settings.shape)
         return images.view(image_shape), is_unclamped, clamped_values
 
-    @without_autocast
     def _gradient_of_images(
         self,
         image_gradient: Float[Tensor, "... 3 height width"],
