@@ -40,6 +40,8 @@ _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
 }
 # Names of the arrays of a mesh that have one row for each face.
 PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss", "normal_ids")
+# A mesh is far from the origin beyond its size times this factor.
+FAR = 10
 # The three edges of a triangle. Each edge joins two of the corners 0, 1 and 2.
 EDGES = ((0, 1), (1, 2), (2, 0))
 # Corners of the four triangles into which a triangle is divided. Points 0, 1 and 2 are its corners.
@@ -148,6 +150,16 @@ class Mesh:
                 raise InputError(f"{fault}: give indices from {least} to {most}")
         if self.normal_ids is None:
             object.__setattr__(self, "normal_ids", normal_groups(self.vertices, self.faces))
+
+    @cached_property
+    def origin(self) -> np.ndarray:
+        """Center of a mesh that is far from the origin, or else the origin, shape (3,).
+
+        Relative to it, positions have enough digits in float32.
+        """
+        ends = np.array([self.vertices.min(0), self.vertices.max(0)])
+        is_far = np.abs(ends).max() > FAR * np.ptp(ends, axis=0).max()
+        return ends.mean(0) if is_far else np.zeros(3)
 
     @staticmethod
     def plain(

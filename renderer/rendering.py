@@ -44,8 +44,6 @@ from renderer.visibility.fragments import Fragments, build_fragments, views_at_o
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]
 # Largest albedo that `render` accepts: 1 and a margin for rounding errors.
 MAX_ALBEDO = 1 + 1e-4
-# A mesh is moved to the origin if its center is farther away than its size times this factor.
-FAR = 10
 # Words with which errors ask for the argument `lights` of `render`.
 _LOCAL_LIGHTS = "a list of lamps and projectors, alone or in pairs (basis, coefficients)"
 # Default camera for pictures of lights. It looks from the same direction as the first camera of
@@ -164,14 +162,12 @@ def render(
 
     is_moved = vertices is not None
     vertices = torch.from_numpy(mesh.vertices) if vertices is None else vertices
-    center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    is_far = np.abs(center).max() > FAR * np.ptp(mesh.vertices, axis=0).max()
     pinholes = [camera for camera in all_cameras if isinstance(camera, PinholeCamera)]
-    if is_far and not local_lights and len(pinholes) == len(all_cameras):
+    if mesh.origin.any() and not local_lights and len(pinholes) == len(all_cameras):
         # In coordinates of the earth, float32 would round vertices to meters.
-        mesh = replace(mesh, vertices=mesh.vertices - center)
-        vertices = vertices.double() - torch.from_numpy(center).to(vertices.device)
-        all_cameras = [camera.translated(-center) for camera in pinholes]
+        vertices = vertices.double() - torch.from_numpy(mesh.origin).to(vertices.device)
+        all_cameras = [camera.translated(-mesh.origin) for camera in pinholes]
+        mesh = replace(mesh, vertices=mesh.vertices - mesh.origin)
     vertices = vertices.to(like)
     # Rasterizing and ray tracing have no gradients, so they take a mesh and cameras with plain
     # numbers instead of tensors.

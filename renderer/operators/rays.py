@@ -206,14 +206,9 @@ class Rays:
         self._mesh = mesh
 
     @cached_property
-    def _center(self) -> np.ndarray:
-        """Center of the mesh, about which float32 has enough digits."""
-        return (self._mesh.vertices.min(0) + self._mesh.vertices.max(0)) / 2
-
-    @cached_property
     def offset(self) -> float:
         """Distance above the surface at which rays start, in world units."""
-        return OFFSET * float(np.abs(self._mesh.vertices - self._center).max())
+        return OFFSET * float(np.abs(self._mesh.vertices - self._mesh.origin).max())
 
     def blocked(self, surface: Surface, directions: Float[Tensor, "D 3"]) -> Iterator[BlockedRays]:
         """Find the rays that the mesh blocks, among those in D directions (`ray_directions`).
@@ -225,7 +220,9 @@ class Rays:
         if not len(pixels):
             return
         normals, planes = surface.normals, surface.planes
-        starts = (surface.points + self.offset * planes - torch.from_numpy(self._center)).float()
+        starts = (
+            surface.points + self.offset * planes - torch.from_numpy(self._mesh.origin)
+        ).float()
         sample_count, _ = surface.samples_of_pixels
         # The directions form turns, in each of which a pixel goes once through its samples. So
         # those in one place of all turns start at the same sample. Pixels with a rare number of
@@ -268,7 +265,7 @@ class Rays:
         """Embree scene with all faces of the mesh, in which rays are cast."""
         advice = "embreex, or set shadows=false and use no lamps and no projectors"
         scene = import_package("embreex.rtcore_scene", advice).EmbreeScene(robust=True)
-        vertices = (self._mesh.vertices - self._center).astype(np.float32)
+        vertices = (self._mesh.vertices - self._mesh.origin).astype(np.float32)
         # The constructor of `TriangleMesh` adds the triangles to the scene.
         meshes = import_package("embreex.mesh_construction", advice)
         meshes.TriangleMesh(scene, vertices, self._mesh.faces.astype(np.int32))
@@ -323,7 +320,7 @@ class Rays:
 
         Rays are infinite if `lengths` is None.
         """
-        return self._first_hit(origins - torch.from_numpy(self._center), directions, lengths)
+        return self._first_hit(origins - torch.from_numpy(self._mesh.origin), directions, lengths)
 
     def _first_hit(self, *rays: Tensor | None) -> Int[Tensor, " N"]:
         """Find the first faces of `first_hit` from origins relative to the center."""

@@ -50,8 +50,6 @@ from renderer.visibility.fragments import Fragments
 PATCH_DIRECTIONS = 2**9
 # Approximate number of patches of the surface of a mesh, between which light bounces.
 PATCHES = 2**11
-# Distance from the origin, in sides of the cells of patches, beyond which these begin at the mesh.
-FAR_CELLS = 1000
 # Image positions (x, y) of the corners of a triangle around the image center. In the
 # artificial view `Patches.view`, each piece of the mesh covers this triangle. A sample at
 # the image center then shows the center of the piece.
@@ -107,10 +105,7 @@ class Patches:
         # a cubic grid, if the normals are equal after each component is rounded to -1, 0 or 1, and
         # if both sides are fronts or both are backs.
         centers = pieces.vertices[pieces.faces].mean(axis=1)
-        side = math.sqrt(patch_area)
-        lowest = mesh.vertices.min(0)
-        start = np.where(np.abs(lowest) > FAR_CELLS * side, lowest, 0)
-        cells = np.floor((centers - start) / side)
+        cells = np.floor((centers - mesh.origin) / math.sqrt(patch_area))
         keys = np.hstack([cells, np.rint(pieces.face_normals())])[piece_of_side]
         _, patch_of_side = np.unique(np.hstack([keys, facing]), axis=0, return_inverse=True)
         # NumPy 2.0.0 returns the shape (S, 1), other versions return (S,).
