@@ -19,7 +19,7 @@ from augment.settings import NO_CLASS_PIXEL
 from augment.tasks.classification import Classification
 from augment.tasks.detection import FINAL, Detection
 from augment.tasks.segmentation import BACKGROUND, Segmentation
-from augment.tasks.task import Criterion, Task
+from augment.tasks.task import NO_GRADIENT, Criterion, Task
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import require_unit_range
@@ -126,10 +126,12 @@ class AdversarialLighting:
             return lights
         is_float = images.is_floating_point()
         unit = images.float() if is_float else images.float() / torch.iinfo(images.dtype).max
+        # Networks of another precision get images of this precision.
+        given = images.dtype if is_float else unit.dtype
         network = CheckedNetwork(self.model, "model", self.task, len(self.classes) or None)
         best, lowest = lights, torch.full((len(unit),), torch.inf, device=unit.device)
         with frozen_eval_mode(self.model):
-            image_of_row, criterion = self._criterion(network, unit, targets)
+            image_of_row, criterion = self._criterion(network, unit.to(given), targets)
             if not len(image_of_row):
                 return lights
             rows = image_of_row.tolist()
@@ -138,13 +140,16 @@ class AdversarialLighting:
                 with torch.set_grad_enabled(step < self.steps):
                     # The numbers of these lights are leaves of the graph, which get gradients.
                     leaves = [light and _leaf(light) for light in lights]
-                    outputs = network(self.lighting.apply(unit, {"lights": leaves}))
+                    relit = self.lighting.apply(unit, {"lights": leaves})
+                    outputs = _in_float32(network(relit.to(given)))
                     is_list = isinstance(outputs, list)
                     chosen = [outputs[row] for row in rows] if is_list else outputs[rows]
                     # The cost of an image is the sum of the costs of its objects.
                     costs = criterion.cost(chosen)
                     cost = costs.new_zeros(len(unit)).index_add(0, image_of_row, costs)
                     if step < self.steps:
+                        if not cost.requires_grad:
+                            raise InputError(f"the network {NO_GRADIENT}")
                         cost.sum().backward()
                 is_lower = (cost < lowest).tolist()
                 lowest = torch.minimum(lowest, cost.detach())
@@ -161,7 +166,7 @@ class AdversarialLighting:
         classes = self.classes
         if targets is None:
             with torch.no_grad():
-                outputs = network(unit)
+                outputs = _in_float32(network(unit))
         elif isinstance(self.task, Detection):
             expected = 'a dictionary with "boxes" and "labels" for each image'
             given = errors.as_list("targets", targets, Mapping, expected)
@@ -221,6 +226,13 @@ def _as_found(boxes: Any, labels: Any) -> dict[str, Tensor]:
     boxes = torch.as_tensor(boxes, dtype=torch.float32).as_subclass(Tensor)
     labels = errors.as_integers("labels", labels)
     return {"boxes": boxes.reshape(-1, 4), "labels": labels, "scores": torch.ones(len(labels))}
+
+
+def _in_float32(outputs: Any) -> Any:
+    """Convert floating-point outputs of a network, in which costs of half precision would round."""
+    return tree_map_only(
+        Tensor, lambda item: item.float() if item.is_floating_point() else item, outputs
+    )
 
 
 def _leaf(light: Light) -> Light:

@@ -14,8 +14,8 @@ from augment.exposure import DIM, IsDim, light_settings, with_normalized_light
 from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
 from augment.switch import DIM_NAME, LIT_NAME, Chooser, Recognizer, Switch
 from augment.tasks import recognized_task
-from augment.tasks.classification import Classification, class_index, log_odds
-from augment.tasks.task import Task
+from augment.tasks.classification import TWO_CLASSES, Classification, class_index, log_odds
+from augment.tasks.task import Task, gradient_of, tensors_of
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import require_unit_range
@@ -287,30 +287,38 @@ class TaskNetwork(CheckedNetwork):
         return self.inputs.describe(self.network, self.size)
 
     def is_differentiable(self, render: Callable[[], Tensor]) -> bool:
-        """Return whether the outputs are differentiable in the pixels.
+        """Return whether the outputs have a gradient in the pixels that is not zero.
 
-        A network of torch with weights is assumed to have differentiable
-        outputs. Any other function is called with a gray image to find out.
-        Other tasks show it some of the images, because a detector finds
-        nothing in a gray one.
+        It is missing if images are converted to bytes, and zero if they are
+        rounded. Constant outputs have one, and so has a network of torch with
+        weights that finds nothing in the images.
 
         Args:
-            render: Function that makes the images of a scene.
+            render: Function that makes the images of a scene, to which a gray
+                one is added.
         """
-        if next(self.parameters(), None) is not None:
-            return True
         images = render()[:MAX_PROBED]
-        # Any image tells whether logits have gradients, but boxes exist only where objects are.
-        if isinstance(self.task, Classification):
-            shown = images.new_full((1, 3, *height_and_width(self.size)), GRAY)
-        else:
-            shown = images.clone()
-        try:
-            with torch.enable_grad():
-                return self.task.has_gradient(super().forward(shown.requires_grad_()))
-        except InputError:
-            # A function that converts images to NumPy fails on images with gradients.
-            return False
+        gray = images.new_full((1, 3, *height_and_width(self.size)), GRAY)
+        totals = []
+        with torch.enable_grad(), wrappers.frozen_eval_mode(self):
+            for image in torch.cat([images, gray]).split(1):
+                shown = image.clone().requires_grad_()
+                try:
+                    outputs = [item for item in tensors_of(super().forward(shown)) if item.numel()]
+                except InputError:
+                    # A function that converts images to NumPy fails on images with gradients.
+                    return False
+                if not outputs:
+                    continue
+                squares = [item.double().square().sum() for item in outputs]
+                total = torch.stack(squares).sum()
+                gradient = gradient_of(total, shown)
+                if gradient is None or gradient.any():
+                    return gradient is not None
+                totals.append(float(total.detach()))
+        # All gradients are zero. Those of constant outputs are right.
+        has_weights = next(self.parameters(), None) is not None
+        return len({*totals}) == 1 if totals else has_weights
 
     def train(self, mode: bool = True) -> Self:
         """Do nothing but keep evaluation mode, whatever `mode` is."""
@@ -375,8 +383,7 @@ class Classifier(TaskNetwork):
         """Check the arguments, which the docstring of the class explains. Freeze the network."""
         super().__init__(network, size, classes, name, normalize_light)
         if len(self.classes) < 2:
-            advice = "give at least two, with one logit each (for one output z, the logits 0 and z)"
-            raise InputError(f"classifier {name} has classes={self.classes}: {advice}")
+            raise InputError(f"classifier {name} has classes={self.classes}: {TWO_CLASSES}")
 
     def detect(
         self, images: Float[Tensor, "N 3 height width"], label: str | None = None

@@ -364,9 +364,7 @@ def _read_onnx(path: Path) -> Content:
     try:
         with torch.no_grad():
             converted = importlib.import_module("onnx2torch").convert(str(path)).eval()
-            converted = ChannelsLast(converted) if is_last else converted
-            # `network` turns probabilities into logits.
-            converted = Logarithm(converted) if network.has_probabilities else converted
+            converted = Converted(converted, is_last, bool(network.has_probabilities))
             # Compare all outputs of the converted network with those of onnxruntime.
             for pair in zip(tree_leaves(converted(images)), tree_leaves(expected), strict=True):
                 torch.testing.assert_close(*pair, rtol=1e-3, atol=1e-3)
@@ -378,20 +376,17 @@ def _read_onnx(path: Path) -> Content:
     return converted, sizes
 
 
-class ChannelsLast(Network):
-    """Give a network images with channels last, (N, H, W, 3)."""
+class Converted(Network):
+    """Network of onnx2torch, with channels first and logits, as `read_onnx` gives them."""
+
+    def __init__(self, network: nn.Module, is_last: bool, has_probabilities: bool):
+        super().__init__(network)
+        self.is_last, self.has_probabilities = is_last, has_probabilities
 
     def forward(self, images: Tensor) -> Any:
         """Compute the outputs of images (N, 3, H, W)."""
-        return self.network(images.permute(0, 2, 3, 1))
-
-
-class Logarithm(Network):
-    """Turn the probabilities of a network into logits."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Compute the logits of images."""
-        return log_probabilities(self.network(images))
+        outputs = self.network(images.permute(0, 2, 3, 1) if self.is_last else images)
+        return log_probabilities(outputs) if self.has_probabilities else outputs
 
 
 def read_onnx(path: Path) -> tuple[Function, list[int | None], bool]:

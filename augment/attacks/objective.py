@@ -29,7 +29,8 @@ from augment.network import BatchSize, Network, Quantization, eval_mode, straigh
 from augment.progress import Phases
 from augment.random_streams import generator
 from augment.scene.truth import Rows
-from augment.tasks.task import Criterion
+from augment.tasks.task import NO_GRADIENT, Criterion, gradient_of
+from renderer.errors import InputError
 from renderer.image import clamp, to_bytes, to_unit
 
 # Attack values of E examples, the indices of examples, and images of their V views.
@@ -291,20 +292,26 @@ class Objective:
 
 def _image_gradient(cost: Tensor, outputs: Any, batch: SingleImages) -> Tensor:
     """Compute the gradient of the costs with respect to the images."""
-    if not cost.requires_grad:
+    if not cost.requires_grad and not isinstance(outputs, Tensor):
         # A detector that finds nothing returns nothing that depends on the image.
         return torch.zeros_like(batch)
     # Detections are lists of several tensors.
     if not isinstance(outputs, Tensor):
-        (gradient,) = torch.autograd.grad(cost.sum(), batch)
-        return gradient
-    (output_gradient,) = torch.autograd.grad(cost.sum(), outputs)
+        return _required(gradient_of(cost.sum(), batch))
+    output_gradient = _required(gradient_of(cost.sum(), outputs))
     # The gradient of a confident prediction is so small that it would round to zero in a
     # network of half precision. A factor that is a power of two changes no other digits.
     largest = output_gradient.flatten(1).abs().amax(1).clamp(min=MIN_GRADIENT)
     power = (largest / torch.frexp(largest).mantissa).view(-1, *[1] * (outputs.ndim - 1))
-    (gradient,) = torch.autograd.grad(outputs, batch, output_gradient / power)
+    gradient = _required(gradient_of(outputs, batch, output_gradient / power))
     return gradient * power.view(-1, 1, 1, 1)
+
+
+def _required(gradient: Tensor | None) -> Tensor:
+    """Return a gradient, or raise InputError if a network has none."""
+    if gradient is None:
+        raise InputError(f"the network {NO_GRADIENT}")
+    return gradient
 
 
 def preprocessed_model(settings: AttackSettings, classifier: nn.Module) -> nn.Module:

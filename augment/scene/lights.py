@@ -25,7 +25,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.scene import loops, patterns, surfaces
-from augment.scene.black_body import planckian_rgb
 from augment.scene.surfaces import Range, limits
 from renderer.errors import InputError, as_list, require_choice, require_number
 from renderer.settings import Size, height_and_width
@@ -452,7 +451,7 @@ class ColorTemperature(LightModel):
         # The camera assumes a color between that of D65 (6504 K) and that of the lamp.
         assumed = 1 / 6504 + balance * (lamp - 1 / 6504)
         kelvin = 1 / torch.stack([lamp, assumed])
-        color = torch.div(*planckian_rgb(kelvin, torch.stack([tint, 0 * tint])))
+        color = torch.div(*patterns.planckian_rgb(kelvin, torch.stack([tint, 0 * tint])))
         return Illumination(torch.ones_like(lamp), color / patterns.luminance(color))
 
 

@@ -85,6 +85,10 @@ class Classification(Task):
         return evidence.softmax(-1)
 
 
+# What errors advise if a classifier has a single class.
+TWO_CLASSES = "give at least two, with one logit each (for one output z, the logits 0 and z)"
+
+
 class _LogitReader:
     """Function that checks the outputs of a classifier: rows of logits, and no probabilities.
 
@@ -110,6 +114,8 @@ class _LogitReader:
             remedy = f"it must return logits {(len(images), self.class_count or 'C')}"
             shape = tuple(images.shape)
             raise InputError(f"{self.title} returned {returned} for images {shape}: {remedy}")
+        if logits.shape[1] < 2:
+            raise InputError(f"{self.title} returned one logit for each image: {TWO_CLASSES}")
         if self.probability_rows is not None and len(logits):
             rows = self.probability_rows + len(logits)
             self.probability_rows = rows if are_probabilities(logits) else None

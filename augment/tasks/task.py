@@ -24,6 +24,10 @@ from renderer.errors import InputError, require
 NO_CLASS = -(10**9)
 # What is predicted if no class is found.
 NOTHING = "nothing"
+# What errors say of a network whose outputs do not depend on the images for autograd.
+NO_GRADIENT = (
+    "returned outputs without a gradient: compute them in torch, or choose optimizer=random_search"
+)
 # Function from the outputs of a network, and from the images that it got, to outputs of a task.
 Reader = Callable[[Any, Tensor], Any]
 # Function that finds where the objects of the images of an attack are.
@@ -180,22 +184,21 @@ class Task(ABC):
 
     def require_finite(self, outputs: Any, images: Tensor, title: str) -> None:
         """Check that outputs of an attacked network are finite, and have the gradient of images."""
-        values = [item for item in _tensors(outputs) if item.is_floating_point()]
+        values = [item for item in tensors_of(outputs) if item.is_floating_point()]
         fault = f"{title} returned NaN or infinite outputs: check its weights"
         if not values:
-            raise InputError(fault)
+            raise InputError(f"{title} returned no floating-point outputs: convert them")
         for item in values:
             require(item.isfinite().all(), lambda: InputError(fault))
         # A detector that finds nothing has no gradient.
         is_empty = not any(item.numel() for item in values)
         needs_gradient = torch.is_grad_enabled() and images.requires_grad and not is_empty
         if needs_gradient and not self.has_gradient(outputs):
-            advice = "compute them in torch, or choose optimizer='random_search'"
-            raise InputError(f"{title} returned outputs without a gradient: {advice}")
+            raise InputError(f"{title} {NO_GRADIENT}")
 
     def has_gradient(self, outputs: Any) -> bool:
         """Return whether outputs have a gradient."""
-        return any(item.requires_grad for item in _tensors(outputs))
+        return any(item.requires_grad for item in tensors_of(outputs))
 
     @abstractmethod
     def criterion(self, source: Tensor, truth: GetTruth, class_count: int) -> Criterion:
@@ -244,9 +247,16 @@ class Task(ABC):
         return image
 
 
-def _tensors(outputs: Any) -> list[Tensor]:
+def tensors_of(outputs: Any) -> list[Tensor]:
     """Return the tensors of outputs, also in lists and dictionaries."""
     return [item for item in tree_leaves(outputs) if isinstance(item, Tensor)]
+
+
+def gradient_of(values: Tensor, images: Tensor, weights: Tensor | None = None) -> Tensor | None:
+    """Compute the gradient of values with respect to images. None if they do not depend on them."""
+    if not values.requires_grad:
+        return None
+    return torch.autograd.grad(values, images, weights, allow_unused=True)[0]
 
 
 def unique_names(names: Sequence[str]) -> list[str]:

@@ -44,6 +44,33 @@ def test_steps_lower_the_evidence_of_the_class_in_most_images(images, light):
     assert ((after < before).sum() >= 5) and (after <= before + 0.05).all()
 
 
+@pytest.mark.parametrize("dtype", [torch.half, torch.bfloat16, torch.double])
+def test_a_network_of_another_precision_gets_images_of_its_own(images, dtype):
+    floats, labels = (images / 255).to(dtype), torch.zeros(8, dtype=torch.int64)
+    found = []
+    for model in (Mean().to(dtype), Mean()):
+        torch.manual_seed(0)
+        given = floats if model.scale.dtype == dtype else floats.float()
+        found.append(nb.AdversarialLighting(model, steps=1, lights="linear")(given, labels))
+    assert found[0].dtype == dtype
+    # Costs of half precision may differ in the sign of a small gradient.
+    assert (found[0] - found[1]).abs().mean() < (0.02 if dtype != torch.double else 1e-6)
+
+
+def test_networks_with_one_logit_or_without_a_gradient_are_refused(images):
+    first = nn.Sequential(nn.Flatten(), nn.Linear(3 * 16**2, 1))
+
+    class Detached(Mean):
+        def forward(self, images):
+            return super().forward(images.detach())
+
+    for labels in (None, torch.zeros(8, dtype=torch.int64)):
+        with pytest.raises(InputError, match="at least two"):
+            nb.AdversarialLighting(first)(images, labels)
+        with pytest.raises(InputError, match="without a gradient"):
+            nb.AdversarialLighting(Detached())(images, labels)
+
+
 def test_each_image_is_seen_as_often_as_stated_and_the_network_stays_as_it_was(images):
     model = Mean().train()
     for steps, targets, extra in ((1, torch.zeros(8).long(), 0), (2, None, 1)):

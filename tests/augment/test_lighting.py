@@ -373,7 +373,7 @@ def test_the_normals_of_a_tilted_plane_follow_from_its_depth():
     ],
 )
 def test_chromaticities_of_lamps_are_those_of_the_cie(kelvin, offset, x, y):
-    rgb = lights.planckian_rgb(torch.full((1, 1, 1), float(kelvin)).double(), offset).flatten()
+    rgb = patterns.planckian_rgb(torch.full((1, 1, 1), float(kelvin)).double(), offset).flatten()
     to_xyz = np.array(
         [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
     )

@@ -123,9 +123,13 @@ def test_a_function_without_gradients_is_attacked_by_random_search(photographs):
     def brightest(images):
         return np.asarray(images.detach())[:, :, : SIZE // 2].mean((2, 3))
 
-    result = attack_photographs(brightest, photographs[:2], SETTINGS)
-    assert RANDOM in result.changed
-    assert ADVERSARIAL not in result.changed
+    def rounded(images):  # has a gradient, which is 0
+        return ((images * 255).round() / 255)[:, :, : SIZE // 2].mean((2, 3))
+
+    for function in (brightest, rounded):
+        result = attack_photographs(function, photographs[:2], SETTINGS)
+        assert RANDOM in result.changed
+        assert ADVERSARIAL not in result.changed
     assert torch.equal(result.kept(), result.kept(RANDOM))
     with pytest.raises(InputError, match="light=adversarial"):
         result.kept(ADVERSARIAL)

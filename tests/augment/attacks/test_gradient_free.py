@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ import augment
 from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.problem import SceneProblem
 from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
 from renderer.light.files import load_light
 from renderer.light.nonnegative import project_nonnegative
 
@@ -136,6 +139,45 @@ def test_a_function_without_gradients_is_attacked_by_random_search_with_one_sent
     with pytest.warns(UserWarning, match="random search attacks it with at most 5 queries"):
         result = augment.attack(logits_of_means, scene, settings=settings, force=True)
     assert result.settings.optimizer == "random_search"
+
+
+class Changed(nn.Module):
+    """A network with weights that gets images of which a function lost the gradient."""
+
+    def __init__(self, change):
+        super().__init__()
+        self.change, self.scale = change, nn.Parameter(torch.tensor(30.0))
+
+    def forward(self, images):
+        means = self.change(images).mean((2, 3))
+        return self.scale * means[:, [0, 2]]
+
+
+LOSSES = {
+    "bytes": lambda images: (images * 255).round().byte() / 255,
+    "detached": lambda images: images.detach(),
+    "rounded": lambda images: (images * 255).round() / 255,
+}
+
+
+@pytest.mark.parametrize("lost", LOSSES)
+@pytest.mark.parametrize("is_module", [True, False])
+def test_networks_whose_images_lose_their_gradient_are_searched_or_refused(lost, is_module):
+    network = Changed(LOSSES[lost]).eval()
+    given = network if is_module else lambda images: network(images)
+    scene = augment.build_scene([("solid:orange", 0)], 8, rasterizer="numpy")
+    settings = augment.AttackSettings(lighting=augment.StepSettings("linf", 0.2), max_queries=5)
+    options = {"classes": ["red", "blue"], "force": True}
+    with pytest.warns(UserWarning, match="random search attacks it"):
+        result = augment.attack(given, scene, settings=settings, **options)
+    assert result.settings.optimizer == "random_search"
+    if lost != "rounded":
+        explicit = replace(settings, optimizer="gradient", max_queries=None)
+        with pytest.raises(InputError, match="without a gradient"):
+            augment.attack(given, scene, settings=explicit, **options)
+        service = augment.AugmentationService.from_meshes([("solid:orange", 0)], 8, views=1)
+        with pytest.raises(InputError, match="without a gradient"):
+            service.regenerate(network, 0)
 
 
 @pytest.mark.parametrize("is_plain", [True, False])
