@@ -194,6 +194,8 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]
     # The orientation 1 of EXIF means that the top row is stored first.
     if spec.roi != spec.roi_full or image.orientation != 1:
         raise InputError("the image is stored cropped or rotated: save the whole, upright image")
+    if image.nsubimages > 1 and not {*"RGB"} <= {*spec.channelnames}:
+        raise InputError("the first of several images in the file has no R, G and B: save it alone")
     # CIE x and y of red, green, blue and white.
     chromaticities = spec.getattribute("chromaticities") or REC_709
     if image.file_format_name == "hdr":

@@ -259,6 +259,30 @@ def test_an_exr_file_without_light_or_of_a_part_is_refused(tmp_path, names, attr
         read_map(tmp_path / "map.exr")
 
 
+@pytest.mark.parametrize("is_first", [True, False])
+def test_of_several_images_in_an_exr_file_the_first_is_read_if_it_has_colors(tmp_path, is_first):
+    openimageio = pytest.importorskip("OpenImageIO")
+    path = str(tmp_path / "map.exr")
+    specs = []
+    for channels in ("RGB", "Y") if is_first else ("Y", "RGB"):
+        spec = openimageio.ImageSpec(16, 8, len(channels), "float")
+        spec.channelnames = tuple(channels)
+        spec.attribute("oiio:subimagename", channels)
+        specs.append(spec)
+    output = openimageio.ImageOutput.create(path)
+    output.open(path, tuple(specs))
+    for index, spec in enumerate(specs):
+        if index:
+            output.open(path, spec, "AppendSubimage")
+        output.write_image(np.full((8, 16, spec.nchannels), 2.0, np.float32))
+    output.close()
+    if is_first:
+        assert (read_map(tmp_path / "map.exr") == 2).all()
+    else:
+        with pytest.raises(InputError, match="no R, G and B"):
+            read_map(tmp_path / "map.exr")
+
+
 def test_a_hdr_file_with_its_bottom_row_first_is_refused(tmp_path):
     (tmp_path / "map.hdr").write_bytes(HDR_HEADER.replace(b"-Y", b"+Y") + bytes(24))
     with pytest.raises(InputError, match=r"map\.hdr"):
