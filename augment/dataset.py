@@ -243,7 +243,7 @@ def _renders(
             normals = None if maps_of is None else maps_of[row, 1:]
             seen = labels, boxes, masks, visible, depth, normals
             shown = scene.examples[example]
-            light = conditions.light[row].cpu() * shown.exposure
+            light = scene.exposed(conditions.light[row].cpu(), example)
             name = scene.objects[shown.object].name
             yield LabeledRender(start + example, images[row], *seen, facts, light, name)
 

@@ -124,7 +124,7 @@ class Adversary(errors.ShortRepr):
         return Adversary(
             shown=_attacked_object(item, after.row(row, item.mesh), scene.settings.encoding),
             cameras=tuple(camera.fixed() for camera in scene.cameras_under(after, row, example)),
-            light=after.light[row].detach().cpu() * before_attack.exposure,
+            light=scene.exposed(after.light[row].detach().cpu(), example),
             basis=scene.basis_under(after, row),
             background=scene.backgrounds[before_attack.background].cpu(),
             settings=scene.settings,

@@ -141,8 +141,7 @@ def _write_example(
     light_numbers = write_adversary(Adversary.of(scene, example, after, *images), path)
     # The files of an adversary have the light after the attack. Add that before it.
     light_before, basis_before = result.light(problem.start, example)
-    exposed = light_before.cpu() * scene.examples[example].exposure
-    save_lights(path, exposed, basis_before, "_before")
+    save_lights(path, scene.exposed(light_before.cpu(), example), basis_before, "_before")
 
     classes = result.classifier.classes
     minimum = result.minimum

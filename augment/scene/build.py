@@ -24,7 +24,7 @@ from augment.augmentation_settings import SpecularLayerSettings, VariationSettin
 from augment.network import say_once
 from augment.progress import progress
 from augment.scene import objects as placed
-from augment.scene.objects import SceneObject
+from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import unlabeled
 from augment.settings import (
@@ -480,7 +480,12 @@ def expose(scene: Scene) -> Scene:
     for index, item in enumerate(scene.objects):
         rows = [row for row, example in enumerate(scene.examples) if example.object == index]
         # At most `PROBED` examples at equal distances. -(-a // b) divides and rounds up.
-        values = _linear_values(scene, rows[:: -(-len(rows) // PROBED)]) if rows else torch.empty(0)
+        values, local = torch.empty(0), torch.zeros(1)
+        if rows:
+            probe = _probe(scene, rows[:: -(-len(rows) // PROBED)])
+            # Light of projector and lamps, which the exposure leaves as it is.
+            local = _linear_values(probe, 0.0) if scene.basis.local_lights else local
+            values = _linear_values(probe, 1.0) - local
         # Fraction of the values that are not 0, which alone can grow with the exposure.
         lit = float((values > 0).float().mean()) if rows else 0.0
         aim = min(MEAN, LIT_MEAN * lit)
@@ -488,7 +493,7 @@ def expose(scene: Scene) -> Scene:
         # The mean grows with the exposure. 40 halvings leave 2^-35 stops.
         for _ in range(40):
             middle = (low + high) / 2
-            mean = encode(clamp(values * 2**middle), scene.settings.encoding).mean()
+            mean = encode(clamp(values * 2**middle + local), scene.settings.encoding).mean()
             low, high = (middle, high) if mean < aim else (low, middle)
         # Nothing brightens what is black.
         factors.append(2**low if lit else 1.0)
@@ -501,20 +506,30 @@ def expose(scene: Scene) -> Scene:
     return scene.changed(examples=examples)
 
 
-def _linear_values(scene: Scene, rows: list[int]) -> Float[Tensor, "N 3"]:
-    """Return the linear values, before clamping, of the pixels of the first object in examples."""
+def _probe(scene: Scene, rows: list[int]) -> Scene:
+    """Return a scene of some examples before black."""
     # Direct rendering: transfer operators would be built for light that never changes.
-    probe = scene.changed(
+    return scene.changed(
         examples=[scene.examples[row] for row in rows],
         lights=scene.lights[rows],
         backgrounds=torch.zeros_like(scene.backgrounds),
         camera_effects=None,
         one_light=True,
     )
-    every = torch.arange(len(rows))
+
+
+def _linear_values(probe: Scene, factor: float) -> Float[Tensor, "N 3"]:
+    """Return the linear values, before clamping, of the pixels of the first object in examples.
+
+    The environment light is multiplied by the factor.
+    """
+    every = torch.arange(len(probe))
     # Images that have the values of the object at its pixels, and 0 elsewhere.
-    canvas = torch.zeros(len(rows) * scene.views, 3, scene.settings.pixel_count)
-    for layer in probe.layers(probe.conditions(every), every.to(scene.lights.device)):
+    canvas = torch.zeros(len(probe) * probe.views, 3, probe.settings.pixel_count)
+    lights = probe.lights.clone()
+    if probe.basis.environment is not None:
+        lights[:, probe.basis.environment.rows] *= factor
+    for layer in probe.layers(Conditions(lights), every.to(lights.device)):
         shown = layer.composite.detach().float().cpu()
         canvas[layer.rows] = canvas[layer.rows].index_copy(2, layer.pixels.cpu(), shown)
     masks = probe.truth(unlabeled).masks[:, :, 0].flatten(0, 1).flatten(1).cpu()

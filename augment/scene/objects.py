@@ -385,7 +385,7 @@ class Example:
         object: Index of the object among the objects of the scene.
         cameras: The V cameras.
         background: Index of the background among the backgrounds of the scene.
-        exposure: Factor that multiplies the light of the scene.
+        exposure: Factor that multiplies the environment light of the scene.
     """
 
     object: int

@@ -139,8 +139,10 @@ class Scene:
         self.object_of = torch.tensor([example.object for example in examples], device=device)
         self._background = torch.tensor([example.background for example in examples], device=device)
         exposures = torch.tensor([example.exposure for example in examples])
-        # Two axes of size 1 let the exposures multiply lights of shape (E, coefficients, 3).
-        self._exposure = exposures.to(lights)[:, None, None]
+        # Factors of the coefficients. Those of projectors and lamps have limits, so they stay.
+        self._exposure = torch.ones_like(self.lights[..., :1])
+        if basis.environment is not None:
+            self._exposure[:, basis.environment.rows] = exposures.to(lights)[:, None, None]
 
         self.group_size = max(1, AT_ONCE // (self.views * settings.pixel_count))
         self.attack_bytes = self._count_attack_bytes()
@@ -303,13 +305,7 @@ class Scene:
         return self.basis.moved(conditions.positions[row].detach())
 
     def cameras_under(self, conditions: Conditions, row: int, example: int) -> tuple[Camera, ...]:
-        """Return the V cameras of an example, which may have moved.
-
-        Args:
-            conditions: Conditions of some examples, with the changes of cameras.
-            row: Index of the example in the first dimension of the conditions.
-            example: Index of the example in the scene.
-        """
+        """Return the V cameras of an example, which may have moved, by a row of conditions."""
         cameras = self.cameras[example]
         if conditions.cameras is None:
             return cameras
@@ -337,6 +333,12 @@ class Scene:
             InputError: If there is no such example.
         """
         return Conditions(self.lights[self._as_examples(examples)])
+
+    def exposed(
+        self, light: Float[Tensor, "*batch K 3"], examples: Int[Tensor, " *batch"] | int
+    ) -> Float[Tensor, "*batch K 3"]:
+        """Multiply the environment light of examples by their exposures."""
+        return light * self._exposure[examples].to(light.device)
 
     @without_autocast
     def render(
@@ -432,12 +434,7 @@ class Scene:
     def surface_maps(
         self, conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Float[Tensor, "A V 4 height width"]:
-        """Return the depth and the three components of normals in the views of examples.
-
-        Args:
-            conditions: Shape and pose of the A examples.
-            examples: Indices of the A examples.
-        """
+        """Return the depth and the three components of normals in the views of examples."""
         maps = torch.zeros(len(examples), self.views, 4, *self.settings.shape)
         for group in self._groups(conditions, examples.tolist()):
             of_views = self._direct_renderer.surface_maps(group)
@@ -479,7 +476,7 @@ class Scene:
         Image a · V + v of a layer is view v of the example with the index `examples[a]`.
         """
         errors.require_bounded(light=conditions.light)
-        light = conditions.light * self._exposure[examples]
+        light = self.exposed(conditions.light, examples)
         changes = (conditions.vertices, conditions.albedo, conditions.gloss)
         if self.one_light or any(values is not None for values in changes):
             return self._render_directly(replace(conditions, light=light), examples, is_draft)

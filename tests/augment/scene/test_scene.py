@@ -1,5 +1,6 @@
 """Scenes render each example as its mesh alone is rendered, in light of the degree it needs."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +19,12 @@ from augment.attacks.problem import SceneProblem
 from augment.augmentation_settings import VariationSettings, views_of
 from augment.network import say_once
 from augment.scene import render
-from augment.scene.build import build_scene, warn_of_exposure
+from augment.scene.build import build_local_light, build_scene, warn_of_exposure
 from augment.scene.objects import Conditions, Example, load_object
 from augment.scene.render import NEAR
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
-from augment.settings import ObjectSettings
+from augment.settings import ObjectSettings, ProjectorSettings
 from renderer.camera import orbit_cameras
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import ambient, probe
@@ -75,6 +76,28 @@ def test_the_automatic_exposure_makes_the_mean_of_an_object_two_fifths(light, en
         pixels = images[rows].movedim(1, 0)[:, masks[rows]]
         assert float(pixels.mean()) == pytest.approx(0.4, abs=1e-5)
     assert scene.examples[0].exposure != scene.examples[3].exposure
+
+
+def test_the_automatic_exposure_leaves_the_projector_within_its_power_and_its_radius(tmp_path):
+    dark = ObjectSettings(mesh="solid:orange:7", label="orange", albedo_scale=0.2)
+    projector = ProjectorSettings(pixels=4, polar=45.0)
+    scene = build_scene([dark], 24, projector=projector, exposure="auto", backgrounds=[0.0])
+    images = scene.render(scene.conditions(FIRST), FIRST)
+    mask = scene.truth(lambda label: 0).masks[0, 0, 0]
+    assert float(images[0, 0][:, mask].mean()) == pytest.approx(0.4, abs=1e-3)
+    assert scene.examples[0].exposure > 2
+    _, start = build_local_light(projector)
+    problem = SceneProblem(scene, [make_parameter("projector", scene, StepSettings("linf", 0.5))])
+    values = problem.project(problem.start + 9.0, FIRST)
+    conditions = problem.conditions(values, FIRST)
+    after = problem.images(values)[0]
+    write_adversary(Adversary.of(scene, 0, conditions, images[0], after), tmp_path)
+    written = json.loads((tmp_path / "projector.json").read_text())
+    coefficients = np.array(written["coefficients"])
+    assert np.abs(coefficients - start.numpy()).max() <= 0.5 + 1e-6
+    assert coefficients.max() <= written["power"]
+    again = reload(tmp_path).scene(choose("numba"))
+    torch.testing.assert_close(again.render(again.conditions(FIRST), FIRST)[0], after)
 
 
 @pytest.mark.parametrize(("red", "white"), [(0, 0), (0, 2), (12, 0)])
