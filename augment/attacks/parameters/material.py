@@ -15,7 +15,6 @@ from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import METALLIC, Conditions, initial_materials
 from augment.scene.scene import Scene
 from renderer.settings import MIN_ROUGHNESS
-from renderer.vectors import Ball, nearest_in_box
 
 # The four attack values of an attack on the material are roughness, metallic, specular factor and
 # hue. `GLOSS` selects the first three, and `HUE` the last.
@@ -66,8 +65,7 @@ class Material(Parameter):
         highest = 1 - ROUNDING
         lowest_material = self._unit.new_tensor([MIN_ROUGHNESS + ROUNDING, 0, 0, -math.inf])
         highest_material = self._unit.new_tensor([highest, highest, highest, math.inf])
-        self._lowest_values = lowest_material / self._unit
-        self._highest_values = highest_material / self._unit
+        self.box = lowest_material / self._unit, highest_material / self._unit
         # Append a fourth column for the rotation of the hue, which starts at 0.
         initial_material = F.pad(self._average_gloss, (0, 1))
         start = initial_material.clamp(lowest_material, highest_material) / self._unit
@@ -122,7 +120,3 @@ class Material(Parameter):
                 albedo_offset = hue.new_zeros(*hue.shape, 3)
             conditions = replace(conditions, hue=hue, albedo=albedo_offset)
         return conditions
-
-    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
-        """Find the nearest values whose gloss the renderer can show."""
-        return nearest_in_box(values, self._lowest_values, self._highest_values, within)
