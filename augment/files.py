@@ -231,8 +231,7 @@ def _read_torchscript(path: Path) -> Content:
         example = f"as in network=torchvision:resnet50 weights={path}"
         reason = advice_for_pickles(path) or f"{reason}, {example}"
         raise name_error(path, f"cannot be loaded, because it {reason}")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
+    with warnings.catch_warnings(action="ignore"):  # Ignore that torch.jit is deprecated.
         network = Scripted(torch.jit.load(path, map_location="cpu").eval())
     return network, (None, None, None, None)  # TorchScript stores no size of the images.
 
@@ -248,8 +247,7 @@ class Scripted(Network):
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """Return a copy with weights of its own."""
         content = io.BytesIO()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
+        with warnings.catch_warnings(action="ignore"):  # Ignore that torch.jit is deprecated.
             torch.jit.save(self.network, content)
             content.seek(0)
             copied = type(self)(torch.jit.load(content))

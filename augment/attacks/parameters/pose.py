@@ -142,9 +142,6 @@ def _pose_units(settings: PoseSettings) -> Float[Tensor, " 9"]:
     logarithm of the scale (1), polar angle and azimuth of the cameras in degrees (2), and the
     logarithm of their distance (1).
     """
-    units = [settings.rotation, settings.rotation, settings.rotation]
-    units += [settings.shift, settings.shift]
-    units += [math.log1p(settings.scale)]
-    units += [settings.view, settings.view]
-    units += [math.log1p(settings.distance)]
+    units = [settings.rotation] * 3 + [settings.shift] * 2 + [math.log1p(settings.scale)]
+    units += [settings.view] * 2 + [math.log1p(settings.distance)]
     return torch.tensor(units, dtype=torch.float64)
