@@ -106,9 +106,7 @@ class Pose(Parameter):
         vertices = conditions.vertices
         if vertices is None:
             vertices = self._vertices[objects]
-        moved_vertices = []
-        for index, unmoved, change in zip(objects.tolist(), vertices, changes, strict=True):
-            moved_vertices.append(self._moved(index, unmoved, change))
+        moved_vertices = [*map(self._moved, objects.tolist(), vertices, changes)]
         # `stack` refuses an empty list, as there is without examples.
         if moved_vertices:
             vertices = torch.stack(moved_vertices)
