@@ -102,12 +102,11 @@ class LocalLight(LightParameter):
     def __init__(self, scene: Scene, settings: StepSettings, name: str):
         """Find the light among the local lights of the scene."""
         self.name = name
-        for light in scene.basis.local_lights:
-            if light.basis.name == name:
-                super().__init__(scene, settings, light, nonnegative=True)
-                return
-        fault = f"{name} cannot be attacked, because the scene has none"
-        raise InputError(f"{fault}: build the scene with {name}=...", name)
+        lights = {light.basis.name: light for light in scene.basis.local_lights}
+        if name not in lights:
+            fault = f"{name} cannot be attacked, because the scene has none"
+            raise InputError(f"{fault}: build the scene with {name}=...", name)
+        super().__init__(scene, settings, lights[name], nonnegative=True)
 
 
 # An attack on a daylight sky changes three values: two angles of the sun, and the turbidity (haze)
