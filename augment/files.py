@@ -28,18 +28,9 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves
 
 from augment import classifier as classifiers
+from augment import network as wrappers
 from augment.classifier import Classifier, TaskNetwork
-from augment.network import (
-    ARRAYS,
-    FILE,
-    YOU,
-    Function,
-    Network,
-    log_probabilities,
-    plain_outputs,
-    say_once,
-    unwrapped,
-)
+from augment.network import FILE, YOU, Network, say_once, unwrapped
 from augment.tasks.task import Task
 from renderer.errors import InputError, explained, reading, require_file, require_kind, single_line
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
@@ -219,7 +210,7 @@ def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
     # Show the first image beside the second and then beside the third. Its logits must not change.
     with torch.no_grad():
         outputs = [classifier.network(images[[0, other]]) for other in (1, 2)]
-    first, second = (plain_outputs(output).float() for output in outputs)
+    first, second = (wrappers.plain_outputs(output).float() for output in outputs)
     if (first[0] - second[0]).abs().max() > MAX_CHANGE * (first.max() - first.min()):
         raise name_error(name, IN_TRAINING_MODE)
 
@@ -231,8 +222,7 @@ def _read_torchscript(path: Path) -> Content:
         example = f"as in network=torchvision:resnet50 weights={path}"
         reason = advice_for_pickles(path) or f"{reason}, {example}"
         raise name_error(path, f"cannot be loaded, because it {reason}")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
+    with warnings.catch_warnings(action="ignore"):  # Ignore that torch.jit is deprecated.
         network = Scripted(torch.jit.load(path, map_location="cpu").eval())
     return network, (None, None, None, None)  # TorchScript stores no size of the images.
 
@@ -248,8 +238,7 @@ class Scripted(Network):
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """Return a copy with weights of its own."""
         content = io.BytesIO()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Ignore that torch.jit is deprecated.
+        with warnings.catch_warnings(action="ignore"):  # Ignore that torch.jit is deprecated.
             torch.jit.save(self.network, content)
             content.seek(0)
             copied = type(self)(torch.jit.load(content))
@@ -386,10 +375,10 @@ class Converted(Network):
     def forward(self, images: Tensor) -> Any:
         """Compute the outputs of images (N, 3, H, W)."""
         outputs = self.network(images.permute(0, 2, 3, 1) if self.is_last else images)
-        return log_probabilities(outputs) if self.has_probabilities else outputs
+        return wrappers.log_probabilities(outputs) if self.has_probabilities else outputs
 
 
-def read_onnx(path: Path) -> tuple[Function, list[int | None], bool]:
+def read_onnx(path: Path) -> tuple[wrappers.Function, list[int | None], bool]:
     """Read a file of ONNX with onnxruntime, on the CPU.
 
     The network has no gradients. Its one input is images of float32. Several outputs are a tuple.
@@ -411,7 +400,7 @@ def read_onnx(path: Path) -> tuple[Function, list[int | None], bool]:
         found = session.run(None, {images.name: batch.astype(np.float32)})
         return found[0] if len(found) == 1 else tuple(map(torch.from_numpy, found))
 
-    return Function(outputs, ARRAYS), sizes, is_last
+    return wrappers.Function(outputs, wrappers.ARRAYS), sizes, is_last
 
 
 def read_weights(path: Path) -> State:

@@ -30,7 +30,7 @@ from augment.random_streams import generator, stream_seed
 from augment.scene import loops
 from augment.scene.lights import MODELS, Drawn, Illumination, LightModel, LowLight, normal_noise
 from augment.scene.loops import BIN_BITS, BINS
-from augment.scene.patterns import draw_projected_light, luminance, require_photographs
+from augment.scene.patterns import by_kind, draw_projected_light, luminance, require_photographs
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import OVERSHOOT, decode, encode, to_bytes, to_unit
@@ -245,7 +245,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         Raises:
             InputError: If Albumentations is not installed.
         """
-        return _albumentations(self)
+        return _albumentations_class()(self.lights, self.strength, self.p)
 
 
 def relight_photographs(
@@ -386,22 +386,18 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
             fault = f"an image has values above {BRIGHTEST}, such as those of bytes"
             warnings.warn(f"{fault}: divide them by 255 unless they are HDR", stacklevel=2)
     depths = None if depth is None else _as_depth(depth, frames, count)
-    # Rows of the frames that have the same model and the same strength. Unchanged frames have None.
-    groups: dict[Any, list[int]] = {}
-    for row, light in enumerate(lights):
-        groups.setdefault((id(light and light.model), light and light.strength), []).append(row)
-    parts = []
-    for rows in groups.values():
-        chosen = [light for light in (lights[row] for row in rows) if light is not None]
-        part = frames if len(rows) == len(frames) else frames[rows]
+    # Frames of one kind have the same model and the same strength. Unchanged frames have None.
+    keys = [light and (id(light.model), light.strength) for light in lights]
+    kinds = [*dict.fromkeys(keys)]
+
+    def relight(kind: int, rows: list[int] | slice) -> Tensor:
+        of_kind = zip(lights, keys, strict=True)
+        chosen = [light for light, key in of_kind if light and key == kinds[kind]]
         depth_of_rows = None if depths is None else depths[rows]
         with usual_defaults():
-            parts.append(_relight(part, chosen, depth_of_rows) if chosen else part)
-    relit = parts[0]
-    if len(parts) > 1:
-        # Sort the frames back to their original order.
-        order = torch.tensor([row for rows in groups.values() for row in rows]).argsort()
-        relit = torch.cat(parts)[order.to(plain.device)]
+            return _relight(frames[rows], chosen, depth_of_rows) if chosen else frames[rows]
+
+    relit = by_kind([kinds.index(key) for key in keys], relight)
     if frames.is_contiguous(memory_format=torch.channels_last):
         relit = relit.contiguous(memory_format=torch.channels_last)
     return relit.reshape(plain.shape)
@@ -526,11 +522,6 @@ def relit_bytes(colors: UInt8[Tensor, "N C H W"], light: Illumination) -> UInt8[
     return relit
 
 
-def _albumentations(lighting: RandomLighting) -> Any:
-    """Wrap a transform for Albumentations."""
-    return _albumentations_class()(lighting.lights, lighting.strength, lighting.p)
-
-
 @cache
 def _albumentations_class() -> Any:
     """Define the transform of Albumentations once, as its `from_dict` looks for it by its name."""
@@ -564,6 +555,6 @@ def _albumentations_class() -> Any:
             return {"lights": named, "strength": self.lighting.strength}
 
         def __reduce__(self) -> tuple[Any, ...]:
-            return _albumentations, (self.lighting,), self.__dict__
+            return RandomLighting.albumentations, (self.lighting,), self.__dict__
 
     return Lighting

@@ -122,7 +122,7 @@ class ShadedView:
         """Add up the radiance of all lights; `fragments` may assign samples to other pixels."""
         # Autograd adds up gradients in the reverse of this order, so another order would change the
         # last bits of gradients.
-        summands: list[Tensor | None] = []
+        summands = []
         if self.light.environment is not None:
             arguments = (fragments, self.vertices, self.light.environment, self.albedo)
             gloss = sample_gloss(self.mesh, self.fragments, self.gloss)
@@ -131,16 +131,15 @@ class ShadedView:
             else:
                 summands.append(glossy_radiance(*arguments, self._normals, gloss))
         # Change of the radiance by shadows and bounces.
-        if has_indirect:
-            summands.append(self._indirect_radiance())
+        if has_indirect and (indirect := self._indirect_radiance()) is not None:
+            summands.append(indirect)
         for basis, coefficients in self.light.local_lights:
             assert self.lamp_view is not None
             shown = basis, self.albedo, coefficients, self.lamp_positions, fragments
             summands.append(self.lamp_view.radiance(*shown))
-        given_summands = [summand for summand in summands if summand is not None]
-        if not given_summands:
+        if not summands:
             return torch.zeros(3, len(fragments.pixels)).to(self.albedo)
-        return reduce(torch.add, given_summands)
+        return reduce(torch.add, summands)
 
     def _radiance_with_silhouettes(
         self, camera: Camera, background: Float[Tensor, "3 pixels"]

@@ -460,14 +460,12 @@ def surface_of_cells(is_filled: Bool[np.ndarray, "X Y Z"]) -> tuple[np.ndarray, 
         # Corners of the lower side of a cell along the axis, relative to the
         # cell's lowest corner. The order is counter-clockwise seen from above.
         square = np.array([0 * u, u, u + v, v])
-        is_lower_neighbor_filled = np.roll(padded, 1, axis)[1:-1, 1:-1, 1:-1]
-        is_upper_neighbor_filled = np.roll(padded, -1, axis)[1:-1, 1:-1, 1:-1]
-        # A filled cell next to an empty cell has a side on the surface.
-        cells_with_lower_side = np.argwhere(is_filled & ~is_lower_neighbor_filled)
-        cells_with_upper_side = np.argwhere(is_filled & ~is_upper_neighbor_filled)
         # A lower side faces down, so its corners are in the reversed order.
-        squares.append(cells_with_lower_side[:, None] + square[::-1])
-        squares.append(cells_with_upper_side[:, None] + unit_vectors[axis] + square)
+        for toward, side in ((1, square[::-1]), (-1, unit_vectors[axis] + square)):
+            is_neighbor_filled = np.roll(padded, toward, axis)[1:-1, 1:-1, 1:-1]
+            # A filled cell next to an empty cell has a side on the surface.
+            cells = np.argwhere(is_filled & ~is_neighbor_filled)
+            squares.append(cells[:, None] + side)
     corners = np.concatenate(squares).reshape(-1, 3)
     vertices, corner_to_vertex = np.unique(corners, axis=0, return_inverse=True)
     square_vertices = corner_to_vertex.reshape(-1, 4)

@@ -98,7 +98,7 @@ def sample(
 class NormBalls:
     """Values of E examples, in norm-balls around those at which attacks start.
 
-    A subclass whose values are not all feasible overrides `project_feasible`.
+    A subclass whose values are not all feasible sets `box`, or overrides `project_feasible`.
 
     Attributes:
         settings: Norm-ball and steps of the attack.
@@ -107,7 +107,10 @@ class NormBalls:
         used_mask: Mask of the values that an attack may change, shape (E, D).
             The other values have no effect on the image. None if every example
             uses all values.
+        box: Smallest and largest feasible values.
     """
+
+    box: Any = (-math.inf, math.inf)
 
     def __init__(self, settings: StepSettings, start: Tensor, used_mask: Tensor | None = None):
         self.settings = settings
@@ -119,12 +122,13 @@ class NormBalls:
         return None
 
     def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
-        """Find the nearest feasible values. By default, all values are feasible.
+        """Find the nearest feasible values. By default, those in the box are feasible.
 
         The nearest values are meant in the Euclidean sense, and the centers of `within` are
         feasible.
         """
-        return nearest_in_box(values, -math.inf, math.inf, within)
+        low, high = self.box
+        return nearest_in_box(values, low, high, within)
 
     def scale_gradient(self, gradient: Values) -> Values:
         """Compute the step that gradient descent subtracts from the values.
@@ -167,13 +171,10 @@ class NormBalls:
         used_count = used.sum(1, keepdim=True)
         return length * used / used_count.clamp(min=1).sqrt()
 
-    def project(self, values: Values, examples: Examples) -> Values:
+    def project(self, values: Values, examples: Examples | slice) -> Values:
         """Find the nearest values that are feasible and lie in the norm-balls around the start."""
-        return self._project(values, self.start[examples])
-
-    def _project(self, values: Values, center: Values) -> Values:
         radius = self.settings.radius
-        ball = None if radius is None else Ball(center, radius, self.settings.norm)
+        ball = None if radius is None else Ball(self.start[examples], radius, self.settings.norm)
         return self.project_feasible(values, ball)
 
     def sample(self, draws: Generator, reached: Values | None = None) -> Values:
@@ -191,7 +192,8 @@ class NormBalls:
             distance = (reached - self.start).norm(dim=1, keepdim=True)
             offset = direction * distance / direction.norm(dim=1, keepdim=True)
             return self.project_feasible(self.start + offset)
-        return self._project(sample(self.settings, self.start, draws, self.used_mask), self.start)
+        drawn = sample(self.settings, self.start, draws, self.used_mask)
+        return self.project(drawn, slice(None))
 
 
 @dataclass(frozen=True)

@@ -375,9 +375,8 @@ def _reached_roughness(
     parts = (material.roughness, material.metallic, material.specular_factor) if material else ()
     if layer is None and not any(parts):
         return MATTE
-    materials = placed.initial_materials(item)
     # Roughness of each face of the object itself.
-    roughness = materials.face_gloss[materials.object_mask, placed.ROUGHNESS]
+    roughness = placed.initial_materials(item)[item.own_faces, placed.ROUGHNESS]
     if layer is not None:
         roughness = torch.full_like(roughness, layer.roughness[0])
     if material is not None and material.roughness:

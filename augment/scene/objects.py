@@ -16,7 +16,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from augment.settings import MeshSettings, ObjectSettings
@@ -334,32 +334,11 @@ MATTE = (1.0, 0.0, 0.0)
 SPECULAR_LAYER = (0.5, 0.0, 1.0)
 
 
-@dataclass(frozen=True)
-class FaceMaterials:
-    """Specular materials of the F faces of a mesh: objects and their table.
-
-    Attributes:
-        face_gloss: Roughness, metallic and specular factor of each face.
-        object_mask: Mask of the faces that belong to the object itself.
-    """
-
-    face_gloss: Float[Tensor, "F 3"]
-    object_mask: Bool[Tensor, " F"]
-
-    def average(self) -> Tensor:
-        """Average roughness, metallic and specular factor over the object's faces, shape (3,)."""
-        return self.face_gloss[self.object_mask].mean(0)
-
-    def is_uniform(self) -> bool:
-        """Return whether all faces belong to the object and have the same material."""
-        return bool(self.object_mask.all() and (self.face_gloss == self.face_gloss[0]).all())
-
-
-def initial_materials(item: SceneObject) -> FaceMaterials:
+def initial_materials(item: SceneObject) -> Float[Tensor, "F 3"]:
     """Return the materials with which an attack on the material of an object starts.
 
-    They are those of the mesh. If the object is matte (metallic and specular
-    factor are zero on all its faces), its faces get the material
+    They are roughness, metallic and specular factor of the F faces of the mesh. If the object is
+    matte (metallic and specular factor are zero on all its faces), its faces get the material
     `SPECULAR_LAYER`. Others and table keep their materials.
     """
     object_mask = torch.from_numpy(item.own_faces)
@@ -370,7 +349,7 @@ def initial_materials(item: SceneObject) -> FaceMaterials:
     if not face_gloss[object_mask, METALLIC:].any():
         specular_layer = face_gloss.new_tensor(SPECULAR_LAYER)
         face_gloss = torch.where(object_mask[:, None], specular_layer, face_gloss)
-    return FaceMaterials(face_gloss=face_gloss, object_mask=object_mask)
+    return face_gloss
 
 
 # Fields of `Conditions` whose second axis is the faces of a mesh.

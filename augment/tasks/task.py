@@ -193,12 +193,8 @@ class Task(ABC):
         # A detector that finds nothing has no gradient.
         is_empty = not any(item.numel() for item in values)
         needs_gradient = torch.is_grad_enabled() and images.requires_grad and not is_empty
-        if needs_gradient and not self.has_gradient(outputs):
+        if needs_gradient and not any(item.requires_grad for item in values):
             raise InputError(f"{title} {NO_GRADIENT}")
-
-    def has_gradient(self, outputs: Any) -> bool:
-        """Return whether outputs have a gradient."""
-        return any(item.requires_grad for item in tensors_of(outputs))
 
     @abstractmethod
     def criterion(self, source: Tensor, truth: GetTruth, class_count: int) -> Criterion:

@@ -179,9 +179,8 @@ def parse_numbers(text: bytes, dtype: type) -> np.ndarray:
     """Parse numbers between blanks or line breaks."""
     if not text.strip():
         return np.zeros(0, dtype)
-    with warnings.catch_warnings():
-        # NumPy stops at a word that is no number, with a warning or, in new versions, an error.
-        warnings.simplefilter("error", DeprecationWarning)
+    # NumPy stops at a word that is no number, with a warning or, in new versions, an error.
+    with warnings.catch_warnings(action="error", category=DeprecationWarning):
         try:
             return np.fromstring(text, dtype, sep=" ")
         except (ValueError, DeprecationWarning) as error:

@@ -289,11 +289,8 @@ def monomial_coefficients(degree: int) -> Float64[Tensor, "monomials K"]:
     # The same derivatives as sums of monomials of degree `degree` - 1: one row for each
     # monomial, one column for each harmonic Y_k.
     along_x, along_y, along_z = lower_coefficients @ in_harmonics
-    powers = []
-    for a in range(degree, -1, -1):
-        for b in range(degree - a, -1, -1):
-            # Power of x, or of y if a = 0, or of z if a = b = 0.
-            powers.append(a or b or degree)
+    # Power of x, or of y if a = 0, or of z if a = b = 0.
+    powers = [a or b or degree for a in range(degree, -1, -1) for b in range(degree - a, -1, -1)]
     # First come all monomials with x. Those with y but without x come from the last
     # `degree` rows of `along_y`, which are without x. The last monomial is z^degree.
     derivatives = torch.cat([along_x, along_y[-degree:], along_z[-1:]])

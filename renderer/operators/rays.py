@@ -220,9 +220,8 @@ class Rays:
         if not len(pixels):
             return
         normals, planes = surface.normals, surface.planes
-        starts = (
-            surface.points + self.offset * planes - torch.from_numpy(self._mesh.origin)
-        ).float()
+        above = surface.points + self.offset * planes
+        starts = (above - torch.from_numpy(self._mesh.origin)).float()
         sample_count, _ = surface.samples_of_pixels
         # The directions form turns, in each of which a pixel goes once through its samples. So
         # those in one place of all turns start at the same sample. Pixels with a rare number of
@@ -324,10 +323,9 @@ class Rays:
 
     def _first_hit(self, *rays: Tensor | None) -> Int[Tensor, " N"]:
         """Find the first faces of `first_hit` from origins relative to the center."""
-        given = [
-            np.ascontiguousarray(each.numpy(), np.float32) for each in rays if each is not None
-        ]
-        return torch.from_numpy(self._scene.run(*given)).long()
+        given = [each.numpy() for each in rays if each is not None]
+        arrays = [np.ascontiguousarray(each, np.float32) for each in given]
+        return torch.from_numpy(self._scene.run(*arrays)).long()
 
 
 @cache_tensors

@@ -373,13 +373,9 @@ class _Silhouettes:
         places = start[across_and_along], end[across_and_along]
         edge, line, fraction, next_sample = _cut_edges(*places, shape)
         # Row-major indices of the first sample after each cut, and of the sample before.
-        if axis == X:
-            after = line * columns + next_sample
-            before = after - 1
-        else:
-            after = next_sample * columns + line
-            before = after - columns
-        cells = torch.stack([before, after])
+        row, column, step = (line, next_sample, 1) if axis == X else (next_sample, line, columns)
+        after = row * columns + column
+        cells = torch.stack([after - step, after])
         # Indices among the covered samples before and after the cuts, or NOT_COVERED.
         samples = self.sample_grid.flatten()[cells].long()
         place = start[:, edge] + fraction * (end - start)[:, edge]

@@ -21,7 +21,7 @@ from renderer.light.ringing import nonnegative_window
 from renderer.light.skylight import ZENITH
 from renderer.light.skylight import coefficients as sky_coefficients
 from renderer.settings import TURBIDITY
-from renderer.vectors import Ball, nearest_in_box
+from renderer.vectors import Ball
 
 
 class LightParameter(Parameter):
@@ -102,12 +102,11 @@ class LocalLight(LightParameter):
     def __init__(self, scene: Scene, settings: StepSettings, name: str):
         """Find the light among the local lights of the scene."""
         self.name = name
-        for light in scene.basis.local_lights:
-            if light.basis.name == name:
-                super().__init__(scene, settings, light, nonnegative=True)
-                return
-        fault = f"{name} cannot be attacked, because the scene has none"
-        raise InputError(f"{fault}: build the scene with {name}=...", name)
+        lights = {light.basis.name: light for light in scene.basis.local_lights}
+        if name not in lights:
+            fault = f"{name} cannot be attacked, because the scene has none"
+            raise InputError(f"{fault}: build the scene with {name}=...", name)
+        super().__init__(scene, settings, lights[name], nonnegative=True)
 
 
 # An attack on a daylight sky changes three values: two angles of the sun, and the turbidity (haze)
@@ -145,12 +144,12 @@ class Skylight(Parameter):
 
         self._window = nonnegative_window(HARMONICS.degree) if nonnegative else None
         self._sun = settings.sun
-        values = [
-            settings.zenith / settings.sun,
-            settings.azimuth / settings.sun,
-            settings.turbidity / TURBIDITY_UNIT,
-        ]
-        start = torch.tensor(values, dtype=torch.float64).to(scene.lights)
+        units = torch.tensor([self._sun, self._sun, TURBIDITY_UNIT], dtype=torch.float64)
+        initial = units.new_tensor([settings.zenith, settings.azimuth, settings.turbidity])
+        start = (initial / units).to(scene.lights)
+        # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
+        limits = units.new_tensor([ZENITH, (-math.inf, math.inf), TURBIDITY])
+        self.box = (limits.T / units).to(scene.lights)
         super().__init__(settings, start=start.expand(len(scene), -1))
 
     def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
@@ -170,20 +169,6 @@ class Skylight(Parameter):
         missing_count = self._basis.size - sky.shape[-2]
         sky = F.pad(sky, (0, 0, 0, missing_count))
         return replace_light(conditions, self._rows, sky.to(conditions.light))
-
-    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
-        """Find the nearest values for which the sky model is defined."""
-        # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
-        # The order of the values is zenith angle, azimuth, turbidity.
-        lowest_zenith, highest_zenith = ZENITH
-        lowest_turbidity, highest_turbidity = TURBIDITY
-        low = values.new_tensor(
-            [lowest_zenith / self._sun, -math.inf, lowest_turbidity / TURBIDITY_UNIT]
-        )
-        high = values.new_tensor(
-            [highest_zenith / self._sun, math.inf, highest_turbidity / TURBIDITY_UNIT]
-        )
-        return nearest_in_box(values, low, high, within)
 
 
 class Positions(Parameter):

@@ -15,7 +15,6 @@ from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import METALLIC, Conditions, initial_materials
 from augment.scene.scene import Scene
 from renderer.settings import MIN_ROUGHNESS
-from renderer.vectors import Ball, nearest_in_box
 
 # The four attack values of an attack on the material are roughness, metallic, specular factor and
 # hue. `GLOSS` selects the first three, and `HUE` the last.
@@ -66,8 +65,7 @@ class Material(Parameter):
         highest = 1 - ROUNDING
         lowest_material = self._unit.new_tensor([MIN_ROUGHNESS + ROUNDING, 0, 0, -math.inf])
         highest_material = self._unit.new_tensor([highest, highest, highest, math.inf])
-        self._lowest_values = lowest_material / self._unit
-        self._highest_values = highest_material / self._unit
+        self.box = lowest_material / self._unit, highest_material / self._unit
         # Append a fourth column for the rotation of the hue, which starts at 0.
         initial_material = F.pad(self._average_gloss, (0, 1))
         start = initial_material.clamp(lowest_material, highest_material) / self._unit
@@ -79,16 +77,20 @@ class Material(Parameter):
     def _read_materials(self, scene: Scene) -> None:
         """Keep the materials of the objects of a scene before the attack."""
         self._face_count = max(len(item.mesh.faces) for item in scene.objects)
-        materials = [initial_materials(item) for item in scene.objects]
-        averages = [material.average() for material in materials]
+        glosses = [initial_materials(item) for item in scene.objects]
+        # Masks of the faces of each object itself, without props and table.
+        masks = [torch.from_numpy(item.own_faces) for item in scene.objects]
+        pairs = [*zip(glosses, masks, strict=True)]
+        averages = [gloss[mask].mean(0) for gloss, mask in pairs]
         # Average roughness, metallic and specular factor of each object, shape (objects, 3).
         self._average_gloss = torch.stack(averages).to(scene.lights)
         # Save memory: of faces that are alike, keep one only.
-        kept = slice(1 if all(material.is_uniform() for material in materials) else None)
+        are_alike = all(mask.all() and (gloss == gloss[0]).all() for gloss, mask in pairs)
+        kept = slice(1 if are_alike else None)
         # F is the number of faces of the largest mesh, or 1 if the faces of each object are
         # alike. The shapes are (objects, F, 3) and (objects, F).
-        face_gloss = pad_sequence([each.face_gloss[kept] for each in materials], batch_first=True)
-        object_mask = pad_sequence([each.object_mask[kept] for each in materials], batch_first=True)
+        face_gloss = pad_sequence([gloss[kept] for gloss in glosses], batch_first=True)
+        object_mask = pad_sequence([mask[kept] for mask in masks], batch_first=True)
         self._face_gloss = face_gloss.to(scene.lights)
         self._object_mask = object_mask.to(scene.lights)
 
@@ -122,7 +124,3 @@ class Material(Parameter):
                 albedo_offset = hue.new_zeros(*hue.shape, 3)
             conditions = replace(conditions, hue=hue, albedo=albedo_offset)
         return conditions
-
-    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
-        """Find the nearest values whose gloss the renderer can show."""
-        return nearest_in_box(values, self._lowest_values, self._highest_values, within)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -19,7 +19,7 @@ from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
-from renderer.vectors import Ball, nearest_in_box, rotation_matrices
+from renderer.vectors import rotation_matrices
 
 # An attack on the pose changes a vector of values. The following constants are positions in it:
 # of the rotation vector of the object, of its shift along x and y, of the logarithm of its scale,
@@ -61,9 +61,15 @@ class Pose(Parameter):
             raise InputError(f"silhouettes=False: {advice}", "silhouettes")
         self._object_of = scene.object_of
         self._vertices = scene.vertices
-        self._movable_objects = _movable_objects(scene)
+        masks = [torch.from_numpy(item.own_vertices) for item in scene.objects]
+        # Mask of the vertices of each object itself, without props and table, shape (objects, N).
+        self._object_masks = pad_sequence(masks, batch_first=True).to(scene.lights.device)
+        # Height z of the ground of each object. None for an object without props or table, which
+        # may float.
+        self._grounds = [None if item.own is None else item.lowest for item in scene.objects]
         self._unit = _pose_units(settings).to(scene.lights)
-        self._limit = self._largest_values(scene, settings)
+        limit = self._largest_values(scene, settings)
+        self.box = -limit, limit
         # A value with the unit 0 has no effect.
         used_mask = (self._unit > 0).expand(len(scene.object_of), -1)
         super().__init__(settings, start=self._unit.new_zeros(used_mask.shape), used_mask=used_mask)
@@ -100,17 +106,31 @@ class Pose(Parameter):
         vertices = conditions.vertices
         if vertices is None:
             vertices = self._vertices[objects]
-        moved_vertices = []
-        for index, unmoved, change in zip(objects.tolist(), vertices, changes, strict=True):
-            moved_vertices.append(self._movable_objects[index].move(unmoved, change))
+        moved_vertices = [*map(self._moved, objects.tolist(), vertices, changes)]
         # `stack` refuses an empty list, as there is without examples.
         if moved_vertices:
             vertices = torch.stack(moved_vertices)
         return replace(conditions, vertices=vertices, cameras=changes[:, CAMERA])
 
-    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
-        """Find the nearest values at which object and camera do not meet."""
-        return nearest_in_box(values, -self._limit, self._limit, within)
+    def _moved(
+        self, index: int, vertices: Float[Tensor, "N 3"], change: Float[Tensor, " D"]
+    ) -> Float[Tensor, "N 3"]:
+        """Scale, rotate and shift an object of the scene.
+
+        The change is in degrees, world units and logarithms, in the order of `_pose_units`. Props
+        and table do not move, and the lowest vertex of an object on a ground stays on it.
+        """
+        object_mask, ground_height = self._object_masks[index], self._grounds[index]
+        scaled = change[SCALE].exp() * vertices
+        rotated = scaled @ rotation_matrices(change[ROTATION]).T
+        # Append 0 for the shift along z.
+        shift = F.pad(change[SHIFT], (0, 1))
+        moved = rotated + shift
+        # Lift the object until its lowest vertex is on the ground.
+        if ground_height is not None:
+            lift = ground_height - moved[object_mask, 2].amin()
+            moved = moved + lift * moved.new_tensor([0, 0, 1])
+        return torch.where(object_mask[:, None], moved, vertices)
 
 
 def _pose_units(settings: PoseSettings) -> Float[Tensor, " 9"]:
@@ -120,56 +140,6 @@ def _pose_units(settings: PoseSettings) -> Float[Tensor, " 9"]:
     logarithm of the scale (1), polar angle and azimuth of the cameras in degrees (2), and the
     logarithm of their distance (1).
     """
-    units = [settings.rotation, settings.rotation, settings.rotation]
-    units += [settings.shift, settings.shift]
-    units += [math.log1p(settings.scale)]
-    units += [settings.view, settings.view]
-    units += [math.log1p(settings.distance)]
+    units = [settings.rotation] * 3 + [settings.shift] * 2 + [math.log1p(settings.scale)]
+    units += [settings.view] * 2 + [math.log1p(settings.distance)]
     return torch.tensor(units, dtype=torch.float64)
-
-
-def _movable_objects(scene: Scene) -> list[_MovableObject]:
-    """Create a movable copy of each object of a scene, in the order of `scene.objects`."""
-    masks = [torch.from_numpy(item.own_vertices) for item in scene.objects]
-    # One row for each object, one column for each of the N vertices of the largest mesh.
-    object_masks = pad_sequence(masks, batch_first=True).to(scene.lights.device)
-    movable_objects = []
-    for item, object_mask in zip(scene.objects, object_masks, strict=True):
-        # `item.own` is None if the mesh contains the object only, without props or table.
-        ground_height = None if item.own is None else item.lowest
-        movable_objects.append(_MovableObject(object_mask, ground_height))
-    return movable_objects
-
-
-@dataclass(frozen=True)
-class _MovableObject:
-    """Object that moves while its props and its table stay as they are.
-
-    Attributes:
-        object_mask: Mask of the vertices that belong to the object itself and
-            not to props or table, shape (N,).
-        ground_height: z coordinate of the ground on which the object stands.
-            None for an object without props or table, which may float.
-    """
-
-    object_mask: Bool[Tensor, " N"]
-    ground_height: float | None
-
-    def move(
-        self, vertices: Float[Tensor, "N 3"], change: Float[Tensor, " D"]
-    ) -> Float[Tensor, "N 3"]:
-        """Scale, rotate and shift the object.
-
-        The change is in degrees, world units and logarithms, in the order of `_pose_units`. Props
-        and table do not move, and the lowest vertex of an object on a ground stays on it.
-        """
-        scaled = change[SCALE].exp() * vertices
-        rotated = scaled @ rotation_matrices(change[ROTATION]).T
-        # Append 0 for the shift along z.
-        shift = F.pad(change[SHIFT], (0, 1))
-        moved = rotated + shift
-        # Lift the object until its lowest vertex is on the ground.
-        if self.ground_height is not None:
-            lift = self.ground_height - moved[self.object_mask, 2].amin()
-            moved = moved + lift * moved.new_tensor([0, 0, 1])
-        return torch.where(self.object_mask[:, None], moved, vertices)
