@@ -1,8 +1,8 @@
 """A classifier: a network whose outputs are logits, with the names of its classes."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from dataclasses import dataclass, replace
+from typing import Any, Self, cast
 
 import numpy as np
 import torch
@@ -40,9 +40,8 @@ ImageFunction = Callable[[Tensor], Any]
 # Name of one positive class, or names of several.
 Label = str | Sequence[str]
 Normalization = str | tuple[Sequence[float], Sequence[float]] | None
-# Value of the gray image with which a function is called to find out whether it has gradients.
+# A network is called with a gray image, and so many others, to find out whether it has gradients.
 GRAY = 0.5
-# Number of images of a scene with which a function of another task is called for that.
 MAX_PROBED = 8
 
 
@@ -282,6 +281,18 @@ class TaskNetwork(CheckedNetwork):
         made.recognizer = self.recognizer
         return made
 
+    def with_task(self, task: Task) -> Self:
+        """Return a copy with other settings of its task, such as the goal of attacks."""
+        if type(task) is not type(self.task):
+            reason = f"task is {task}, but {self.title} has the task {self.task}"
+            raise InputError(f"{reason}: leave the task out")
+        decode = getattr(self.task, "decode", None)
+        if decode is not None:
+            task = replace(cast(Any, task), decode=cast(Any, task).decode or decode)
+        made = type(self)(self.network, self.size, self.classes, self.name, task=task)
+        made.inputs, made.recognizer = self.inputs, self.recognizer
+        return made
+
     def describe_inputs(self) -> str:
         """Write size, normalization and value range of the images, each with who states it."""
         return self.inputs.describe(self.network, self.size)
@@ -455,7 +466,11 @@ def as_network(
         if classes is not None or normalization is not None or value_range != UNIT_RANGE:
             given = "classes, normalization and value_range"
             raise InputError(f"{given} are for a plain network: leave them out")
-        _require_own(network, size, task)
+        if size not in (None, network.size):
+            advice = f"use the size of its images, {network.size}"
+            raise InputError(f"size={size} does not fit {network.title}: {advice}")
+        if task is not None and task != network.task:
+            network = network.with_task(task)
         if says:
             wrappers.say_inputs(network.name, network.network, network.size, network.inputs)
         return network.normalizing_light(normalize_light)
@@ -505,16 +520,6 @@ def as_network(
         made = TaskNetwork(function, size, known, name, normalize_light, task)
     made.inputs = inputs
     return made
-
-
-def _require_own(network: TaskNetwork, size: Size | None, task: Task | None) -> None:
-    """Check that a size and a task, if they are given, are those of a network."""
-    if task not in (None, network.task):
-        reason = f"task is {task}, but {network.title} has the task {network.task}"
-        raise InputError(f"{reason}: leave the task out")
-    if size not in (None, network.size):
-        advice = f"use the size of its images, {network.size}"
-        raise InputError(f"size={size} does not fit {network.title}: {advice}")
 
 
 def _describe_inputs(

@@ -212,10 +212,7 @@ def with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
             raise InputError(f"{name}={value} is no setting of {own.name}: leave it out", name)
     if not given:
         return network
-    options = network.network, network.size, network.classes, network.name
-    changed = TaskNetwork(*options, task=replace(own, **given))
-    # It stays the same who stated the facts about the images.
-    changed.inputs = network.inputs
+    changed = network.with_task(replace(own, **given))
     say_once(f"network {network.name}: its task is {changed.task}")
     return changed
 

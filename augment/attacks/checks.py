@@ -379,7 +379,7 @@ def _classify(
     task, count = classifier.task, len(examples)
     labels = [adversary.shown.label for adversary in changed[count:]]
     # Classes are matched by name, because another classifier may have another order of classes.
-    names = [label if isinstance(label, str) else classes[label] for label in labels]
+    names = [classes[result.classifier.label(label)] for label in labels]
     source = torch.tensor([*map(classifier.label, names)]).long()
     source = source[:, None].expand(-1, result.criterion.view_count)
     target = result.criterion.select(examples).target

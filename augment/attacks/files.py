@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from augment.progress import progress
 from augment.scene.objects import Conditions
 from renderer.errors import as_folder, as_list, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
-from renderer.io.files import atomic_write
+from renderer.io.files import atomic_write, remove
 from renderer.io.images import draw_grid, tiles_of, write_image
 from renderer.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.rendering import light_sphere
@@ -90,6 +91,9 @@ def save(
     verify = [verify] if isinstance(verify, str) else verify
     verify = as_list("verify", verify, str, "a list of renderers")
     require_renderers(verify)
+    if (folder / LINES).exists():
+        # Files of an earlier attack would be taken for those of this one.
+        remove(*folder.glob("example_*"))
     folder.mkdir(parents=True, exist_ok=True)
     images = result.images_in_views.cpu()
     paths = [folder / f"example_{example:03d}" for example in range(len(images))]
@@ -138,7 +142,11 @@ def _write_example(
     problem, scene = result.problem, result.problem.scene
     images = result.images_in_views_before[example], result.images_in_views[example]
     write_image(path.with_suffix(".png"), figure(result, example))
-    light_numbers = write_adversary(Adversary.of(scene, example, after, *images), path)
+    adversary = Adversary.of(scene, example, after, *images)
+    # An index would be another class of another network.
+    label = result.classifier.classes[result.classifier.label(adversary.shown.label)]
+    adversary = replace(adversary, shown=replace(adversary.shown, label=label))
+    light_numbers = write_adversary(adversary, path)
     # The files of an adversary have the light after the attack. Add that before it.
     light_before, basis_before = result.light(problem.start, example)
     save_lights(path, scene.exposed(light_before.cpu(), example), basis_before, "_before")

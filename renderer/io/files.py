@@ -77,6 +77,15 @@ def atomic_write(
         temporary.write_bytes(data)
 
 
+def remove(*paths: Path) -> None:
+    """Remove files and folders in this order, if they exist."""
+    for path in paths:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
 def remove_unfinished(folder: Path) -> None:
     """Remove the temporary files of a killed process, if no other process writes to the folder."""
     for unfinished in folder.glob(TEMPORARY):

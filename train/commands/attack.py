@@ -204,8 +204,7 @@ def attacks(
         return
     for index, item in enumerate(settings.meshes):
         key = f"meshes[{index}]"
-        mesh = read_object(item, "", key)
-        mesh.label = class_of_meshes([item], classifier.classes, key, mesh.label or settings.label)
+        mesh = _labeled(item, key, classifier, settings)
         build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
         chosen = settings.scene
         try:
@@ -242,6 +241,15 @@ def build_attacked(
         return build_scene([item], size, scene.views, **options)
 
 
+def _labeled(
+    item: Any, key: str, classifier: Classifier, settings: AttackExperimentSettings
+) -> ObjectSettings:
+    """Read a mesh of the settings, which has a label of its own, that of all or its name."""
+    mesh = read_object(item, "", key)
+    mesh.label = class_of_meshes([item], classifier.classes, key, mesh.label or settings.label)
+    return mesh
+
+
 def load_targets(
     settings: AttackExperimentSettings, attacked: Classifier, device: torch.device
 ) -> dict[str, Sequence[Any]]:
@@ -249,10 +257,9 @@ def load_targets(
 
     Return the arguments of `nb.transfer`.
     """
-    label = ""
     chosen = settings.transfer
-    if chosen.networks or chosen.meshes:
-        # The class is compared by name, because its index may differ in other classifiers.
+    label = ""
+    if chosen.meshes:
         label = class_of_meshes(settings.meshes, attacked.classes, "meshes", settings.label)
     classifiers = []
     for item in chosen.networks:
@@ -262,8 +269,10 @@ def load_targets(
         name = str(values.get("network"))
         with keyed(name="transfer.networks", weights="transfer.networks: weights"):
             other = load_network(name, values.get("weights"), trust_code=settings.trust)
+        # Classes are compared by name, because their indices may differ in other classifiers.
         # `label` raises an InputError if the classifier lacks the class.
-        other.label(label)
+        for index, mesh in enumerate(settings.meshes):
+            other.label(_labeled(mesh, f"meshes[{index}]", attacked, settings).label)
         classifiers.append(other.to(device))
     objects = []
     for mesh in read_objects(chosen.meshes, label, "transfer.meshes").values():

@@ -161,10 +161,11 @@ def held_out_rows(split: Split, fraction: float, argument: str = "fraction") -> 
     for label in split.labels.unique():
         indices_of_class = torch.nonzero(split.labels == label).squeeze(1)
         class_size = len(indices_of_class)
-        count = round(fraction * class_size)
-        if not 0 < count < class_size:
-            fault = f"{argument}={fraction} selects {count} of the {class_size} images of a class"
-            raise InputError(f"{fault}: choose one that leaves some in both splits", argument)
+        if class_size == 1:
+            fault = f"class {int(label)} has one image, which {argument}={fraction} cannot split"
+            raise InputError(f"{fault}: add images of this class, or remove it", argument)
+        # At least one image of each class is in either part.
+        count = min(max(round(fraction * class_size), 1), class_size - 1)
         # A larger fraction takes more of the same random order.
         order = torch.randperm(class_size, generator=draws)
         is_held_out[indices_of_class[order[:count]]] = True

@@ -16,7 +16,7 @@ from train.results.intervals import Jackknife, change
 from train.results.metrics import COUNTED_EACH, METRICS, Pool, Pooled, metric_title
 from train.results.predictions import PREDICTIONS
 from train.results.store import INITIAL, Methods, RunSummary, Scored, ScoredRun
-from train.results.tables import Estimate, Table, describe_intervals, format_interval
+from train.results.tables import RANGE, Estimate, Table, describe_intervals, format_interval
 from train.settings import PHOTOGRAPHS, UNLABELED
 
 # Titles of the columns of tables that have a column for each metric in `METRICS`.
@@ -127,7 +127,7 @@ def _mean(estimates: Iterable[Estimate | None]) -> Estimate | None:
     if len(known) < 2:
         return known[0] if known else None
     values = [item.value for item in known if item.value is not None]
-    over = f"lowest and highest of {len(values)} seeds"
+    over = f"{RANGE} of {len(values)} seeds"
     return Estimate(fmean(values), min(values), max(values), over)
 
 

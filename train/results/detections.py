@@ -276,6 +276,10 @@ def estimate(
     (every_unit,) = units.groups
     unit_of_image = [np.unique(every_unit[images], return_inverse=True)[1] for images in groups]
     (result,) = leave_out(of_groups, Units(unit_of_image, units.over))
+    # Images without objects do not change the recall, and images without detections no precision.
+    if all((item == result.value).all() for item in result.without[1:]):
+        count = int(unit_of_image[0].max()) + 1
+        result = replace(result, without=result.without[:1], unit_count=count)
     if result.unit_count < 2 or not all(np.isfinite(item).all() for item in result.without):
         return Estimate(float(result.value))
     return result.estimate

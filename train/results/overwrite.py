@@ -1,12 +1,12 @@
 """Protect or remove results of earlier commands. Only `overwrite=true` lets a command do so."""
 
-import shutil
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from augment.attack_settings import LINES
 from renderer.errors import InputError
+from renderer.io.files import remove
 from train import run_folder
 from train.data import photo
 from train.results import predictions
@@ -85,7 +85,7 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
     """
     names = (*OF_RUN, run_folder.FAILURE, PAGE, run_folder.RENDERS, BEFORE, KEPT_ASIDE)
     logs = [*folder.glob("events.out.tfevents.*"), *folder.glob(f"*/{SUMMARY}")]
-    _remove(*(folder / name for name in names), *logs)
+    remove(*(folder / name for name in names), *logs)
     with suppress(InputError):  # config.yaml may be missing.
         for name in (PHOTOGRAPHS_FIRST, *read_config(folder / CONFIG).get("compare", ())):
             if with_others and (folder / name / CONFIG).is_file():
@@ -95,15 +95,6 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
 
 def remove_attack(out: Path) -> None:
     """Remove the results of an earlier pnb-attack, so that no report shows them with new ones."""
-    _remove(*(out / name for name in (PAGE, CONFIG, RELIT, SWEEP_TABLE, SWEEP_FIGURE)))
+    remove(*(out / name for name in (PAGE, CONFIG, RELIT, SWEEP_TABLE, SWEEP_FIGURE)))
     for lines in out.glob(f"*/{LINES}"):
-        _remove(*lines.parent.glob("example_*"), lines.with_name(TRANSFERS), lines)
-
-
-def _remove(*paths: Path) -> None:
-    """Remove files and folders in this order, if they exist."""
-    for path in paths:
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+        remove(*lines.parent.glob("example_*"), lines.with_name(TRANSFERS), lines)

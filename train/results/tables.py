@@ -18,6 +18,7 @@ from renderer.io.files import atomic_write
 OBJECTS = "objects"
 IMAGES = "images"
 THESE_OBJECTS = "images, for these objects"
+RANGE = "lowest and highest"  # of several seeds, which are no interval
 NORMAL_QUANTILE = NormalDist().inv_cdf(0.975)
 
 
@@ -174,4 +175,7 @@ def describe_intervals(estimates: Iterable[Estimate | None]) -> str:
     over = {item.over for item in estimates if item is not None and item.low is not None}
     # A set has no order, and the more general statement comes first.
     units = sorted(over - {""}, key=lambda words: (THESE_OBJECTS in words, words))
-    return "95% intervals " + ", or ".join(f"over {words}" for words in units) if units else ""
+    ranges = [words for words in units if words.startswith(RANGE)]
+    intervals = [f"over {words}" for words in units if words not in ranges]
+    shown = ["95% intervals " + ", or ".join(intervals)] if intervals else []
+    return ", or ".join([*shown, *ranges])

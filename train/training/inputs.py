@@ -95,7 +95,11 @@ class Initial:
         """
         for key in ("classes", "size"):
             if self.architecture[key] != description[key]:
-                raise InputError(f"network={self.source} has another {key}: give the same {key}")
+                fault = f"network={self.source} has another {key}"
+                if key == "size":
+                    own, of_data = self.architecture[key], description[key]
+                    fault = f"network={self.source} takes {own} pixels, but the data has {of_data}"
+                raise InputError(f"{fault}: give the same {key}")
         with checkpoints.checks_architecture(self.source):
             network.load_state_dict(self.weights)
 
@@ -258,6 +262,9 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> s
             loaded = load(path, size, data.test_fraction, skip, data.workers)
     with keyed("data.path"):
         require_range("image size", loaded.size, MIN_SIZE, MAX_SIZE)
+    if settings.size not in (None, loaded.size):
+        fault = f"size={settings.size}, but images of data={data.name} have {loaded.size} pixels"
+        raise InputError(f"{fault}: set size={loaded.size}, or leave it out", "size")
     return loaded
 
 

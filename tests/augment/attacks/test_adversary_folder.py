@@ -23,6 +23,39 @@ from renderer.solids import solid
 from renderer.surface.gloss import Gloss
 from renderer.visibility import choose
 
+NAMES = ["red", "green", "blue"]
+
+
+def channels_in_order(order: list[int]) -> augment.Classifier:
+    names = [NAMES[index] for index in order]
+    return augment.Classifier(lambda images: 30 * images.mean((2, 3))[:, order], 16, names)
+
+
+@pytest.mark.parametrize("label", ["red", 0, "0"])
+def test_an_index_of_a_class_is_that_of_the_attacked_network_everywhere(label, tmp_path):
+    first, other = channels_in_order([0, 1, 2]), channels_in_order([2, 0, 1])
+    scene = augment.build_scene([("solid:orange", label)], 16, rasterizer="numpy")
+    steps = augment.StepSettings("linf", 0.4, "sign", 0.1)
+    settings = augment.AttackSettings(lighting=steps, allow_negative=True, max_steps=4)
+    result = augment.attack(first, scene, settings=settings)
+    assert augment.transfer(result, [other])[0]["clean_correct"] == [True]
+    augment.save(result, tmp_path, verify=())
+    assert reload(tmp_path / "example_000").shown.label == "red"
+
+
+def test_files_of_an_earlier_attack_in_the_same_folder_are_gone(attacked, tmp_path):
+    views = augment.build_scene([("solid:orange", "orange")], 8, views=2, rasterizer="numpy")
+    settings = augment.AttackSettings(pixels=augment.StepSettings("linf", 0.05), max_steps=1)
+    options = {"settings": settings, "classes": ["orange", "other"], "force": True}
+    network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)).eval()
+    augment.save(augment.attack(network, views, **options), tmp_path, verify=())
+    (tmp_path / "notes.txt").write_text("kept")
+    augment.save(attacked("lighting", max_steps=1), tmp_path, verify=())
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"attack.jsonl", "example_000", "example_000.png", "notes.txt"}
+    assert not (tmp_path / "example_000" / "pixels.npy").exists()
+
+
 OTHERS = {"skylight", "projector", "lamps", "positions", "pose"}  # Each has a test of its own.
 CHANGE_TEXTURES = {"material", "albedo"}
 CLASSES = ("orange", "lime", "sky")

@@ -136,6 +136,14 @@ def test_an_object_that_is_not_found_before_is_reported_and_no_success(goal):
     assert not result.clean_correct.any() and not result.success.any()
 
 
+def test_a_task_with_another_goal_replaces_that_of_a_loaded_network():
+    loaded = as_network(brightness_detector, SIZE, CLASSES)
+    task = nb.Detection(threshold=0.3, goal="mislabel")
+    assert as_network(loaded, task=task).task == task
+    with pytest.raises(nb.InputError, match="leave the task out"):
+        as_network(loaded, task=nb.Segmentation())
+
+
 BOX = {"boxes": [[2.0, 3.0, 10.0, 12.0]], "labels": [0], "scores": [0.9]}
 CANDIDATE = {"candidate_boxes": [[0.0, 0.0, 8.0, 8.0]]}
 

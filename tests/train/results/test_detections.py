@@ -126,6 +126,25 @@ def test_objects_of_the_same_photograph_add_nothing_to_its_interval():
     assert 0.2 < recall(1).low < 0.35
 
 
+@pytest.mark.parametrize("is_found", [True, False])
+def test_photographs_without_objects_do_not_change_the_interval_of_the_recall(is_found):
+    """It is Wilson's for the photographs with objects."""
+
+    def metrics(empty):
+        found = [_found(*(BOX, [0], [0.9]) if is_found else ([], [], []))] * 50
+        marked = [_marked(BOX, [0])] * 50 + [_marked([], [])] * empty
+        matches = _match(found + [_found([], [], [])] * empty, marked)
+        return detections.score(matches, [0], 0.4)
+
+    alone = metrics(0)
+    assert alone.recall.high - alone.recall.low < 0.08
+    for empty in (1, 2, 3, 40):
+        for name in ("recall", "ap50"):
+            found, expected = (getattr(each, name) for each in (metrics(empty), alone))
+            ends = [found.value, found.low, found.high]
+            assert ends == pytest.approx([expected.value, expected.low, expected.high], abs=2e-3)
+
+
 def test_no_false_detection_has_an_upper_limit_like_the_rule_of_three():
     matches = _match([_found([], [], [])] * 100, [_marked([], [])] * 100)
     metrics = detections.score(matches, [0], 0.4)

@@ -17,6 +17,14 @@ def test_a_fraction_has_the_wilson_interval():
     assert found == pytest.approx(expected, rel=1e-4)
 
 
+def test_the_range_of_seeds_is_not_called_an_interval():
+    of_seeds = tables.Estimate(0.5, 0.4, 0.6, f"{tables.RANGE} of 2 seeds")
+    of_images = tables.Estimate(0.5, 0.4, 0.6, "images")
+    assert tables.describe_intervals([of_seeds]) == "lowest and highest of 2 seeds"
+    described = tables.describe_intervals([of_images, of_seeds])
+    assert described == "95% intervals over images, or lowest and highest of 2 seeds"
+
+
 def test_a_fraction_of_nothing_is_unknown():
     nothing = fraction(0, 0)
     assert nothing == Proportion(value=None, low=None, high=None, hits=0, n=0)
