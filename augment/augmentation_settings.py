@@ -67,7 +67,7 @@ class VariationSettings(Settings):
 
     shift: float = setting(0.0, "Largest shift as a fraction of the image width.", within=FRACTION)
     scale: list[float] = pair(list(UNCHANGED), "factor of the size in the image.", FACTOR)
-    exposure: list[float] = pair(list(UNCHANGED), "factor of the lighting.", FACTOR)
+    exposure: list[float] = pair(list(UNCHANGED), "factor of the environment light.", FACTOR)
     backgrounds: str | None = setting(None, "Folder of images for scene.backgrounds. null: none.")
     instances: bool = setting(False, "Draw another instance of each solid without a seed.")
     azimuth: float = setting(

@@ -164,7 +164,7 @@ class SceneSettings(Settings):
         "null: 6, or what the smoothest specular material needs that the run can reach.",
         within=(0, base.MAX_DEGREE),
     )
-    exposure: Any = setting(1.0, "Factor of the lighting. auto: a mean of 0.4 for each mesh.")
+    exposure: Any = setting(1.0, "Factor of the environment light. auto: a mean of 0.4 per mesh.")
     # `projector` and `lamps` are dictionaries that `__post_init__` converts to settings, because
     # OmegaConf cannot set a single field of an optional dataclass.
     projector: Any = setting(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
 from augment.files import as_facts, require_no_facts
-from augment.network import device_of, gradient_flags_kept
+from augment.network import device_of, gradient_flags_kept, say_once
 from augment.settings import NormalizeLight
 from augment.tasks.detection import Detection
 from augment.tasks.segmentation import Segmentation
@@ -201,6 +201,9 @@ def evaluate(
             # Thresholds that are stored with the network, used if every label has one.
             stored = {point.label: point for point in made.operating_points}
             points = [stored[name] for name in labels] if stored.keys() >= set(labels) else []
+            if stored and not points and calibrate is None:
+                names = ", ".join(stored)
+                say_once(f"the stored thresholds are not used: set label={names}")
             if calibrate is not None and false_positive_rate is not None:
                 chosen_on = Path(calibrate), labels, false_positive_rate, skip_unreadable
                 points = scoring.choose_operating_points(predictor, *chosen_on)

@@ -189,7 +189,7 @@ def _read(folder: Path) -> RunSummary:
     path = folder.absolute()
     # The last two parts of the path are the name of a network without a run.
     name = str(Path(*path.parts[-2:]))
-    settings = {"network": str(path)}
+    settings: dict[str, Any] = {"network": str(path)}
     if (folder / SUMMARY).is_file():
         # pnb-evaluate wrote it. The folder lies in its parent as scores lie in the folder of a run.
         scores = {path.name: StoredScores.read(read_json(folder / SUMMARY))}
@@ -198,7 +198,14 @@ def _read(folder: Path) -> RunSummary:
         # This import is here because it imports torch, which other results do not need.
         from train.checkpoints import load_selected
 
-        stored = load_selected(folder)[1].get("scores", {})
+        state = load_selected(folder)[1]
+        stored = state.get("scores", {})
+        # Its training, or else its thresholds, tell the positive classes.
+        points = state.get("operating_point", ())
+        points = [points] if isinstance(points, dict) else points
+        label = state.get("settings", {}).get("label") or [point["label"] for point in points]
+        if label:
+            settings["label"] = label
         # None for a network that was not scored on test images.
         accuracy = stored.get("test/accuracy")
         # Scores on photographs are mappings. Others are numbers.
