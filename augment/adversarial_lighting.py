@@ -148,9 +148,11 @@ class AdversarialLighting:
                     costs = criterion.cost(chosen)
                     cost = costs.new_zeros(len(unit)).index_add(0, image_of_row, costs)
                     if step < self.steps:
-                        if not cost.requires_grad:
+                        # The cost of a detector that finds nothing is constant.
+                        if not cost.requires_grad and not is_list:
                             raise InputError(f"the network {NO_GRADIENT}")
-                        cost.sum().backward()
+                        if cost.requires_grad:
+                            cost.sum().backward()
                 is_lower = (cost < lowest).tolist()
                 lowest = torch.minimum(lowest, cost.detach())
                 pairs = zip(is_lower, lights, best, strict=True)

@@ -71,6 +71,18 @@ def test_networks_with_one_logit_or_without_a_gradient_are_refused(images):
             nb.AdversarialLighting(Detached())(images, labels)
 
 
+def test_a_detector_that_finds_nothing_has_nothing_to_hide(images):
+    class Nothing(nn.Module):
+        def forward(self, images):
+            empty = {"boxes": torch.zeros(0, 4), "scores": torch.zeros(0)}
+            return [{**empty, "labels": torch.zeros(0, dtype=torch.int64)} for _ in images]
+
+    targets = [{"boxes": [[2.0, 3.0, 10.0, 12.0]], "labels": [0]}] * len(images)
+    options = {"task": nb.Detection(), "classes": ["ball", "lamp"], "lights": "linear"}
+    found = nb.AdversarialLighting(Nothing(), **options)(images, targets)
+    assert found.shape == images.shape
+
+
 def test_each_image_is_seen_as_often_as_stated_and_the_network_stays_as_it_was(images):
     model = Mean().train()
     for steps, targets, extra in ((1, torch.zeros(8).long(), 0), (2, None, 1)):

@@ -252,19 +252,22 @@ def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
     paths = {name: of / name for of in folders for name in names if (of / name).is_file()}
     # Other images in the folder, by name without folder. Most files need no search.
     others: dict[str, list[Path]] = defaultdict(list)
+    used = {*paths.values()}
     for path in visible_files(folders[0]) if len(paths) < len(names) else ():
-        if path.suffix.lower() in SUFFIXES and folders[0] / path not in paths.values():
+        if path.suffix.lower() in SUFFIXES and folders[0] / path not in used:
             others[path.name].append(folders[0] / path)
     uses = Counter(PurePosixPath(name).name for name in names)
     for name in [name for name in names if name not in paths]:
         parts = PurePosixPath(name).parts
-        found = others[parts[-1]]
-        # An image is in the same folders as its name says, from the last one on. Of images in other
-        # folders, the name alone must tell.
-        most = max((_equal_ends(path.parts, parts) for path in found), default=0)
-        found = [path for path in found if _equal_ends(path.parts, parts) == most]
+        # Images of this name, by the number of equal parts at the end of their paths.
+        by_equal_parts: dict[int, list[Path]] = defaultdict(list)
+        for image in others[parts[-1]]:
+            by_equal_parts[_equal_ends(image.parts, parts)].append(image)
+        most = max(by_equal_parts, default=0)
+        # An image in another folder may be any of several that have its name.
         if most == 1 and uses[parts[-1]] > 1:
             continue
+        found = by_equal_parts[most]
         if len(found) > 1:
             listed = " and ".join(map(str, found[:2]))
             raise InputError(f"{file} names the image {name}, which may be {listed}")
@@ -293,7 +296,8 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
     if paths:
         console.info("%s: the images of its entry val are read", named)
     photographs = []
-    read = []
+    # Label files that exist.
+    read: list[Path] = []
     for path in paths or [folder / item.path for item in find_unlabeled(folder)]:
         # A photograph can have a label file in several places. The first that exists counts.
         labels = next(filter(Path.is_file, _label_files(path)), None)
@@ -308,13 +312,18 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
         first = _label_files(photographs[0].path.absolute())[0]
         fault = f"photos={folder} has neither a COCO file nor label files of YOLO"
         raise InputError(f"{fault}: add some, such as {first}", "photos")
-    # Label files without an image. Images of an entry val may share their folder with others.
-    every = [item.path for item in photographs]
-    every += [folder / item.path for item in find_unlabeled(folder)]
-    known = {file for image in every for file in _label_files(image)}
-    found = {file.absolute() for of in {file.parent for file in read} for file in of.glob("*.txt")}
-    missing = [str(file) for file in sorted(found - known) if file.name not in CLASS_FILES]
-    return Annotations(folder, photographs, classes, missing)
+    return Annotations(folder, photographs, classes, _labels_without_image(photographs, read))
+
+
+def _labels_without_image(photographs: Sequence[Annotated], labels: Sequence[Path]) -> list[str]:
+    """Find the files beside given label files whose image is missing."""
+    # The images of an entry val may share their folder with others, which are not missing.
+    folders = {item.path.parent.absolute() for item in photographs if item.path.parent.is_dir()}
+    images = [file for of in folders for file in of.iterdir() if file.suffix.lower() in SUFFIXES]
+    known = {file for image in images for file in _label_files(image)}
+    beside = {file.parent for file in labels}
+    found = {file.absolute() for of in beside for file in of.glob("*.txt")}
+    return [str(file) for file in sorted(found - known) if file.name not in CLASS_FILES]
 
 
 def _label_files(path: Path) -> list[Path]:
@@ -368,9 +377,9 @@ def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Pa
     # The folder itself, and the two above it.
     for parent in [folder, *list(folder.absolute().parents)[:2]]:
         files = [file for suffix in YAML for file in parent.glob(f"*{suffix}")]
-        for file in (
-            [given] if given else sorted(files, key=lambda file: (file.stem != "data", file))
-        ):
+        # data.yaml comes first.
+        files.sort(key=lambda file: (file.stem != "data", file))
+        for file in [given] if given else files:
             with explained(f"{file} cannot be read", "give names as a list, or index: name"):
                 names = _yaml_mapping(file).get("names")
                 # Names are a list, or a mapping from index to name.

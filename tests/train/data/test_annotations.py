@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -137,6 +138,26 @@ def test_labels_of_yolo_without_an_image_are_counted(tmp_path, val):
     read = read_annotations(tmp_path)
     assert (read.classes, len(read.photographs)) == (("cat",), 1 if "list" in val else 2)
     assert read.missing == [str(tmp_path / "labels" / "3.txt")]
+
+
+def test_labels_beside_images_of_a_relative_folder_are_not_missing(tmp_path, monkeypatch):
+    for name in ("1", "2"):
+        _draw(tmp_path / "set" / f"{name}.png")
+    for name in ("1", "2", "3"):
+        (tmp_path / "set" / f"{name}.txt").write_text("0 0.5 0.5 0.2 0.2\n")
+    (tmp_path / "set" / "data.yaml").write_text("names: [cat]\n")
+    monkeypatch.chdir(tmp_path)
+    assert read_annotations(Path("set")).missing == [str(tmp_path / "set" / "3.txt")]
+
+
+def test_images_of_val_may_lie_in_another_folder_than_data_yaml(tmp_path):
+    _draw(tmp_path / "elsewhere" / "images" / "a.png")
+    (tmp_path / "elsewhere" / "labels").mkdir()
+    (tmp_path / "elsewhere" / "labels" / "a.txt").write_text("0 0.5 0.5 0.2 0.2\n")
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "data.yaml").write_text("{names: [cat], val: ../elsewhere/images}\n")
+    read = read_annotations(tmp_path / "set")
+    assert (len(read.photographs), read.missing) == (1, [])
 
 
 @pytest.mark.parametrize("shape", [[2, 2], [2, 3]])
