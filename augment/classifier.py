@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -271,14 +271,17 @@ class TaskNetwork(CheckedNetwork):
         return self.with_network(Switch(self, other, chooses), name=name)
 
     def with_network(
-        self, network: nn.Module, normalize_light: NormalizeLight = None, name: str | None = None
+        self,
+        network: nn.Module,
+        normalize_light: NormalizeLight = None,
+        name: str | None = None,
+        task: Task | None = None,
     ) -> Self:
         """Return a copy with another network of the same images, and without operating points."""
-        options: dict[str, Any] = {} if isinstance(self, Classifier) else {"task": self.task}
+        options: Any = {} if isinstance(self, Classifier) else {"task": task or self.task}
         given = self.size, self.classes, name or self.name, normalize_light
         made = type(self)(network, *given, **options)
-        made.inputs = self.inputs
-        made.recognizer = self.recognizer
+        made.inputs, made.recognizer = self.inputs, self.recognizer
         return made
 
     def with_task(self, task: Task) -> Self:
@@ -286,12 +289,11 @@ class TaskNetwork(CheckedNetwork):
         if type(task) is not type(self.task):
             reason = f"task is {task}, but {self.title} has the task {self.task}"
             raise InputError(f"{reason}: leave the task out")
+        changed: Any = task
         decode = getattr(self.task, "decode", None)
-        if decode is not None:
-            task = replace(cast(Any, task), decode=cast(Any, task).decode or decode)
-        made = type(self)(self.network, self.size, self.classes, self.name, task=task)
-        made.inputs, made.recognizer = self.inputs, self.recognizer
-        return made
+        if decode is not None and changed.decode is None:
+            changed = replace(changed, decode=decode)
+        return self.with_network(self.network, task=changed)
 
     def describe_inputs(self) -> str:
         """Write size, normalization and value range of the images, each with who states it."""
@@ -300,9 +302,8 @@ class TaskNetwork(CheckedNetwork):
     def is_differentiable(self, render: Callable[[], Tensor]) -> bool:
         """Return whether the outputs have a gradient in the pixels that is not zero.
 
-        It is missing if images are converted to bytes, and zero if they are
-        rounded. Constant outputs have one, and so has a network of torch with
-        weights that finds nothing in the images.
+        It is missing if images are converted to bytes, and zero if they are rounded. Constant
+        outputs count as differentiable, and so does a network with weights that finds nothing.
 
         Args:
             render: Function that makes the images of a scene, to which a gray
@@ -321,8 +322,7 @@ class TaskNetwork(CheckedNetwork):
                     return False
                 if not outputs:
                     continue
-                squares = [item.double().square().sum() for item in outputs]
-                total = torch.stack(squares).sum()
+                total = torch.stack([item.double().square().sum() for item in outputs]).sum()
                 gradient = gradient_of(total, shown)
                 if gradient is None or gradient.any():
                     return gradient is not None

@@ -11,7 +11,8 @@ import math
 import warnings
 from bisect import bisect
 from collections import UserDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from copy import copy
 from functools import cache
 from itertools import accumulate
@@ -34,7 +35,7 @@ from augment.scene.patterns import by_kind, draw_projected_light, luminance, req
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import OVERSHOOT, decode, encode, to_bytes, to_unit
-from renderer.modes import usual_defaults
+from renderer.modes import without_autocast
 
 # Keys of a sample at which a plain tensor is an image, whatever stands before it.
 IMAGES = ("image", "images", "img", "pixel_values")
@@ -148,7 +149,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         count = max([math.prod(_batch_shape(image)) for image in flat_inputs], default=1)
         models, weights = [*self.lights], [*self.lights.values()]
         lights: list[Light | None] = []
-        with usual_defaults():
+        with _usual_defaults():
             seeds = torch.randint(2**62, (count,)).tolist()
             for seed, (chance, choice) in zip(seeds, torch.rand(count, 2).tolist(), strict=True):
                 # Draw a model with a probability in proportion to its weight.
@@ -248,6 +249,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         return _albumentations_class()(self.lights, self.strength, self.p)
 
 
+@without_autocast
 def relight_photographs(
     photographs: Tensor,
     seed: int = 0,
@@ -297,9 +299,22 @@ def relight_photographs(
         require_photographs("slides", slides)
     count, _, *shape = photographs.shape
     # Photographs stand for the albedo, and the light of the projector multiplies it.
-    with usual_defaults():
+    with _usual_defaults():
         light = draw_projected_light(count, shape, generator(seed, "relight"), slides)
         return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
+
+
+@contextmanager
+def _usual_defaults() -> Iterator[None]:
+    """Create tensors on the CPU in 32 bits, in a `with` block."""
+    with ExitStack() as stack:
+        made = torch.empty(0)  # Ten times as fast as `torch.get_default_device`.
+        if made.device.type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        if made.dtype != torch.float32:
+            stack.callback(torch.set_default_dtype, made.dtype)
+            torch.set_default_dtype(torch.float32)
+        yield
 
 
 def _key_of(path: Sequence[Any]) -> Any:
@@ -394,7 +409,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         of_kind = zip(lights, keys, strict=True)
         chosen = [light for light, key in of_kind if light and key == kinds[kind]]
         depth_of_rows = None if depths is None else depths[rows]
-        with usual_defaults():
+        with _usual_defaults():
             return _relight(frames[rows], chosen, depth_of_rows) if chosen else frames[rows]
 
     relit = by_kind([kinds.index(key) for key in keys], relight)
@@ -416,6 +431,7 @@ def _as_depth(depth: Any, frames: Tensor, count: int) -> Float[Tensor, "N 1 H W"
     return values.repeat_interleave(len(frames) // len(values), 0)
 
 
+@without_autocast
 def _relight(
     images: Tensor, lights: Sequence[Light], depth: Float[Tensor, "N 1 H W"] | None
 ) -> Tensor:

@@ -1,7 +1,6 @@
 """Modes of torch in which renders are computed: without autocast and second derivatives."""
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -24,22 +23,6 @@ def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **options)
 
     return called
-
-
-@contextmanager
-def usual_defaults() -> Iterator[None]:
-    """Create tensors on the CPU in 32 bits, and compute without autocast, in a `with` block."""
-    with ExitStack() as stack:
-        for kind in ("cpu", "cuda"):
-            if torch.is_autocast_enabled(kind):
-                stack.enter_context(torch.autocast(kind, enabled=False))
-        made = torch.empty(0)  # Ten times as fast as `torch.get_default_device`.
-        if made.device.type != "cpu":
-            stack.enter_context(torch.device("cpu"))
-        if made.dtype != torch.float32:
-            stack.callback(torch.set_default_dtype, made.dtype)
-            torch.set_default_dtype(torch.float32)
-        yield
 
 
 def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:

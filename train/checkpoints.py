@@ -270,9 +270,7 @@ def load_run(
             loaded = TaskNetwork(*facts, task=Detection())
         else:
             loaded = Classifier(*facts)
-            # Earlier versions stored a single operating point instead of a list.
-            stored = state.get("operating_point", [])
-            points = stored if isinstance(stored, list) else [stored]
+            points = state.get("operating_point", [])
             loaded.operating_points = [OperatingPoint(**values) for values in points]
             for point in loaded.operating_points:
                 # This call raises InputError if the network lacks the class.
@@ -359,4 +357,7 @@ def _load_published(path: Path) -> dict[str, Any]:
         for name in file.keys():  # noqa: SIM118 (The file is no mapping.)
             value = file.get_tensor(name)
             weights[name] = value.float() if value.is_floating_point() else value
+        if isinstance(points := facts.get("operating_point"), dict):
+            # Earlier versions stored a single operating point instead of a list.
+            facts["operating_point"] = [points]
         return _checked({**facts, "model": weights})

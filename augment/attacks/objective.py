@@ -292,11 +292,11 @@ class Objective:
 
 def _image_gradient(cost: Tensor, outputs: Any, batch: SingleImages) -> Tensor:
     """Compute the gradient of the costs with respect to the images."""
-    if not cost.requires_grad and not isinstance(outputs, Tensor):
-        # A detector that finds nothing returns nothing that depends on the image.
-        return torch.zeros_like(batch)
     # Detections are lists of several tensors.
     if not isinstance(outputs, Tensor):
+        if not cost.requires_grad:
+            # A detector that finds nothing returns nothing that depends on the image.
+            return torch.zeros_like(batch)
         return _required(gradient_of(cost.sum(), batch))
     output_gradient = _required(gradient_of(cost.sum(), outputs))
     # The gradient of a confident prediction is so small that it would round to zero in a

@@ -456,10 +456,10 @@ class DirectRenderer:
     ) -> PixelRadiance:
         """Render `views_at_once` views of an object with changed shape, colors, gloss or lamps.
 
-        Their images are one tall image, in one light or in one for each view, for which the object
-        must be matte. The result is differentiable in the light and in all
-        changes. With `settings.silhouettes`, it is also differentiable in fields of the camera that
-        are tensors. A draft of moved vertices with shadows or bounces has fewer samples and rays.
+        Their images are one tall image. All views have the same light or, if the object is matte,
+        each may have its own. The result is differentiable in the light and in all changes. With
+        `settings.silhouettes`, it is also differentiable in fields of the camera that are tensors.
+        A draft of moved vertices with shadows or bounces has fewer samples and rays.
         """
         _, _, object_index, cameras, changed = group
         item = self.objects[object_index]

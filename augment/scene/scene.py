@@ -572,8 +572,9 @@ class Scene:
             return index, -1 if is_shared else row
 
         images = product(range(len(numbers)), range(self.views))
+        at_once = self._direct_renderer.views_at_once()
         for (index, _), of_mesh in groupby(sorted(images, key=shown), key=shown):
-            while group := list(islice(of_mesh, self._direct_renderer.views_at_once())):
+            while group := list(islice(of_mesh, at_once)):
                 rows, views = zip(*group, strict=True)
                 changed = conditions.row(rows[0], self.objects[index].mesh)
                 of_views = tuple(cameras[row][view] for row, view in group)

@@ -281,7 +281,7 @@ class _Variation:
         room = Room(rays, item.radius, item.lowest, wall_distance)
         # Projector and lamps of the scene, which also light the room.
         local = split_light(scene.basis, scene.lights[row].cpu().double()).local_lights
-        # The exposure does not count for them.
+        # The exposure multiplies all light below, but must not change theirs.
         local = [(basis, values / example.exposure) for basis, values in local]
         arriving = irradiance(room, camera, scene.settings, sky.cpu().double(), lamp, local)
         # A lamp at zero stands for no directional light. The third axis points to the camera.

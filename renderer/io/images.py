@@ -35,17 +35,19 @@ from renderer.settings import REC_709, Size, height_and_width
 if TYPE_CHECKING:
     from torch import Tensor
 
+# Old versions of Pillow do not know AVIF.
+_HAS_AVIF = "avif" in features.modules
 # Suffixes of the files in a folder that count as images.
-_AVIF = [".avif"] if "avif" in features.modules else []
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif"),
-    *(".jp2", ".ppm", ".pgm", *_AVIF),
+    *(".jp2", ".ppm", ".pgm"),
+    *([".avif"] if _HAS_AVIF else []),
 )
 # Formats of Pillow that are read, whatever the name of the file. Others can run programs:
 # Pillow passes an EPS file to Ghostscript. "TGA" is last, because it has no signature.
 FORMATS = [
     *("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "JPEG2000", "PPM"),
-    *(["AVIF"] if _AVIF else []),
+    *(["AVIF"] if _HAS_AVIF else []),
     "TGA",
 ]
 # A large JPEG file is decoded at a reduced size before it is

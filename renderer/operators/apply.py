@@ -449,7 +449,8 @@ class _Image(torch.autograd.Function):
     ) -> Float[Tensor, "... 3 height width"]:
         """Render one image under each light."""
         images, is_unclamped, clamped_values = operator._images(lights, background)
-        ctx.save_for_backward(lights)  # so that `once_differentiable` finds it
+        # `once_differentiable` looks for saved tensors.
+        ctx.save_for_backward(lights)
         ctx.operator = operator
         ctx.is_unclamped = is_unclamped
         ctx.clamped_values = clamped_values

@@ -322,7 +322,7 @@ class Rays:
         return self._first_hit(origins - torch.from_numpy(self._mesh.origin), directions, lengths)
 
     def _first_hit(self, *rays: Tensor | None) -> Int[Tensor, " N"]:
-        """Find the first faces of `first_hit` from origins relative to the center."""
+        """Find the faces of `first_hit`, with origins of rays relative to that of the mesh."""
         given = [each.numpy() for each in rays if each is not None]
         arrays = [np.ascontiguousarray(each, np.float32) for each in given]
         return torch.from_numpy(self._scene.run(*arrays)).long()

@@ -212,8 +212,8 @@ def render_in(scene: Scene, light: Float[Tensor, "C K"]) -> Float[Tensor, "E 1 3
 
 
 def plain_images(views: Views, size: Size) -> Float[Tensor, "E 3 H W"]:
-    """Render all views before an attack."""
-    scene = views.scene(size)
+    """Render all views before an attack, in the only light in which they are shown."""
+    scene = views.scene(size).changed(one_light=True)
     return render_in(scene, scene.lights[0])[:, 0]
 
 

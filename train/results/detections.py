@@ -276,7 +276,8 @@ def estimate(
     (every_unit,) = units.groups
     unit_of_image = [np.unique(every_unit[images], return_inverse=True)[1] for images in groups]
     (result,) = leave_out(of_groups, Units(unit_of_image, units.over))
-    # Images without objects do not change the recall, and images without detections no precision.
+    # Images without objects do not change the recall, and without detections no precision either.
+    # Such a group says nothing about the interval.
     if all((item == result.value).all() for item in result.without[1:]):
         count = int(unit_of_image[0].max()) + 1
         result = replace(result, without=result.without[:1], unit_count=count)

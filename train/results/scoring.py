@@ -391,9 +391,10 @@ def choose_operating_points(
             fault = f"calibrate={folder} has {count} negatives for {name}"
             raise InputError(f"{fault}: {advice}", "calibrate")
         (threshold,) = thresholds(log_odds, np.ones(count, int), [str(rate)])
-        # Between this score and the next one, which rounding in other precisions would exchange.
+        # Half-way to the next score, rounding in another precision does not exceed the threshold.
         higher = rows.log_odds[rows.log_odds > threshold]
-        threshold = (threshold + higher.min(initial=np.inf)) / 2 if len(higher) else threshold
+        if len(higher):
+            threshold = (threshold + higher.min()) / 2
         chosen_on = (folder.resolve().name, predicted.images_hash, count)
         points.append(OperatingPoint(name, float(threshold), rate, *chosen_on))
     return points

@@ -201,9 +201,8 @@ def _read(folder: Path) -> RunSummary:
         state = load_selected(folder)[1]
         stored = state.get("scores", {})
         # Its training, or else its thresholds, tell the positive classes.
-        points = state.get("operating_point", ())
-        points = [points] if isinstance(points, dict) else points
-        label = state.get("settings", {}).get("label") or [point["label"] for point in points]
+        of_points = [point["label"] for point in state.get("operating_point", ())]
+        label = state.get("settings", {}).get("label") or of_points
         if label:
             settings["label"] = label
         # None for a network that was not scored on test images.
@@ -365,6 +364,8 @@ def read_attack(folder: Path) -> AttackSummary:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         # A line has the key "example" or, if it is about the whole attack, "checks".
         examples = [line for line in lines if "example" in line]
+        if len({line["example"] for line in examples}) < len(examples):
+            raise ValueError("it has an example twice")
         checks = [dict(line["checks"]) for line in lines if "checks" in line]
         # Examples that were classified correctly before the attack.
         correct = [line for line in examples if not line["success_before"]]
