@@ -5,6 +5,7 @@ pools of one evaluation: of all images, and of each label, source, mesh and clas
 name of a positive class. An image is a positive if it shows this class, and otherwise a negative.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
@@ -294,7 +295,7 @@ class Pool(ShortRepr):
 def choose_units(*groups: Predictions) -> Units:
     """Choose objects as units if each group shows enough of them, and otherwise images.
 
-    Images show the same object if they have the same mesh. An image with an
+    Images show the same object if they have the same label and mesh. An image with an
     unknown mesh counts as a different object.
     """
     objects = [_objects(group) for group in groups]
@@ -306,7 +307,8 @@ def choose_units(*groups: Predictions) -> Units:
 
 def _objects(predictions: Predictions) -> list[object]:
     """Name the object that each photograph shows."""
-    return [item.mesh or item.path for item in predictions.photograph]
+    items = predictions.photograph
+    return [(item.label, item.mesh) if item.mesh else item.path for item in items]
 
 
 def _number(names: Iterable[object]) -> np.ndarray:
@@ -372,8 +374,16 @@ class Pooled(ShortRepr):
 
     @cached_property
     def by_mesh(self) -> dict[str, Pool]:
-        """For each known mesh, the predictions for its images, which are scored together."""
-        return self._by_content([item.mesh for item in self.predictions.photograph])
+        """For each known mesh, the predictions for its images, which are scored together.
+
+        If photographs of several labels name the same mesh, these are different objects, and the
+        label stands before the name.
+        """
+        items = self.predictions.photograph
+        labels = Counter(mesh for _, mesh in {(item.label, item.mesh) for item in items})
+        shared = {mesh for mesh, count in labels.items() if mesh and count > 1}
+        names = [f"{item.label}: {item.mesh}" if item.mesh in shared else item.mesh for item in items]
+        return self._by_content(names)
 
     @cached_property
     def by_class(self) -> dict[str, Pool]:

@@ -188,13 +188,13 @@ def test_a_source_is_ranked_against_the_hard_negatives_that_it_names(fruit, tmp_
 
 def test_meshes_are_objects_and_ranked_against_all_images_of_the_other_kind(fruit, tmp_path):
     """Meshes m and n are oranges, and mesh k is another thing. Images without one are objects."""
-    mesh_of_letter = {"a": "m", "c": "m", "b": "n", "f": "k", "h": "k"}
+    mesh_of_letter = {"a": "m", "c": "m", "b": "n", "h": "k", "i": "k"}
     *_, folder = fruit
     write_table(folder, mesh=[mesh_of_letter.get(item.letter, "") for item in FRUIT])
     scores = scored(*fruit, "orange", tmp_path / "out", by="mesh")
     summary = scores.to_summary()
     assert summary["auc"]["positive_objects"] == 4  # m, n, d, e
-    assert summary["auc"]["negative_objects"] == 4  # k, g, i, j
+    assert summary["auc"]["negative_objects"] == 4  # f, g, k, j
     assert summary["auc"]["over"] == THESE_OBJECTS
     assert THESE_OBJECTS in scoring.format_scores(scores)
     for mesh, is_orange in (("k", False), ("m", True)):
@@ -204,6 +204,17 @@ def test_meshes_are_objects_and_ranked_against_all_images_of_the_other_kind(frui
         expected = count_metrics(shown + others)["auc"]
         assert metrics["auc"]["value"] == pytest.approx(expected, abs=1e-12)
         assert counts(metrics["recall"]) == counts(count_metrics(shown)["recall"])
+
+
+def test_objects_of_different_classes_may_have_the_same_name(fruit, tmp_path):
+    *_, folder = fruit
+    write_table(folder, mesh=[f"object {number % 3}" for number in range(len(FRUIT))])
+    summary = scored(*fruit, "orange", tmp_path / "out", by="mesh").to_summary()
+    shown = {(item.name.split("/")[0], number % 3) for number, item in enumerate(FRUIT)}
+    oranges = sum(label == "orange" for label, _ in shown)
+    assert summary["auc"]["positive_objects"] == oranges
+    assert summary["auc"]["negative_objects"] == len(shown) - oranges
+    assert len(summary["by_mesh"]) == len(shown)
 
 
 class TestAnOperatingPoint:
