@@ -211,6 +211,17 @@ def test_adversarial_images_are_those_of_the_papers_loop(serve, model, scene, la
     assert renders.diagnostics["zero_gradient"] == 0
 
 
+def test_steps_of_restarts_count_among_all_steps(serve, model):
+    """No step of this length changes a prediction, so each example that is attacked uses all."""
+    settings = TrainingAttackSettings(
+        lighting=StepSettings("l2", radius=1e-9, step_size=1e-9), max_steps=2, restarts=1
+    )
+    diagnostics = serve(attack=settings).regenerate(model, 0).diagnostics
+    assert diagnostics["attack_success_before"] < 1
+    assert diagnostics["used_all_steps"] == 1 - diagnostics["attack_success_before"]
+    assert diagnostics["steps"] == 4 * diagnostics["used_all_steps"]
+
+
 WARM = {"warm_start": True, "init": "random"}
 
 
