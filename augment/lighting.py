@@ -290,7 +290,12 @@ def relight_photographs(
         torch.uint8
     """
     errors.require_whole("seed", seed)
+    if lights is None and strength != 1.0:
+        raise InputError("strength is for lights: give lights, or leave it out", "strength")
     if lights is not None:
+        if slides is not None:
+            fault = "slides are for the projector without lights"
+            raise InputError(f"{fault}: give nb.lights.ProjectedSlide", "slides")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stream_seed(seed, "lights"))
             return RandomLighting(lights, strength=strength)(photographs)

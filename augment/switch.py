@@ -25,7 +25,8 @@ class Switch(nn.Module):
         self.training = network.training
 
     def forward(self, images: Tensor) -> Any:
-        is_chosen = self.chooses(images.detach())
+        # Nothing is chosen of no images, and means over them do not exist.
+        is_chosen = self.chooses(images.detach()) if len(images) else torch.zeros(0)
         if not is_chosen.any():
             return self.network(images)
         if is_chosen.all():

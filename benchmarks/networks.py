@@ -173,7 +173,7 @@ def score_photographs(
     words = [f"{title}={light}" for title, light in lights.items()]
     for title, rows in real_light.choose_lights(folder, words).items():
         draws = real_light.measure(predictions, folder.objects, counts, rows)
-        units_of_metrics = real_light.count_units(units[rows], predictions.positive[rows])
+        units_of_metrics = real_light.count_units(predictions, units, rows)
         estimates = list(map(real_light.estimate, draws, units_of_metrics))
         scores[title] = dict(zip(real_light.METRICS, estimates, strict=True))
     return scores

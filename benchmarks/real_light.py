@@ -27,13 +27,14 @@ import argparse
 import csv
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import torch
 from scipy.stats import spearmanr
 
 import norm_balls as nb
@@ -42,12 +43,17 @@ from augment.exposure import IsDim
 from augment.switch import SWITCHES
 from renderer.errors import InputError, require_whole
 from renderer.image import to_unit
-from renderer.io.images import SUFFIXES, crop_center, read_rgb, write_image
+from renderer.io.images import write_image
 from renderer.settings import MAX_SIZE
 from train.checkpoints import RUN, is_classifier, load_network, load_run
 from train.class_names import class_name
 from train.data.photo import Photograph
-from train.data.photographs import find_photographs, load_photographs, unsupported_files
+from train.data.photographs import (
+    find_photographs,
+    find_unlabeled,
+    load_photographs,
+    unsupported_files,
+)
 from train.results.intervals import auc_and_recalls, class_means, weighted_means
 from train.results.metrics import MIN_OBJECTS
 from train.results.predictions import Predictions
@@ -87,6 +93,25 @@ def light_of(photograph: Photograph) -> str:
     """Return the light of a photograph, which its name states, or photos.csv."""
     light, separator, _ = photograph.path.name.partition("__")
     return light if separator else photograph.source or PLAIN
+
+
+class Stratum(NamedTuple):
+    """Units that are drawn together: their objects or classes, lights, and indices."""
+
+    kind: frozenset[str]
+    lights: frozenset[str]
+    members: list[int]
+
+
+def joined(strata: Iterable[Stratum]) -> list[Stratum]:
+    """Join strata of the same kind that share a light, also by way of others."""
+    found: list[Stratum] = []
+    for kind, lights, members in strata:
+        near = [other for other in found if other.kind == kind and other.lights & lights]
+        found = [other for other in found if other not in near]
+        every = [index for stratum in near for index in stratum.members] + members
+        found.append(Stratum(kind, lights.union(*(other.lights for other in near)), every))
+    return found
 
 
 @dataclass(frozen=True)
@@ -143,26 +168,25 @@ class Folder:
     def draw(self, label: str) -> np.ndarray:
         """Draw how often each photograph counts, shape (1 + DRAWS, N); first, each counts once.
 
-        Units of the same objects that occur in the same lights are drawn together, so each light
-        keeps its number of photographs of each object. Objects with a single photograph are drawn
+        Units of the same objects that share a light are drawn together. So lights that share none
+        keep their numbers of photographs of each object. Objects with a single photograph are drawn
         with others of their class. Objects as units differ in the lights alone.
         """
         unit_of_photograph = self.units(label)
         units = np.unique(unit_of_photograph)
         has_objects = self.has_objects(label)
-        of_objects: dict[tuple[frozenset, frozenset], list[int]] = {}
+        single = []
         for index, unit in enumerate(units):
             is_unit = unit_of_photograph == unit
             objects = frozenset(() if has_objects else self.objects[is_unit])
-            of_objects.setdefault((frozenset(self.lights[is_unit]), objects), []).append(index)
-        kinds: dict[object, list[int]] = {}
-        for (lights, objects), members in of_objects.items():
+            single.append(Stratum(objects, frozenset(self.lights[is_unit]), [index]))
+        strata = []
+        for objects, lights, members in joined(single):
             classes = frozenset(name.partition(": ")[0] for name in objects)
-            kind = lights, classes if len(members) == 1 else objects
-            kinds.setdefault(kind, []).extend(members)
+            strata.append(Stratum(classes if len(members) == 1 else objects, lights, members))
         counts = np.zeros((DRAWS, len(units)), int)
         generator = np.random.default_rng(0)
-        for members in kinds.values():
+        for _, _, members in joined(strata):
             share = np.full(len(members), 1 / len(members))
             counts[:, members] = generator.multinomial(len(members), share, size=DRAWS)
         return np.insert(counts, 0, 1, axis=0)[:, np.searchsorted(units, unit_of_photograph)]
@@ -217,12 +241,13 @@ def over_seeds(seeds: Sequence[Statistics]) -> Statistics:
     return np.stack(seeds)[drawn, :, columns].mean(axis=1).T
 
 
-def count_units(units: np.ndarray, is_positive: np.ndarray) -> list[int]:
+def count_units(predictions: Predictions, units: np.ndarray, rows: np.ndarray) -> list[int]:
     """Count the units that decide each of METRICS. Both sides decide the AUC."""
-    every, positives, negatives = (
-        len({*units[rows]}) for rows in (slice(None), is_positive, ~is_positive)
+    is_known, is_positive = np.isfinite(predictions.true_rank), predictions.positive
+    known, positives, negatives = (
+        len({*units[rows & side]}) for side in (is_known, is_positive, ~is_positive)
     )
-    return [every, positives, positives, negatives, min(positives, negatives)]
+    return [known, positives, positives, negatives, min(positives, negatives)]
 
 
 def estimate(draws: np.ndarray, units: int, is_change: bool = False) -> Estimate:
@@ -253,8 +278,10 @@ def score(options: argparse.Namespace) -> None:
     found = find_photographs(options.folder, classes, labels[0])
     if others := unsupported_files(options.folder):
         print(f"{len(others)} files are left out, of kinds that are not read, such as {others[0]}")
-    folder = Folder(options.folder, found, options.crops)
-    groups = choose_lights(folder, options.lights)
+    groups = choose_lights(Folder(options.folder, found), options.lights)
+    is_chosen = np.any([*groups.values()], axis=0)
+    groups = {title: rows[is_chosen] for title, rows in groups.items()}
+    folder = Folder(options.folder, [*compress(found, is_chosen)], options.crops)
     predictions = {
         title: [predict(loaded[name], folder, labels).by_label for name in names]
         for title, names in networks.items()
@@ -288,9 +315,14 @@ def print_tables(
     first_network, *_ = predictions
     first_light, *_ = groups
 
+    measured: dict[tuple[str, bytes], Statistics] = {}
+
     def statistics(title: str, rows: np.ndarray) -> Statistics:
-        measured = [measure(one, folder.objects, counts, rows) for one in predictions[title]]
-        return over_seeds(measured)
+        key = title, rows.tobytes()
+        if key not in measured:
+            seeds = [measure(one, folder.objects, counts, rows) for one in predictions[title]]
+            measured[key] = over_seeds(seeds)
+        return measured[key]
 
     results = {
         (title, light): statistics(title, rows)
@@ -298,28 +330,27 @@ def print_tables(
         for light, rows in groups.items()
     }
     gains, changes = {}, {}
+    pairs: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for light, rows in groups.items():
+        # Photographs of the objects that a light shares with the first one.
+        pair = rows, groups[first_light]
+        both = np.isin(folder.objects, np.intersect1d(*(folder.objects[side] for side in pair)))
+        pairs[light] = rows & both, groups[first_light] & both
     for (title, light), values in results.items():
         if title != first_network:
             gains[title, light] = values - results[first_network, light]
         if light != first_light:
-            # Photographs of the objects that both lights show.
-            pair = groups[light], groups[first_light]
-            both = np.isin(folder.objects, np.intersect1d(*(folder.objects[rows] for rows in pair)))
-            now, before = values, results[title, first_light]
-            if not both[pair[0] | pair[1]].all():
-                now, before = (statistics(title, rows & both) for rows in pair)
+            now, before = (statistics(title, rows) for rows in pairs[light])
             changes[title, light] = now - before
     what = "objects" if folder.has_objects(label) else "photographs, for these objects"
-    is_positive = predictions[first_network][0].positive
-    unit_counts = {
-        light: count_units(units[rows], is_positive[rows]) for light, rows in groups.items()
-    }
     absolute: list[list[str]] = []
     kinds = {"": results, f" minus {first_network}": gains, f" minus {first_light}": changes}
     for suffix, table in kinds.items():
         lines = []
         for (title, light), values in table.items():
-            shown = zip(values, unit_counts[light], strict=True)
+            rows = pairs[light][0] if table is changes else groups[light]
+            unit_counts = count_units(predictions[title][0], units, rows)
+            shown = zip(values, unit_counts, strict=True)
             estimates = [estimate(row, count, bool(suffix)) for row, count in shown]
             cells = [format_interval(item, "+" if suffix else "") for item in estimates]
             lines.append([title, light, *cells])
@@ -328,7 +359,8 @@ def print_tables(
             print(Table(heading, HEADER, lines), end="\n\n", flush=True)
         absolute = absolute or lines
     for light, rows in groups.items():
-        every, positives, *_ = unit_counts[light]
+        is_positive = rows & predictions[first_network][0].positive
+        every, positives = (len({*units[side]}) for side in (rows, is_positive))
         print(f"{light}: {rows.sum()} images, {every} {what}, {positives} of them with {label}")
     return absolute
 
@@ -361,6 +393,8 @@ def simulate(options: argparse.Namespace) -> None:
     found = find_photographs(options.photos, options.classes, options.classes[0])
     names = {*options.classes, *(f"{OTHER_PREFIX}{name}" for name in options.classes)}
     chosen = [item for item in found if item.label in names and item.source not in options.exclude]
+    if not chosen:
+        raise InputError(f"{options.photos} has no folder of {', '.join(options.classes)}")
     require_whole("size", options.size, 1, MAX_SIZE)
     if options.folder.is_dir() and any(options.folder.iterdir()):
         raise InputError(f"{options.folder} is not empty: choose a new folder")
@@ -385,9 +419,14 @@ def read_scores(words: Sequence[str], label: str, metric: str) -> dict[str, dict
     """Read a metric of each network by the light, which has the title of its file before it."""
     scores: dict[str, dict[str, float]] = {}
     for word in words:
-        title, _, path = word.partition("=")
+        title, separator, path = word.partition("=")
+        if not separator:
+            raise InputError(f"{word} has no title: give TITLE={word}")
         with Path(path).open(newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
+            table = csv.DictReader(file)
+            if missing := {"label", "network", "light", metric}.difference(table.fieldnames or ()):
+                raise InputError(f"{path} has no column {min(missing)}: give a file of score --out")
+            for row in table:
                 if row["label"] == label and row[metric]:
                     column = scores.setdefault(f"{title}: {row['light']}", {})
                     # A cell is a value, mostly with an interval behind it.
@@ -402,9 +441,11 @@ def rank_correlation(first: Mapping[str, float], second: Mapping[str, float]) ->
     sqrt((1 + ρ² / 2) / (n − 3)). It treats the networks as independent, and some share weights.
     """
     shared = sorted(first.keys() & second.keys())
-    if len(shared) < 4:
+    values = [[scores[name] for name in shared] for scores in (first, second)]
+    # Networks that are all equal in a light have no ranks.
+    if len(shared) < 4 or min(map(len, map(set, values))) < 2:
         return Estimate()
-    value = float(spearmanr(*([scores[name] for name in shared] for scores in (first, second)))[0])
+    value = float(spearmanr(*values)[0])
     z = np.arctanh(np.clip(value, -1 + 1e-12, 1 - 1e-12))
     margin = NORMAL_QUANTILE * np.sqrt((1 + value**2 / 2) / (len(shared) - 3))
     return Estimate(value, float(np.tanh(z - margin)), float(np.tanh(z + margin)))
@@ -437,14 +478,14 @@ def count_dim(options: argparse.Namespace) -> None:
     for folder in options.folders:
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder: give folders of photographs")
-    paths = sorted(path for folder in options.folders for path in folder.rglob("*.*"))
     counts = [0, 0]
-    for path in paths:
-        if path.suffix.lower() in SUFFIXES:
-            square = crop_center(read_rgb(path, options.size), options.size)
-            image = to_unit(torch.tensor(np.array(square))).permute(2, 0, 1)
-            counts[0] += bool(IsDim()(image[None]))
-            counts[1] += 1
+    for folder in options.folders:
+        found = find_unlabeled(folder)
+        for start in range(0, len(found), 100):
+            batch = found[start : start + 100]
+            _, images, _ = load_photographs(folder, batch, options.size, None)
+            counts[0] += int(IsDim()(to_unit(images)).sum())
+            counts[1] += len(images)
     print(f"{counts[0]} of {counts[1]} photographs are dim")
 
 

@@ -11,6 +11,7 @@ row `--control`, with 95% intervals over photographs and seeds.
 """
 
 import argparse
+import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -85,8 +86,10 @@ def load_or_score(name: str, original: str, options: argparse.Namespace) -> dict
     file = None
     if options.scores is not None:
         options.scores.mkdir(parents=True, exist_ok=True)
+        given = vars(options) | {"networks": [original, name], "control": None, "scores": None}
+        key = hashlib.sha256(repr(sorted(given.items())).encode()).hexdigest()[:16]
         stem = re.sub(r"\W+", "_", name)
-        file = options.scores / f"{stem}.pt"
+        file = options.scores / f"{stem}_{key}.pt"
         if file.exists():
             return torch.load(file)
     classifier = load_network(name)

@@ -4,9 +4,9 @@ A sheet is a picture with a grid of tiles. A tile is an image with its caption
 below.
 
 The first of these that a file has says how its colors become sRGB (PNG, third edition,
-section 4.3): the chunk cICP of a PNG file, an ICC profile, the chunk sRGB, the chunks gAMA
-and cHRM, or the mark of Adobe RGB in the EXIF data of a camera (DCF 2.0). Without any of
-them, pixels are sRGB.
+section 4.3): the chunk cICP of a PNG file, an ICC profile, the codes of an AVIF file (nclx), the
+chunk sRGB, the chunks gAMA and cHRM, or the mark of Adobe RGB in the EXIF data of a camera
+(DCF 2.0). Without any of them, pixels are sRGB.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import io
 import math
 import re
 import reprlib
+import struct
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -338,14 +339,17 @@ ADOBE_GAMMA = 2 + 51 / 256
 ADOBE_PRIMARIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.329)
 # Gammas in this range stand for the curve of sRGB (PNG, section 11.3.2.2).
 SRGB_GAMMAS = (2.1, 2.3)
-# Primaries and gammas by their codes in the chunk cICP (ITU-T H.273). A gamma of None is
-# the curve of sRGB. Files of high dynamic range have other codes.
+# Primaries and gammas by their codes (ITU-T H.273). A gamma of None is the curve of sRGB.
+# Files of high dynamic range have other codes.
 CODED_PRIMARIES = {
     1: REC_709,
     9: (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.329),
     12: (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329),
 }
 CODED_GAMMAS = {4: 2.2, 8: 1.0, 13: None}
+# Codes of AVIF files that stand for sRGB: unspecified ones, and those of video.
+UNCODED_PRIMARIES = {2, 5, 6, 7}
+UNCODED_CURVES = {1, 2, 6, 14, 15}
 # Color spaces of ICC profiles by the modes of Pillow for the same channels.
 SPACE_OF_MODE = {"L": "GRAY", "RGB": "RGB", "CMYK": "CMYK"}
 # A profile is that of sRGB if it changes no 8-bit value by more than this. Different
@@ -357,13 +361,19 @@ Conversion = Callable[[Image.Image], Image.Image]
 
 def conversion_to_srgb(image: Image.Image, path: str | Path) -> Conversion | None:
     """Find how colors (L, RGB or CMYK) of an image file become sRGB. None if they already are."""
-    codes = _coded_colors(Path(path)) if image.format == "PNG" else None
+    profile, codes = image.info.get("icc_profile"), None
+    if image.format == "PNG":
+        codes = _coded_colors(Path(path))
+    elif image.format in ("AVIF", "JPEG2000") and not profile:
+        profile, codes = _read_color_box(Path(path))
     if codes is not None:
-        primaries_code, curve_code = codes
-        if primaries_code not in CODED_PRIMARIES or curve_code not in CODED_GAMMAS:
-            raise ValueError(f"its chunk cICP has the codes {codes}, such as HDR: save it in sRGB")
+        primaries_code, curve_code, is_full = codes
+        is_known = primaries_code in CODED_PRIMARIES and curve_code in CODED_GAMMAS
+        if not (is_known and is_full):
+            fault = f"its codes of color (cICP or nclx) are {codes}, such as HDR"
+            raise ValueError(f"{fault}: save it in sRGB")
         return _conversion(CODED_GAMMAS[curve_code], CODED_PRIMARIES[primaries_code])
-    if profile := image.info.get("icc_profile"):
+    if profile:
         return partial(_apply_profile, profile)
     if "srgb" in image.info:
         return None
@@ -382,8 +392,8 @@ def conversion_to_srgb(image: Image.Image, path: str | Path) -> Conversion | Non
     return None
 
 
-def _coded_colors(path: Path) -> tuple[int, int] | None:
-    """Read the codes of the primaries and of the curve from the chunk cICP of a PNG file."""
+def _coded_colors(path: Path) -> tuple[int, int, int] | None:
+    """Read the codes of primaries and curve, and whether 0 is black, from cICP of a PNG file."""
     with path.open("rb") as file:
         # The signature of PNG has 8 bytes. Each chunk begins with its length and its name, 4 bytes
         # each.
@@ -391,11 +401,24 @@ def _coded_colors(path: Path) -> tuple[int, int] | None:
         while len(header := file.read(8)) == 8 and header[4:] != b"IDAT":
             length = int.from_bytes(header[:4], "big")
             if header[4:] == b"cICP":
-                codes = file.read(2)
-                return codes[0], codes[1]
+                primaries, curve, _, is_full = file.read(4)
+                return primaries, curve, is_full
             # A checksum of 4 bytes follows the data of the chunk.
             file.seek(length + 4, io.SEEK_CUR)
     return None
+
+
+def _read_color_box(path: Path) -> tuple[bytes | None, tuple[int, int, int] | None]:
+    """Return the profile or the codes in the first box colr of an AVIF or JPEG 2000 file."""
+    before, _, after = path.read_bytes().partition(b"colr")
+    box = after[: max(int.from_bytes(before[-4:], "big") - 8, 0)]
+    # Pillow knows the profiles of AVIF files, and turns other ranges of values to the full one.
+    if box[:4] == b"nclx":
+        primaries, curve = struct.unpack(">HH", box[4:8])
+        primaries = 1 if primaries in UNCODED_PRIMARIES else primaries
+        return None, (primaries, 13 if curve in UNCODED_CURVES else curve, 1)
+    # The method 2 is a profile, behind the precedence and the approximation.
+    return (box[3:], None) if box[:1] == b"\2" else (None, None)
 
 
 def _conversion(gamma: float | None, primaries: Sequence[float]) -> Conversion | None:

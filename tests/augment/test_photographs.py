@@ -198,6 +198,13 @@ def test_relit_photographs_repeat_with_their_seed(photographs):
     assert not torch.equal(first, other)
 
 
+@pytest.mark.parametrize("options", [{"strength": 0.5}, {"slides": ..., "lights": ["linear"]}])
+def test_settings_that_would_not_count_are_refused(photographs, options):
+    given = {name: photographs if value is ... else value for name, value in options.items()}
+    with pytest.raises(InputError, match=f"^{next(iter(given))} "):
+        relight_photographs(photographs, **given)
+
+
 def find_bright(images):
     """Detect the left and the right half of each image, if their green light is above 0.4."""
     boxes = torch.tensor([[0.0, 0, 8, 16], [8, 0, 16, 16]])

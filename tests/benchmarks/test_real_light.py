@@ -103,6 +103,9 @@ def test_photographs_of_an_excluded_source_are_not_simulated(tmp_path):
         "score given pretrained/none --label orange --lights dim",
         "score given pretrained/none --label orange --out missing/a.csv",
         "rank a=missing.csv --label orange",
+        "rank a=given.csv --label orange",
+        "rank given.csv --label orange",
+        "simulate given out --classes pear --lights low_light",
         "dim missing",
         "dim broken",
     ],
@@ -110,6 +113,7 @@ def test_photographs_of_an_excluded_source_are_not_simulated(tmp_path):
 def test_a_mistake_of_the_user_is_one_sentence(tmp_path, capsys, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     save(tmp_path / "given/orange/1.png", 40)
+    (tmp_path / "given.csv").write_text("a,b\n1,2\n")
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken/1.png").write_bytes(b"no image")
     with pytest.raises(SystemExit, match="2"):
@@ -231,6 +235,29 @@ def test_an_object_with_one_photograph_is_drawn_with_others_of_its_class():
     assert counts[1:, 0].var() > 0
 
 
+def test_intervals_do_not_depend_on_photographs_that_other_lights_lack():
+    """25 photographs are drawn with replacement, whatever other lights show of them."""
+    draw = np.random.default_rng(0)
+    lights = ("dim", "lamp", "white", "stripes", "half")
+    rows = [(f"orange/plain__{n}.png", None) for n in range(25)]
+    rows += [
+        (f"orange/{x}__{n}.png", None) for n in range(25) for x in lights if draw.random() < 0.5
+    ]
+    counts = folder_of(*rows).draw("orange")[1:, :25]
+    hits = counts @ (np.arange(25) % 2 == 0) / counts.sum(1)
+    # The variance of a fraction of 25: p (1 - p) / n.
+    assert hits.var() == pytest.approx(13 / 25 * 12 / 25 / 25, rel=0.15)
+
+
+def test_lights_without_common_photographs_keep_their_numbers():
+    rows = [
+        (f"orange/{light}__{light}{n}.png", None) for light in ("dim", "lamp") for n in range(4)
+    ]
+    counts = folder_of(*rows).draw("orange")
+    assert (counts[:, :4].sum(1) == 4).all()
+    assert (counts[:, 4:].sum(1) == 4).all()
+
+
 def test_photographs_of_nested_folders_are_different_photographs():
     rows = [
         (f"orange/{folder}/{light}__1.png", None) for folder in "ab" for light in ("plain", "dim")
@@ -250,8 +277,12 @@ def test_changes_between_lights_are_those_of_the_objects_in_both(tmp_path, monke
 
 
 def test_the_interval_of_hardly_varying_draws_is_that_of_the_units_that_decide():
-    units, is_positive = np.arange(42), np.arange(42) < 2
-    assert real_light.count_units(units, is_positive) == [42, 2, 2, 40, 2]
+    names = np.repeat(["orange", "other_ball"], [2, 40])
+    shown = [Photograph(PurePosixPath(name), str(name), None) for name in names]
+    predictions = rank_classes(shown, torch.zeros(42, 2), ["orange", "pear"], ["orange"])
+    units, rows = np.arange(42), np.arange(42) != 41
+    # The class of the balls is unknown, so they do not count for top-1.
+    assert real_light.count_units(predictions, units, rows) == [2, 2, 2, 39, 2]
     draws = np.ones(2001)
     draws[7] = 0.9
     found = real_light.estimate(draws, 2)

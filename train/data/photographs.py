@@ -188,21 +188,23 @@ def is_hidden(name: str) -> bool:
 def visible_files(folder: Path) -> Iterator[PurePosixPath]:
     """Yield the paths of all files that are not hidden, relative to the folder.
 
-    Symbolic links are followed. A link to a folder that contains the link is
+    Symbolic links are followed. A link to a folder on the way to the link is
     not, because the search would not end.
     """
 
     def raise_error(error: OSError) -> NoReturn:
         raise error
 
+    # Real paths of the folders on the way to each folder, with itself.
+    ways = {Path(folder): (Path(folder).resolve(),)}
     for parent, subfolders, files in os.walk(folder, onerror=raise_error, followlinks=True):
-        real_parent = Path(parent).resolve()
+        way = ways.pop(Path(parent))
+        real = {name: Path(parent, name).resolve() for name in subfolders if not is_hidden(name)}
         # This changes the list of `os.walk`, which then visits only these subfolders.
         subfolders[:] = [
-            name
-            for name in subfolders
-            if not is_hidden(name) and not real_parent.is_relative_to(Path(parent, name).resolve())
+            name for name in real if not any(path.is_relative_to(real[name]) for path in way)
         ]
+        ways |= {Path(parent, name): (*way, real[name]) for name in subfolders}
         relative_parent = PurePosixPath(Path(parent).relative_to(folder).as_posix())
         yield from (relative_parent / name for name in files if not is_hidden(name))
 

@@ -158,12 +158,14 @@ def held_out_rows(split: Split, fraction: float, argument: str = "fraction") -> 
     """
     is_held_out = torch.zeros(len(split), dtype=torch.bool)
     draws = generator(0, "validation")
-    for label in split.labels.unique():
+    labels = split.labels.unique()
+    for label in labels:
         indices_of_class = torch.nonzero(split.labels == label).squeeze(1)
         class_size = len(indices_of_class)
         if class_size == 1:
-            fault = f"class {int(label)} has one image, which {argument}={fraction} cannot split"
-            raise InputError(f"{fault}: add images of this class, or remove it", argument)
+            where = f" of class {int(label)}" if len(labels) > 1 else ""
+            fault = f"{argument}={fraction} cannot split the one image{where}"
+            raise InputError(f"{fault}: add images{where}", argument)
         # At least one image of each class is in either part.
         count = min(max(round(fraction * class_size), 1), class_size - 1)
         # A larger fraction takes more of the same random order.

@@ -11,7 +11,7 @@ import numpy as np
 import PIL
 import pytest
 from oracles import linear_of, srgb_of
-from PIL import Image, ImageCms
+from PIL import Image, ImageCms, features
 
 from renderer.errors import InputError
 from renderer.io.images import read_image, read_rgb
@@ -203,6 +203,48 @@ def test_the_color_chunks_of_a_png_file_count(tmp_path, primaries, gamma, chunks
 def test_a_png_file_of_high_dynamic_range_is_refused(tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(png((2, 2), 8, 2, bytes(12), cICP=bytes([9, 16, 0, 1])))
+    with pytest.raises(InputError, match="cICP"):
+        read_image(path, 2)
+
+
+@pytest.mark.skipif("avif" not in features.modules, reason="old versions of Pillow")
+@pytest.mark.parametrize(
+    ("primaries", "codes"),
+    [(DISPLAY_P3, (12, 13)), (SRGB, (1, 13)), (SRGB, (2, 2)), (SRGB, (1, 1)), (SRGB, (6, 6))],
+)
+def test_the_codes_of_an_avif_file_count(tmp_path, primaries, codes):
+    color = tuple(map(int, stored(primaries, None)))
+    path = tmp_path / "a.avif"
+    Image.new("RGB", (8, 8), color).save(path, quality=100, subsampling="4:4:4")
+    before, mark, after = path.read_bytes().partition(b"colrnclx")
+    path.write_bytes(before + mark + struct.pack(">HH", *codes) + after[4:])
+    assert np.abs(read(path) - COLOR).max() <= 4
+    path.write_bytes(before + mark + struct.pack(">HH", 9, 16) + after[4:])
+    with pytest.raises(InputError, match="nclx"):
+        read_image(path, 2)
+
+
+def test_the_profile_of_a_jpeg_2000_file_counts(tmp_path):
+    """The box colr has the method 2, a precedence, an approximation and the profile."""
+    color = tuple(map(int, stored(DISPLAY_P3, None)))
+    path = tmp_path / "a.jp2"
+    Image.new("RGB", (8, 8), color).save(path)
+    content = path.read_bytes()
+    start = content.index(b"colr") - 4
+    length = int.from_bytes(content[start : start + 4], "big")
+    box = b"colr" + bytes([2, 0, 0]) + profile(b"RGB ", srgb_table(), DISPLAY_P3)
+    box = (len(box) + 4).to_bytes(4, "big") + box
+    # The header jp2h has the box colr in it, so it grows by the same bytes.
+    header = content.index(b"jp2h") - 4
+    grown = int.from_bytes(content[header : header + 4], "big") + len(box) - length
+    content = content[:header] + grown.to_bytes(4, "big") + content[header + 4 :]
+    path.write_bytes(content[:start] + box + content[start + length :])
+    assert np.abs(read(path) - COLOR).max() <= 2
+
+
+def test_narrow_ranges_of_a_png_file_are_refused(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_bytes(png((2, 2), 8, 2, bytes(12), cICP=bytes([1, 13, 0, 0])))
     with pytest.raises(InputError, match="cICP"):
         read_image(path, 2)
 

@@ -75,6 +75,14 @@ def test_links_to_folders_and_files_are_followed_but_not_in_circles(tmp_path):
     assert found == ["orange/b.jpg", "orange/deep/a.jpg", "pear/c.jpg", "pear/d.jpg"]
 
 
+def test_folders_that_link_to_each_other_are_searched_once_on_each_way(tmp_path):
+    for name, other in (("orange", "pear"), ("pear", "fig"), ("fig", "orange")):
+        touch(tmp_path, f"{name}/{name}.jpg")
+        (tmp_path / name / "next").symlink_to(tmp_path / other)
+    found = [str(path) for path in photographs.visible_files(tmp_path / "orange")]
+    assert sorted(found) == ["next/next/fig.jpg", "next/pear.jpg", "orange.jpg"]
+
+
 def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
     others = ["notes.txt", "orange/b.HEIC", "orange/c.jxl"]
     touch(tmp_path, "orange/a.jpg", "orange/.d.heic", "lab.json", *others)

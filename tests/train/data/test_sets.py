@@ -105,7 +105,7 @@ def test_train_and_test_folders_are_the_splits(tmp_path):
         (["fig/a.png"], "has 1 class folders: give two or more"),
         (["fig/a.png", "lime/.a.png"], "data/lime holds no image"),
         (["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"], "the folders test, train, val: "),
-        (["fig/a.png", "lime/a.png"], "has one image, which test_fraction=0.1 cannot split"),
+        (["fig/a.png", "lime/a.png"], "^test_fraction=0.1 cannot split the one image of class 0"),
     ],
 )
 def test_a_fault_in_a_folder_is_named(tmp_path, images, fault):

@@ -174,6 +174,7 @@ def test_a_hardened_classifier_recognizes_the_light_of_its_training(weights, tmp
         expected = nb.load_run(tmp_path / "run").recognizer(images)
         assert (lit.recognizer(images) == expected).all()
         switched = plain.with_lit(lit)
+        assert not len(switched(images[:0]))
         torch.testing.assert_close(
             switched(images), torch.where(expected[:, None], lit(images), plain(images))
         )
