@@ -10,6 +10,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 from torch.utils._pytree import tree_map_only
+from torchvision import tv_tensors
+from torchvision.transforms import v2
 
 from augment.classifier import CheckedNetwork, TaskNetwork
 from augment.lighting import Light, RandomLighting
@@ -125,7 +127,8 @@ class AdversarialLighting:
         if not any(lights):
             return lights
         is_float = images.is_floating_point()
-        unit = images.float() if is_float else images.float() / torch.iinfo(images.dtype).max
+        # The search leaves the gradients of its caller alone.
+        unit = images.detach().float() / (1 if is_float else torch.iinfo(images.dtype).max)
         # Networks of another precision get images of this precision.
         given = images.dtype if is_float else unit.dtype
         network = CheckedNetwork(self.model, "model", self.task, len(self.classes) or None)
@@ -140,6 +143,7 @@ class AdversarialLighting:
                 with torch.set_grad_enabled(step < self.steps):
                     # The numbers of these lights are leaves of the graph, which get gradients.
                     leaves = [light and _leaf(light) for light in lights]
+                    values = [light.values for light in leaves if light]
                     relit = self.lighting.apply(unit, {"lights": leaves})
                     outputs = _in_float32(network(relit.to(given)))
                     is_list = isinstance(outputs, list)
@@ -151,14 +155,16 @@ class AdversarialLighting:
                         # The cost of a detector that finds nothing is constant.
                         if not cost.requires_grad and not is_list:
                             raise InputError(f"the network {NO_GRADIENT}")
+                        gradients: Sequence[Tensor | None] = [None] * len(values)
                         if cost.requires_grad:
-                            cost.sum().backward()
+                            gradients = torch.autograd.grad(cost.sum(), values, allow_unused=True)
                 is_lower = (cost < lowest).tolist()
                 lowest = torch.minimum(lowest, cost.detach())
                 pairs = zip(is_lower, lights, best, strict=True)
                 best = [new if lower else old for lower, new, old in pairs]
                 if step < self.steps:
-                    lights = [light and self._stepped(light) for light in leaves]
+                    left = iter(gradients)
+                    lights = [light and self._stepped(light, next(left)) for light in leaves]
         return best
 
     def _criterion(
@@ -177,6 +183,8 @@ class AdversarialLighting:
             reader = Detection().reader("targets: the data set", len(classes))
             found = (_as_found(item["boxes"], item["labels"]) for item in given)
             outputs = [reader.checked(FINAL, item, unit) for item in found]
+            for output in outputs:
+                reader.require_possible(output, *unit.shape[2:])
         else:
             outputs, classes = self._as_outputs(targets, unit)
         if len(outputs) != len(unit):
@@ -211,10 +219,9 @@ class AdversarialLighting:
         outputs = F.one_hot(targets.where(has_class, count), count + 1).movedim(-1, 1)
         return outputs.float(), [*self.classes, BACKGROUND]
 
-    def _stepped(self, light: Light) -> Light:
+    def _stepped(self, light: Light, gradient: Tensor | None) -> Light:
         """Move the numbers of a light along the sign of their gradient, within [0, 1]."""
         values = light.values.detach().clone()
-        gradient = light.values.grad
         if gradient is not None:
             # The light is differentiable in its first numbers only. The others stay.
             smooth = slice(light.model.dimensions)
@@ -225,6 +232,9 @@ class AdversarialLighting:
 
 def _as_found(boxes: Any, labels: Any) -> dict[str, Tensor]:
     """Return the boxes and labels of an image as a detector that is sure of them does."""
+    if isinstance(boxes, tv_tensors.BoundingBoxes):
+        corners = tv_tensors.BoundingBoxFormat.XYXY
+        boxes = v2.functional.convert_bounding_box_format(boxes, new_format=corners)
     boxes = torch.as_tensor(boxes, dtype=torch.float32).as_subclass(Tensor)
     labels = errors.as_integers("labels", labels)
     return {"boxes": boxes.reshape(-1, 4), "labels": labels, "scores": torch.ones(len(labels))}

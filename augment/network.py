@@ -119,10 +119,14 @@ def plain_outputs(outputs: Any) -> Any:
 
 
 def unwrapped(network: Any) -> Any:
-    """Return the raw network inside of all `Network` modules."""
-    while isinstance(network, Network):
-        network = network.network
-    return network
+    """Return the raw network inside of `Network` modules, and of wrappers of torch."""
+    if isinstance(network, Network):
+        return unwrapped(network.network)
+    if isinstance(network, nn.DataParallel | nn.parallel.DistributedDataParallel):
+        return unwrapped(network.module)
+    # `torch.compile` keeps the network under this name.
+    inner = getattr(network, "_orig_mod", None)
+    return network if inner is None else unwrapped(inner)
 
 
 def text_vectors(network: nn.Module, class_count: int) -> list[str]:
@@ -415,16 +419,21 @@ def eval_mode(network: Any) -> Iterator[None]:
 
     A function is left as it is.
     """
-    modules = network.modules() if isinstance(network, nn.Module) else ()
-    training = [module for module in modules if module.training]
+    modules = [*network.modules()] if isinstance(network, nn.Module) else []
+    flags = [module.training for module in modules]
     # `eval` of a large network takes as long as rendering an image, so call it only if needed.
-    if training:
+    if any(flags):
         network.eval()
     try:
         yield
     finally:
-        for module in training:
-            module.training = True
+        if any(flags):
+            # Some modules do more than to keep the flag, such as LoRA, which merges weights.
+            for module, flag in zip(modules, flags, strict=True):
+                if flag and type(module).train is not nn.Module.train:
+                    module.train()
+            for module, flag in zip(modules, flags, strict=True):
+                module.training = flag
 
 
 @contextmanager

@@ -430,7 +430,8 @@ class _Reader:
         if (right < left).any() or (bottom < top).any():
             advice = "give left, top, right, bottom, and not width and height"
             raise InputError(f"{self.title} returned boxes that end before they begin: {advice}")
-        is_outside = (left >= width) | (right <= 0) | (top >= height) | (bottom <= 0)
+        # Detectors that clip boxes at the border leave some on it, which have no area.
+        is_outside = (left > width) | (right < 0) | (top > height) | (bottom < 0)
         # Boxes that all end within the first pixel are probably in units of the image size.
         is_fraction = len(right) > 0 and bool((right <= 1).all() & (bottom <= 1).all())
         if is_outside.any() or (is_fraction and min(height, width) > 1):

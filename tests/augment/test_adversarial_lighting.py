@@ -94,6 +94,21 @@ def test_each_image_is_seen_as_often_as_stated_and_the_network_stays_as_it_was(i
     assert model.training and model.scale.requires_grad and model.scale.grad is None
 
 
+def test_gradients_of_the_caller_are_left_alone(images):
+    """A module before the light is in training, too, and the images have a gradient."""
+    before = nn.Conv2d(3, 3, 1)
+    given = (images / 255).requires_grad_()
+    model = Mean()
+    model.offset = torch.zeros(1, requires_grad=True)
+    shown = nb.AdversarialLighting(model, steps=2, lights="linear")(
+        before(given).sigmoid(), torch.zeros(8).long()
+    )
+    tensors = (before.weight, given, model.offset)
+    assert all(tensor.grad is None for tensor in tensors)
+    model(shown).sum().backward()
+    assert before.weight.grad.abs().sum() > 0
+
+
 DETECTOR = BrightBox((2.0, 2.0, 12.0, 12.0))
 
 
@@ -139,9 +154,13 @@ def test_labels_may_be_lists_arrays_and_tensors_of_any_integers(images, given):
 
 def test_boxes_may_be_whole_numbers_lists_or_those_of_a_sample(images):
     box, size = [2, 2, 12, 12], images.shape[-2:]
-    of_a_sample = tv_tensors.BoundingBoxes([box], format="XYXY", canvas_size=size)
+    formats = {"XYXY": box, "XYWH": [2, 2, 10, 10], "CXCYWH": [7, 7, 10, 10]}
+    of_samples = [
+        tv_tensors.BoundingBoxes([sides], format=name, canvas_size=size)
+        for name, sides in formats.items()
+    ]
     found = []
-    for boxes in (torch.tensor([box]).float(), torch.tensor([box]), [box], of_a_sample):
+    for boxes in (torch.tensor([box]).float(), torch.tensor([box]), [box], *of_samples):
         lighting = hiding(steps=1)
         targets = [{"boxes": boxes, "labels": [1]}] * 7 + [{"boxes": [], "labels": []}]
         torch.manual_seed(0)

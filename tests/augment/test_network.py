@@ -112,6 +112,32 @@ def test_outputs_of_many_images_are_those_of_a_copy_in_eval_mode(network, shape,
     torch.testing.assert_close(outputs, expected.detach())
 
 
+class Merged(nn.Linear):
+    """Layer that adds another matrix to its weights in eval mode, as those of LoRA do."""
+
+    is_merged = False
+
+    def train(self, mode: bool = True):
+        super().train(mode)
+        if mode == self.is_merged:
+            self.is_merged = not mode
+            self.weight.data += -1.0 if mode else 1.0
+        return self
+
+
+def test_modules_that_change_with_the_mode_are_changed_back():
+    network = nn.Sequential(nn.Flatten(), Merged(3 * 64, 5), nn.Dropout(), Merged(5, 5))
+    network.train()
+    network[3].eval()
+    network[2].training = False
+    before = [network[index].weight.detach().clone() for index in (1, 3)]
+    compute_outputs(network, torch.rand(2, 3, 8, 8))
+    assert [module.training for module in network] == [True, True, False, False]
+    assert [network[index].is_merged for index in (1, 3)] == [False, True]
+    for index, weights in zip((1, 3), before, strict=True):
+        torch.testing.assert_close(network[index].weight.detach(), weights)
+
+
 def test_images_of_8_bits_and_batches_from_files_have_the_same_outputs(network):
     stored = torch.randint(256, (7, 3, 8, 8), dtype=torch.uint8)
     expected = compute_outputs(network, stored / 255)

@@ -210,6 +210,9 @@ def _read_coco(file: Path) -> Annotations:
         names = {item["id"]: str(item["name"]) for item in content["categories"]}
         classes = tuple(dict.fromkeys(names[key] for key in sorted(names)))
         images = {item["id"]: item for item in content["images"]}
+        if len({*map(type, images)}) == 1:
+            # As pycocotools does it, of equal scores that of the lower id comes first.
+            images = dict(sorted(images.items()))
         for item in images.values():
             item["file_name"] = str(item["file_name"]).replace("\\", "/")
         names_of_images = [item["file_name"] for item in images.values()]

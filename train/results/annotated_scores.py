@@ -205,9 +205,10 @@ def evaluate_detector(
     label_of_class = _choose_labels(annotations, network.classes, labels)
     task = network.task
     assert isinstance(task, Detection)
-    # Matches of the photographs in each folder: those for recall, and those for AP50, whose IoU
-    # is always 0.5. `listed` has all detections.
-    matches: dict[str, list[list[Matches]]] = {}
+    # Matches of each photograph: those for recall, and those for AP50, whose IoU is always 0.5.
+    # Equal scores are ranked in their order. `listed` has all detections.
+    matches: list[list[Matches]] = []
+    sources: dict[str, list[int]] = {}
     listed: list[dict[str, Any]] = []
     pictures: dict[str, Tensor] = {}
     for item, fitted, output in _outputs(network, annotations.photographs, how, pictures):
@@ -218,8 +219,8 @@ def evaluate_detector(
         # Classes that are not scored have a label that no detection has.
         true = np.array([label_of_class.get(name, -1) for name in names], int)
         pair = Found(boxes, own, scores), Marked(fitted.boxes, true, item.is_crowd[fitted.is_kept])
-        matched = [detections.match_image(*pair, iou) for iou in (task.iou, 0.5)]
-        matches.setdefault(item.source or ".", []).append(matched)
+        sources.setdefault(item.source or ".", []).append(len(matches))
+        matches.append([detections.match_image(*pair, iou) for iou in (task.iou, 0.5)])
         for box, label, score in zip(boxes, own, scores, strict=True):
             left, top, right, bottom = box.round(2).tolist()
             # COCO's form of a box is left, top, width and height.
@@ -228,16 +229,17 @@ def evaluate_detector(
             listed.append(entry | {"score": round(float(score), 4)})
         if not fitted.is_kept.all():
             console.warning("%s: a box without an area in the photograph is left out", item.name)
-    all_matches = [matched for of_source in matches.values() for matched in of_source]
-    by_label = _score(all_matches, label_of_class, task)
-    sources = sorted(matches) if len(matches) > 1 else ()
-    by_source = {source: _score(matches[source], label_of_class, task) for source in sources}
+    by_label = _score(matches, label_of_class, task)
+    by_source = {
+        source: _score([matches[index] for index in sources[source]], label_of_class, task)
+        for source in (sorted(sources) if len(sources) > 1 else ())
+    }
     overall = by_label.pop(ALL)
     missing = f" ({len(annotations.missing)} files are missing)" if annotations.missing else ""
     return DetectionScores(
         size=height_and_width(network.size),
         fit=how.fit,
-        photograph_count=len(all_matches),
+        photograph_count=len(matches),
         missing=annotations.missing,
         contents=f"{missing} with {overall.n} objects",
         pictures=pictures,
@@ -282,8 +284,10 @@ def _score(
     """Return the metrics of all classes, and of each class, in some photographs."""
     at_iou, at_half = map(detections.join, zip(*matches, strict=True))
     groups = {ALL: [*labels.values()], **{name: [label] for name, label in labels.items()}}
+    # A score of 32 bits reaches the threshold that rounds to it.
+    threshold = min(task.threshold, float(np.float32(task.threshold)))
     return {
-        name: detections.score(at_iou, chosen, task.threshold, at_half)
+        name: detections.score(at_iou, chosen, threshold, at_half)
         for name, chosen in groups.items()
     }
 

@@ -173,6 +173,13 @@ def test_impossible_boxes_are_refused(change, message):
         nb.Detection().reader("network", 3)([item], torch.zeros(1, 3, SIZE, SIZE))
 
 
+@pytest.mark.parametrize("box", [[16.0, 3.0, 16.0, 9.0], [3.0, 0.0, 9.0, 0.0]])
+def test_boxes_that_were_clipped_at_the_border_are_possible(box):
+    item = {name: torch.tensor(value) for name, value in (BOX | {"boxes": [box]}).items()}
+    found = nb.Detection().reader("network", 3)([item], torch.zeros(1, 3, SIZE, SIZE))
+    assert found[0]["boxes"].tolist() == [box]
+
+
 @pytest.mark.parametrize(
     ("decode", "message"),
     [

@@ -90,7 +90,15 @@ def test_the_gradient_of_a_segmenter_of_torchvision_is_that_of_finite_difference
     require_slope(of_torchvision(segmentation, name), nb.Segmentation())
 
 
-def test_candidates_of_torchvision_are_its_boxes_without_suppression_in_the_pixels_given():
+WRAPPERS = {
+    "plain": lambda network: network,
+    "DataParallel": lambda network: torch.nn.DataParallel(network).eval(),
+    "compiled": lambda network: torch.compile(network, backend="eager"),
+}
+
+
+@pytest.mark.parametrize("wrap", WRAPPERS.values(), ids=WRAPPERS)
+def test_candidates_of_torchvision_are_its_boxes_without_suppression_in_the_pixels_given(wrap):
     network = small_detector(len(CLASSES), SIZE)
     images = torch.rand(2, 3, 48, 96, generator=torch.Generator().manual_seed(0))
     opened = deepcopy(network)
@@ -98,7 +106,7 @@ def test_candidates_of_torchvision_are_its_boxes_without_suppression_in_the_pixe
     vars(opened).update(limits, nms_thresh=1.0)
     with torch.no_grad():
         own, expected = network(images), opened(images)
-        found = as_network(network, (48, 96), CLASSES)(images)
+        found = as_network(wrap(network), (48, 96), CLASSES)(images)
     for item, final, candidates in zip(found, own, expected, strict=True):
         assert len(candidates["boxes"]) > len(final["boxes"])
         for key in ("boxes", "scores", "labels"):

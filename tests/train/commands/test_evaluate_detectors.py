@@ -68,6 +68,31 @@ def test_recall_and_false_detections_are_the_counted_ones_and_written(photograph
     assert (out / "contact_sheet.png").is_file()
 
 
+@pytest.mark.parametrize("threshold", [0.1, 0.3, 0.7, 0.9])
+def test_a_score_at_the_threshold_counts(photographs, threshold):
+    def find(images):
+        found = _find_white(images)
+        return [item | {"scores": torch.full_like(item["scores"], threshold)} for item in found]
+
+    task = nb.Detection(threshold=threshold)
+    scores = nb.evaluate(find, photographs, classes=CLASSES, size=120, task=task)
+    assert scores.by_label["dog"].recall.value == pytest.approx(2 / 3)
+
+
+def test_the_order_of_images_in_the_file_does_not_matter(photographs):
+    """Without the object of photograph 2, each has an equal score, and the first one is right."""
+    file = photographs / "annotations.json"
+    content = json.loads(file.read_text())
+    content["annotations"] = content["annotations"][:1]
+    precision = []
+    for images in (content["images"], content["images"][::-1]):
+        file.write_text(json.dumps(content | {"images": images}))
+        scores = nb.evaluate(_find_white, photographs, "dog", classes=CLASSES, size=120)
+        precision.append(scores.overall.ap50.value)
+    # pycocotools sorts images by their id.
+    assert precision == [1, 1]
+
+
 def test_a_class_that_the_network_lacks_is_not_scored(photographs):
     scores = nb.evaluate(_find_white, photographs, classes=CLASSES, size=120)
     assert scores.labels == ["dog", "Cow"]
