@@ -196,7 +196,7 @@ def visible_files(folder: Path) -> Iterator[PurePosixPath]:
         raise error
 
     # Real paths of the folders on the way to each folder, with itself.
-    ways = {Path(folder): (Path(folder).resolve(),)}
+    ways: dict[Path, tuple[Path, ...]] = {Path(folder): (Path(folder).resolve(),)}
     for parent, subfolders, files in os.walk(folder, onerror=raise_error, followlinks=True):
         way = ways.pop(Path(parent))
         real = {name: Path(parent, name).resolve() for name in subfolders if not is_hidden(name)}
