@@ -189,13 +189,15 @@ def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) 
     # A mask of the faces of the part, its texture or NO_TEXTURE, and its gloss, empty if matte.
     for is_in_part, texture_id, gloss in by_material(mesh):
         has_texture = texture_id >= 0
+        # Mitsuba shows the colors of corners beside a white texture.
+        is_white = has_texture and mesh.textures[texture_id].min() == 255
         has_factors = has_texture and mesh.gloss_textures
         part = Part(
             positions=mesh.vertices[mesh.faces[is_in_part]],
             normals=normals[is_in_part],
             uvs=mesh.corner_uvs[is_in_part],
             colors=colors[is_in_part],
-            texture=mesh.textures[texture_id] if has_texture else None,
+            texture=mesh.textures[texture_id] if has_texture and not is_white else None,
             gloss=np.array(gloss) if gloss else None,
             factors=mesh.gloss_textures[texture_id] if has_factors else None,
         )

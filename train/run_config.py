@@ -40,7 +40,7 @@ INPUTS = (
     *("data.path", "weights", "classes", "scene.backgrounds", "scene.light", "augment.folder"),
     *("augment.vary.environments", "augment.vary.backgrounds", "augment.vary.camera.slides"),
     *("scene.projector.pattern", "scene.lamps.start", "unlabeled", "network", "hardened"),
-    *("meshes", "hard_negatives", "environments", "photos", "laboratory"),
+    *("meshes", "hard_negatives", "environments", "photos", "laboratory", "model.name"),
 )
 
 
@@ -213,7 +213,9 @@ def fingerprints(settings: Any) -> dict[str, str]:
     """
     # Values of the settings by their dotted keys. Those of INPUTS may name files.
     values = dict(dotted(asdict(settings)))
-    texts = _collect_texts([values.get(key) for key in INPUTS]) - {""}
+    # The folders of photos={NAME: FOLDER} have keys such as photos.NAME.
+    folders = [value for key, value in values.items() if key.startswith("photos.")]
+    texts = _collect_texts([*(values.get(key) for key in INPUTS), *folders]) - {""}
     paths = {text.removeprefix("run:"): _path_of(text) for text in sorted(texts)}
     return {name: _fingerprint(path) for name, path in paths.items() if path.exists()}
 

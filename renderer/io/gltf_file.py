@@ -333,20 +333,27 @@ class Material:
     def with_gloss_texture(self, texels: np.ndarray, placement: Placement) -> "Material":
         """Return a copy with factors of roughness and metallic (H, W, 2)."""
         # A material without a texture gets a white one, because each `gloss_texture` of `Mesh`
-        # belongs to a texture.
-        material = self.with_placement(placement, (1, 1))
-        assert material.texture is not None
-        # Textures that will be extended need the same size.
-        if placement.wraps != (REPEAT, REPEAT):
-            channels = [_resized(plane, material.texture) for plane in np.moveaxis(texels, 2, 0)]
-            texels = np.stack(channels, axis=-1)
-        return replace(material, gloss_texture=texels)
+        # belongs to a texture. Textures that will be extended need the same size.
+        is_extended = placement.wraps != (REPEAT, REPEAT)
+        shape = texels.shape[:2] if is_extended else (1, 1)
+        material = self.with_placement(placement, (shape[0], shape[1]))
+        texture = material.texture
+        assert texture is not None
+        if is_extended:
+            size = max(texture.shape[1], shape[1]), max(texture.shape[0], shape[0])
+            texture, texels = _resized(texture, size), _resized(texels, size)
+            if material.alpha is not None:
+                alpha = _resized(material.alpha[..., None], size)[..., 0]
+                material = replace(material, alpha=alpha)
+        return replace(material, texture=texture, gloss_texture=texels)
 
 
-def _resized(channel: np.ndarray, texture: np.ndarray) -> np.ndarray:
-    """Resize a channel to the height and the width of a texture."""
-    height, width = texture.shape[:2]
-    return np.array(Image.fromarray(channel).resize((width, height), Image.Resampling.BILINEAR))
+def _resized(texture: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Resize the channels of a texture to a width and a height."""
+    planes = [Image.fromarray(plane) for plane in np.moveaxis(texture, 2, 0)]
+    shape = size[0], size[1]
+    resized = [np.array(plane.resize(shape, Image.Resampling.BILINEAR)) for plane in planes]
+    return np.stack(resized, axis=-1)
 
 
 def ignored_features(tree: dict[str, Any]) -> list[str]:
@@ -444,10 +451,11 @@ def _specular_glossiness(
     else:
         material = material.with_placement(placement, reflectance.shape)
         assert material.texture is not None
-        diffuse_fraction = _resized((1 - reflectance).astype(np.float32), material.texture)
+        fraction = (1 - reflectance[..., None]).astype(np.float32)
+        fraction = _resized(fraction, material.texture.shape[1::-1])
         # Colors are multiplied as linear light and encoded again.
         linear = decode(torch.from_numpy(material.texture).float() / 255, "srgb")
-        dimmed = to_bytes(encode(linear * torch.from_numpy(diffuse_fraction)[..., None], "srgb"))
+        dimmed = to_bytes(encode(linear * torch.from_numpy(fraction), "srgb"))
         material = replace(material, texture=dimmed.numpy())
     if not gloss:
         return material

@@ -80,6 +80,8 @@ def sensor_of(camera: Camera, size: Size, pixel_format: str = "rgba") -> Scene:
         pose = pose_of(camera, camera.width / 2)
         return sensor(pose, size, {"type": "orthographic"}, pixel_format)
     lens: Scene = {"type": "perspective", "fov": camera.angle}
+    # By default, Mitsuba shows nothing nearer than 0.01 or farther than 10,000 units.
+    lens |= {"near_clip": min(0.01, camera.near), "far_clip": max(1e4, camera.far)}
     if camera.principal_right or camera.principal_up:
         # The principal point is measured from the image center in halves of the image, and
         # Mitsuba measures the image center from the principal point, right and down, in widths

@@ -25,7 +25,14 @@ from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.light import harmonics
 from renderer.light.basis import COEFFICIENTS, DEGREE, HARMONICS, Harmonics, LocalBasis
-from renderer.light.environment import SUFFIXES, read_panorama, to_map, write_map
+from renderer.light.environment import (
+    FEWEST_ROWS,
+    SUFFIXES,
+    read_map,
+    read_panorama,
+    to_map,
+    write_map,
+)
 from renderer.light.ringing import window_without_ringing
 from renderer.mesh import Y_UP_TO_Z_UP
 
@@ -87,11 +94,12 @@ def save_light(
     errors.require_bounded(coefficients=coefficients)
     errors.require_shape("coefficients", coefficients, basis.size, 3)
     if isinstance(basis, Harmonics) and is_map:
-        errors.require_whole("height", height, 1, MAX_MAP_HEIGHT)
+        errors.require_whole("height", height, FEWEST_ROWS, MAX_MAP_HEIGHT)
         # A map cannot have negative radiance, so a light without it is written.
         physical = basis.project_nonnegative(coefficients)
         write_map(path, to_map(physical, height).clamp(min=0))
-        return float(harmonics.irradiance_error(physical, coefficients))
+        written = harmonics.project(read_map(path), basis.degree).to(coefficients)
+        return float(harmonics.irradiance_error(written, coefficients))
     description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
     picture = basis.picture(coefficients)
     atomic_write(path, json.dumps(description, allow_nan=False) + "\n")

@@ -296,6 +296,9 @@ def of_seen_faces(rows: np.ndarray, fragments: Fragments) -> Tensor:
 MAX_TEXELS = 2**26
 # Number of texels of a new texture that are computed at once. It limits the memory.
 SHEET_BLOCK = 2**20
+# Number of texels across a face whose corners differ by 1. With it, colors at the corners are off
+# by at most 0.01.
+TEXELS_PER_CHANGE = 32
 
 
 def with_added_albedo(
@@ -313,14 +316,16 @@ def with_added_albedo(
         ρ' = clamp(rotate_hue(s ρ) + d, 0, max(1, s ρ)) / s'
 
     with float32 precision at corners, and with 8 bits in textures.
-    The corners of faces with a texture become white, because texels hold the product. `added` is
-    linear, and `hue` in degrees. The second result is the albedo scale s' for rendering the new
+    The corners of faces with a texture become white, because texels hold the product. If all texels
+    are equal, the corners hold it, and the texture becomes white. `added` is linear, and `hue` in
+    degrees. The second result is the albedo scale s' for rendering the new
     mesh: 1, or the largest albedo above 1, because files store values up to 1.
 
     In a texture, neighboring faces with different colors d may share texels, and interpolation at
     the border of a face reads texels outside of the face. Each face therefore gets a chart: a copy
     of the rectangle of old texels that interpolation reads in this face, with ρ' of this face. All
-    charts of an old texture lie on the new texture, and interpolation has the old weights.
+    charts of an old texture lie on the new texture, and interpolation has the old weights. The old
+    texture is first enlarged if that of the gloss is larger, or if colors change within few texels.
     """
     corner_albedo = decode(torch.from_numpy(mesh.corner_colors), encoding)
     # Linear value of each 8-bit value.
@@ -336,16 +341,31 @@ def with_added_albedo(
         hue_at_points = None if hue is None else torch.from_numpy(hue[faces]).float()
         added_at_points = torch.from_numpy(added[faces]).float()
         changed = changed_albedo(albedo * albedo_scale, hue_at_points, added_at_points)
-        return encode(changed / new_scale, encoding)
+        return encode((changed / new_scale).clamp(max=1), encoding)
 
+    even = [len(np.unique(texture.reshape(-1, 3), axis=0)) == 1 for texture in mesh.textures]
+    has_even = np.isin(mesh.texture_ids, np.flatnonzero(even))
+    for number in np.flatnonzero(even):
+        texel = torch.from_numpy(mesh.textures[number][0, 0]).long()
+        corner_albedo[mesh.texture_ids == number] *= albedo_of_byte.take(texel)
     corner_faces = np.arange(len(mesh.faces)).repeat(3)
     colors = paint(corner_albedo.flatten(0, 1), corner_faces).view(-1, 3, 3).numpy()
-    colors[mesh.texture_ids != NO_TEXTURE] = 1
+    colors[(mesh.texture_ids != NO_TEXTURE) & ~has_even] = 1
     uvs = mesh.corner_uvs.copy()
     textures, gloss_textures = [], []
     for texture_id, texture in enumerate(mesh.textures):
         faces = np.flatnonzero(mesh.texture_ids == texture_id)
         gloss = mesh.gloss_textures[texture_id] if mesh.gloss_textures else texture[..., :0]
+        if even[texture_id]:
+            textures.append(np.full((1, 1, 3), 255, np.uint8))
+            gloss_textures.append(gloss)
+            continue
+        change = np.ptp(corner_albedo[faces].numpy(), axis=1).max(1)
+        factor = _enlargement(mesh.corner_uvs[faces], change, texture.shape, gloss.shape)
+        size = [factor * side for side in texture.shape[:2]]
+        texture = texture if factor == 1 else _resized(texture, size, encoding)
+        if mesh.gloss_textures and gloss.shape[:2] != texture.shape[:2]:
+            gloss = _resized(gloss, size, "linear")
         charts = _Charts(mesh.corner_uvs[faces], texture.shape[1::-1])
         new_texture, new_gloss = (
             np.zeros((*charts.sheet_size[::-1], old.shape[2]), np.uint8) for old in (texture, gloss)
@@ -358,8 +378,10 @@ def with_added_albedo(
             if mesh.one_color_per_face:
                 albedo *= corner_albedo[faces[chart], 0]
             else:
-                weights = charts.weights(chart, center)
-                albedo *= torch.einsum("nk,nkc->nc", weights, corner_albedo[faces[chart]])
+                corners = corner_albedo[faces[chart]]
+                color = torch.einsum("nk,nkc->nc", charts.weights(chart, center), corners)
+                # Texels outside of the face continue its colors, as far as the corners have them.
+                albedo *= color.clamp(corners.amin(1), corners.amax(1))
             new_texture.reshape(-1, 3)[on_sheet] = to_bytes(paint(albedo, faces[chart])).numpy()
             if mesh.gloss_textures:
                 new_gloss.reshape(-1, gloss.shape[2])[on_sheet] = _texels_at(center, gloss)
@@ -369,6 +391,41 @@ def with_added_albedo(
     sheets: dict[str, Any] = {"textures": tuple(textures)}
     sheets["gloss_textures"] = tuple(gloss_textures) if mesh.gloss_textures else ()
     return replace(mesh, corner_colors=colors, corner_uvs=uvs, **sheets), new_scale
+
+
+def _enlargement(
+    uvs: Float[np.ndarray, "N 3 2"],
+    change: Float[np.ndarray, " N"],
+    shape: tuple[int, ...],
+    gloss_shape: tuple[int, ...],
+) -> int:
+    """Return by how much a texture is enlarged, an odd number.
+
+    It then has as many texels as that of the gloss, and TEXELS_PER_CHANGE across a face whose
+    corners differ by a `change` of 1, if MAX_TEXELS permit.
+    """
+    across = (np.ptp(uvs, axis=1) * shape[1::-1]).max(1)
+    is_changing = (change > 0) & (across > 0)
+    ratios = TEXELS_PER_CHANGE * change[is_changing] / across[is_changing]
+    of_gloss = [gloss_shape[axis] / shape[axis] for axis in (0, 1)] if gloss_shape[2] else []
+    needed = max([1.0, *of_gloss, *ratios.tolist()])
+    texels = max((np.ptp(uvs, axis=1) * shape[1::-1] + 2).prod(1).sum(), shape[0] * shape[1])
+    limited = max(min(math.ceil(needed), int(math.sqrt(MAX_TEXELS / 4 / texels))), 1)
+    return limited - (limited + 1) % 2 if limited < needed else limited + (limited + 1) % 2
+
+
+def _resized(
+    texture: UInt8[np.ndarray, "rows columns C"], size: Sequence[int], encoding: str
+) -> UInt8[np.ndarray, "_ _ C"]:
+    """Interpolate a texture that repeats. An odd factor keeps the texels at their centers."""
+    linear = decode(torch.from_numpy(texture) / 255, encoding)
+    for axis, count in enumerate(texture.shape[:2]):
+        place = (torch.arange(size[axis]) + 0.5) * (count / size[axis]) - 0.5
+        before = place.floor().long()
+        part = (place - before)[:, None, None].transpose(0, axis)
+        first, second = (linear.index_select(axis, (before + step) % count) for step in (0, 1))
+        linear = torch.lerp(first, second, part)
+    return to_bytes(encode(linear, encoding)).numpy()
 
 
 def _texels_at(
@@ -435,15 +492,12 @@ class _Charts:
     def weights(
         self, chart: Int[np.ndarray, " T"], center: Float[np.ndarray, "T 2"]
     ) -> Float[Tensor, "T 3"]:
-        """Compute the barycentric weights of T texels in the faces of their charts.
-
-        Negative weights, which are outside of the face, are replaced by 0.
-        """
+        """Compute the barycentric weights of T texels in the faces of their charts."""
         from_first_corner = center * self._new_size - self._positions[chart, 0]
         # Weights of the second and the third corner. The first has the rest to 1.
         last_weights = np.einsum("ni,nij->nj", from_first_corner, self._inverse_edges[chart])
-        weights = np.column_stack([1 - last_weights.sum(axis=1), last_weights]).clip(min=0)
-        return torch.from_numpy(weights / weights.sum(axis=1, keepdims=True)).float()
+        weights = np.column_stack([1 - last_weights.sum(axis=1), last_weights])
+        return torch.from_numpy(weights).float()
 
 
 def _pack(sizes: Int[np.ndarray, "N 2"]) -> tuple[np.ndarray, tuple[int, int]]:

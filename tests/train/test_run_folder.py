@@ -74,7 +74,7 @@ def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
     [
         *("meshes=[[solid:orange, {{mesh: {}, at: [1, 1]}}]]", "scene.backgrounds=[0.5,{}]"),
         *("augment.vary.environments=[{}]", "network={0.parent}", "data.path={0.parent}"),
-        *("scene.light={}", "augment.folder={0.parent}"),
+        *("scene.light={}", "augment.folder={0.parent}", "photos={{lab: {0.parent}}}"),
     ],
 )
 def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
@@ -90,6 +90,13 @@ def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
         InputError, match=rf"{file.parent}\S* has changed since {folder} began: put it back"
     ):
         run_config.require_same_run(folder, settings)
+
+
+def test_the_module_of_a_network_from_scratch_is_an_input(tiny, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "drawn.py").write_text("# one\n")
+    settings = tiny("model=python:drawn:build")
+    assert "python:drawn:build" in run_config.fingerprints(settings)
 
 
 def replace_content(file: Path) -> None:

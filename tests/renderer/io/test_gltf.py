@@ -555,6 +555,22 @@ def different_places() -> Gltf:
     return gltf.square(pbrMetallicRoughness=model)
 
 
+@pytest.mark.parametrize("wrap", [10497, 33071, 33648])
+@pytest.mark.parametrize("color_side", [0, 2, 8])
+def test_a_gloss_texture_keeps_its_texels_in_every_wrap_mode(tmp_path, wrap, color_side):
+    """With coordinates in [0, 1], all modes show the same interior (glTF 2.0, 3.8.4)."""
+    texels = np.full((8, 8, 3), 255, np.uint8)
+    texels[:4, :, 1] = 60
+    gltf = Gltf()
+    samplers = {"wrapS": wrap, "wrapT": wrap}
+    model = {"metallicRoughnessTexture": gltf.texture(texels, **samplers)}
+    if color_side:
+        colors = color_texels(color_side, color_side)
+        model["baseColorTexture"] = gltf.texture(colors, **samplers)
+    mesh = gltf.square(pbrMetallicRoughness=model).load(tmp_path, gloss=True)
+    assert {60, 255} <= {*np.unique(mesh.gloss_textures[0][..., 0])}
+
+
 def short_morph_target() -> Gltf:
     gltf = plain()
     target = {"POSITION": gltf.array(np.float32([[0, 0, 1]]))}

@@ -13,6 +13,7 @@ from renderer.camera import OrthographicCamera
 from renderer.mesh import Mesh
 from renderer.settings import ENCODINGS, ImageSettings
 from renderer.surface.albedo import face_albedo, paint_faces, surface_albedo, with_added_albedo
+from renderer.surface.gloss import sample_gloss
 from renderer.visibility import choose
 from renderer.visibility.fragments import Fragments, build_fragments
 
@@ -168,16 +169,53 @@ def test_colors_and_textures_hold_the_added_albedo(encoding, albedo_scale, angle
     assert error[~is_untextured].max() < largest_error + 1e-5
 
 
-def test_corners_of_different_colors_are_painted_into_the_texels_between_them():
-    """A white texture gets the interpolated colors of the corners, rounded to 8 bits."""
-    white = np.full((64, 64, 3), 255, np.uint8)
-    mesh = poster(white, color=np.array([[0.2] * 3, [0.9, 0.2, 0.2], [0.8] * 3, [0.4] * 3]))
+COLORS = np.array([[0.2] * 3, [0.9, 0.2, 0.2], [0.8] * 3, [0.4] * 3])
+
+
+@pytest.mark.parametrize(("side", "tolerance"), [(64, 1.1 / 255), (8, 0.01), (3, 0.01), (2, 0.01)])
+def test_corners_of_different_colors_are_painted_into_the_texels_between_them(side, tolerance):
+    """Texels hold the product with the interpolated colors of the corners, rounded to 8 bits."""
+    texture = np.full((side, side, 3), 255, np.uint8)
+    texture[0, 0] = 100
+    mesh = poster(texture, color=COLORS)
     fragments = view(mesh, 32)
     painted, _ = with_added_albedo(mesh, np.zeros((2, 3)), "linear")
     assert (painted.corner_colors == 1).all()
     expected = surface_albedo(mesh, fragments, "linear")
     found = surface_albedo(painted, fragments, "linear")
-    torch.testing.assert_close(found, expected, rtol=0, atol=1.1 / 255)
+    torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("side", [1, 5])
+def test_corners_hold_the_product_with_a_texture_of_equal_texels(side):
+    mesh = poster(np.full((side, side, 3), 100, np.uint8), color=COLORS)
+    fragments = view(mesh, 32)
+    painted, _ = with_added_albedo(mesh, np.full((2, 3), 0.05), "srgb", 1.5)
+    added = torch.full((2, 3), 0.05, dtype=torch.float64)
+    expected = paint_faces(mesh, fragments, "srgb", 1.5, added)
+    found = surface_albedo(painted, fragments, "srgb")
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("side", [1, 4])
+def test_a_gloss_texture_that_is_larger_keeps_its_texels(side):
+    texture = random_texture(side, side)
+    wave = np.sin(np.arange(8) / 8 * 2 * np.pi)
+    gloss = np.rint(155 + 50 * wave[:, None, None] + 50 * wave[:, None]).repeat(2, 2)
+    gloss = gloss.astype(np.uint8)
+    mesh = replace(poster(texture), gloss=np.ones((2, 3), np.float32), gloss_textures=(gloss,))
+    painted, _ = with_added_albedo(mesh, np.zeros((2, 3)), "srgb")
+    fragments = view(mesh, 8)
+    before, after = (sample_gloss(one, fragments) for one in (mesh, painted))
+    torch.testing.assert_close(after.roughness, before.roughness, rtol=0, atol=0.03 * (side > 1))
+
+
+@pytest.mark.parametrize("albedo_scale", [1.1, 1.7, 1.95, 2.15, 3.3])
+def test_files_hold_no_color_above_one(albedo_scale):
+    mesh = patchwork_sphere()
+    added = np.zeros((len(mesh.faces), 3))
+    painted, _ = with_added_albedo(mesh, added, "linear", albedo_scale)
+    assert painted.corner_colors.max() <= 1
 
 
 def test_the_float32_gradient_of_a_painted_albedo_is_the_same_on_several_threads_and_on_one():
