@@ -581,6 +581,7 @@ def answers(questions: Sequence[str], device: str, minutes: float) -> Iterator[R
             # An error in one question must not end a session on a GPU.
             message = f"{type(error).__name__}: {error}"
             yield {"question": name, "error": message[:MAX_TEXT]}
+            continue
         yield {"answered": name, "seconds": round(time.monotonic() - begin)}
 
 

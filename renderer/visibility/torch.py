@@ -22,7 +22,7 @@ from renderer.visibility.numpy import (
 )
 
 # Faces of all views that are prepared at once, and smallest number of pairs of a face and a sample
-# that are tested at once. A face takes about 300 bytes, and a pair 200.
+# that are tested at once. A face takes up to 700 bytes, and a pair 200.
 FACES_PER_TILE = 2**20
 PAIRS_PER_TILE = 2**20
 
@@ -39,7 +39,9 @@ def rasterize(
     # Number of views that are drawn at once.
     step = max(1, FACES_PER_TILE // max(1, len(faces)))
     for some_keys, some_points in zip(keys.split(step), points.split(step), strict=True):
-        _draw(some_keys, some_points, faces, closed)
+        for first in range(0, len(faces), FACES_PER_TILE):
+            some_faces = faces[first : first + FACES_PER_TILE]
+            _draw(some_keys, some_points, some_faces, first, closed)
     # The conversion keeps the low 32 bits of each key, the face index.
     return keys.int()
 
@@ -105,9 +107,10 @@ def _draw(
     keys: Int[Tensor, "N R C"],
     points: Float[Tensor, "N V 3"],
     faces: Int[Tensor, "F 3"],
+    first: int,
     closed: bool,
 ) -> None:
-    """Lower the key of each sample to that of the nearest face.
+    """Lower the key of each sample to that of the nearest face. `first` is the index of face 0.
 
     A key has the depth in its high bits and the index of the face in its low FACE_BITS bits. The
     smallest key of a sample is therefore the nearest face, or the first of equally near faces.
@@ -128,7 +131,7 @@ def _draw(
         x, y, depth, slope_x, slope_y = planes[:, triangle]
         rounded = (depth + (row - y) * slope_y + slope_x * (column - x)).round()
         is_seen = is_inside & (rounded >= 0) & (rounded < FAR)
-        view, face = triangle // len(faces), triangle % len(faces)
+        view, face = triangle // len(faces), first + triangle % len(faces)
         key = torch.where(is_seen, (rounded.long() << FACE_BITS) | face, EMPTY_KEY)
         keys.view(-1).scatter_reduce_(0, (view * rows + row) * columns + column, key, "amin")
 
