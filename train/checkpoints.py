@@ -29,7 +29,15 @@ from augment.settings import PYTHON, NormalizeLight
 from augment.sources import SOURCES, import_function, load_classifier
 from augment.switch import LIT_NAME, SWITCHES, Recognizer
 from augment.tasks.detection import Detection
-from renderer.errors import InputError, as_path, explained, keyed, require_file, require_kind
+from renderer.errors import (
+    InputError,
+    as_path,
+    explained,
+    keyed,
+    reading,
+    require_file,
+    require_kind,
+)
 from renderer.io.files import atomic_write
 from train.networks import DETECTOR, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
@@ -78,8 +86,8 @@ def _refused_if_damaged(path: Path) -> AbstractContextManager[None]:
 
 def checks_architecture(path: Path) -> AbstractContextManager[None]:
     """Raise InputError if the block cannot load weights into a network of another architecture."""
-    fault = f"checkpoint {path} is from another architecture"
-    return explained(fault, "use the model settings of its run", "", Exception)
+    name = f"checkpoint {path}"
+    return reading(name, "is from another architecture", "use the model settings of its run")
 
 
 def _checked(state: dict[str, Any]) -> dict[str, Any]:
@@ -136,6 +144,8 @@ def load_network(
 ) -> Any:
     """Load a classifier by its name: the network of a training run, or any other classifier.
 
+    The folder of a run or of a published network stands for "run:FOLDER".
+
     The arguments other than `name` are those of `nb.load_classifier`. The network of a run has
     its own weights and its own `facts`, such as classes and size, so these must then be None.
     """
@@ -165,7 +175,7 @@ def load_network(
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path
     if (folder / BEST).is_file() or (published_folder(folder) / PUBLISHED).is_file():
-        raise InputError(f"name={name} is a training run: give name={RUN}{folder} instead", "name")
+        name = f"{RUN}{folder}"
     if not name.startswith(RUN):
         return load_classifier(name, weights, **options, **facts)
     require_no_facts(name, as_facts(**facts))
@@ -224,6 +234,9 @@ def load_run(
     trust_code: bool = False,
 ) -> Classifier:
     """Load the network that a training run selected, or a published network.
+
+    A run of `harden` on a plain network in memory cannot be loaded, because its file has the
+    weights, but not the code. Keep the network that `harden` returns, and save its `state_dict()`.
 
     Args:
         run: Folder of the run, folder below pretrained/, or the file of the network in it.

@@ -3,7 +3,7 @@
 This module imports neither torch nor NumPy; see `renderer.settings`.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,11 @@ PATTERNS = (*TRAINED_PATTERNS, *OTHER_PATTERNS, SLIDES)
 # Layouts of the data sets of pnb-render, and the maps that it writes for each render.
 DATA_SET_FORMATS = ("imagefolder", "coco", "yolo", "webdataset")
 DATA_SET_MAPS = ("mask", "depth", "normals")
+# Settings of pnb-attack that count for photographs, besides those of the network.
+OF_RELIGHTING = (
+    *("seed", "out", "overwrite", "unlabeled"),
+    *("attack.relighting", "attack.batch_size", "attack.sensor_noise"),
+)
 # The objects that pnb-lab renders by default: six oranges, and ten other objects.
 LAB_MESHES = [
     *(f"solid:orange:{seed}" for seed in range(101, 107)),
@@ -140,6 +145,8 @@ class AttackExperimentSettings(TaskSettings):
             raise InputError("attack=relighting and unlabeled=FOLDER: set both, or neither")
         if self.unlabeled is not None and (attacked or self.reload):
             raise InputError("attack=relighting takes no meshes: remove the others", "attack")
+        if self.unlabeled is not None:
+            self._require_relighting_alone()
         # An attacked light that the scene lacks, such as a projector, is added with default
         # settings. An attack on the positions of lamps needs lamps that shine.
         for light, settings_class in scenes.LOCAL_LIGHT_SETTINGS.items():
@@ -149,6 +156,16 @@ class AttackExperimentSettings(TaskSettings):
             self.scene.lamps = LampsSettings(start=LAMP_POWER)
         if "pose" in attacked:
             self.renderer.silhouettes = True
+
+    def _require_relighting_alone(self) -> None:
+        """Check that no setting differs from its default that does not count for photographs."""
+        default = dict(common.dotted(asdict(AttackExperimentSettings())))
+        counting = (*OF_RELIGHTING, *(field.name for field in fields(TaskSettings)))
+        for key, value in common.dotted(asdict(self)):
+            counts = any(f"{key}.".startswith(f"{name}.") for name in counting)
+            if not counts and value != default.get(key):
+                fault = f"{key}={value} does not count for attack=relighting"
+                raise InputError(f"{fault}: leave it out", key)
 
 
 @dataclass

@@ -121,7 +121,7 @@ def publish(
     """Write the network of a run as half-precision safetensors, for other users.
 
     The metadata of the file holds the settings and the scores of the run as JSON. `load_run`
-    reads the file.
+    reads the file. A run that `load_run` cannot load cannot be published, either.
 
     Args:
         run: Folder of a finished run, or of a published network.

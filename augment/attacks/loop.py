@@ -22,7 +22,7 @@ from torch import Tensor
 from augment.attack_settings import GRADIENT
 from augment.attacks.objective import NOISE_DRAWS, Examples, Images, Objective, Score, Values
 from augment.attacks.optimizers import KINDS, Evaluation, Optimizer, Problem, chosen
-from augment.network import frozen_eval_mode
+from augment.network import frozen_eval_mode, say_once
 from augment.progress import progress
 from augment.scene.truth import Rows
 from renderer.errors import Check, ShortRepr, late_checks, raise_first
@@ -169,8 +169,15 @@ def _minimize_group(
     Further values are for examples that fail, or fail with sensor noise, while queries remain.
     """
     settings = objective.settings
-    result = minimize_from(start, optimizer, objective, examples)
     limit = settings.query_limit_of_start
+    optimizer.begin(examples, start)
+    # A start shows its initial values, and then the candidates of a step.
+    needed = (1 + optimizer.candidate_count) * objective.passes_per_candidate
+    if optimizer.candidate_count > 1 and limit is not None and limit < needed:
+        given = f"max_queries={settings.query_limit} with restarts={settings.restarts}"
+        advice = f"set max_queries to at least {needed * (1 + settings.restarts)}"
+        say_once(f"{given} is too little for a step of {settings.optimizer}: {advice}")
+    result = minimize_from(start, optimizer, objective, examples)
     # Stop if the queries of a start do not even pay for one candidate.
     if limit is not None and limit < objective.passes_per_candidate:
         return result

@@ -209,6 +209,11 @@ def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_p
     torch.testing.assert_close(classifier(images), network(images), rtol=tolerance, atol=tolerance)
 
 
+def test_the_folder_of_a_run_is_its_network(network, tmp_path):
+    write(tmp_path, network)
+    assert load_network(str(tmp_path)).name == f"run:{tmp_path}"
+
+
 @pytest.mark.parametrize("name", ["torchvision:shufflenet_v2_x0_5", "python:own_models:build"])
 def test_other_networks_are_loaded_by_their_name_and_copied_without_their_code(tmp_path, name):
     network = build_network(CLASSES, 16, name, MEAN, STD).eval()
@@ -237,7 +242,7 @@ def test_other_networks_are_loaded_by_their_name_and_copied_without_their_code(t
 def test_a_description_of_other_weights_is_refused_in_one_sentence(network, tmp_path, changes):
     write(tmp_path, network, **changes)
     for name in (BEST, PUBLISHED):
-        with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name} [^\n]+$"):
+        with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name}:? [^\n]+$"):
             load_run(tmp_path / name)
 
 

@@ -52,7 +52,8 @@ ADVICE = {
 }
 # What a user does next if no remedy helps: without and with a hardened network.
 NEXT_HARDENING = (
-    "Next: harden it (pnb-train experiment=classifier), and audit both with hardened=run:FOLDER."
+    "Next: harden it if it has weights and is a classifier (pnb-train experiment=classifier) or a "
+    "detector (nb.harden in Python), and audit both with hardened=."
 )
 NEXT_DATA = (
     "Next: harden with more meshes of the class and photographs of the place of use, and audit "

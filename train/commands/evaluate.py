@@ -130,7 +130,7 @@ def evaluate(
             or "float32". A detector computes in float32.
         fit: How photographs get the size of a detector or a segmenter:
             "letterbox" keeps their aspect ratio and adds gray borders, "stretch"
-            does not.
+            does not. A classifier takes the default alone.
         task: Task of the network, such as `nb.Detection(threshold=0.3)`. None if
             its outputs tell.
         device: Device that computes. None for the device of the network.
@@ -172,6 +172,8 @@ def evaluate(
         made = as_network(network, *given, normalize_light=normalize_light, task=task).to(device)
         if not isinstance(made, Classifier) and (by != GROUPS[0] or calibrate is not None):
             raise InputError("by and calibrate are for classifiers: leave them out")
+        if isinstance(made, Classifier) and fit != LETTERBOX:
+            raise InputError(f"fit={fit} is for detectors and segmenters: leave it out", "fit")
         if isinstance(made.task, Segmentation) and label is not None:
             raise InputError("label is for classifiers and detectors: leave it out", "label")
         if isinstance(made.task, Detection):

@@ -21,6 +21,7 @@ from augment.settings import PYTHON
 from augment.sources import load_source
 from augment.switch import SWITCHES
 from augment.tasks.classification import Classification, class_index, complementary_label
+from augment.tasks.detection import Detection
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, is_whole, keyed, keys_of, require_range
 from renderer.settings import MAX_SIZE
@@ -172,7 +173,9 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         classifier = load_source(name, weights, facts, settings.trust)
     if not isinstance(classifier.task, Classification):
         fault = f"network={name} is no classifier, but for {classifier.task.name}"
-        raise InputError(f"{fault}: train it by nb.harden in Python", "network")
+        is_detector = isinstance(classifier.task, Detection)
+        advice = "train it by nb.harden in Python" if is_detector else "give a classifier"
+        raise InputError(f"{fault}: {advice}", "network")
     if not list(classifier.network.parameters()):  # ONNX and quantized networks have none.
         advice = "give a file of TorchScript or torch.export"
         raise InputError(f"network={name} has no weights to train: {advice}", "network")

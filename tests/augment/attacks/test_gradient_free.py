@@ -230,3 +230,15 @@ def test_rounded_probabilities_become_their_logarithms(class_count, rounded):
     classifier = augment.Classifier(lambda images: probabilities, 4, classes)
     found = classifier(torch.full((6, 3, 4, 4), 0.5)).exp()
     torch.testing.assert_close(found, torch.from_numpy(probabilities).float())
+
+
+@pytest.mark.parametrize("is_enough", [True, False])
+def test_cma_es_warns_exactly_if_the_queries_of_a_start_pay_for_no_step(
+    attacked, caplog, is_enough
+):
+    pytest.importorskip("cma")
+    steps = {"lighting": augment.StepSettings("l2", 0.1)}
+    options = {"optimizer": "cma_es", "restarts": 1, "margin": 100.0}
+    result = attacked(steps, max_queries=200 if is_enough else 18, **options)
+    assert (result.steps > 0).all() == is_enough
+    assert ("max_queries" in caplog.text) != is_enough

@@ -65,3 +65,10 @@ def test_only_a_given_folder_is_written_and_the_network_stays(photographs, tmp_p
     assert network.weight.requires_grad and not network.training
     nb.evaluate(network, photographs, out="scores", **OPTIONS)
     assert (tmp_path / "scores" / "summary.json").is_file()
+
+
+def test_a_classifier_refuses_the_fit_that_only_other_tasks_use(tmp_path):
+    network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)).eval()
+    with pytest.raises(nb.InputError) as caught:
+        nb.evaluate(network, tmp_path, "a", classes=["a", "b"], size=8, fit="stretch")
+    assert caught.value.argument == "fit"
