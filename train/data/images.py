@@ -94,7 +94,7 @@ class ImageFiles:
             errors |= errors_in_batch
             # Unless errors are skipped, the first one stops the run.
             for path, error in () if self.skip else errors.items():
-                advice = "replace the file, or set evaluate.skip_unreadable=true"
+                advice = "replace the file, or set skip_unreadable=True"
                 raise InputError(f"{self.folder / path} cannot be read ({error}): {advice}")
             yield images
         if errors:

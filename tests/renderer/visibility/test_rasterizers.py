@@ -245,6 +245,17 @@ def test_numba_and_torch_equal_numpy_to_the_bit(
         np.testing.assert_array_equal(other, plain)
 
 
+@pytest.mark.parametrize("closed", [False, True])
+def test_torch_draws_the_same_faces_in_small_tiles(monkeypatch, closed):
+    points, faces = random_triangles(3, 40)
+    faces = np.concatenate([faces, faces])  # Of equally near faces, the first counts.
+    monkeypatch.setattr("renderer.visibility.torch.FACES_PER_TILE", 7)
+    plain, tiled = (
+        choose(name).rasterize(points, faces, 33, closed) for name in ("numpy", "torch")
+    )
+    np.testing.assert_array_equal(tiled, plain)
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_auto_draws_on_a_gpu_what_numpy_draws():
     points, faces = random_triangles(seed=11, count=500)
