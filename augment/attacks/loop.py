@@ -170,14 +170,13 @@ def _minimize_group(
     """
     settings = objective.settings
     limit = settings.query_limit_of_start
-    optimizer.begin(examples, start)
+    result = minimize_from(start, optimizer, objective, examples)
     # A start shows its initial values, and then the candidates of a step.
     needed = (1 + optimizer.candidate_count) * objective.passes_per_candidate
     if optimizer.candidate_count > 1 and limit is not None and limit < needed:
         given = f"max_queries={settings.query_limit} with restarts={settings.restarts}"
         advice = f"set max_queries to at least {needed * (1 + settings.restarts)}"
         say_once(f"{given} is too little for a step of {settings.optimizer}: {advice}")
-    result = minimize_from(start, optimizer, objective, examples)
     # Stop if the queries of a start do not even pay for one candidate.
     if limit is not None and limit < objective.passes_per_candidate:
         return result
