@@ -34,6 +34,7 @@ takes a few minutes:
 import argparse
 import csv
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -429,7 +430,6 @@ class Style:
 
 
 STYLES = {"front": Style("k-", 5, 3), "pnb-train": Style("r*", 14, 3)}
-OTHER_STYLE = Style("o", 5, 2)
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -481,8 +481,9 @@ def parse_row(row: Row) -> Row:
 def draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
     """Draw the points of a panel by setting or, if the degrees differ, by degree.
 
-    Settings that differ in the type in parentheses are one group. References, whose error is 0,
-    have no point.
+    Settings that differ in the type in parentheses are one group. Settings that differ in a degree
+    in parentheses are a curve, whose points have the degree beside them. References, whose error is
+    0, have no point.
     """
     has_degrees = len({row.get("degree") for row in rows}) > 1
     shown = [row for row in rows if error_of(row) > 0]
@@ -490,6 +491,9 @@ def draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
     points: dict[str, list[tuple[float, float]]] = {"front": [], "pnb-train": []}
     for row in shown:
         row["group"] = row["setting"].partition(" (")[0]
+        if degree := re.search(r"\(degree (\d+), ", row["setting"]):
+            row["group"] = row["setting"].replace(degree[0], "(")
+            axes.annotate(degree[1], (row["time_ms"], error_of(row)), fontsize=7)
         if has_degrees:
             row["group"] = f"degree {row['degree']}"
         points.setdefault(row["group"], [])
@@ -497,10 +501,12 @@ def draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
         marks = [mark for mark in ("front", "pnb-train") if row[mark]]
         for group in [row["group"], *marks]:
             points[group].append((row["time_ms"], error_of(row)))
-    for group, group_points in points.items():
+    for number, (group, group_points) in enumerate(points.items()):
         if not group_points:
             continue
-        style = STYLES.get(group, OTHER_STYLE)
+        # There are ten colors, and then other markers. The first two groups are in STYLES.
+        marker = "o" if number < 12 else "s"
+        style = STYLES.get(group, Style(f"{marker}-" if "(" in group else marker, 5, 2))
         times, errors = zip(*group_points, strict=True)
         axes.loglog(
             times, errors, style.line, label=group, ms=style.marker_size, zorder=style.layer
