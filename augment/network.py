@@ -118,10 +118,12 @@ def plain_outputs(outputs: Any) -> Any:
     return getattr(outputs, "logits", outputs)
 
 
-def unwrapped(network: Any) -> Any:
-    """Return the raw network inside of `Network` modules, and of wrappers of torch."""
+def unwrapped(network: Any, own_alone: bool = False) -> Any:
+    """Return the raw network inside of `Network` modules, and of wrappers of torch by default."""
     if isinstance(network, Network):
-        return unwrapped(network.network)
+        return unwrapped(network.network, own_alone)
+    if own_alone:
+        return network
     if isinstance(network, nn.DataParallel | nn.parallel.DistributedDataParallel):
         return unwrapped(network.module)
     # `torch.compile` keeps the network under this name.
@@ -431,7 +433,7 @@ def eval_mode(network: Any) -> Iterator[None]:
             # Some modules do more than to keep the flag, such as LoRA, which merges weights.
             for module, flag in zip(modules, flags, strict=True):
                 if flag and type(module).train is not nn.Module.train:
-                    module.train()
+                    module.train(True)
             for module, flag in zip(modules, flags, strict=True):
                 module.training = flag
 

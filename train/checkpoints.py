@@ -174,7 +174,8 @@ def load_network(
     path = Path(name)
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path
-    if (folder / BEST).is_file() or (published_folder(folder) / PUBLISHED).is_file():
+    is_run = (folder / BEST).is_file() or (published_folder(folder) / PUBLISHED).is_file()
+    if name and is_run:
         name = f"{RUN}{folder}"
     if not name.startswith(RUN):
         return load_classifier(name, weights, **options, **facts)

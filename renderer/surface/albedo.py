@@ -327,7 +327,8 @@ def with_added_albedo(
     charts of an old texture lie on the new texture, and interpolation has the old weights. The old
     texture is first enlarged if that of the gloss is larger, or if colors change within few texels.
     """
-    corner_albedo = decode(torch.from_numpy(mesh.corner_colors), encoding)
+    # In the encoding "linear", `decode` returns the colors of the mesh themselves.
+    corner_albedo = decode(torch.from_numpy(mesh.corner_colors).float(), encoding).clone()
     # Linear value of each 8-bit value.
     albedo_of_byte = decode(torch.arange(256) / 255, encoding)
     # The largest corner color, times the largest texel if all faces have a texture.
@@ -343,7 +344,7 @@ def with_added_albedo(
         changed = changed_albedo(albedo * albedo_scale, hue_at_points, added_at_points)
         return encode((changed / new_scale).clamp(max=1), encoding)
 
-    even = [len(np.unique(texture.reshape(-1, 3), axis=0)) == 1 for texture in mesh.textures]
+    even = [texture.size and (texture == texture[:1, :1]).all() for texture in mesh.textures]
     has_even = np.isin(mesh.texture_ids, np.flatnonzero(even))
     for number in np.flatnonzero(even):
         texel = torch.from_numpy(mesh.textures[number][0, 0]).long()
@@ -405,7 +406,8 @@ def _enlargement(
     corners differ by a `change` of 1, if MAX_TEXELS permit.
     """
     across = (np.ptp(uvs, axis=1) * shape[1::-1]).max(1)
-    is_changing = (change > 0) & (across > 0)
+    # Faces within a texel have about one color, and would enlarge the texture without end.
+    is_changing = (change > 0) & (across > 0.5)
     ratios = TEXELS_PER_CHANGE * change[is_changing] / across[is_changing]
     of_gloss = [gloss_shape[axis] / shape[axis] for axis in (0, 1)] if gloss_shape[2] else []
     needed = max([1.0, *of_gloss, *ratios.tolist()])

@@ -117,7 +117,7 @@ class Merged(nn.Linear):
 
     is_merged = False
 
-    def train(self, mode: bool = True):
+    def train(self, mode: bool):
         super().train(mode)
         if mode == self.is_merged:
             self.is_merged = not mode
@@ -128,7 +128,7 @@ class Merged(nn.Linear):
 def test_modules_that_change_with_the_mode_are_changed_back():
     network = nn.Sequential(nn.Flatten(), Merged(3 * 64, 5), nn.Dropout(), Merged(5, 5))
     network.train()
-    network[3].eval()
+    network[3].train(False)
     network[2].training = False
     before = [network[index].weight.detach().clone() for index in (1, 3)]
     compute_outputs(network, torch.rand(2, 3, 8, 8))

@@ -222,7 +222,8 @@ class Run:
             return
         path = self.folder / WEIGHTS
         # The weights have the names of the user's own network, without wrappers of this library.
-        weights = wrappers.unwrapped(self.trainer.selected.network).state_dict()
+        raw = wrappers.unwrapped(self.trainer.selected.network, own_alone=True)
+        weights = raw.state_dict()
         checkpoints.save(path, {name: value.cpu() for name, value in weights.items()})
         console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
         # Settings of the wrapper that normalizes the light of images. None without one.

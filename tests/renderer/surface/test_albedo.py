@@ -186,6 +186,23 @@ def test_corners_of_different_colors_are_painted_into_the_texels_between_them(si
     torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
 
 
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+@pytest.mark.parametrize("value", [100, 255])
+def test_the_given_mesh_stays_as_it_was(encoding, value):
+    mesh = poster(np.full((2, 2, 3), value, np.uint8), color=COLORS)
+    before = mesh.corner_colors.copy()
+    with_added_albedo(mesh, np.full((2, 3), 0.1), encoding)
+    assert np.array_equal(mesh.corner_colors, before)
+
+
+def test_a_face_within_a_texel_enlarges_no_texture():
+    """Its corners differ, and it is 0.0001 wide in the texture."""
+    uvs = np.float32([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1e-4, 1e-4], [0, 1e-4]]])
+    mesh = replace(poster(random_texture(64, 64), color=COLORS), corner_uvs=uvs)
+    painted, _ = with_added_albedo(mesh, np.zeros((2, 3)), "linear")
+    assert painted.textures[0].size < 4 * 64 * 64 * 3
+
+
 @pytest.mark.parametrize("side", [1, 5])
 def test_corners_hold_the_product_with_a_texture_of_equal_texels(side):
     mesh = poster(np.full((side, side, 3), 100, np.uint8), color=COLORS)
