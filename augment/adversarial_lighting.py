@@ -127,7 +127,7 @@ class AdversarialLighting:
         if not any(lights):
             return lights
         is_float = images.is_floating_point()
-        # The search leaves the gradients of its caller alone.
+        # The gradient ends at the images, because what made them belongs to the caller.
         unit = images.detach().float() / (1 if is_float else torch.iinfo(images.dtype).max)
         # Networks of another precision get images of this precision.
         given = images.dtype if is_float else unit.dtype
@@ -143,7 +143,6 @@ class AdversarialLighting:
                 with torch.set_grad_enabled(step < self.steps):
                     # The numbers of these lights are leaves of the graph, which get gradients.
                     leaves = [light and _leaf(light) for light in lights]
-                    values = [light.values for light in leaves if light]
                     relit = self.lighting.apply(unit, {"lights": leaves})
                     outputs = _in_float32(network(relit.to(given)))
                     is_list = isinstance(outputs, list)
@@ -155,16 +154,15 @@ class AdversarialLighting:
                         # The cost of a detector that finds nothing is constant.
                         if not cost.requires_grad and not is_list:
                             raise InputError(f"the network {NO_GRADIENT}")
-                        gradients: Sequence[Tensor | None] = [None] * len(values)
                         if cost.requires_grad:
-                            gradients = torch.autograd.grad(cost.sum(), values, allow_unused=True)
+                            # Other tensors, such as those of the caller, get no gradient.
+                            cost.sum().backward(inputs=[light.values for light in leaves if light])
                 is_lower = (cost < lowest).tolist()
                 lowest = torch.minimum(lowest, cost.detach())
                 pairs = zip(is_lower, lights, best, strict=True)
                 best = [new if lower else old for lower, new, old in pairs]
                 if step < self.steps:
-                    left = iter(gradients)
-                    lights = [light and self._stepped(light, next(left)) for light in leaves]
+                    lights = [light and self._stepped(light) for light in leaves]
         return best
 
     def _criterion(
@@ -219,9 +217,10 @@ class AdversarialLighting:
         outputs = F.one_hot(targets.where(has_class, count), count + 1).movedim(-1, 1)
         return outputs.float(), [*self.classes, BACKGROUND]
 
-    def _stepped(self, light: Light, gradient: Tensor | None) -> Light:
+    def _stepped(self, light: Light) -> Light:
         """Move the numbers of a light along the sign of their gradient, within [0, 1]."""
         values = light.values.detach().clone()
+        gradient = light.values.grad
         if gradient is not None:
             # The light is differentiable in its first numbers only. The others stay.
             smooth = slice(light.model.dimensions)

@@ -290,15 +290,15 @@ def relight_photographs(
         torch.uint8
     """
     errors.require_whole("seed", seed)
-    if lights is None and strength != 1.0:
-        raise InputError("strength is for lights: give lights, or leave it out", "strength")
     if lights is not None:
         if slides is not None:
-            fault = "slides are for the projector without lights"
-            raise InputError(f"{fault}: give nb.lights.ProjectedSlide", "slides")
+            advice = "give nb.lights.ProjectedSlide(slides) among the lights"
+            raise InputError(f"slides are not used with lights: {advice}", "slides")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stream_seed(seed, "lights"))
             return RandomLighting(lights, strength=strength)(photographs)
+    if strength != 1.0:
+        raise InputError("strength is not used without lights: give lights", "strength")
     require_photographs("photographs", photographs)
     if slides is not None:
         require_photographs("slides", slides)

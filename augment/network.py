@@ -119,7 +119,7 @@ def plain_outputs(outputs: Any) -> Any:
 
 
 def unwrapped(network: Any, own_alone: bool = False) -> Any:
-    """Return the raw network inside of `Network` modules, and of wrappers of torch by default."""
+    """Return the raw network in `Network` modules and, unless `own_alone`, in wrappers of torch."""
     if isinstance(network, Network):
         return unwrapped(network.network, own_alone)
     if own_alone:
@@ -430,7 +430,7 @@ def eval_mode(network: Any) -> Iterator[None]:
         yield
     finally:
         if any(flags):
-            # Some modules do more than to keep the flag, such as LoRA, which merges weights.
+            # Modules of LoRA, for example, merge their weights when the mode changes.
             for module, flag in zip(modules, flags, strict=True):
                 if flag and type(module).train is not nn.Module.train:
                     module.train(True)

@@ -25,7 +25,7 @@ class Switch(nn.Module):
         self.training = network.training
 
     def forward(self, images: Tensor) -> Any:
-        # Nothing is chosen of no images, and means over them do not exist.
+        # Without images, there is nothing to choose, and no mean to choose by.
         is_chosen = self.chooses(images.detach()) if len(images) else torch.zeros(0)
         if not is_chosen.any():
             return self.network(images)

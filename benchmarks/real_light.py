@@ -104,7 +104,7 @@ class Stratum(NamedTuple):
 
 
 def joined(strata: Iterable[Stratum]) -> list[Stratum]:
-    """Join strata of the same kind that share a light, also by way of others."""
+    """Join strata of the same kind that share a light, directly or through other strata."""
     found: list[Stratum] = []
     for kind, lights, members in strata:
         near = [other for other in found if other.kind == kind and other.lights & lights]
@@ -332,7 +332,7 @@ def print_tables(
     gains, changes = {}, {}
     pairs: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for light, rows in groups.items():
-        # Photographs of the objects that a light shares with the first one.
+        # Only photographs of objects that both lights show are compared.
         pair = rows, groups[first_light]
         both = np.isin(folder.objects, np.intersect1d(*(folder.objects[side] for side in pair)))
         pairs[light] = rows & both, groups[first_light] & both

@@ -189,7 +189,7 @@ def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) 
     # A mask of the faces of the part, its texture or NO_TEXTURE, and its gloss, empty if matte.
     for is_in_part, texture_id, gloss in by_material(mesh):
         has_texture = texture_id >= 0
-        # Mitsuba shows the colors of corners beside a white texture.
+        # Mitsuba shows either a texture or the colors of corners, which a white one would hide.
         is_white = has_texture and mesh.textures[texture_id].min() == 255
         has_factors = has_texture and mesh.gloss_textures
         part = Part(

@@ -158,7 +158,7 @@ class AttackExperimentSettings(TaskSettings):
             self.renderer.silhouettes = True
 
     def _require_relighting_alone(self) -> None:
-        """Check that no setting differs from its default that does not count for photographs."""
+        """Refuse settings that do not count for photographs and differ from their defaults."""
         default = dict(common.dotted(asdict(AttackExperimentSettings())))
         counting = (*OF_RELIGHTING, *(field.name for field in fields(TaskSettings)))
         for key, value in common.dotted(asdict(self)):

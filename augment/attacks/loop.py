@@ -171,7 +171,7 @@ def _minimize_group(
     settings = objective.settings
     limit = settings.query_limit_of_start
     result = minimize_from(start, optimizer, objective, examples)
-    # A start shows its initial values, and then the candidates of a step.
+    # The network sees the initial values of a start, and then the candidates of its first step.
     needed = (1 + optimizer.candidate_count) * objective.passes_per_candidate
     if optimizer.candidate_count > 1 and limit is not None and limit < needed:
         given = f"max_queries={settings.query_limit} with restarts={settings.restarts}"

@@ -430,7 +430,7 @@ class _Reader:
         if (right < left).any() or (bottom < top).any():
             advice = "give left, top, right, bottom, and not width and height"
             raise InputError(f"{self.title} returned boxes that end before they begin: {advice}")
-        # Detectors that clip boxes at the border leave some on it, which have no area.
+        # A box outside of the image that a detector has clipped lies on the border.
         is_outside = (left > width) | (right < 0) | (top > height) | (bottom < 0)
         # Boxes that all end within the first pixel are probably in units of the image size.
         is_fraction = len(right) > 0 and bool((right <= 1).all() & (bottom <= 1).all())

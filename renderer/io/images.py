@@ -393,7 +393,7 @@ def conversion_to_srgb(image: Image.Image, path: str | Path) -> Conversion | Non
 
 
 def _coded_colors(path: Path) -> tuple[int, int, int] | None:
-    """Read the codes of primaries and curve, and whether 0 is black, from cICP of a PNG file."""
+    """Read the codes of primaries, curve and range of values from the chunk cICP of a PNG file."""
     with path.open("rb") as file:
         # The signature of PNG has 8 bytes. Each chunk begins with its length and its name, 4 bytes
         # each.
@@ -417,7 +417,7 @@ def _read_color_box(path: Path) -> tuple[bytes | None, tuple[int, int, int] | No
         primaries, curve = struct.unpack(">HH", box[4:8])
         primaries = 1 if primaries in UNCODED_PRIMARIES else primaries
         return None, (primaries, 13 if curve in UNCODED_CURVES else curve, 1)
-    # The method 2 is a profile, behind the precedence and the approximation.
+    # Method 2 stores a profile, which follows the precedence and the approximation.
     return (box[3:], None) if box[:1] == b"\2" else (None, None)
 
 

@@ -381,7 +381,7 @@ def with_added_albedo(
             else:
                 corners = corner_albedo[faces[chart]]
                 color = torch.einsum("nk,nkc->nc", charts.weights(chart, center), corners)
-                # Texels outside of the face continue its colors, as far as the corners have them.
+                # Texels outside of the face continue its colors, within the range of its corners.
                 albedo *= color.clamp(corners.amin(1), corners.amax(1))
             new_texture.reshape(-1, 3)[on_sheet] = to_bytes(paint(albedo, faces[chart])).numpy()
             if mesh.gloss_textures:
@@ -400,10 +400,10 @@ def _enlargement(
     shape: tuple[int, ...],
     gloss_shape: tuple[int, ...],
 ) -> int:
-    """Return by how much a texture is enlarged, an odd number.
+    """Return the odd factor by which a texture is enlarged.
 
-    It then has as many texels as that of the gloss, and TEXELS_PER_CHANGE across a face whose
-    corners differ by a `change` of 1, if MAX_TEXELS permit.
+    The texture then has as many texels as that of the gloss, and TEXELS_PER_CHANGE across a face
+    whose corners differ by a `change` of 1, if MAX_TEXELS permits.
     """
     across = (np.ptp(uvs, axis=1) * shape[1::-1]).max(1)
     # Faces within a texel have about one color, and would enlarge the texture without end.
@@ -412,14 +412,15 @@ def _enlargement(
     of_gloss = [gloss_shape[axis] / shape[axis] for axis in (0, 1)] if gloss_shape[2] else []
     needed = max([1.0, *of_gloss, *ratios.tolist()])
     texels = max((np.ptp(uvs, axis=1) * shape[1::-1] + 2).prod(1).sum(), shape[0] * shape[1])
-    limited = max(min(math.ceil(needed), int(math.sqrt(MAX_TEXELS / 4 / texels))), 1)
-    return limited - (limited + 1) % 2 if limited < needed else limited + (limited + 1) % 2
+    largest = max(int(math.sqrt(MAX_TEXELS / 4 / texels)), 1)
+    # This is the smallest odd number that suffices, or the largest one that is permitted.
+    return min(2 * math.ceil((needed - 1) / 2) + 1, largest - (largest + 1) % 2)
 
 
 def _resized(
     texture: UInt8[np.ndarray, "rows columns C"], size: Sequence[int], encoding: str
 ) -> UInt8[np.ndarray, "_ _ C"]:
-    """Interpolate a texture that repeats. An odd factor keeps the texels at their centers."""
+    """Resize a texture that repeats, by interpolation. An odd factor keeps the given texels."""
     linear = decode(torch.from_numpy(texture) / 255, encoding)
     for axis, count in enumerate(texture.shape[:2]):
         place = (torch.arange(size[axis]) + 0.5) * (count / size[axis]) - 0.5

@@ -52,8 +52,8 @@ ADVICE = {
 }
 # What a user does next if no remedy helps: without and with a hardened network.
 NEXT_HARDENING = (
-    "Next: harden it if it has weights and is a classifier (pnb-train experiment=classifier) or a "
-    "detector (nb.harden in Python), and audit both with hardened=."
+    "Next, if the network has weights: harden a classifier with pnb-train experiment=classifier, "
+    "or a detector with nb.harden, and audit both with hardened=run:FOLDER."
 )
 NEXT_DATA = (
     "Next: harden with more meshes of the class and photographs of the place of use, and audit "

@@ -211,7 +211,7 @@ def _read_coco(file: Path) -> Annotations:
         classes = tuple(dict.fromkeys(names[key] for key in sorted(names)))
         images = {item["id"]: item for item in content["images"]}
         if len({*map(type, images)}) == 1:
-            # As pycocotools does it, of equal scores that of the lower id comes first.
+            # Of equal scores, that of the lower image id comes first, as in pycocotools.
             images = dict(sorted(images.items()))
         for item in images.values():
             item["file_name"] = str(item["file_name"]).replace("\\", "/")

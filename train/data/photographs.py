@@ -195,7 +195,7 @@ def visible_files(folder: Path) -> Iterator[PurePosixPath]:
     def raise_error(error: OSError) -> NoReturn:
         raise error
 
-    # Real paths of the folders on the way to each folder, with itself.
+    # Real paths of each folder and of those on the way to it.
     ways: dict[Path, tuple[Path, ...]] = {Path(folder): (Path(folder).resolve(),)}
     for parent, subfolders, files in os.walk(folder, onerror=raise_error, followlinks=True):
         way = ways.pop(Path(parent))

@@ -196,7 +196,7 @@ def test_the_given_mesh_stays_as_it_was(encoding, value):
 
 
 def test_a_face_within_a_texel_enlarges_no_texture():
-    """Its corners differ, and it is 0.0001 wide in the texture."""
+    """The colors of its corners differ, and it is 0.0001 wide in the texture."""
     uvs = np.float32([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1e-4, 1e-4], [0, 1e-4]]])
     mesh = replace(poster(random_texture(64, 64), color=COLORS), corner_uvs=uvs)
     painted, _ = with_added_albedo(mesh, np.zeros((2, 3)), "linear")

@@ -80,7 +80,7 @@ def test_a_score_at_the_threshold_counts(photographs, threshold):
 
 
 def test_the_order_of_images_in_the_file_does_not_matter(photographs):
-    """Without the object of photograph 2, each has an equal score, and the first one is right."""
+    """Only the first photograph shows a dog, and all detections of dogs have equal scores."""
     file = photographs / "annotations.json"
     content = json.loads(file.read_text())
     content["annotations"] = content["annotations"][:1]
