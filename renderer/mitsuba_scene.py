@@ -15,7 +15,8 @@ The renderers differ in these ways:
 - Specular reflection is the plugin `principled`, with the same lobe. Below its
   coat, the diffuse reflection does not lose the light that the coat reflects.
   The color is therefore multiplied by the fraction of the light that passes the
-  coat on average. A difference of 1 to 3% remains.
+  coat on average. A difference of 1 to 3% remains, and
+  of up to 6% with metallic textures.
 
 Both renderers return radiance that is premultiplied with the coverage.
 """

@@ -307,7 +307,8 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
         rows = []
         if labels is not None:
             read.append(labels)
-            rows = [*_yolo_rows(labels, len(classes), has_keypoints)]
+            # A line that stands twice is one object, as for Ultralytics.
+            rows = [*dict.fromkeys(_yolo_rows(labels, len(classes), has_keypoints))]
         name = path.relative_to(folder) if path.is_relative_to(folder) else path
         # Coordinates are fractions, so the image has the width and height 1.
         photographs.append(_annotated(path, str(name), (1, 1), rows))
