@@ -42,7 +42,8 @@ class AdversarialLighting:
 
     Args:
         model: Network from images in [0, 1] to outputs. Its mode and its
-            gradient flags are restored after each call.
+            gradient flags are restored after each call. Meanwhile, no other
+            thread may use it.
         task: What its outputs mean, such as `nb.Detection()`. None for
             classification, or that of a network of `nb.load_classifier`.
         steps: Number of steps along the gradient.

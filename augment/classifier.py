@@ -95,6 +95,8 @@ class CheckedNetwork(wrappers.Network):
         """Compute the outputs of images in the form of the task, and check them."""
         # A network of a task inside has asked its own network already.
         task = None if isinstance(self.network, TaskNetwork | Switch) else self.task
+        # A network may change its images in place, such as the normalization of torchvision.
+        images = images.clone()
         try:
             outputs = self.network(images) if task is None else task.outputs(self.network, images)
         except Exception as error:

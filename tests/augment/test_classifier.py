@@ -123,6 +123,24 @@ def test_a_plain_network_is_attacked_like_its_classifier_and_stays_as_it_is(netw
         assert torch.equal(result.logits, expected.logits)
 
 
+def test_a_network_that_changes_its_images_in_place_is_attacked_as_one_that_copies_them():
+    def made(is_in_place: bool) -> nn.Module:
+        first = Normalize(MEAN, STD, inplace=is_in_place)
+        linear = nn.Linear(3, 3)
+        linear.load_state_dict({"weight": torch.eye(3), "bias": torch.zeros(3)})
+        return nn.Sequential(first, nn.AdaptiveAvgPool2d(1), nn.Flatten(), linear).eval()
+
+    images = (random_images() * 255).to(torch.uint8)
+    results = []
+    for network in map(made, (False, True)):
+        attacked = nb.attack_photographs(network, images)
+        torch.manual_seed(0)
+        relit = nb.AdversarialLighting(network)(images)
+        found = augment.attack(network, scene(0), settings=light(), force=True)
+        results.append((attacked.changed, relit, found.images))
+    torch.testing.assert_close(*results, rtol=0, atol=0)
+
+
 def test_a_number_is_an_index_even_if_a_class_has_this_number_as_its_name(network):
     options = {"settings": light(), "force": True, "classes": ("1", "2", "0")}
     by_index = augment.attack(network, scene(1), target=2, **options).criterion
