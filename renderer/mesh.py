@@ -157,7 +157,9 @@ class Mesh:
 
         Relative to it, positions have enough digits in float32.
         """
-        ends = np.array([self.vertices.min(0), self.vertices.max(0)])
+        # Vertices that no face uses do not count.
+        corners = self.vertices[self.faces].reshape(-1, 3)
+        ends = np.array([corners.min(0), corners.max(0)])
         is_far = np.abs(ends).max() > FAR * np.ptp(ends, axis=0).max()
         return ends.mean(0) if is_far else np.zeros(3)
 
@@ -271,7 +273,8 @@ class Mesh:
         Each connected part of the mesh must be watertight, and its faces must be
         counter-clockwise seen from outside. This is so if each edge of the part
         belongs to one face in one direction and to one face in the other
-        direction, and if the faces enclose a positive volume.
+        direction, and if the faces enclose a positive volume. The part must not cross itself: a
+        bulge that is inside out, as a large change of the shape can make it, is not noticed.
         """
         part_of_face = _closed_parts(self.faces.astype(np.int64).tobytes())
         if part_of_face is None:
@@ -405,9 +408,9 @@ def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
     areas = mesh.face_areas()
     if not areas.sum() > 0:
         raise InputError("the surface of the mesh has the area 0: give faces with an area")
-    face_centers = mesh.vertices.take(mesh.faces, axis=0).mean(axis=1)
-    center = np.average(face_centers, axis=0, weights=areas)
-    return center, np.abs(mesh.vertices - center).max()
+    corners = mesh.vertices.take(mesh.faces, axis=0)
+    center = np.average(corners.mean(axis=1), axis=0, weights=areas)
+    return center, np.abs(corners - center).max()
 
 
 def transformed(mesh: Mesh, matrix: Float[np.ndarray, "4 4"]) -> Mesh:

@@ -157,14 +157,17 @@ def render(
     image_dtype = like.dtype
     # Rounded to half precision, vertices would move by pixels.
     like = like.to(torch.promote_types(image_dtype, torch.float32))
+    pinholes = [camera for camera in all_cameras if isinstance(camera, PinholeCamera)]
+    is_movable = not local_lights and len(pinholes) == len(all_cameras)
+    if mesh.origin.any() and not is_movable:
+        # In coordinates of the earth, float32 would round vertices to meters.
+        like = like.double()
     light = None if light is None else light.to(like)
     split = SplitLight(light, [(basis, values.to(like)) for basis, values in local_lights])
 
     is_moved = vertices is not None
     vertices = torch.from_numpy(mesh.vertices) if vertices is None else vertices
-    pinholes = [camera for camera in all_cameras if isinstance(camera, PinholeCamera)]
-    if mesh.origin.any() and not local_lights and len(pinholes) == len(all_cameras):
-        # In coordinates of the earth, float32 would round vertices to meters.
+    if mesh.origin.any() and is_movable:
         vertices = vertices.double() - torch.from_numpy(mesh.origin).to(vertices.device)
         all_cameras = [camera.translated(-mesh.origin) for camera in pinholes]
         mesh = replace(mesh, vertices=mesh.vertices - mesh.origin)

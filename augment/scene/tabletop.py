@@ -282,14 +282,15 @@ def project_along_light(
 def _passes_near_origin(points: Tensor, directions: Tensor, radius: float) -> Bool[Tensor, " ..."]:
     """Find the rays that pass through a sphere around the origin.
 
-    Starts are outside of the sphere. Directions are one for all rays, shape (3,), or D for each
-    start as columns, shape (3, D).
+    Starts may lie in the sphere, such as below an object that overhangs its table. Directions are
+    one for all rays, shape (3,), or D for each start as columns, shape (3, D).
     """
     # A ray comes nearest to the origin after the distance -along from its start.
     along = points @ directions
     squared = points.square().sum(-1, keepdim=directions.ndim > 1)
     # Pythagoras gives the squared distance between the ray and the origin.
-    return (along < 0) & (squared - along**2 < radius**2)
+    comes_near = (along < 0) & (squared - along**2 < radius**2)
+    return comes_near | (squared < radius**2)
 
 
 def _directions(normals: Float[Tensor, "2 3"]) -> Float[Tensor, "2 D 3"]:

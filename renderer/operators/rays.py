@@ -208,7 +208,8 @@ class Rays:
     @cached_property
     def offset(self) -> float:
         """Distance above the surface at which rays start, in world units."""
-        return OFFSET * float(np.abs(self._mesh.vertices - self._mesh.origin).max())
+        corners = self._mesh.vertices[self._mesh.faces]
+        return OFFSET * float(np.abs(corners - self._mesh.origin).max())
 
     def blocked(self, surface: Surface, directions: Float[Tensor, "D 3"]) -> Iterator[BlockedRays]:
         """Find the rays that the mesh blocks, among those in D directions (`ray_directions`).

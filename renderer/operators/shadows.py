@@ -34,6 +34,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix, vstack
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from renderer.errors import InputError
@@ -50,6 +51,8 @@ from renderer.visibility.fragments import Fragments
 PATCH_DIRECTIONS = 2**9
 # Approximate number of patches of the surface of a mesh, between which light bounces.
 PATCHES = 2**11
+# Largest number of patches. With more, bounces would take long.
+MAX_PATCHES = 2**15
 # Image positions (x, y) of the corners of a triangle around the image center. In the
 # artificial view `Patches.view`, each piece of the mesh covers this triangle. A sample at
 # the image center then shows the center of the piece.
@@ -102,14 +105,14 @@ class Patches:
         facing = np.repeat(sides, piece_count)[:, None]
         piece_of_side = np.tile(np.arange(piece_count), len(sides))
         # Two sides belong to the same patch if the centers of their pieces lie in the same cell of
-        # a cubic grid, if the normals are equal after each component is rounded to -1, 0 or 1, and
-        # if both sides are fronts or both are backs.
+        # a cubic grid, if the normals are equal after each component is rounded to -1, 0 or 1, if
+        # both sides are fronts or both are backs, and if the pieces are connected.
         centers = pieces.vertices[pieces.faces].mean(axis=1)
         cells = np.floor((centers - mesh.origin) / math.sqrt(patch_area))
         keys = np.hstack([cells, np.rint(pieces.face_normals())])[piece_of_side]
         _, patch_of_side = np.unique(np.hstack([keys, facing]), axis=0, return_inverse=True)
         # NumPy 2.0.0 returns the shape (S, 1), other versions return (S,).
-        patch_of_side = patch_of_side.ravel()
+        patch_of_side = _connected(pieces, piece_of_side, patch_of_side.ravel())
         # Each side becomes a sample. Sort them by patch, because `Fragments` needs the
         # samples of a pixel (here, a patch) next to each other.
         sample_to_side = np.argsort(patch_of_side, kind="stable")
@@ -171,6 +174,26 @@ class Patches:
     def _normals(self) -> Tensor:
         """Unit normals of the F pieces, shape (F, 3)."""
         return torch.from_numpy(self.pieces.face_normals())
+
+
+def _connected(
+    pieces: Mesh, piece_of_side: Int[np.ndarray, " S"], group_of_side: Int[np.ndarray, " S"]
+) -> Int[np.ndarray, " S"]:
+    """Divide groups of sides of pieces into connected ones, and return the index of each side.
+
+    Without this, a surface just below another, such as that of a table below a book, would share
+    its patches. Groups of a mesh of many small parts stay as they are, to limit the time.
+    """
+    corners = pieces.vertices[pieces.faces[piece_of_side]].reshape(-1, 3)
+    _, corner = np.unique(corners, axis=0, return_inverse=True)
+    # Nodes of the graph are the corners of each group. A side connects its three nodes.
+    node = corner.reshape(-1, 3) * (group_of_side.max() + 1) + group_of_side[:, None]
+    nodes, node = np.unique(node, return_inverse=True)
+    node = node.reshape(-1, 3)
+    starts, ends = node[:, [0, 1]].ravel(), node[:, [1, 2]].ravel()
+    graph = csr_matrix((np.ones(len(starts)), (starts, ends)), (len(nodes), len(nodes)))
+    count, part_of_node = connected_components(graph, directed=False)
+    return part_of_node[node[:, 0]].astype(np.int64) if count <= MAX_PATCHES else group_of_side
 
 
 class Transport:

@@ -106,6 +106,13 @@ def test_autocast_changes_no_bit_of_images_operators_and_gradients(stone):
     assert torch.equal(*gradients)
 
 
+def camera_at(place: np.ndarray) -> renderer.PinholeCamera:
+    axes = renderer.PerspectiveCamera(50.0, 30.0, 2.6, distance=5.0).axes() * [[1], [-1], [-1]]
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = axes, [0, 0, 5.0] - axes @ place
+    return renderer.PinholeCamera.from_matrix(view, [[60, 0, 12], [0, 60, 12], [0, 0, 1]], 24)
+
+
 OFFSETS = [1e3, 5e5]
 
 
@@ -114,13 +121,6 @@ OFFSETS = [1e3, 5e5]
 def test_a_mesh_in_coordinates_of_the_earth_is_rendered_as_at_the_origin(offset, options):
     cup, light = renderer.solid("cup"), load_light("grace")
     place = offset * np.array([0.5, -1.0, 0.25])
-    axes = renderer.PerspectiveCamera(50.0, 30.0, 2.6, distance=5.0).axes() * [[1], [-1], [-1]]
-
-    def camera_at(place: np.ndarray) -> renderer.PinholeCamera:
-        view = np.eye(4)
-        view[:3, :3], view[:3, 3] = axes, [0, 0, 5.0] - axes @ place
-        return renderer.PinholeCamera.from_matrix(view, [[60, 0, 12], [0, 60, 12], [0, 0, 1]], 24)
-
     moved = replace(cup, vertices=cup.vertices + place)
     expected = renderer.render(cup, camera_at(np.zeros(3)), light, 24, **options)
     found = renderer.render(moved, camera_at(place), light, 24, **options)
@@ -129,6 +129,30 @@ def test_a_mesh_in_coordinates_of_the_earth_is_rendered_as_at_the_origin(offset,
     torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
     operator = renderer.precompute_transfer(moved, camera_at(place), 24, **options)
     torch.testing.assert_close(operator.image(light, 0.5), expected, rtol=0, atol=tolerance)
+
+
+def test_a_lamp_lights_a_mesh_far_from_the_origin_as_at_the_origin():
+    cup, far = renderer.solid("cup"), np.array([6e4, 5e4, 1e3])
+    images = []
+    for place in (np.zeros(3), far):
+        mesh = replace(cup, vertices=cup.vertices + place)
+        lamp = Lamps((tuple(place + np.array([0.5, 1.0, 3.0])),))
+        options = {"size": 24, "normals": "flat", "lights": [lamp]}
+        images.append(renderer.render(mesh, camera_at(place), None, **options))
+    assert images[0].max() > 0.1
+    torch.testing.assert_close(*images, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"shadows": True}, {"lights": [Lamps(((1.0, 1.0, 2.0),))]}]
+)
+def test_vertices_that_no_face_uses_change_neither_images_nor_normalized_meshes(options):
+    cup = renderer.normalize(renderer.solid("cup"))
+    more = replace(cup, vertices=np.vstack([cup.vertices, [[-3e4, 0.0, 0.0]]]))
+    camera, light = renderer.OrthographicCamera(55.0, 20.0, 2.3), load_light("grace")
+    expected = renderer.render(cup, camera, light, 24, **options)
+    assert torch.equal(renderer.render(more, camera, light, 24, **options), expected)
+    assert np.array_equal(renderer.normalize(more).vertices[:-1], renderer.normalize(cup).vertices)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16])

@@ -45,12 +45,14 @@ class Place:
     mesh: Mesh
 
 
-def place(surface: str, camera: PerspectiveCamera | OrthographicCamera) -> Place:
+def place(
+    surface: str, camera: PerspectiveCamera | OrthographicCamera, height: float = -1.0
+) -> Place:
     azimuth = math.radians(camera.azimuth)
     towards = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     aside = [-towards[1], towards[0], 0.0]
     if surface == "table":
-        return Place(-1.0, 50.0, square([0, 0, -1], [1, 0, 0], [0, 1, 0]))
+        return Place(height, 50.0, square([0, 0, height], [1, 0, 0], [0, 1, 0]))
     return Place(-50.0, 1.5, square(list(-1.5 * towards), aside, [0, 0, 1]))
 
 
@@ -75,16 +77,18 @@ class Comparison:
         assert errors.quantile(0.98) < typical * largest
 
 
-def compare(surface, camera, sky=None, lamps=(), light=(), scale: float = 1.0) -> Comparison:
-    placed = place(surface, camera)
+def compare(
+    surface, camera, sky=None, lamps=(), light=(), scale: float = 1.0, mesh=BALL, height=-1.0
+) -> Comparison:
+    placed = place(surface, camera, height)
     camera = camera.with_clip_range(9.0)
     even = ambient(torch.full((3,), 0.2))
-    ball = renderer.render(BALL, camera, even, **RENDERED)[0]
+    ball = renderer.render(mesh, camera, even, **RENDERED)[0]
     flat = renderer.render(placed.mesh, camera, even, **RENDERED)[0]
     is_surface = (ball == 0) & (flat > 0.999 * flat.max())
-    both = concatenate([BALL, placed.mesh])
+    both = concatenate([mesh, placed.mesh])
     expected = renderer.render(both, camera, sky, lights=list(lamps), **RENDERED).double()
-    around = tabletop.Room(Rays(BALL), 1.8, placed.height, placed.wall)
+    around = tabletop.Room(Rays(mesh), 1.8, placed.height, placed.wall)
     image = ImageSettings(SIZE, samples=3)
     found = scale * tabletop.irradiance(around, camera, image, *light)
     return Comparison(found[:, is_surface], expected[:, is_surface])
@@ -99,15 +103,28 @@ def test_table_and_wall_are_lit_by_a_sky_as_meshes_are(surface, camera):
     compared.require_close(mean=0.02, typical=0.07)
 
 
-@each_surface
-def test_table_and_wall_are_lit_by_a_far_lamp_as_meshes_are(surface, camera):
-    """Only the edge of the shadow differs."""
+# A square plate with a side of 1.6, which hovers above a table.
+PLATE = Mesh.plain(
+    square([0, 0, 0], [2 / 15, 0, 0], [0, 2 / 15, 0]).vertices, [[0, 1, 2], [0, 2, 3]]
+)
+SHADED = [
+    (surface, camera, BALL, -1.0)
+    for surface, camera in zip(("table", "wall"), CAMERAS.values(), strict=True)
+]
+LOW = OrthographicCamera(80.0, 22.9, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("surface", "camera", "mesh", "height"), [*SHADED, ("table", LOW, PLATE, -0.15)]
+)
+def test_table_and_wall_are_lit_by_a_far_lamp_as_meshes_are(surface, camera, mesh, height):
+    """Only the edge of the shadow differs. The plate shades points that are within its radius."""
     direction = torch.nn.functional.normalize(torch.tensor([0.5, 0.1, 0.8]).double(), dim=0)
     position = tuple((FAR * direction).tolist())
     power = torch.full((1, 3), 0.1 * FAR**2).double()
     lamps = [(Lamps((position,), 1e5), power)]
     light = (torch.zeros(49, 3).double(), direction)
-    compared = compare(surface, camera, lamps=lamps, light=light, scale=0.1)
+    compared = compare(surface, camera, None, lamps, light, 0.1, mesh, height)
     compared.require_close(mean=0.01, typical=0.02)
 
 

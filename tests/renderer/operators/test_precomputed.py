@@ -175,6 +175,26 @@ def test_the_second_bounce_in_a_sphere_with_a_hole_has_its_closed_form(monkeypat
     assert two_bounces - one_bounce == pytest.approx(expected, rel=0.05)
 
 
+def test_a_hidden_sheet_just_below_a_floor_reflects_no_light():
+    def square(corner, first, second) -> np.ndarray:
+        return np.array([np.zeros(3), first, np.add(first, second), second]) + corner
+
+    floor = square([-1, -1, 0.03], [2, 0, 0], [0, 2, 0])
+    wall = square([-1, -1, 0.03], [0, 2, 0], [0, 0, 2])
+    images = []
+    for squares, colors in (
+        ((floor, wall), (0.8, 0.8)),
+        ((floor, wall, floor - [0, 0, 0.01]), (0.8, 0.8, 0)),
+    ):
+        faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(len(squares))[:, None, None]
+        corner_colors = np.repeat(colors, 4)[:, None].repeat(3, axis=1)
+        mesh = Mesh.plain(np.vstack(squares), faces.reshape(-1, 3), corner_colors)
+        camera = OrthographicCamera(60.0, 0.0, 3.0)
+        options = {"normals": "flat", "bounces": 2, "rasterizer": "numpy"}
+        images.append(render(mesh, camera, 0.6 * load_light("uniform"), 16, **options))
+    torch.testing.assert_close(*images, rtol=0, atol=0.002)
+
+
 def test_bounces_reflect_the_scaled_albedo():
     """Half of an albedo is the same surface as half of the scale."""
     bright = pit(1.0)
