@@ -16,8 +16,7 @@ from torch import Tensor
 from augment import distributed
 from augment.random_streams import generator
 from augment.scene.truth import NO_OBJECT
-from train.data.images import ImageFiles
-from train.data.sets import Split
+from train.data.sets import ImageFiles, Split
 
 # A training image of up to 64 pixels per side is shifted by at most 4 pixels.
 # A larger image is shifted by at most a sixteenth of its side.

@@ -8,8 +8,7 @@ from scipy.stats import binomtest, chisquare
 
 from augment.scene.truth import NO_OBJECT, boxes_of
 from train.data import batches
-from train.data.images import ImageFiles
-from train.data.sets import Split
+from train.data.sets import ImageFiles, Split
 from train.training.detection import object_maps, target_of
 
 

@@ -7,9 +7,8 @@ from PIL import Image
 
 from renderer.errors import InputError
 from train.data.batches import Round, TrainingImages, training_batches
-from train.data.images import ImageFiles
 from train.data.photographs import find_unlabeled, load_photographs
-from train.data.sets import Split, load_folder, load_unlabeled
+from train.data.sets import ImageFiles, Split, load_folder, load_unlabeled
 
 SIZE = 72
 
