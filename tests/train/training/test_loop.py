@@ -20,10 +20,9 @@ from train.networks import WideResNet
 from train.run_folder import read_metrics
 from train.settings import TrainSettings
 from train.training import loop
-from train.training.loop import Trainer, evaluate
+from train.training.loop import Trainer, activation_bytes, evaluate
 from train.training.recipe import freeze
 from train.training.run_log import RunLog
-from train.training.step import activation_bytes
 
 SHAPE = {"depth": 10, "width": 1, "dropout": 0.0}
 ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "size": 16, **SHAPE}
