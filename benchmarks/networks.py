@@ -37,8 +37,8 @@ from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS
 from renderer.light.files import perturb
 from renderer.settings import height_and_width
-from train.auditing.audit import NEGATIVE_SOLIDS
 from train.auditing.lights import AMPLITUDE, Views
+from train.commands.audit import NEGATIVE_SOLIDS
 from train.data.photo import TABLE
 from train.data.photographs import find_photographs
 from train.results.scoring import Predictor, score

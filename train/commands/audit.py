@@ -1,38 +1,101 @@
-"""pnb-audit and nb.audit: how safe a network is in unusual lighting."""
+"""pnb-audit and nb.audit: how safe a network is in unusual lighting.
 
-from collections.abc import Callable, Sequence
+An audit consists of many measurements, such as the attacks on one network with
+one kind of lighting. Each result is written to its own file or folder, completely
+or not at all. An audit that was stopped therefore continues with the first
+missing result. `train.auditing.page` then reads all results and writes the
+report.
+
+The folder of the audit has a subfolder of results for each network. The names of
+the subfolders are CLASSIFIER and HARDENED.
+"""
+
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from augment.classifier import UNIT_RANGE, Normalization, TaskNetwork, as_network
+from augment.attack_settings import RelightingSettings
+from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
 from augment.network import device_of, gradient_flags_kept
+from augment.scene.objects import load_object
 from augment.settings import NormalizeLight
+from augment.tasks.detection import Detection
 from augment.tasks.task import Task
-from renderer.errors import as_list
-from renderer.settings import Size
-from train.auditing.audit import run_audit
-from train.auditing.network import CLASSIFIER, HARDENED, AuditReport
-from train.class_names import MeshItem, as_mappings
-from train.command_settings import ENVIRONMENTS, AuditSettings
-from train.run_folder import folder_or_temporary
+from renderer.errors import InputError, as_list, keyed
+from renderer.io.files import atomic_write
+from renderer.light.files import UNIFORM, load_light
+from renderer.mitsuba_scene import mitsuba
+from renderer.settings import Size, height_and_width
+from train import class_names, console
+from train.auditing import found, lights, page, relit
+from train.auditing import network as audited
+from train.auditing.network import CLASSIFIER, HARDENED, IN_WORDS, AuditReport
+from train.checkpoints import load_chosen, load_network
+from train.command_settings import ENVIRONMENTS, AuditSettings, LabSettings
+from train.data.annotations import read_annotations
+from train.data.photographs import find_photographs, find_unlabeled
+from train.device import choose_device
+from train.laboratory.laboratory import write_laboratory
+from train.results.overwrite import require_replaceable
+from train.results.page import PAGE
+from train.results.scoring import Predictor, evaluate_photographs
+from train.run_config import CONFIG, read_config, require_same, write_config
+from train.run_folder import folder_or_temporary, read_json, sole_writer, writable_folder
+from train.settings import LABORATORY, OTHER_PREFIX, PHOTOGRAPHS, published_folder, read_objects
+from train.system import command_line
+
+# Number of views of the meshes that are rendered in environment lighting.
+VIEW_COUNT = 24
+# Number of random environment lights, in addition to those that the user names.
+RANDOM_LIGHT_COUNT = 8
+# Number of views that are attacked with each kind of lighting.
+ATTACKED_COUNT = 12
+# Number of random setups of light, camera and pose that are path-traced for each
+# projected pattern and each environment map.
+SETUPS = 6
+# Projected patterns of the path-traced renders. No training of this project uses them.
+PATTERNS = ("gradient", "rings", "window", "leaves", "text", "colors")
+# Number of light paths per pixel of the path-traced renders. The noise is 1.3 of 255 on average.
+SPP = 16
+# Generated solids that serve as hard negatives if the user names none.
+NEGATIVE_SOLIDS = ("lemon", "apple", "peach", "pear", "sweet_pepper", "ball")
+NO_HARD_NEGATIVES = (
+    "hard_negatives is empty, so false positives are measured on generated fruit and balls; "
+    "name meshes of what the classifier may confuse with the class."
+)
+NO_PHOTOGRAPHS = (
+    "photos shows no objects of other classes, and a hardened network may take similar objects on "
+    "real photographs for the class, which renders do not show: give photographs of such objects."
+)
+# Settings of pnb-audit that name the folders of test images, by the name of the images.
+FOLDER_KEYS = {LABORATORY: "laboratory", PHOTOGRAPHS: "photos"}
+# When a stopped audit continues, these settings may be set if they were not set before.
+SETTABLE_LATER = ("hardened", "photos", "unlabeled")
+# The networks of an audit, by their keys CLASSIFIER and HARDENED.
+Networks = Mapping[str, Classifier]
 
 
 def run(settings: AuditSettings) -> None:
     """Test a network in unusual lighting, and print the main numbers and the path of the report."""
-    audited = run_audit(settings)
-    print(audited.screen)
-    print(f"report: {audited.path}")
+    result = run_audit(settings)
+    print(f"{result.screen}\nreport: {result.path}")
 
 
 def audit(
     network: TaskNetwork | Callable[[Tensor], Any],
-    meshes: Sequence[MeshItem],
+    meshes: Sequence[class_names.MeshItem],
     label: str | int | None = None,
     *,
-    hard_negatives: Sequence[MeshItem] = (),
+    hard_negatives: Sequence[class_names.MeshItem] = (),
     hardened: TaskNetwork | Callable[[Tensor], Any] | None = None,
     classes: Sequence[str] | None = None,
     size: Size | None = None,
@@ -122,8 +185,8 @@ def audit(
             networks[HARDENED] = as_network(hardened, *options, argument="hardened", **named)
         with folder_or_temporary(out) as folder:
             # `run_audit` takes settings, as the command does, so the arguments become settings.
-            items = as_mappings("meshes", meshes)
-            negatives = as_mappings("hard_negatives", hard_negatives)
+            items = class_names.as_mappings("meshes", meshes)
+            negatives = class_names.as_mappings("hard_negatives", hard_negatives)
             folders = {"photos": photos, "laboratory": laboratory, "out": folder}
             given: dict[str, Any] = {key: path and str(path) for key, path in folders.items()}
             given |= {"label": label, "meshes": items, "hard_negatives": negatives, "seed": seed}
@@ -131,3 +194,340 @@ def audit(
             maps = as_list("environments", environments, str, "a list of names")
             settings = AuditSettings(network=networks[CLASSIFIER].name, environments=maps, **given)
             return run_audit(settings, networks).report()
+
+
+def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page.Audited:
+    """Test networks in unusual lighting, and write a report to the folder `settings.out`.
+
+    Results that an earlier, stopped audit wrote to this folder are not measured again. The keys
+    of `networks` are CLASSIFIER and HARDENED. None loads those that the settings name.
+    """
+    is_named = networks is None
+    device = choose_device(settings.device)
+    loaded = networks or _load_networks(settings)
+    networks = {key: network.to(device) for key, network in loaded.items()}
+    # Without meshes, only photographs are attacked, and there is no plan.
+    plan, given = None, settings
+    if settings.meshes:
+        settings = complete(settings, networks[CLASSIFIER].classes)
+        plan = _Plan(settings, networks, device)
+    # A path below pretrained/ is found from any working folder.
+    photographs = published_folder(Path(str(settings.unlabeled)))
+    if plan is None:
+        find_unlabeled(photographs)
+    caveats = _caveats(given, networks, plan)
+    out = writable_folder(settings.out, "out")
+    # config.yaml does not name networks that the caller passes as objects, so the results there may
+    # be about others. A folder without config.yaml raises an InputError.
+    is_continued = False
+    with suppress(InputError):
+        is_continued = is_named and "hard_negatives" in read_config(out / CONFIG)
+    require_replaceable(out, "out", settings.overwrite or is_continued)
+    renders = out / "renders"
+    # Renders of an earlier, stopped audit are used again, and need no Mitsuba.
+    has_renders = renders.exists() and not settings.overwrite
+    if plan is not None and plan.has_classes and LABORATORY not in plan.image_folders:
+        try:
+            # `mitsuba` raises an InputError if Mitsuba, which renders, is not installed.
+            with nullcontext() if has_renders else mitsuba():
+                plan.image_folders = {LABORATORY: renders} | plan.image_folders
+        except InputError as error:
+            caveats.append(f"The laboratory is left out, and hard_negatives with it ({error}).")
+    for sentence in caveats:
+        console.warning(sentence)
+    described = [f"Images of {one.name}: {one.describe_inputs()}." for one in networks.values()]
+    caveats = [*described, *caveats]
+    with sole_writer("out", out):
+        _prepare_folder(settings, out, renders)
+        for key in networks:
+            (out / key).mkdir(exist_ok=True)
+        names = {key: network.name for key, network in networks.items()}
+        # Both networks can have the same name.
+        if len({*names.values()}) < len(names):
+            names[HARDENED] += " (hardened)"
+        # Without meshes, the page is about photographs, and has no label.
+        label, remedies = settings.label if plan else "", audited.name_remedies(networks)
+        write_page = partial(page.write_audit_page, label, names, remedies)
+        for missing, folders in plan.measure(networks, out, settings) if plan else ():
+            path = write_page(folders, out, caveats, missing).path
+            # A caller from Python gets the complete page.
+            if is_named:
+                console.warning(f"first results: {path}")
+        if settings.unlabeled:
+            _attack_photographs(settings, networks, photographs, out)
+        return write_page(plan.image_folders if plan else {}, out, caveats)
+
+
+def _load_networks(settings: AuditSettings) -> dict[str, Classifier]:
+    """Load the network that the settings name, and the hardened one, if they name one."""
+    networks = {CLASSIFIER: load_chosen(settings)}
+    if settings.hardened:
+        with keyed(name="hardened"):
+            networks[HARDENED] = load_network(settings.hardened, trust_code=settings.trust)
+    return networks
+
+
+def _attack_photographs(
+    settings: AuditSettings, networks: Networks, photographs: Path, out: Path
+) -> None:
+    """Attack the light of photographs without labels, and write the results for each network."""
+    attack = RelightingSettings(passes=relit.PASSES)
+    count = settings.scale(relit.PHOTOGRAPH_COUNT)
+    options: dict[str, Any] = {"seed": settings.seed, "limit": count}
+    for key, network in networks.items():
+        # The folder is written in one step, so a folder that exists is complete.
+        write = partial(relit.attack_folder, network, photographs, attack, **options)
+        _write_folder(out / key / relit.RELIT_FOLDER, write)
+
+
+def _caveats(settings: AuditSettings, networks: Networks, plan: "_Plan | None") -> list[str]:
+    """Write sentences for the beginning of the report."""
+    caveats = []
+    sizes = [str(network.size) for network in networks.values()]
+    if len({*sizes}) > 1:
+        listed = " and ".join(sizes)
+        caveats.append(f"The networks take images of {listed} pixels, and differ by that, too.")
+    if settings.meshes and not (settings.hard_negatives or settings.laboratory):
+        caveats.append(NO_HARD_NEGATIVES)
+    if plan is not None and HARDENED in networks and not plan.has_other_photographs:
+        caveats.append(NO_PHOTOGRAPHS)
+    for network in networks.values():
+        if plan is None and not isinstance(network, Classifier):
+            continue
+        # `render` makes images by which the network is tried. A classifier needs none.
+        render: Callable[[], Tensor] = partial(torch.empty, 0, device=device_of(network))
+        if plan is not None:
+            # Only an image with an object tells whether a detector has gradients.
+            render = partial(lights.plain_images, plan.attacked_views, network.size)
+        if not network.is_differentiable(render):
+            caveats.append(f"{network.name} has no gradients: only random search attacks it.")
+    return caveats
+
+
+class _Plan:
+    """Images and lighting of an audit, checked before anything is written.
+
+    Attributes:
+        label: Class whose objects are tested.
+        items: Meshes and hard negatives, which need not be of a class of the networks.
+        image_folders: Folders of labeled test images: "laboratory" for
+            path-traced renders, and "photographs". Each may be missing.
+        environments: Names or files of environment lights.
+        random_light_count: Number of random environment lights.
+        views: Views that are rendered in environment lighting.
+        attacked_views: Views whose lighting is attacked.
+    """
+
+    def __init__(self, settings: AuditSettings, networks: Networks, device: torch.device):
+        self.label = settings.label
+        meshes = [*read_objects(settings.meshes, self.label, "meshes").values()]
+        hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
+        for item in hard_negatives:
+            # Such a label is of no class of the network, and names a folder of test images.
+            if item.label == "":
+                item.label = OTHER_PREFIX + class_names.name_of_mesh(item.mesh)
+        for item in meshes:
+            if item.label != self.label:
+                fault = f"meshes has {item.mesh} of the class {item.label}, not {self.label}"
+                raise InputError(f"{fault}: give others as hard_negatives", "meshes")
+        self.items = [*meshes, *hard_negatives]
+        folders = {LABORATORY: settings.laboratory, PHOTOGRAPHS: settings.photos}
+        self.has_classes = all(isinstance(network, Classifier) for network in networks.values())
+        # Boxes of objects in photographs, which only a detector needs.
+        self.annotations = None
+        if not self.has_classes:
+            tasks = {network.task.name for network in networks.values()}
+            if len(tasks) > 1:
+                raise InputError(f"hardened is of another task: {' and '.join(sorted(tasks))}")
+            if settings.laboratory or (settings.photos and tasks != {Detection.name}):
+                reason = f"laboratory and photos are no images for {tasks.pop()}"
+                raise InputError(f"{reason}: a detector takes photos with boxes")
+            if settings.photos:
+                with keyed("photos"):
+                    self.annotations = read_annotations(published_folder(Path(settings.photos)))
+            folders = {}
+        self.image_folders = {
+            name: published_folder(Path(folder)) for name, folder in folders.items() if folder
+        }
+        # A detector scores photographs without boxes of the label, too.
+        self.has_other_photographs = self.annotations is not None
+        # A network that lacks a class raises an InputError.
+        labels = {of.label for of in self.items if not str(of.label).startswith(OTHER_PREFIX)}
+        for network in networks.values():
+            for name in labels:
+                network.label(name)
+            for name, folder in self.image_folders.items():
+                with keyed(FOLDER_KEYS[name]):
+                    found = find_photographs(folder, network.classes, self.label)
+                if name == PHOTOGRAPHS:
+                    self.has_other_photographs = bool({item.label for item in found} - {self.label})
+        # Hard negatives and lights are loaded only to report a file that cannot be read
+        # before the audit begins.
+        objects = [load_object(item) for item in self.items]
+        for name in settings.environments:
+            load_light(name)
+        self.environments = [UNIFORM, *settings.environments]
+        self.random_light_count = settings.scale(RANDOM_LIGHT_COUNT)
+        positives = objects[: len(meshes)]
+        self.negatives = objects[len(meshes) :]
+        # Most views are only shown in other light, and few are attacked, since this takes longer.
+        self.views, self.attacked_views = (
+            lights.Views(positives, settings.scale(count), settings.seed, device)
+            for count in (VIEW_COUNT, ATTACKED_COUNT)
+        )
+
+    def measured_folders(self) -> dict[str, Path]:
+        """Return the folders of test images on which `measure` has scored the networks by now."""
+        return {name: folder for name, folder in self.image_folders.items() if folder.exists()}
+
+    def measure(
+        self, networks: Networks, out: Path, settings: AuditSettings
+    ) -> Iterator[tuple[str, dict[str, Path]]]:
+        """Test and attack the networks, except for results that exist already.
+
+        What takes long comes last. Before it, yield what is still to come, in words, and the
+        folders of test images that are scored. The views of all networks have the ordinary light
+        and the size at which the audited network recognizes most views.
+        """
+        path = out / CLASSIFIER / lights.PLAIN
+        _write_json(path, lights.find_plain_views, networks[CLASSIFIER], self.attacked_views)
+        plain = lights.PlainViews(**read_json(path))
+        views, attacked_views = (
+            replace(views, light=plain.light, exposure=plain.exposure, size=plain.size)
+            for views in (self.views, self.attacked_views)
+        )
+        # Arguments of the functions that show views in all lights of the audit.
+        environments = (views, self.environments, self.random_light_count)
+        # Attacks within the largest radius, which go on with smaller radii, by the path of both.
+        attacks: dict[Path, Iterator[dict[str, Any]]] = {}
+        for key, network in networks.items():
+            results = out / key
+            recognize = lights.recognize_in_environments
+            _write_json(results / lights.RECOGNIZED, recognize, network, *environments)
+            for kind in lights.KINDS:
+                path = results / f"{kind}.json"
+                if not path.exists():
+                    attacks[path] = lights.success_by_light(network, attacked_views, kind, results)
+                    _write_json(results / (kind + lights.FIRST), next, attacks[path])
+        self._score(networks, out)
+        to_render = self.image_folders.keys() - self.measured_folders().keys()
+        later = [IN_WORDS[name] for name in to_render]
+        if attacks:
+            missing = " and ".join(["attacks within smaller radii", *later])
+            yield missing, self.measured_folders()
+        for path, counts in attacks.items():
+            _write_json(path, lambda counts=counts: [*counts][-1])
+            path.with_name(path.stem + lights.FIRST).unlink()
+        for key, network in networks.items():
+            results = out / key
+            # Light that fools one network is shown to the other network.
+            for other in networks.values():
+                if other is not network:
+                    shown = (network, other, attacked_views)
+                    _write_json(results / lights.TRANSFER, lights.transfer_success, *shown)
+            if not self.has_classes:
+                negatives = replace(views, objects=self.negatives)
+                lit = (network, views, attacked_views, negatives, *environments[1:], results)
+                _write_json(results / found.DETECTED, found.find_in_lights, *lit)
+        if later:
+            yield later[0], self.measured_folders()
+            # The test images are rendered for the network with the largest images.
+            sizes = [network.size for network in networks.values()]
+            size = max(sizes, key=lambda size: math.prod(height_and_width(size)))
+            renders = self.image_folders[LABORATORY]
+            _write_folder(renders, partial(_write_renders, settings, self, size))
+            self._score(networks, out)
+
+    def _score(self, networks: Networks, out: Path) -> None:
+        """Score the networks on test images, also with the remedy "normalized light"."""
+        for key, network in {**networks, **audited.normalizing(networks)}.items():
+            for name, images in self.measured_folders().items():
+                predictor = Predictor(network, network.classes, network.size, self.views.device)
+                # Unreadable photographs are left out.
+                evaluate = partial(evaluate_photographs, predictor, images, self.label)
+                _write_folder(out / key / name, partial(evaluate, skip_unreadable=True))
+            if self.annotations is not None:
+                write_scores = partial(found.score_photographs, network, self.annotations)
+                _write_folder(out / key / found.BOXED, write_scores)
+
+
+def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:
+    """Name all classes, and fill in the class and the hard negatives if they are left out.
+
+    The class is that of the meshes. Hard negatives are only filled in if test images must be
+    rendered.
+    """
+    label = class_names.class_of_meshes(settings.meshes, classes, "meshes", settings.label)
+    negatives = settings.hard_negatives
+    if not (negatives or settings.laboratory):
+        # Solids of the class itself are no negatives.
+        names = [one for one in NEGATIVE_SOLIDS if class_names.class_of_name(one, [label]) is None]
+        negatives = [f"solid:{name}" for name in names]
+    items: dict[str, Any] = {
+        key: [class_names.with_class_name(item, classes, key) for item in given]
+        for key, given in (("meshes", settings.meshes), ("hard_negatives", negatives))
+    }
+    others = read_objects(items["hard_negatives"], "", "hard_negatives")
+    class_names.require_others(others, [label], classes)
+    return replace(settings, label=label, **items)
+
+
+def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
+    """Prepare the folder of an audit, and write the settings to its file config.yaml.
+
+    With `settings.overwrite`, the results of an earlier audit are removed.
+    Otherwise an earlier audit in the folder must have the same settings.
+    """
+    if settings.overwrite:
+        networks = (key + end for key in (CLASSIFIER, HARDENED) for end in ("", lights.NORMALIZED))
+        (out / PAGE).unlink(missing_ok=True)
+        for name in (*networks, renders.name):
+            # A folder that exists counts as complete, so it loses its name first.
+            removed = out / f"{name}.part"
+            shutil.rmtree(removed, ignore_errors=True)
+            with suppress(FileNotFoundError):
+                (out / name).rename(removed)
+            shutil.rmtree(removed, ignore_errors=True)
+    elif (out / CONFIG).exists():
+        # A stopped audit may continue with a change of some settings, but only from None.
+        require_same(
+            out, settings, "out=", lambda key, old, _: old is None and key in SETTABLE_LATER
+        )
+    write_config(out, settings, command=command_line("audit"))
+
+
+def _write_renders(settings: AuditSettings, plan: _Plan, size: Size, out: Path) -> None:
+    """Render the path-traced test images on which an audit scores networks.
+
+    They show the meshes and the hard negatives under each pattern of PATTERNS,
+    and in each environment map of the audit.
+    """
+    # Each lighting gets the same number of setups.
+    lighting_count = len(PATTERNS) + len(settings.environments)
+    lab_settings = LabSettings(
+        out=str(out),
+        label=settings.label,
+        meshes=[asdict(item) for item in plan.items],
+        setups=settings.scale(SETUPS) * lighting_count,
+        patterns=[*PATTERNS],
+        environments=settings.environments,
+        size=size,
+        spp=SPP,
+        seed=settings.seed,
+    )
+    write_laboratory(lab_settings)
+
+
+def _write_json(path: Path, measure: Callable[..., Any], *arguments: Any) -> None:
+    """Write the mapping or the dataclass of a function to a JSON file, unless the file exists."""
+    if not path.exists():
+        atomic_write(path, json.dumps(measure(*arguments), default=asdict) + "\n", durable=True)
+
+
+def _write_folder(folder: Path, write: Callable[[Path], object]) -> None:
+    """Write a result to FOLDER.part and rename it when complete, unless FOLDER exists."""
+    if not folder.exists():
+        unfinished = folder.with_name(f"{folder.name}.part")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        write(unfinished)
+        unfinished.rename(folder)

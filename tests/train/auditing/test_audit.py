@@ -18,10 +18,11 @@ from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.light.files import load_light
 from tests.helpers import darker_than
-from train.auditing import audit, lights
-from train.auditing.audit import run_audit
+from train.auditing import lights
 from train.auditing.network import RECOGNIZED, AuditedNetwork
 from train.command_settings import AuditSettings
+from train.commands import audit
+from train.commands.audit import run_audit
 from train.results.tables import fraction
 from train.settings import LABORATORY
 

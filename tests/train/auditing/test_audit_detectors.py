@@ -12,10 +12,10 @@ from augment.settings import ObjectSettings
 from renderer.io.images import write_image
 from tests.helpers import find_red
 from train.auditing import found
-from train.auditing.audit import run_audit
 from train.auditing.lights import KINDS, Views, recognize_in_environments, render_in
 from train.auditing.relit import RELIT_FOLDER, read_relit
 from train.command_settings import AuditSettings
+from train.commands.audit import run_audit
 
 SIZE = 32
 

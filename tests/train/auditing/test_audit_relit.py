@@ -7,9 +7,9 @@ import pytest
 import augment
 from renderer.errors import InputError
 from tests.helpers import bright_or_dark, save_noise
-from train.auditing.audit import run_audit
 from train.auditing.relit import RELIT_FOLDER, read_relit
 from train.command_settings import AuditSettings
+from train.commands.audit import run_audit
 from train.results.predictions import RELIT
 
 NETWORKS = {

@@ -8,7 +8,6 @@ import torch
 import augment
 from renderer.io.images import write_image
 from tests.helpers import darker_than
-from train.auditing import audit
 from train.auditing.network import (
     BOTH,
     HARDENING,
@@ -19,6 +18,7 @@ from train.auditing.network import (
     recommend,
 )
 from train.command_settings import AuditSettings
+from train.commands import audit
 from train.data.photo import Photograph
 from train.results.compare import Evaluation
 from train.results.metrics import Pooled

@@ -7,8 +7,8 @@ from PIL import Image
 from torch import Tensor, nn
 
 import norm_balls as nb
-from train.auditing import audit as engine
 from train.auditing import lights
+from train.commands import audit as engine
 
 SIZE = 8
 CLASSES = ["orange", "apple"]

@@ -8,9 +8,10 @@ import pytest
 from PIL import Image
 
 from tests.helpers import darker_than
-from train.auditing import audit, lights
-from train.auditing.audit import run_audit
+from train.auditing import lights
 from train.command_settings import AuditSettings
+from train.commands import audit
+from train.commands.audit import run_audit
 
 pytestmark = pytest.mark.slow
 CLASSES = ("orange", "other")
