@@ -20,8 +20,7 @@ from renderer.solids import SOLIDS, solid
 from train.command_settings import LabSettings
 from train.data.photographs import find_photographs, load_photographs
 from train.laboratory import laboratory as lab
-from train.laboratory.laboratory import lab_parts, path_traced
-from train.laboratory.shots import FOV, Shot, draw_shots
+from train.laboratory.laboratory import FOV, Shot, draw_shots, lab_parts, path_traced
 
 pytest.importorskip("mitsuba")
 
