@@ -30,7 +30,7 @@ class TrainCommand(Command):
             job = HydraConfig.get()
             if job.mode == RunMode.MULTIRUN:
                 config.out = job.runtime.output_dir
-                import_function("train.commands.sweep:run_in_sweep")(config)
+                import_function("train.commands.experiment:run_in_sweep")(config)
                 return
             if not config.train.resume:
                 # Report mistakes in the settings before the import of the module
@@ -57,15 +57,13 @@ def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str 
     `parent` with the same hash keeps its name.
     """
     # Settings of Hydra itself, such as hydra.job, and CIRCUMSTANCES do not change the result.
-    words = [override for override in overrides if not HYDRAS_OWN.match(override)]
-    pairs = sorted((key, value) for key, _, value in (word.partition("=") for word in words))
-    pairs = [(key, value) for key, value in pairs if key not in CIRCUMSTANCES]
+    words = [word.partition("=") for word in overrides if not HYDRAS_OWN.match(word)]
+    pairs = sorted((key, value) for key, _, value in words if key not in CIRCUMSTANCES)
     digest = hashlib.sha256(repr(pairs).encode(errors="surrogatepass")).hexdigest()
     ending = f"@{digest[:8]}"
     # The folder of an earlier run with these settings, from which training can continue.
-    if parent:
-        for known in Path(parent).glob(f"*{ending}"):
-            return known.name
+    for known in Path(parent).glob(f"*{ending}") if parent else ():
+        return known.name
     shown = [f"{key}-{value}" for key, value in pairs if key not in fixed]
     parts = [re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII)[:MAX_PART] for text in shown]
     return ("+".join(parts) or "run")[:MAX_NAME] + ending
@@ -90,7 +88,7 @@ main = TrainCommand(
     ],
     groups=["experiment", "data", "augment", "attack@augment.attack", "launcher"],
     rewrite=name_model,
-    sweep="train.commands.sweep:sweep",
+    sweep="train.commands.experiment:sweep",
 )
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ from tests.train.helpers import read_markdown
 from train import __main__ as command
 from train.__main__ import run_name
 from train.cli import USER_ERROR, expand
-from train.commands import sweep
-from train.commands.sweep import format_sweep
+from train.commands import experiment
+from train.commands.experiment import format_sweep
 from train.run_config import write_config
 from train.run_folder import FAILURE, LAST, LOCK, locked, read_metrics
 from train.training import loop
@@ -35,7 +35,9 @@ SMALL = [
 @pytest.fixture(autouse=True, scope="module")
 def no_report() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep, "report_of", lambda folders, out: f"report: {len(folders)} in {out}")
+        patch.setattr(
+            experiment, "report_of", lambda folders, out: f"report: {len(folders)} in {out}"
+        )
         yield
 
 
