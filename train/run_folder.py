@@ -4,13 +4,14 @@ import json
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
 from renderer.errors import InputError, as_folder, explained
-from renderer.io.files import remove_unfinished
+from renderer.io.files import atomic_write, remove_unfinished
 
 # Name of the file in a folder that a process locks while it writes to the folder.
 LOCK = ".lock"
@@ -52,6 +53,11 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that contains one object."""
     with opened_text(path) as text:
         return _parse_object(text)
+
+
+def write_json(path: Path, content: object, durable: bool = False, **options: Any) -> None:
+    """Write a JSON file. Values may be dataclasses, and `options` are those of `json.dumps`."""
+    atomic_write(path, json.dumps(content, default=asdict, **options) + "\n", durable)
 
 
 def _parse_object(text: str) -> dict[str, Any]:

@@ -9,14 +9,13 @@ from typing import Any
 from augment import dataset
 from augment.progress import progress
 from renderer.errors import InputError, keyed, keys_of
-from renderer.io.files import atomic_write
 from train.checkpoints import load_chosen
 from train.class_names import name_of_mesh
 from train.command_settings import RenderSettings
 from train.data.annotations import DATA_SET
 from train.data.formats import FORMATS
 from train.device import choose_device, choose_rasterizer
-from train.run_folder import read_json, writable_folder
+from train.run_folder import read_json, writable_folder, write_json
 from train.settings import label_names, read_objects
 
 # Processes that share a data set differ in these settings only.
@@ -96,4 +95,4 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
     elif any(path.name not in (DATA_SET, LAUNCHER) for path in folder.iterdir()):
         raise InputError(f"out={folder} is not empty: choose a new folder", "out")
     else:
-        atomic_write(path, json.dumps(facts, indent=1))
+        write_json(path, facts, indent=1)

@@ -30,7 +30,6 @@ from augment.scene.objects import load_object
 from augment.scene.patterns import LAB_RESOLUTION, draw_lab_color, draw_lab_pattern
 from renderer.errors import InputError
 from renderer.image import decode, encode
-from renderer.io.files import atomic_write
 from renderer.io.images import read_image, write_image
 from renderer.io.mitsuba_entries import environment, look_at, projector, sensor
 from renderer.light.basis import HARMONICS
@@ -45,7 +44,7 @@ from train import settings as common
 from train.command_settings import OTHER_PATTERNS, LabSettings
 from train.data.photo import DESCRIPTION, TABLE
 from train.results.tables import write_csv
-from train.run_folder import LOCK, read_json, sole_writer, writable_folder
+from train.run_folder import LOCK, read_json, sole_writer, writable_folder, write_json
 from train.settings import OTHER_PREFIX, ExperimentSettings, label_names, simplified
 
 # Glob pattern of the renders in the folder of the test set. Their paths are
@@ -406,7 +405,7 @@ def write_laboratory(settings: LabSettings) -> int:
         versions = {"python": platform.python_version()}
         versions |= {name: version(name) for name in PACKAGES}
         description = {**asdict(settings), "versions": versions}
-        atomic_write(out / DESCRIPTION, json.dumps(description, indent=2) + "\n")
+        write_json(out / DESCRIPTION, description, indent=2)
         return len(rows)
 
 
@@ -519,16 +518,10 @@ def kept_aside_settings(
             # A solid that is no class of the network gets a label that marks it as another object.
             label = class_of_simplified.get(simplified(name), OTHER_PREFIX + name)
             meshes += _generated(name, label, NEGATIVE_COUNT)
-    return LabSettings(
-        out=str(out),
-        label=settings.label,
-        meshes=meshes,
-        setups=settings.evaluate.laboratory_setups,
-        patterns=[*OTHER_PATTERNS],
-        size=size,
-        seed=FIRST_SEED + settings.seed,
-        overwrite=True,
-    )
+    setups = settings.evaluate.laboratory_setups
+    seed = FIRST_SEED + settings.seed
+    rendered = str(out), settings.label, meshes, setups, [*OTHER_PATTERNS]
+    return LabSettings(*rendered, size=size, seed=seed, overwrite=True)
 
 
 def can_be_generated(label: str) -> bool:

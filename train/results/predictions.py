@@ -5,9 +5,8 @@ of a photograph and a label.
 """
 
 import csv
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from renderer.errors import ShortRepr, explained
-from renderer.io.files import atomic_write, remove_unfinished
+from renderer.io.files import remove_unfinished
 from train.data.photo import SEPARATOR, Photograph, split_sources
 from train.results.tables import write_csv
+from train.run_folder import write_json
 from train.settings import label_names
 
 # Files in a folder of scores: predictions, metrics and pictures.
@@ -158,8 +158,7 @@ def begin_scores(out: Path) -> None:
 
 def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
     """Write summary.json, the last file of a folder of scores. Its values may be dataclasses."""
-    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False, default=asdict)
-    atomic_write(out / SUMMARY, text + "\n")
+    write_json(out / SUMMARY, summary, indent=2, ensure_ascii=False, allow_nan=False)
 
 
 def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
@@ -168,16 +167,11 @@ def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
     with explained(fault, "score the photographs again with pnb-evaluate"):
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
-        photographs = [
-            Photograph(
-                path=PurePosixPath(row["path"]),
-                label=row["label"],
-                source=row["source"] or None,
-                hard_negatives=split_sources(row["hard_negatives"]),
-                mesh=row["mesh"] or None,
-            )
-            for row in rows
-        ]
+        photographs = []
+        for row in rows:
+            hard_negatives = split_sources(row["hard_negatives"])
+            about = row["source"] or None, hard_negatives, row["mesh"] or None
+            photographs.append(Photograph(PurePosixPath(row["path"]), row["label"], *about))
 
         # An empty cell is the value `unknown`. Without one, it raises ValueError.
         def numbers(name: str, unknown: str = "") -> list[float]:
