@@ -1,13 +1,17 @@
-"""Test a classifier on renders in many kinds of lighting, and attack the lighting.
+"""Test a network on renders in many kinds of lighting, and attack the lighting.
 
 All classifiers of an audit see the same objects from the same cameras, in images
 of the size that each classifier takes. No lighting has negative radiance in any
 direction.
+
+Of a detector or a segmenter, only the class of the meshes counts. On renders of hard negatives,
+each of its detections or pixels is false.
 """
 
 import base64
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -26,18 +30,20 @@ from augment.attacks.checks import success_by_radius, transfer
 from augment.attacks.result import AttackResult
 from augment.augmentation_settings import VariationSettings
 from augment.classifier import TaskNetwork
-from augment.network import compute_outputs
+from augment.network import compute_outputs, device_of
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.build import build_local_light
 from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
+from augment.scene.truth import NO_OBJECT, Truth
 from augment.scene.vary import vary
 from augment.settings import LOCAL_LIGHT_SETTINGS
+from augment.tasks.detection import Detection
 from augment.tasks.task import Criterion
 from renderer.camera import orbit_cameras
 from renderer.errors import MAX_SCALE
-from renderer.image import to_bytes
+from renderer.image import to_bytes, to_unit
 from renderer.io.files import write_numbers
 from renderer.io.images import encode_image
 from renderer.light.basis import HARMONICS, with_local_lights
@@ -45,6 +51,11 @@ from renderer.light.files import UNIFORM, load_light, perturb
 from renderer.rendering import light_sphere
 from renderer.settings import ImageSettings, Size, height_and_width
 from renderer.visibility import choose
+from train.data.annotations import LETTERBOX, Annotations
+from train.results import annotated_scores, detections
+from train.results.detections import Found, Marked, Matches
+from train.results.intervals import Units
+from train.results.pictures import evenly_spaced
 
 # Result file: in which environment lights a network recognizes each view.
 RECOGNIZED = "recognized.json"
@@ -54,6 +65,14 @@ PLAIN = "plain_light.json"
 FIRST = "_first.json"
 # Result file: how often attacks on a network also fool the other network.
 TRANSFER = "transfer.json"
+# Result file: metrics in each group of lights, and recall against false detections per image.
+DETECTED = "detections.json"
+# Folder of the scores on photographs with boxes.
+BOXED = "photographs_with_boxes"
+# What the intervals are over.
+VIEWS = "views"
+# Number of points of the curve of recall against false detections.
+CURVE_POINTS = 50
 # End of the key of a network whose images are normalized before they are classified.
 NORMALIZED = "_normalized_light"
 # Number of images that a classifier classifies in one pass.
@@ -98,6 +117,10 @@ CLASS_COUNT = 5
 SIDE = 200
 # Width and height of the image of a white ball, which shows the light, in pixels.
 BALL_SIDE = 120
+
+
+# Environment lights by name.
+Lights = Mapping[str, Float[Tensor, "C K"]]
 
 
 class LightKind(NamedTuple):
@@ -162,29 +185,21 @@ class Views:
         local_lights = [build_local_light(LOCAL_LIGHT_SETTINGS[kind]())] if is_local else []
         natural_light = load_light(self.light) * self.exposure
         basis, lights = with_local_lights(natural_light, local_lights)
-        scene = Scene.grid(
-            objects,
-            CAMERA,
-            # A gray background, shape (1, 1, H, W).
-            torch.full((1, 1, *height_and_width(size)), BACKGROUND),
-            lights.to(self.device),
-            ImageSettings(size, samples=2, encoding="srgb", normals="smooth"),
-            choose("auto"),
-            shared=False,
-            basis=basis,
-        )
+        # A gray background, shape (1, 1, H, W).
+        background = torch.full((1, 1, *height_and_width(size)), BACKGROUND)
+        settings = ImageSettings(size, samples=2, encoding="srgb", normals="smooth")
+        shown = objects, CAMERA, background, lights.to(self.device), settings, choose("auto")
+        scene = Scene.grid(*shown, shared=False, basis=basis)
         # Azimuth of the camera, rotation and size of the object are random in each view.
         variation = replace(VARIATION, scale=[self.size * scale for scale in VARIATION.scale])
         return vary(scene, variation, generator(self.seed, "views"))
 
 
-def environment_lights(
-    views: Views, environments: Sequence[str], random_light_count: int
-) -> dict[str, Float[Tensor, "C K"]]:
+def environment_lights(views: Views, environments: Sequence[str], random_count: int) -> Lights:
     """Return the environment lights of an audit by name, at the exposure of the views."""
     noise = generator(views.seed, "lights")
     center = load_light(LIGHT)
-    random_lights = perturb(center, random_light_count, AMPLITUDE, radius=None, generator=noise)
+    random_lights = perturb(center, random_count, AMPLITUDE, radius=None, generator=noise)
     lights = {Path(name).stem: load_light(name) for name in environments}
     for number, light in enumerate(HARMONICS.project_nonnegative(random_lights), 1):
         lights[f"{RANDOM}{number}"] = light
@@ -192,12 +207,11 @@ def environment_lights(
 
 
 def recognize_in_environments(
-    classifier: TaskNetwork, views: Views, environments: Sequence[str], random_light_count: int
+    classifier: TaskNetwork, views: Views, lights: Lights
 ) -> dict[str, list[bool]]:
     """Test whether a classifier recognizes views in several environment lights."""
-    lights = environment_lights(views, environments, random_light_count)
     scene = views.scene(classifier.size)
-    criterion = criterion_of(classifier, scene)
+    criterion = criterion_of(classifier, scene, classifier.label(scene.labels[0]))
     return {
         name: is_found(classifier, criterion, render_in(scene, light)).tolist()
         for name, light in progress(lights.items(), "renders in other light")
@@ -217,10 +231,9 @@ def plain_images(views: Views, size: Size) -> Float[Tensor, "E 3 H W"]:
     return render_in(scene, scene.lights[0])[:, 0]
 
 
-def criterion_of(network: TaskNetwork, scene: Scene) -> Criterion:
-    """Return the criterion of an attack on the class of a scene, the same in all E examples."""
-    label = network.label(scene.labels[0])
-    source = torch.full((len(scene), 1), label, device=scene.lights.device)
+def criterion_of(network: TaskNetwork, scene: Scene, label: int) -> Criterion:
+    """Return the criterion of an attack on a scene, all of whose views show the same class."""
+    source = torch.full((len(scene), scene.views), label, device=scene.lights.device)
     truth = partial(scene.truth, network.label)
     return network.task.criterion(source, truth, len(network.classes))
 
@@ -400,7 +413,7 @@ def find_plain_views(classifier: TaskNetwork, views: Views) -> PlainViews:
     tried: list[PlainViews] = []
     for size in progress(SIZES, "search for plain light"):
         scene = replace(views, size=size).scene(classifier.size)
-        criterion = criterion_of(classifier, scene)
+        criterion = criterion_of(classifier, scene, classifier.label(scene.labels[0]))
         for exposure, name in product(EXPOSURES, PLAIN_LIGHTS):
             images = render_in(scene, load_light(name).to(scene.lights) * exposure)
             recognized = int(is_found(classifier, criterion, images).sum())
@@ -410,3 +423,100 @@ def find_plain_views(classifier: TaskNetwork, views: Views) -> PlainViews:
             if recognized >= ENOUGH * views.count:
                 return tried[-1]
     return max(tried, key=lambda item: item.recognized)
+
+
+def _find(
+    network: TaskNetwork, label: int, images: Float[Tensor, "E 1 3 H W"], truth: Truth | None
+) -> list[tuple[Any, Any]]:
+    """Return a pair for each render: what is found, and the truth. None stands for no object."""
+    pairs: list[tuple[Any, Any]] = []
+    for row, output in enumerate(compute_outputs(network, images[:, 0], BATCH)):
+        # The mask of the class in a segmentation, and the true mask: 1 on the object, otherwise 0.
+        if not isinstance(network.task, Detection):
+            shown = (output.argmax(0) == label).long()
+            mask = torch.zeros_like(shown) if truth is None else truth.masks[row, 0, 0].long()
+            pairs.append((shown.cpu().numpy(), mask.cpu().numpy()))
+            continue
+        # The detections, and the true boxes of the view.
+        arrays = [output[name].cpu().numpy() for name in ("boxes", "labels", "scores")]
+        boxes, labels = np.zeros((0, 4)), np.zeros(0, int)
+        if truth is not None:
+            is_marked = truth.labels[row, 0] != NO_OBJECT
+            boxes = truth.boxes[row, 0][is_marked].cpu().double().numpy()
+            labels = truth.labels[row, 0][is_marked].cpu().numpy()
+        pairs.append((Found(*arrays), Marked(boxes, labels, np.zeros(len(labels), bool))))
+    return pairs
+
+
+def find_in_lights(
+    network: TaskNetwork,
+    views: Views,
+    attacked_views: Views,
+    negatives: Views,
+    unusual: Lights,
+    out: Path,
+) -> dict[str, Any]:
+    """Score a network in plain and unusual light, after its attacks have been written to `out`."""
+    label = network.label(views.objects[0].label)
+    # Pairs of what is found and the truth, with the number of their view, by the title of a group.
+    groups: defaultdict[str, list[tuple[int, tuple[Any, Any]]]] = defaultdict(list)
+    plain = load_light(views.light).to(views.device) * views.exposure
+    # The hard negatives have no truth: all that is found in them is false.
+    for shown, title in ((views, ""), (negatives, "hard negatives, ")):
+        scene = shown.scene(network.size)
+        truth = None if title else scene.truth(network.label)
+        # Views of hard negatives are other units than those of the class.
+        first = views.count if title else 0
+        for name, light in progress({"": plain, **unusual}.items(), "objects in other light"):
+            pairs = _find(network, label, render_in(scene, light), truth)
+            group = "random light" if name.startswith(RANDOM) else "environments"
+            groups[group if name else "plain light"] += enumerate(pairs, first)
+    truth = attacked_views.scene(network.size).truth(network.label)
+    for kind, light_kind in KINDS.items():
+        images = to_unit(torch.from_numpy(np.load(out / f"{kind}.npy"))).to(views.device)
+        groups[f"attacked: {light_kind.title}"] += enumerate(_find(network, label, images, truth))
+    task = network.task
+    metrics: dict[str, Any] = {}
+    for title, numbered in groups.items():
+        # Lights of the same view are no independent units, so the interval is over the views.
+        units = Units([np.array([unit for unit, _ in numbered])], VIEWS)
+        pairs = [pair for _, pair in numbered]
+        if isinstance(task, Detection):
+            at_iou, at_half = (_match(pairs, iou) for iou in (task.iou, 0.5))
+            measured = at_iou, [label], task.threshold, at_half, units
+            metrics[title] = asdict(detections.score(*measured))
+        else:
+            miou, _ = detections.mean_iou(pairs, 2, units)
+            metrics[title] = {"n": len(pairs), "miou": asdict(miou)}
+    # Only detections have scores, and so a curve of recall against false detections.
+    if not isinstance(task, Detection):
+        return {"metrics": metrics, "curve": []}
+    not_attacked = ("plain light", "environments", "random light")
+    every = [pair for title in not_attacked for _, pair in groups.get(title, [])]
+    return {"metrics": metrics, "curve": _curve(_match(every, task.iou).of([label]))}
+
+
+def _match(pairs: Sequence[tuple[Found, Marked]], iou: float) -> Matches:
+    """Return the matches of detections and true boxes in all views."""
+    return detections.join([detections.match_image(*pair, iou) for pair in pairs])
+
+
+def _curve(matches: Matches) -> list[tuple[float, ...]]:
+    """Return false detections per image and recall at descending thresholds."""
+    every = np.ones((1, matches.image_count))
+    # Objects that are never detected have the score -inf, which is no threshold.
+    finite = matches.object_score[np.isfinite(matches.object_score)]
+    thresholds = np.unique([*finite, *matches.score])[::-1]
+    measures = (matches.false_per_image, matches.recall)
+    # CURVE_POINTS thresholds are enough for the plot.
+    return [
+        tuple(float(measure(threshold, every)[0]) for measure in measures)
+        for threshold in evenly_spaced(thresholds.tolist(), CURVE_POINTS)
+    ]
+
+
+def score_photographs(network: TaskNetwork, annotations: Annotations, out: Path) -> None:
+    """Score a detector on photographs with boxes. Unreadable ones are left out."""
+    how = annotated_scores.Showing(LETTERBOX, skip_unreadable=True, device=device_of(network))
+    scores = annotated_scores.evaluate_detector(network, annotations, None, how)
+    annotated_scores.write(scores, out)

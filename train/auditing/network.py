@@ -17,7 +17,7 @@ from train.results import tables
 from train.results.compare import ALL, Difference, Evaluation, Evaluations, difference, mean_metric
 from train.results.first_screen import EQUAL_RATE, gain_sentence
 from train.results.intervals import Units, leave_out_of_mean
-from train.results.metrics import METRICS, metric_title
+from train.results.metrics import METRICS, TITLES
 from train.results.store import RunSummary, ScoredRun, read_summaries
 from train.results.tables import Estimate, Proportion, Table, fraction
 from train.run_folder import read_json
@@ -333,17 +333,13 @@ class AuditedNetwork:
             images: {name: item for name in METRICS if (item := stored.overall.find(name))}
             for images, stored in self.run.photographs.items()
         }
-        attacks = {
-            kind: AttackCounts(
-                unit=KINDS[kind].unit,
-                radii=KINDS[kind].radii,
-                views=counts["n"],
-                correct=counts["correct"],
-                adversarial=tuple(counts["adversarial"]),
-                random=tuple(counts["random"]),
-            )
-            for kind, counts in self.counts.items()
-        }
+        attacks = {}
+        for kind, counts in self.counts.items():
+            light = KINDS[kind]
+            # At each radius, the views that an attack, or random draws alone, make misclassified.
+            lost = tuple(counts["adversarial"]), tuple(counts["random"])
+            before = counts["n"], counts["correct"]
+            attacks[kind] = AttackCounts(light.unit, light.radii, *before, *lost)
         # `views` says for each view whether it is recognized, so the mean is a fraction.
         recognized = {light: sum(views) / len(views) for light, views in self.recognized.items()}
         return NetworkReport(self.name, self.answer, recognized, attacks, scores, self.transfers)
@@ -422,7 +418,7 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
         gains_of_name = (gains[name], gain_over(name, chosen))
         if all(gain and gain.low is not None and gain.low > 0 for gain in gains_of_name):
             chosen = name
-    title = metric_title(metric)
+    title = TITLES[metric]
     gain = gains.get(chosen)
     if gain is None:
         reason = f"No gain in {title} is proven for: {', '.join(remedies)}. "

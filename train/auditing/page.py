@@ -12,17 +12,17 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from train.auditing import found
+from train.auditing import lights
 from train.auditing import network as audited
-from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS
+from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS, VIEWS
 from train.auditing.network import IN_WORDS, AuditedNetwork, AuditReport, Recommendation
 from train.auditing.relit import relit_sections, screen_of_photographs
 from train.results import compare, first_screen
 from train.results.metrics import Metrics
 from train.results.page import scores_section, write_page
-from train.results.pictures import Picture, plot_by_radius, read_square
+from train.results.pictures import Picture, plot_by_radius, plot_curves, read_square
 from train.results.predictions import SUMMARY, Predictions
-from train.results.tables import Estimate, fraction
+from train.results.tables import Estimate, Table, format_interval, fraction
 from train.run_config import CONFIG, read_config
 from train.run_folder import read_json
 from train.settings import in_words
@@ -37,6 +37,19 @@ VERDICTS = {
 SLIDER_SCRIPT = (Path(__file__).parent / "slider.js").read_text(encoding="utf-8")
 # Number of images in a gallery of the worst predictions.
 WORST = 10
+# Header of the table of metrics.
+HEADER = {
+    "recall": "recall",
+    "ap50": "AP50",
+    "false_per_image": "false detections per image",
+    "miou": "mIoU",
+}
+# What is said about the metrics.
+ABOUT = (
+    "Recall at the score threshold, average precision at an IoU of 0.5, and detections of {} "
+    "without an object."
+)
+ABOUT_PIXELS = "Mean of the IoU of the pixels of {} and of that of all other pixels."
 # The audited network and the hardened one, if there is one.
 Networks = Sequence[AuditedNetwork]
 
@@ -61,14 +74,10 @@ class Audited(NamedTuple):
     def report(self) -> AuditReport:
         """Collect the numbers of the audit."""
         networks = {key: network.report() for key, network in self.networks.items()}
-        recommended = self.recommendation
-        return AuditReport(
-            label=self.label,
-            network=networks[audited.CLASSIFIER],
-            hardened=networks.get(audited.HARDENED),
-            recommendation="" if recommended is None else recommended.sentence,
-            page=self.path.read_text(encoding="utf-8"),
-        )
+        reports = networks[audited.CLASSIFIER], networks.get(audited.HARDENED)
+        recommendation = "" if self.recommendation is None else self.recommendation.sentence
+        page = self.path.read_text(encoding="utf-8")
+        return AuditReport(self.label, *reports, recommendation, page)
 
 
 def write_audit_page(
@@ -142,7 +151,7 @@ def write_audit_page(
         worst=_worst(networks, folders) if folders else {},
         screen=screen,
         lead=[*caveats, *unreadable],
-        detections=found.sections(results, in_words(label)),
+        detections=detection_sections(results, in_words(label)),
         **content,
     )
     return Audited(path, screen, label, by_key, recommendation)
@@ -307,3 +316,37 @@ def _draw(predictions: Predictions, row: int, folder: Path) -> Picture:
     text = first_screen.describe_prediction(predictions, row).text
     caption = f"{in_words(photograph.label)}, {photograph.source}: {text}"
     return read_square(folder / photograph.path, SIDE, caption, caption)
+
+
+def detection_sections(networks: Mapping[str, Path], label: str) -> list[dict[str, Any]]:
+    """Make a section of a report about each network, whose results are in a folder."""
+    made = []
+    for name, folder in networks.items():
+        if not (folder / lights.DETECTED).exists():
+            continue
+        content = read_json(folder / lights.DETECTED)
+        title = f"renders; 95% intervals over {VIEWS}"
+        tables = [_metrics_table(content["metrics"], title, "light")]
+        # The same network with the remedy "normalized light", which may have scores, too.
+        normalized = folder.with_name(f"{folder.name}{NORMALIZED}")
+        for path, end in ((folder, ""), (normalized, ", with normalized light")):
+            if (path / lights.BOXED / SUMMARY).exists():
+                by_label = read_json(path / lights.BOXED / SUMMARY)["by_label"]
+                tables.append(_metrics_table(by_label, f"photographs{end}", "class"))
+        points = {name: [[(x, y) for x, y in content["curve"]]]}
+        chart = plot_curves(points, "recall", "false detections per image")
+        # The curve of a detector that finds nothing is empty, like that of a segmenter.
+        about = ABOUT if "recall" in content["metrics"]["plain light"] else ABOUT_PIXELS
+        shown = {"tables": tables, "charts": [chart] if chart else []}
+        made.append({"name": name, "about": about.format(label), **shown})
+    return made
+
+
+def _metrics_table(metrics_of: Mapping[str, Any], title: str, first: str) -> Table:
+    """Make a table of metrics from a file, with a row for each light or class."""
+    rows, names = [], []
+    for name, metrics in metrics_of.items():
+        names = [metric for metric in HEADER if metric in metrics]
+        estimates = [Estimate(**metrics[metric]) for metric in names]
+        rows.append([name, *map(format_interval, estimates)])
+    return Table(title, [first, *(HEADER[metric] for metric in names)], rows)

@@ -7,7 +7,6 @@ each of its detections or segments in unchanged light by itself. If an audit has
 its only test.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -26,7 +25,6 @@ from augment.photographs import PhotographAttackResult
 from augment.tasks.task import NOTHING
 from renderer.errors import ShortRepr
 from renderer.image import to_unit
-from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from train.data.photographs import find_unlabeled, load_photographs
 from train.results.first_screen import FirstScreen, ShownMetric
@@ -34,7 +32,7 @@ from train.results.intervals import Units, leave_out_of_mean
 from train.results.pictures import Picture, evenly_spaced, read_pictures
 from train.results.predictions import RELIT
 from train.results.tables import Proportion, Table, format_fraction, fraction, join_words
-from train.run_folder import read_json
+from train.run_folder import read_json, write_json
 
 # Pictures are written for this many photographs.
 PICTURE_COUNT = 8
@@ -217,18 +215,11 @@ def attack_folder(
         kept = {light: int((~item[index]).sum()) for light, item in result.changed.items()}
         predicted = classes[int(result.source[index])]
         photographs.append(RelitPhotograph(str(readable[row].path), predicted, kept, becomes))
-    scores = RelitScores(
-        folder=str(folder),
-        slides=settings.slides,
-        gain=settings.gain,
-        passes=settings.passes,
-        photographs=photographs,
-        pictures=_write_pictures(result, out),
-        found=len(found),
-        unreadable=unreadable,
-        finds=classifier.task.finds,
-    )
-    atomic_write(out / RELIT, json.dumps(asdict(scores), indent=1) + "\n", durable=True)
+    pictures = _write_pictures(result, out)
+    searched = settings.slides, settings.gain, settings.passes
+    facts = len(found), unreadable, classifier.task.finds
+    scores = RelitScores(str(folder), *searched, photographs, pictures, *facts)
+    write_json(out / RELIT, scores, durable=True, indent=1)
     return scores
 
 

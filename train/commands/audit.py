@@ -10,7 +10,6 @@ The folder of the audit has a subfolder of results for each network. The names o
 the subfolders are CLASSIFIER and HARDENED.
 """
 
-import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,12 +30,11 @@ from augment.settings import NormalizeLight
 from augment.tasks.detection import Detection
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_list, keyed
-from renderer.io.files import atomic_write
 from renderer.light.files import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
 from renderer.settings import Size, height_and_width
-from train import class_names, console
-from train.auditing import found, lights, page, relit
+from train import class_names, console, run_folder
+from train.auditing import lights, page, relit
 from train.auditing import network as audited
 from train.auditing.network import CLASSIFIER, HARDENED, IN_WORDS, AuditReport
 from train.checkpoints import load_chosen, load_network
@@ -49,7 +47,7 @@ from train.results.overwrite import require_replaceable
 from train.results.page import PAGE
 from train.results.scoring import Predictor, evaluate_photographs
 from train.run_config import CONFIG, read_config, require_same, write_config
-from train.run_folder import folder_or_temporary, read_json, sole_writer, writable_folder
+from train.run_folder import read_json, sole_writer, writable_folder
 from train.settings import LABORATORY, OTHER_PREFIX, PHOTOGRAPHS, published_folder, read_objects
 from train.system import command_line
 
@@ -183,7 +181,7 @@ def audit(
                 # A `TaskNetwork` knows itself whether it normalizes light.
                 named["normalize_light"] = None
             networks[HARDENED] = as_network(hardened, *options, argument="hardened", **named)
-        with folder_or_temporary(out) as folder:
+        with run_folder.folder_or_temporary(out) as folder:
             # `run_audit` takes settings, as the command does, so the arguments become settings.
             items = class_names.as_mappings("meshes", meshes)
             negatives = class_names.as_mappings("hard_negatives", hard_negatives)
@@ -246,7 +244,8 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
         if len({*names.values()}) < len(names):
             names[HARDENED] += " (hardened)"
         # Without meshes, the page is about photographs, and has no label.
-        label, remedies = settings.label if plan else "", audited.name_remedies(networks)
+        label = settings.label if plan else ""
+        remedies = audited.name_remedies(networks)
         write_page = partial(page.write_audit_page, label, names, remedies)
         for missing, folders in plan.measure(networks, out, settings) if plan else ():
             path = write_page(folders, out, caveats, missing).path
@@ -396,14 +395,13 @@ class _Plan:
             replace(views, light=plain.light, exposure=plain.exposure, size=plain.size)
             for views in (self.views, self.attacked_views)
         )
-        # Arguments of the functions that show views in all lights of the audit.
-        environments = (views, self.environments, self.random_light_count)
+        unusual = lights.environment_lights(views, self.environments, self.random_light_count)
         # Attacks within the largest radius, which go on with smaller radii, by the path of both.
         attacks: dict[Path, Iterator[dict[str, Any]]] = {}
         for key, network in networks.items():
             results = out / key
             recognize = lights.recognize_in_environments
-            _write_json(results / lights.RECOGNIZED, recognize, network, *environments)
+            _write_json(results / lights.RECOGNIZED, recognize, network, views, unusual)
             for kind in lights.KINDS:
                 path = results / f"{kind}.json"
                 if not path.exists():
@@ -427,8 +425,8 @@ class _Plan:
                     _write_json(results / lights.TRANSFER, lights.transfer_success, *shown)
             if not self.has_classes:
                 negatives = replace(views, objects=self.negatives)
-                lit = (network, views, attacked_views, negatives, *environments[1:], results)
-                _write_json(results / found.DETECTED, found.find_in_lights, *lit)
+                lit = (network, views, attacked_views, negatives, unusual, results)
+                _write_json(results / lights.DETECTED, lights.find_in_lights, *lit)
         if later:
             yield later[0], self.measured_folders()
             # The test images are rendered for the network with the largest images.
@@ -447,8 +445,8 @@ class _Plan:
                 evaluate = partial(evaluate_photographs, predictor, images, self.label)
                 _write_folder(out / key / name, partial(evaluate, skip_unreadable=True))
             if self.annotations is not None:
-                write_scores = partial(found.score_photographs, network, self.annotations)
-                _write_folder(out / key / found.BOXED, write_scores)
+                write_scores = partial(lights.score_photographs, network, self.annotations)
+                _write_folder(out / key / lights.BOXED, write_scores)
 
 
 def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:
@@ -521,7 +519,7 @@ def _write_renders(settings: AuditSettings, plan: _Plan, size: Size, out: Path) 
 def _write_json(path: Path, measure: Callable[..., Any], *arguments: Any) -> None:
     """Write the mapping or the dataclass of a function to a JSON file, unless the file exists."""
     if not path.exists():
-        atomic_write(path, json.dumps(measure(*arguments), default=asdict) + "\n", durable=True)
+        run_folder.write_json(path, measure(*arguments), durable=True)
 
 
 def _write_folder(folder: Path, write: Callable[[Path], object]) -> None:

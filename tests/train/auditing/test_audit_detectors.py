@@ -11,7 +11,8 @@ from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.io.images import write_image
 from tests.helpers import find_red
-from train.auditing import found
+from train.auditing import lights as engine
+from train.auditing import page
 from train.auditing.lights import KINDS, Views, recognize_in_environments, render_in
 from train.auditing.relit import RELIT_FOLDER, read_relit
 from train.command_settings import AuditSettings
@@ -21,7 +22,7 @@ SIZE = 32
 
 
 def test_recall_on_renders_is_the_part_of_views_in_which_the_object_is_found(monkeypatch, tmp_path):
-    monkeypatch.setattr(found, "KINDS", {})
+    monkeypatch.setattr(engine, "KINDS", {})
     network = as_network(find_red, SIZE, ["orange", "apple"])
     solids = {
         name: load_object(ObjectSettings(f"solid:{name}:0", label=name))
@@ -31,9 +32,10 @@ def test_recall_on_renders_is_the_part_of_views_in_which_the_object_is_found(mon
         Views([item], 3, 0, torch.device("cpu"), exposure=0.7) for item in solids.values()
     )
     lights = ["uniform", "eucalyptus"]
-    content = found.find_in_lights(network, views, views, negatives, lights, 2, tmp_path)
+    unusual = engine.environment_lights(views, lights, 2)
+    content = engine.find_in_lights(network, views, views, negatives, unusual, tmp_path)
     metrics = content["metrics"]
-    recognized = recognize_in_environments(network, views, lights, 2)
+    recognized = recognize_in_environments(network, views, unusual)
     expected = np.mean([recognized[name] for name in lights])
     assert metrics["environments"]["n"] == 6
     assert metrics["environments"]["recall"]["value"] == pytest.approx(expected)
@@ -46,7 +48,7 @@ def test_recall_on_renders_is_the_part_of_views_in_which_the_object_is_found(mon
 
 
 def test_metrics_of_a_detector_that_finds_nothing_are_zero_and_explained(monkeypatch, tmp_path):
-    monkeypatch.setattr(found, "KINDS", {})
+    monkeypatch.setattr(engine, "KINDS", {})
 
     def find_nothing(images):
         empty = {"boxes": torch.zeros(0, 4), "labels": torch.zeros(0).long()}
@@ -55,12 +57,13 @@ def test_metrics_of_a_detector_that_finds_nothing_are_zero_and_explained(monkeyp
     network = as_network(find_nothing, SIZE, ["orange", "apple"], task=nb.Detection())
     item = load_object(ObjectSettings("solid:orange:0", label="orange"))
     views = Views([item], 2, 0, torch.device("cpu"))
-    content = found.find_in_lights(network, views, views, views, ["uniform"], 1, tmp_path)
+    unusual = engine.environment_lights(views, ["uniform"], 1)
+    content = engine.find_in_lights(network, views, views, views, unusual, tmp_path)
     plain = content["metrics"]["plain light"]
     assert plain["recall"]["value"] == plain["false_per_image"]["value"] == 0
-    (tmp_path / found.DETECTED).write_text(json.dumps(content))
-    [section] = found.sections({"nothing": tmp_path}, "orange")
-    assert section["about"] == found.ABOUT.format("orange")
+    (tmp_path / engine.DETECTED).write_text(json.dumps(content))
+    [section] = page.detection_sections({"nothing": tmp_path}, "orange")
+    assert section["about"] == page.ABOUT.format("orange")
 
 
 def test_an_audit_without_meshes_relights_what_a_detector_finds_in_photographs(tmp_path):
@@ -90,7 +93,7 @@ def test_an_audit_of_a_detector_has_a_section_about_detections(tmp_path):
     )
     assert "<h2>Objects in other light" in report.page
     assert "has no gradients" not in report.page
-    stored = json.loads((tmp_path / "classifier" / found.DETECTED).read_text())
+    stored = json.loads((tmp_path / "classifier" / engine.DETECTED).read_text())
     assert {f"attacked: {light.title}" for light in KINDS.values()} <= stored["metrics"].keys()
     assert report.network.attacks["lighting"].correct == 1
 
@@ -100,13 +103,14 @@ def test_the_miou_on_renders_is_that_of_the_pixels_of_the_class(monkeypatch, tmp
         is_gray = (images - 0.5).abs().amax(1) < 0.05
         return torch.stack([is_gray.float(), 0.5 + 0 * images[:, 0]], dim=1)
 
-    monkeypatch.setattr(found, "KINDS", {})
+    monkeypatch.setattr(engine, "KINDS", {})
     network = as_network(find_gray, SIZE, ["background", "orange"])
     items = [load_object(ObjectSettings(f"solid:{name}:0")) for name in ("orange", "lemon")]
     views, negatives = (
         Views([replace(item, label="orange")], 3, 0, torch.device("cpu")) for item in items
     )
-    content = found.find_in_lights(network, views, views, negatives, ["uniform"], 1, tmp_path)
+    unusual = engine.environment_lights(views, ["uniform"], 1)
+    content = engine.find_in_lights(network, views, views, negatives, unusual, tmp_path)
     scenes = [shown.scene(SIZE) for shown in (views, negatives)]
     shown = [find_gray(render_in(scene, scene.lights[0])[:, 0]).argmax(1) for scene in scenes]
     guess = torch.cat(shown).bool()
