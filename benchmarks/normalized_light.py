@@ -31,7 +31,7 @@ from train.data.photographs import find_photographs, load_photographs
 from train.laboratory.laboratory import write_laboratory
 from train.results.compare import ALL, Evaluation, difference, mean_metric
 from train.results.intervals import auc_and_recalls
-from train.results.metrics import Pooled, metric_title
+from train.results.metrics import TITLES, Pooled
 from train.results.scoring import compute_logits, rank_classes
 from train.results.store import RunSummary
 from train.results.tables import Table, format_interval
@@ -222,7 +222,7 @@ def test(options: argparse.Namespace) -> None:
             differences = [difference(normalized, without, ALL, key) for key in SHOWN]
             cells = [format_interval(value, "+") for value in differences]
             rows.append([name, part, "difference", *cells])
-    header = ["network", "images", "normalized light", *map(metric_title, SHOWN)]
+    header = ["network", "images", "normalized light", *(TITLES[name] for name in SHOWN)]
     print(Table("", header, rows))
 
 

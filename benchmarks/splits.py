@@ -48,7 +48,7 @@ from train.data.sets import Split, content_hash, held_out_rows, load_npz
 from train.device import MixedPrecision, choose_precision
 from train.laboratory.laboratory import write_laboratory
 from train.results.compare import ALL, Evaluation, difference, mean_metric
-from train.results.metrics import METRICS, Pooled, metric_title
+from train.results.metrics import METRICS, TITLES, Pooled
 from train.results.predictions import PREDICTIONS, Predictions, write_predictions
 from train.results.scoring import Predictor
 from train.results.store import RunSummary, summarize
@@ -443,7 +443,7 @@ def score(options: argparse.Namespace) -> None:
                 scores[method.name, folder.name],
                 scores[first.name, folder.name],
             )
-    header = ["network", "images", "group", *map(metric_title, METRICS)]
+    header = ["network", "images", "group", *(TITLES[name] for name in METRICS)]
     print(Table("", header, rows))
 
 

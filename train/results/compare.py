@@ -7,20 +7,20 @@ interval.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 from typing import NamedTuple
 
 from train.results import store
 from train.results.intervals import Jackknife, change
-from train.results.metrics import COUNTED_EACH, METRICS, Pool, Pooled, metric_title
+from train.results.metrics import COUNTED_EACH, METRICS, TITLES, Pool, Pooled
 from train.results.predictions import PREDICTIONS
 from train.results.store import INITIAL, Methods, RunSummary, Scored, ScoredRun
 from train.results.tables import RANGE, Estimate, Table, describe_intervals, format_interval
 from train.settings import PHOTOGRAPHS, UNLABELED
 
 # Titles of the columns of tables that have a column for each metric in `METRICS`.
-TITLES = [metric_title(name) for name in METRICS]
+HEADER = [TITLES[name] for name in METRICS]
 # Metrics in the table that commands print without --verbose.
 SHORT_METRICS = ("recall", "false_positive_rate", "auc", "class_top1")
 
@@ -143,7 +143,7 @@ def group_table(methods: Evaluations, by: str) -> Table:
             metrics = [mean_metric(evaluations, subset, name) for name in METRICS]
             shown += metrics
             rows.append([subset.title, method, *map(format_interval, metrics)])
-    return Table(f"by {by}, {describe_intervals(shown)}", [by, "network", *TITLES], rows)
+    return Table(f"by {by}, {describe_intervals(shown)}", [by, "network", *HEADER], rows)
 
 
 def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
@@ -199,11 +199,9 @@ def difference(
     # A run whose metric is unknown has no jackknife.
     if len(after) < len(evaluations) or len(before) < len(reference):
         return None
-    return Difference(
-        **asdict(change(after, before, _seeds(evaluations) == _seeds(reference))),
-        before=fmean(run.value for run in before),
-        after=fmean(run.value for run in after),
-    )
+    gain = change(after, before, _seeds(evaluations) == _seeds(reference))
+    means = (fmean(run.value for run in runs) for runs in (before, after))
+    return Difference(*vars(gain).values(), *means)
 
 
 def _jackknives(evaluations: Sequence[Evaluation], subset: Subset, name: str) -> list[Jackknife]:
@@ -235,7 +233,7 @@ def difference_table(methods: Evaluations, *properties: str) -> Table:
             cells = [format_interval(item, sign="+") for item in differences]
             rows.append([f"{method} minus {base} ({counts})", subset.title, *cells])
     title = f"differences on the same images, {describe_intervals(shown)}"
-    return Table(title, ["networks", "images", *TITLES], rows)
+    return Table(title, ["networks", "images", *HEADER], rows)
 
 
 def run_tables(methods: Methods) -> list[Table]:
@@ -283,7 +281,7 @@ def score_table(title: str, group: Scored) -> Table:
     chosen = " or ".join(sorted(points - {""}))
     if chosen:
         title += f"; threshold for {chosen}"
-    return _run_table(title, TITLES, lines)
+    return _run_table(title, HEADER, lines)
 
 
 # A row of a table: the seed of a run, and the metric of each column.
@@ -349,5 +347,6 @@ def format_short_comparison(runs: Sequence[RunSummary], by: str = "source") -> s
         # The short table has no intervals, except for the gain.
         values = [format_interval(item and Estimate(item.value)) for item in shown]
         rows.append([method, len(runs_of_method), *values, format_interval(gain, sign="+")])
-    header = ["network", "runs", _accuracy_title(runs), *map(metric_title, SHORT_METRICS)]
-    return str(Table(title, [*header, "gain in AUC [95%]"], rows).without_unknown_columns)
+    titles = [TITLES[name] for name in SHORT_METRICS]
+    header = ["network", "runs", _accuracy_title(runs), *titles, "gain in AUC [95%]"]
+    return str(Table(title, header, rows).without_unknown_columns)

@@ -17,7 +17,7 @@ from train.results.metrics import Pool
 from train.results.pictures import Picture, read_square
 from train.results.predictions import Predictions
 from train.results.store import RunSummary
-from train.results.tables import Estimate, Table, describe_intervals, join_words
+from train.results.tables import Estimate, Table, describe_intervals, format_interval, join_words
 from train.run_folder import read_json
 from train.settings import KEPT_ASIDE, PHOTOGRAPHS, in_words
 
@@ -41,7 +41,7 @@ class ShownMetric:
         note: Words that say which values are good, such as "higher is better".
         before: Value for the original network. None if only one network is shown.
         after: Value for the hardened network, or for the only network.
-        is_percentage: Whether the metric is shown in percent.
+        form: Format of its numbers: in percent, or with two decimals.
         interval: What the ends of the interval are.
     """
 
@@ -49,12 +49,12 @@ class ShownMetric:
     note: str
     before: Estimate | None
     after: Estimate
-    is_percentage: bool = True
+    form: str = ".0%"
     interval: str = "95% interval"
 
     def text(self, value: float) -> str:
-        """Write a value of the metric in percent, or with two decimals if it is no percentage."""
-        return f"{value:.0%}" if self.is_percentage else f"{value:.2f}"
+        """Write a value of the metric."""
+        return f"{value:{self.form}}"
 
 
 class ShownPrediction(NamedTuple):
@@ -111,14 +111,9 @@ class FirstScreen:
         """Return the answer, its reasons and the table of the metrics as text."""
         rows = []
         for metric in self.numbers:
-            cells = [metric.title]
-            for estimate in (metric.before, metric.after):
-                if estimate is not None and estimate.value is not None:
-                    cells.append(metric.text(estimate.value))
-                    if estimate.low is not None and estimate.high is not None:
-                        ends = f"{metric.text(estimate.low)}, {metric.text(estimate.high)}"
-                        cells[-1] += f" [{ends}]"
-            rows.append(cells)
+            shown = filter(None, (metric.before, metric.after))
+            cells = [format_interval(estimate, form=metric.form) for estimate in shown]
+            rows.append([metric.title, *cells])
         table = Table("", ["", *self.names], rows)
         return f"{' '.join([self.answer, *self.sentences])}\n\n{table}"
 
@@ -181,7 +176,8 @@ def compare_networks(
         if was is not None and is_now is not None:
             has_one_seed = len(before) == len(after) == 1
             interval = describe_intervals([is_now]) if has_one_seed else is_now.over
-            numbers.append(ShownMetric(title, note, was, is_now, metric != "auc", interval))
+            form = ".2f" if metric == "auc" else ".0%"
+            numbers.append(ShownMetric(title, note, was, is_now, form, interval))
 
     original, hardened = subjects
     sentences = [

@@ -241,14 +241,10 @@ class Pool(ShortRepr):
         # ROC metrics are missing without positives or without negatives. They are then unknown.
         known = {name: jackknife.estimate for name, jackknife in self._rankings.items()}
         auc, *recalls = (known.get(name, Estimate()) for name in ROC_METRICS)
-        positives, negatives = self.ranked
-        auc_with_counts = AreaUnderCurve(
-            **asdict(auc),
-            positives=len(positives),
-            positive_objects=len({*_objects(positives)}),
-            negatives=len(negatives),
-            negative_objects=len({*_objects(negatives)}),
-        )
+        # Numbers of images and objects.
+        positives, negatives = ((len(group), len({*_objects(group)})) for group in self.ranked)
+        area = auc.value, auc.low, auc.high, auc.over
+        auc_with_counts = AreaUnderCurve(*area, *positives, *negatives)
         recall_at = dict(zip(RATES, recalls, strict=True))
         others: dict[str, Any] = {name: known.get(name) for name in TOP_RANKS}
         others |= {name: outcome.proportion for name, outcome in self.outcomes.items()}
@@ -420,11 +416,6 @@ def group_rows(predictions: Predictions, names: Iterable[Any]) -> dict[str, Pred
     """
     column = as_column([*names])
     return {name: predictions[column == name] for name in sorted({*column} - {None})}
-
-
-def metric_title(name: str) -> str:
-    """Return the title of a metric in tables. An example is "recall at 10% FPR"."""
-    return TITLES[name]
 
 
 def describe_point(point: Mapping[str, Any]) -> str:

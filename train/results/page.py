@@ -6,7 +6,6 @@ import shlex
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from itertools import islice
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -70,7 +69,7 @@ def write_report(
     found = store.find(folders)
     methods = store.group_by_method(found.runs)
     # Methods and runs that plots and comparisons show.
-    shown = {name: runs[:MAX_SEEDS] for name, runs in islice(methods.items(), MAX_METHODS)}
+    shown = {name: runs[:MAX_SEEDS] for name, runs in [*methods.items()][:MAX_METHODS]}
     # One training run of each method, whose renders are shown. Only such runs have epochs.
     first = {method: runs[0] for method, runs in shown.items() if runs[0].epochs}
     groups = compare.group_by_images(shown)
@@ -210,10 +209,9 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
     accuracies = [run.before.accuracy or 0.0 for run in runs if run.before]
     # If the agreement with the original network was measured, it is told instead of the accuracy.
     if (agreement := mean("test/agreement")) is not None:
-        sentences.append(
-            f"{method}: on photographs that training did not use, the network predicts the "
-            f"same class as the original in {agreement:.1%} of the cases."
-        )
+        place = "on photographs that training did not use"
+        share = f"the same class as the original in {agreement:.1%} of the cases"
+        sentences.append(f"{method}: {place}, the network predicts {share}.")
     elif accuracies:
         images = runs[0].config.get("test_images", "the test images")
         change = f"from {fmean(accuracies):.1%} to {mean('test/accuracy'):.1%}"
@@ -227,11 +225,9 @@ def _accuracy_sentences(method: str, runs: Sequence[RunSummary]) -> list[str]:
         sentences.append(sentence)
     if (after := mean("test/relit_agreement_after")) is not None:
         light = in_light(OmegaConf.select(runs[0].config, "train.augmentation"))
-        sentences.append(
-            f"{method}: for photographs {light}, "
-            f"{after:.1%} of the predictions are those for the unchanged photographs, "
-            f"and {mean('test/relit_agreement_before'):.1%} before."
-        )
+        kept = f"{after:.1%} of the predictions are those for the unchanged photographs"
+        before = f"and {mean('test/relit_agreement_before'):.1%} before"
+        sentences.append(f"{method}: for photographs {light}, {kept}, {before}.")
     return sentences
 
 

@@ -27,16 +27,11 @@ from augment.tasks.classification import Classification, log_odds
 from renderer.errors import InputError, ShortRepr, require_choice
 from renderer.io.images import write_image
 from renderer.settings import Size, as_size
+from train.data import photographs as folders
 from train.data.photo import TABLE, Photograph
-from train.data.photographs import (
-    find_photographs,
-    load_photographs,
-    require_outside,
-    unsupported_files,
-)
 from train.results import metrics, predictions, tables
 from train.results.intervals import thresholds
-from train.results.metrics import Metrics, Outcome, Pooled, metric_title
+from train.results.metrics import TITLES, Metrics, Outcome, Pooled
 from train.results.pictures import contact_sheet, write_roc
 from train.results.predictions import Predictions
 from train.results.tables import Estimate, Proportion, Table
@@ -107,21 +102,16 @@ class Predictor:
     ) -> FolderPredictions:
         """Predict the classes of all photographs of a folder."""
         labels = label_names(label)
-        found = find_photographs(folder, self.classes, label)
-        photographs, images, unreadable = load_photographs(
+        found = folders.find_photographs(folder, self.classes, label)
+        photographs, images, unreadable = folders.load_photographs(
             folder, found, self.size, skip_unreadable
         )
         logits = compute_logits(self.model, images, len(self.classes), self.device)
-        return FolderPredictions(
-            folder=folder,
-            predictions=rank_classes(photographs, logits, self.classes, labels),
-            images=images,
-            labels=labels,
-            unreadable=unreadable,
-            # Files that are no images.
-            left_out=[str(path) for path in unsupported_files(folder)],
-            images_hash=_hash(folder, photographs, labels),
-        )
+        ranked = rank_classes(photographs, logits, self.classes, labels)
+        # Files that are no images.
+        left_out = [str(path) for path in folders.unsupported_files(folder)]
+        facts = labels, unreadable, left_out, _hash(folder, photographs, labels)
+        return FolderPredictions(folder, ranked, images, *facts)
 
 
 def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]) -> str:
@@ -228,7 +218,7 @@ class Scores(ShortRepr):
         rows = []
         for name in (*_fraction_metrics(self), *RANKING_METRICS):
             if name not in DETAILS:
-                rows.append((metric_title(name), _format_metric(self.overall.find(name))))
+                rows.append((TITLES[name], _format_metric(self.overall.find(name))))
         shown = (self.overall.recall, self.overall.false_positive_rate, self.overall.auc)
         title = f"{_count_images(self)}; {tables.describe_intervals(shown)}"
         return "\n".join([str(Table(title, ["metric", self.label], rows)), *_notes(self)])
@@ -272,11 +262,9 @@ class Scores(ShortRepr):
             # The rank is infinite for all photographs if the model lacks the class.
             known = rows[np.isfinite(rows.true_rank)]
             wrong_classes = Counter(sorted(rows.predicted[rows.true_rank != 1]))
-            scores[name] = ClassScores(
-                n=len(rows),
-                recall=Outcome(known, known.true_rank <= 1).proportion,
-                most_common_wrong=dict(wrong_classes.most_common(WRONG_CLASSES)),
-            )
+            most_common_wrong = dict(wrong_classes.most_common(WRONG_CLASSES))
+            recall = Outcome(known, known.true_rank <= 1).proportion
+            scores[name] = ClassScores(len(rows), recall, most_common_wrong)
         return scores
 
     @property
@@ -321,7 +309,7 @@ def evaluate_photographs(
     predictor: Predictor, folder: Path, label: Label, out: Path, skip_unreadable: bool = False
 ) -> Scores:
     """Score a model on all photographs of a folder, and write the scores to files."""
-    require_outside(out, folder)
+    folders.require_outside(out, folder)
     scores = score(predictor.predict(folder, label, skip_unreadable))
     write(scores, out)
     return scores
@@ -411,7 +399,7 @@ def format_scores(scores: Scores) -> str:
         estimates = [of_group.find(name) for name in names]
         shown += estimates
         rows.append([title, *map(_format_metric, estimates)])
-    table = Table(tables.describe_intervals(shown), ["", *map(metric_title, names)], rows)
+    table = Table(tables.describe_intervals(shown), ["", *(TITLES[name] for name in names)], rows)
     parts = [_count_images(scores), table, _class_table(scores), *_notes(scores)]
     return "\n\n".join(map(str, parts))
 

@@ -67,13 +67,11 @@ class StoredScores:
         labels = label_names(summary.get("label", ""))
         points = summary.get("operating_point", [])
         points = points if isinstance(points, list) else [points]
-        return cls(
-            images=str(summary.get("images") or summary),  # Unknown images: equal scores only.
-            labels=labels,
-            overall=Metrics.read(summary),
-            thresholds={point["label"]: float(point["threshold"]) for point in points},
-            operating_point=" or ".join(dict.fromkeys(map(describe_point, points))),
-        )
+        # If the images are unknown, those of equal scores are the same.
+        images = str(summary.get("images") or summary)
+        thresholds = {point["label"]: float(point["threshold"]) for point in points}
+        operating_point = " or ".join(dict.fromkeys(map(describe_point, points)))
+        return cls(images, labels, Metrics.read(summary), thresholds, operating_point)
 
 
 @dataclass(frozen=True)
@@ -225,25 +223,14 @@ def _read_run(folder: Path) -> RunSummary:
         path = folder / BEFORE
         # The settings that determine the initial network.
         keys = ("network", "weights", "classes", "normalization", "normalize_light", "size")
-        before = RunSummary(
-            folder=path,
-            mode=INITIAL,
-            settings={key: OmegaConf.select(config, key) for key in keys},
-            photographs=read_summaries(path),
-            accuracy=scores["test/accuracy_before"],
-        )
-    return RunSummary(
-        folder=folder,
-        mode=str(config.augment.mode),
-        settings=run_config.decisive_settings(config),
-        photographs=read_summaries(folder),
-        accuracy=scores["test/accuracy"],
-        seed=int(config.seed),
-        config=config,
-        epochs=epochs,
-        scores=scores,
-        before=before,
-    )
+        settings = {key: OmegaConf.select(config, key) for key in keys}
+        accuracy = scores["test/accuracy_before"]
+        before = RunSummary(path, INITIAL, settings, read_summaries(path), accuracy)
+    settings = run_config.decisive_settings(config)
+    photographs = read_summaries(folder)
+    accuracy = scores["test/accuracy"]
+    facts = int(config.seed), config, epochs, scores, before
+    return RunSummary(folder, str(config.augment.mode), settings, photographs, accuracy, *facts)
 
 
 def read_summaries(folder: Path) -> dict[str, StoredScores]:
@@ -366,17 +353,13 @@ def read_attack(folder: Path) -> AttackSummary:
         examples = [line for line in lines if "example" in line]
         if len({line["example"] for line in examples}) < len(examples):
             raise ValueError("it has an example twice")
-        checks = [dict(line["checks"]) for line in lines if "checks" in line]
         # Examples that were classified correctly before the attack.
         correct = [line for line in examples if not line["success_before"]]
-        return AttackSummary(
-            folder=folder,
-            rows=[*map(_example_row, examples)],
-            successes=sum(bool(line["success"]) for line in correct),
-            without_noise=sum(bool(line["success_without_noise"]) for line in correct),
-            correct=len(correct),
-            checks=checks[0] if checks else {},
-        )
+        checks = next((dict(line["checks"]) for line in lines if "checks" in line), {})
+        successes = sum(bool(line["success"]) for line in correct)
+        without_noise = sum(bool(line["success_without_noise"]) for line in correct)
+        rows = [*map(_example_row, examples)]
+        return AttackSummary(folder, rows, successes, without_noise, len(correct), checks)
 
 
 class Unfinished(NamedTuple):

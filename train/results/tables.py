@@ -157,17 +157,17 @@ def format_fraction(proportion: Proportion) -> str:
     return f"{counts} [{proportion.low:.0%}, {proportion.high:.0%}]"
 
 
-def format_interval(estimate: Estimate | None, sign: str = "") -> str:
+def format_interval(estimate: Estimate | None, sign: str = "", form: str = ".3f") -> str:
     """Format the value of a metric with its interval.
 
     `sign` "+" writes a plus before positive numbers.
     """
     if estimate is None or estimate.value is None:
         return "-"
-    value = f"{estimate.value:{sign}.3f}"
+    value = f"{estimate.value:{sign}{form}}"
     if estimate.low is None or estimate.high is None:
         return value
-    return f"{value} [{estimate.low:{sign}.3f}, {estimate.high:{sign}.3f}]"
+    return f"{value} [{estimate.low:{sign}{form}}, {estimate.high:{sign}{form}}]"
 
 
 def describe_intervals(estimates: Iterable[Estimate | None]) -> str:
