@@ -29,15 +29,8 @@ from augment.settings import PYTHON, NormalizeLight
 from augment.sources import SOURCES, import_function, load_classifier
 from augment.switch import LIT_NAME, SWITCHES, Recognizer
 from augment.tasks.detection import Detection
-from renderer.errors import (
-    InputError,
-    as_path,
-    explained,
-    keyed,
-    reading,
-    require_file,
-    require_kind,
-)
+from renderer import errors
+from renderer.errors import InputError, as_path, explained, keyed, require_kind
 from renderer.io.files import atomic_write
 from train.networks import DETECTOR, VERSION, WIDERESNET, build_network
 from train.run_folder import BEST, LAST, PREVIOUS, PUBLISHED, WEIGHTS
@@ -72,7 +65,7 @@ def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> 
 
 def load(path: Path) -> dict[str, Any]:
     """Read a checkpoint that `save` wrote. It is a zip file, whose checksums are compared."""
-    require_file(path, "give a run folder that holds a checkpoint")
+    errors.require_file(path, "give a run folder that holds a checkpoint")
     with _refused_if_damaged(path), ZipFile(path) as archive:
         if archive.testzip():
             raise ValueError("its content does not match its checksums")
@@ -87,7 +80,7 @@ def _refused_if_damaged(path: Path) -> AbstractContextManager[None]:
 def checks_architecture(path: Path) -> AbstractContextManager[None]:
     """Raise InputError if the block cannot load weights into a network of another architecture."""
     name = f"checkpoint {path}"
-    return reading(name, "is from another architecture", "use the model settings of its run")
+    return errors.reading(name, "is from another architecture", "use the model settings of its run")
 
 
 def _checked(state: dict[str, Any]) -> dict[str, Any]:

@@ -140,13 +140,12 @@ class MixedPrecision(Network):
         super().__init__(network.to(memory_format=torch.channels_last))
         self.precision = precision
 
-    def forward(self, images: Tensor, targets: Any = None) -> Any:
+    def forward(self, images: Tensor, *targets: Any) -> Any:
         """Compute outputs or, if a detector gets targets in training mode, its losses."""
         images = images.contiguous(memory_format=torch.channels_last)
-        inputs = (images,) if targets is None else (images, targets)
         dtype = PRECISIONS[self.precision]
         with torch.autocast(images.device.type, dtype, enabled=dtype != torch.float32):
-            outputs = plain_outputs(self.network(*inputs))
+            outputs = plain_outputs(self.network(images, *targets))
         return outputs.float() if isinstance(outputs, Tensor) else outputs
 
 

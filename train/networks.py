@@ -114,9 +114,8 @@ class _Block(nn.Module):
         self.norm2 = nn.BatchNorm2d(outputs)
         self.dropout = Dropout(dropout)
         self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
-        self.shortcut: nn.Module | None = None
-        if inputs != outputs or stride > 1:
-            self.shortcut = nn.Conv2d(inputs, outputs, 1, stride, bias=False)
+        is_changed = inputs != outputs or stride > 1
+        self.shortcut = nn.Conv2d(inputs, outputs, 1, stride, bias=False) if is_changed else None
 
     def forward(self, x: Float[Tensor, "N inputs H W"]) -> Float[Tensor, "N outputs _ _"]:
         """Compute the output features of the block."""

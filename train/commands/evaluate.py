@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
 from augment.files import as_facts, require_no_facts
@@ -67,7 +66,7 @@ def run(settings: EvaluateSettings) -> None:
 
 
 def evaluate(
-    network: TaskNetwork | Callable[[Tensor], Any],
+    network: TaskNetwork | Callable[[torch.Tensor], Any],
     photos: str | Path,
     label: str | int | Sequence[str | int] | None = None,
     *,

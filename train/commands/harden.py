@@ -11,7 +11,6 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor, nn
 
-from augment import classifier as classifiers
 from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
 from augment.network import device_of, keep_text_vectors, unwrapped
@@ -209,8 +208,6 @@ def harden(
 
 def _trainable_copy(network: nn.Module) -> nn.Module:
     """Copy a network, and check that the weights of the copy can be trained."""
-    if not isinstance(network, TaskNetwork):
-        classifiers.require_evaluation_mode(network, "network")
     # Vectors of texts may be results of a text encoder, which have a graph and cannot be copied.
     values = [value for module in network.modules() for value in vars(module).values()]
     results = [value for value in values if isinstance(value, Tensor) and not value.is_leaf]

@@ -5,7 +5,6 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from difflib import get_close_matches
-from math import prod
 from pathlib import Path, PurePosixPath
 from typing import NoReturn
 
@@ -275,10 +274,9 @@ def load_photographs(
     """
     height, width = height_and_width(size)
     count = len(photographs)
-    shape = (count, 3, height, width)
     what = f"{count} photographs of {height} × {width} pixels"
-    require_memory(what, prod(shape), torch.device("cpu"))
-    images = torch.empty(shape, dtype=torch.uint8)
+    require_memory(what, 3 * count * height * width, torch.device("cpu"))
+    images = torch.empty(count, 3, height, width, dtype=torch.uint8)
     paths = [folder / photograph.path for photograph in photographs]
     # Threads read in parallel, because Pillow releases Python's global lock while
     # it decodes and resizes.

@@ -25,7 +25,6 @@ from augment.scene.patterns import draw_projected_light
 from augment.tasks.classification import ClassCriterion, label_loss
 from renderer.errors import MAX_SCALE
 from renderer.image import decode, to_bytes, to_unit
-from renderer.vectors import Ball, nearest_in_box
 from train.settings import LIGHTS, LOW_LIGHT, RELIGHT, RELIGHT_AND_LOW_LIGHT, STRIPES, TrainSettings
 
 # Norm-ball and step size of the attack on pixels. Madry et al. (2018) use a radius of
@@ -202,14 +201,12 @@ class Augmentation:
 class _Pixels(NormBalls):
     """Pixels of images as attacked values, in balls around the images."""
 
+    box = (0, 1)
+
     def __init__(self, images: Images):
         super().__init__(PGD, to_unit(images).flatten(1))
         self.group_size = len(images)
         self._shape = images.shape[1:]
-
-    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        """Clip values to [0, 1]."""
-        return nearest_in_box(values, 0, 1, within)
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
         """Return the images (A, 1, 3, H, W) that consist of the values."""

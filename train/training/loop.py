@@ -178,6 +178,9 @@ class Trainer:
             with random weights. The copy is the teacher of a distillation loss,
             and each epoch of a model soup begins with its weights.
         averages: Moving average and model soup of the network.
+        selected: Network that is validated after each epoch: an average, or the network in
+            training.
+        is_detector: Whether the network finds boxes. It has no accuracy on test images then.
         epoch: Number of finished epochs.
         history: Metrics of each finished epoch by name.
         best: Content of best.pt, the network that the training selected. It is empty before the
@@ -205,6 +208,7 @@ class Trainer:
         self._limits = settings.images_per_epoch, service.settings.regenerate_every
         self.phases = service.phases
         self.seed = service.seed
+        self.is_detector = isinstance(service.task, Detection)
         self.epoch = 0
         self.history: list[dict[str, float]] = []
         self.best: dict[str, Any] = {}
@@ -224,20 +228,11 @@ class Trainer:
         # The validation accuracy of data without labels is the agreement with the initial
         # network. It is highest before any training, and cannot choose an epoch.
         self.averages = Averages(model, settings.ema_decay, settings.soup, not self.labeled)
+        self.selected = self.averages.selected
         has_teacher = settings.distillation_weight or settings.consistency_weight
         teacher = self.initial if has_teacher else None
         options = service, self.architecture["size"], self.labeled
         self.step = TrainingStep(settings, model, teacher, *options)
-
-    @property
-    def is_detector(self) -> bool:
-        """Whether the network finds boxes. It has no accuracy on test images then."""
-        return isinstance(self.service.task, Detection)
-
-    @property
-    def selected(self) -> MixedPrecision:
-        """Network that is validated after each epoch: an average, or the network in training."""
-        return self.averages.selected
 
     def fit(self, split: Split, held_out: Bool[Tensor, " N"], log: RunLog | None) -> None:
         """Train to the last epoch, and write checkpoints.
