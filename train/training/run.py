@@ -30,9 +30,11 @@ from train.results.scoring import Model, Predictor, evaluate_photographs, format
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, BEST, WEIGHTS
 from train.settings import KEPT_ASIDE, LABORATORY, WIDERESNET, ExperimentSettings, in_light
-from train.training import averages, inputs
+from train.training import inputs
+from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, scale_learning_rate
+from train.training.recognition import fit_recognizer, recognizing_layers
 from train.training.run_log import Logger, RunLog
 
 # If the training images are on disk, the mean and the standard deviation of their color
@@ -94,7 +96,7 @@ class Run:
         with keyed(**keys_of("train", settings.train)):
             self.trainer = self._build_trainer(record, threads)
             if settings.train.recognize:
-                averages.recognizing_layers(self.trainer.model.network, self.data.size)
+                recognizing_layers(self.trainer.model.network, self.data.size)
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if earlier is not None:
@@ -261,9 +263,8 @@ class Run:
 
     def _predict(self, model: Model, split: Split, *light_key: int | str) -> Int[Tensor, " N"]:
         """Predict the class of each image of a split, as it is or in the light of training."""
-        device = self.trainer.device
         light = self.settings.train.augmentation
-        return averages.predict(model, split, device, *light_key, light=light).argmax(1)
+        return predict(model, split, self.trainer.device, *light_key, light=light).argmax(1)
 
     def _render_kept_aside(self) -> None:
         """Render test images of other objects and projected patterns than those of the training.
@@ -294,12 +295,12 @@ class Run:
         best = trainer.best
         epoch = best["epoch"]
         # The selected network differs from the last one.
-        if epoch != trainer.epoch or averages.INTERPOLATION in best:
+        if epoch != trainer.epoch or INTERPOLATION in best:
             trainer.selected.network.load_state_dict(best["model"])
             selected = evaluate(trainer.selected, test)["accuracy"]
         scores = {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": epoch}
-        if averages.INTERPOLATION in best:
-            scores["test/interpolation"] = best[averages.INTERPOLATION]
+        if INTERPOLATION in best:
+            scores["test/interpolation"] = best[INTERPOLATION]
         predictions = self._initial_predictions
         has_consistency = bool(self.settings.train.consistency_weight)
         if predictions is not None and (has_consistency or CLASSIFIER in trainer.architecture):
@@ -315,13 +316,13 @@ class Run:
     def _interpolate(self) -> None:
         """Write best.pt with weights between before and after, unless it has been interpolated."""
         trainer = self.trainer
-        if averages.INTERPOLATION in trainer.best or trainer.initial is None:
+        if INTERPOLATION in trainer.best or trainer.initial is None:
             return
         networks = (trainer.initial, trainer.selected, trainer.best["model"])
         validation = self.data.train[self.held_out]
         settings = self.settings
-        weights, factor = averages.interpolate(*networks, validation, settings.train, settings.seed)
-        self._add_to_best({"model": weights, averages.INTERPOLATION: factor})
+        weights, factor = interpolate(*networks, validation, settings.train, settings.seed)
+        self._add_to_best({"model": weights, INTERPOLATION: factor})
 
     def _recognize(self) -> None:
         """Write to best.pt what recognizes the light of the training."""
@@ -329,7 +330,7 @@ class Run:
         splits = self.data.train[~self.held_out], self.data.train[self.held_out]
         network = trainer.selected.network
         network.load_state_dict(trainer.best["model"])
-        fitted = averages.fit_recognizer(network, *splits, self.settings.seed, light)
+        fitted = fit_recognizer(network, *splits, self.settings.seed, light)
         self._add_to_best({checkpoints.RECOGNIZER: fitted})
         name = f"{LIT_NAME}ORIGINAL+{checkpoints.RUN}{self.folder}"
         console.info("network=%s shows this network images in the light of its training", name)

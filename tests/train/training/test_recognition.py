@@ -15,9 +15,9 @@ from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.checkpoints import load_network
 from train.data.sets import Split
-from train.training import averages
+from train.training import recognition
 from train.training.augmentations import relit
-from train.training.averages import DECAY, fit_recognizer, logistic_weights, recognizing_layers
+from train.training.recognition import DECAY, fit_recognizer, logistic_weights, recognizing_layers
 
 SIZE = 32
 
@@ -89,10 +89,10 @@ def test_the_weights_are_the_optimum_that_scipy_finds():
 @pytest.mark.parametrize("count", [2, 30, 250])
 def test_the_expected_errors_are_those_of_random_scores(count):
     scores = torch.rand(20_000, count, generator=torch.Generator().manual_seed(0)).double()
-    thresholds = scores.quantile(averages.KEPT, dim=1, interpolation="higher")
+    thresholds = scores.quantile(recognition.KEPT, dim=1, interpolation="higher")
     # A further score between 0 and 1 exceeds the threshold with this probability.
     expected = (1 - thresholds).mean().item()
-    assert averages.expected_errors(count) == pytest.approx(expected, rel=0.02)
+    assert recognition.expected_errors(count) == pytest.approx(expected, rel=0.02)
 
 
 def test_stripes_are_recognized_and_unchanged_images_are_not(network):
