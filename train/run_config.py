@@ -124,6 +124,9 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
 
     Return the configuration, and the recorded command followed by the new arguments.
     """
+    # This import takes a fifth of a second, and only a resumed run needs it.
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
     folder = Path(config.out).absolute()
     recorded: Any = {}
     if (folder / CONFIG).is_file():
@@ -137,8 +140,8 @@ def resume_config(config: DictConfig, overrides: Sequence[str]) -> tuple[DictCon
     if Path(recorded["out"]) not in folder.parents:
         settings = _move_paths(settings, recorded["out"], str(folder))
     merged = OmegaConf.create(settings)
-    # The command line adds keys of mappings with "++".
-    for key in [override.partition("=")[0].lstrip("+") for override in overrides]:
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key = override.key_or_group
         if key != "out":
             value = OmegaConf.select(config, key)
             OmegaConf.update(merged, key, value, merge=False, force_add=True)

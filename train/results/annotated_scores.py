@@ -53,7 +53,7 @@ class Showing(NamedTuple):
     device: torch.device
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class AnnotatedScores(ShortRepr):
     """Scores of a network on photographs with boxes or masks.
 
@@ -98,7 +98,7 @@ class AnnotatedScores(ShortRepr):
         return f"{self.about}\n{self.table()}"
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class DetectionScores(AnnotatedScores):
     """Scores of a detector on photographs with boxes.
 
@@ -153,7 +153,7 @@ class DetectionScores(AnnotatedScores):
         }
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class SegmentationScores(AnnotatedScores):
     """Scores of a segmenter on photographs with masks.
 
@@ -236,11 +236,20 @@ def evaluate_detector(
     }
     overall = by_label.pop(ALL)
     missing = f" ({len(annotations.missing)} files are missing)" if annotations.missing else ""
-    contents = f"{missing} with {overall.n} objects"
-    size = height_and_width(network.size)
-    shown = size, how.fit, len(matches), annotations.missing, contents, pictures
-    metrics = overall, by_label, by_source
-    return DetectionScores(*shown, task, [*label_of_class], *metrics, listed)
+    return DetectionScores(
+        size=height_and_width(network.size),
+        fit=how.fit,
+        photograph_count=len(matches),
+        missing=annotations.missing,
+        contents=f"{missing} with {overall.n} objects",
+        pictures=pictures,
+        task=task,
+        labels=[*label_of_class],
+        overall=overall,
+        by_label=by_label,
+        by_source=by_source,
+        detections=listed,
+    )
 
 
 def _choose_labels(
@@ -304,9 +313,16 @@ def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> Segm
     named = zip(network.classes, by_class, strict=True)
     # The IoU of a class that no pixel has is NaN.
     known = {name: iou for name, iou in named if np.isfinite(iou)}
-    contents = f" ({len(missing)} others have no mask)" if missing else ""
-    size = height_and_width(network.size)
-    return SegmentationScores(size, how.fit, count, missing, contents, pictures, miou, known)
+    return SegmentationScores(
+        size=height_and_width(network.size),
+        fit=how.fit,
+        photograph_count=count,
+        missing=missing,
+        contents=f" ({len(missing)} others have no mask)" if missing else "",
+        pictures=pictures,
+        miou=miou,
+        by_class=known,
+    )
 
 
 def write(scores: AnnotatedScores, out: Path) -> None:

@@ -7,7 +7,7 @@ interval.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from statistics import fmean, stdev
 from typing import NamedTuple
 
@@ -200,8 +200,8 @@ def difference(
     if len(after) < len(evaluations) or len(before) < len(reference):
         return None
     gain = change(after, before, _seeds(evaluations) == _seeds(reference))
-    means = (fmean(run.value for run in runs) for runs in (before, after))
-    return Difference(*vars(gain).values(), *means)
+    was, is_now = (fmean(run.value for run in runs) for runs in (before, after))
+    return Difference(**asdict(gain), before=was, after=is_now)
 
 
 def _jackknives(evaluations: Sequence[Evaluation], subset: Subset, name: str) -> list[Jackknife]:

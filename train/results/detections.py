@@ -167,11 +167,16 @@ def match_image(found: Found, marked: Marked, iou: float = 0.5) -> Matches:
     # Objects without a detection have the score -inf.
     score_of_object = np.full(len(marked.labels), -np.inf)
     score_of_object[index[is_right]] = found.scores[is_right]
-    # There is one image, with the index 0.
-    image = np.zeros(len(index), int)
-    object_image = np.zeros(len(marked.labels), int)
-    of_detections = found.labels, image, found.scores, is_right
-    matches = Matches(1, *of_detections, marked.labels, object_image, score_of_object)
+    matches = Matches(
+        1,
+        label=found.labels,
+        image=np.zeros(len(index), int),
+        score=found.scores,
+        is_right=is_right,
+        object_label=marked.labels,
+        object_image=np.zeros(len(marked.labels), int),
+        object_score=score_of_object,
+    )
     return matches.choose(index != CROWD, ~marked.is_crowd)
 
 
