@@ -229,8 +229,8 @@ class LocalBasis(Basis):
         name: Name of this kind of light in settings, in file names and in
             messages.
         allow_negative: True if coefficients may be negative.
-        is_movable: True if the sources can be at other positions than
-            `source_positions`. `connect` and `moved` then accept positions.
+        is_movable: True if the sources have `positions` and can move to others. `connect` and
+            `moved` then accept positions.
         power: Largest coefficient. The smallest coefficient is 0.
     """
 
@@ -257,10 +257,6 @@ class LocalBasis(Basis):
             InputError: If a setting is out of range.
         """
 
-    def source_positions(self) -> Tensor:
-        """Return the positions of the L movable light sources in world axes, shape (L, 3)."""
-        raise NotImplementedError
-
     @abstractmethod
     def connect(
         self, points: Tensor, normals: Tensor, positions: Tensor | None = None
@@ -271,7 +267,7 @@ class LocalBasis(Basis):
             points: Surface points in world axes, shape (S, 3).
             normals: Unit normals at the points, shape (S, 3).
             positions: Positions to which the L light sources have moved,
-                shape (L, 3). None for `source_positions`. Only a basis with
+                shape (L, 3). None for their own `positions`. Only a basis with
                 `is_movable` accepts positions.
 
         Returns:

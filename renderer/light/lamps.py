@@ -249,10 +249,6 @@ class Lamps(LocalBasis):
         """Number of lamps."""
         return len(self.positions)
 
-    def source_positions(self) -> Tensor:
-        """Return the positions of the L lamps in world axes, shape (L, 3)."""
-        return torch.tensor(self.positions)
-
     def moved(self, positions: Tensor) -> Self:
         """Return a copy of this basis with the lamps at new positions.
 

@@ -188,7 +188,7 @@ class Positions(Parameter):
             fault = f"{self.name} cannot be attacked, because the scene has no {kinds}"
             raise InputError(f"{fault}: build the scene with {kinds}=...", self.name)
         # All examples start at the same positions of the L lamps, shape (L, 3).
-        positions = light.basis.source_positions().to(scene.lights)
+        positions = torch.tensor(light.basis.positions).to(scene.lights)
         super().__init__(settings, start=positions.flatten().expand(len(scene), -1))
 
     def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
