@@ -22,16 +22,8 @@ from functools import cache, partial
 from inspect import formatannotation
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from renderer.errors import (
-    InputError,
-    describe,
-    is_flag,
-    is_number,
-    is_whole,
-    keyed,
-    require_choice,
-    require_range,
-)
+from renderer import errors
+from renderer.errors import InputError
 
 # Type variable for any settings class.
 Kind = TypeVar("Kind")
@@ -177,7 +169,7 @@ class Settings:
             if facts.checks_type and not _fits(value, hint):
                 # `formatannotation` puts the module before the name of a class.
                 expected = re.sub(r"\b[\w.]+\.", "", formatannotation(hint))
-                given = describe(value)
+                given = errors.describe(value)
                 raise InputError(f"{name} is {given}: give a value of type {expected}", name)
             if value is not None:
                 _check_value(name, value, facts)
@@ -215,7 +207,7 @@ def settings_from(kind: type[Kind], values: object, argument: str) -> Kind:
         return values
     if not isinstance(values, Mapping):
         expected = f"give a mapping or {kind.__name__}(...)"
-        raise InputError(f"{argument} is {describe(values)}: {expected}", argument)
+        raise InputError(f"{argument} is {errors.describe(values)}: {expected}", argument)
     names = [item.name for item in fields(cast(Any, kind))]
     for name in values:
         if name not in names:
@@ -226,7 +218,7 @@ def settings_from(kind: type[Kind], values: object, argument: str) -> Kind:
         if item.name not in values and item.default is item.default_factory is MISSING:
             missing = f"{argument}.{item.name}"
             raise InputError(f"{missing} is not set: give a value", missing)
-    with keyed(argument, **{name: f"{argument}.{name}" for name in names}):
+    with errors.keyed(argument, **{name: f"{argument}.{name}" for name in names}):
         return kind(**values)
 
 
@@ -256,9 +248,9 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
     limits = facts.limits
     for item in items:
         if facts.choices:
-            require_choice(name, item, facts.choices)
-        if limits and not is_number(item):
-            raise InputError(f"{name}={describe(item)} must be a number", name)
+            errors.require_choice(name, item, facts.choices)
+        if limits and not errors.is_number(item):
+            raise InputError(f"{name}={errors.describe(item)} must be a number", name)
         # NaN is outside of all limits.
         if not all(holds(item, end) for _, _, holds, end in limits):
             range_in_words = " and ".join(f"{words} {end:g}" for words, _, _, end in limits)
@@ -269,9 +261,9 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
 # field, by the type with which the field is annotated.
 _CHECKS: dict[Any, Callable[[object], bool]] = {
     Any: lambda value: True,
-    int: is_whole,
-    float: is_number,
-    bool: is_flag,
+    int: errors.is_whole,
+    float: errors.is_number,
+    bool: errors.is_flag,
     str: lambda value: isinstance(value, str | os.PathLike),
     type(None): lambda value: value is None,
 }
@@ -304,9 +296,9 @@ Size = int | Sequence[int]
 def as_size(name: str, size: Any, largest: int = MAX_SAMPLES_PER_ROW) -> int | tuple[int, int]:
     """Check the size of an image. A square has one number, and a rectangle (height, width)."""
     sides = tuple(size) if _is_list(size) else (size, size)
-    if len(sides) != 2 or not all(is_whole(side) and 1 <= side <= largest for side in sides):
+    if len(sides) != 2 or not all(errors.is_whole(side) and 1 <= side <= largest for side in sides):
         expected = f"a whole number from 1 to {largest:,}, or two, (height, width)"
-        raise InputError(f"{name} is {describe(size)}: give {expected}", name)
+        raise InputError(f"{name} is {errors.describe(size)}: give {expected}", name)
     height, width = map(int, sides)
     return height if height == width else (height, width)
 
@@ -361,7 +353,7 @@ class ImageSettings(Settings):
         object.__setattr__(self, "size", as_size("size", self.size))
         super().__post_init__()
         for side in self.shape:
-            require_range("size × samples", side * self.samples, 1, MAX_SAMPLES_PER_ROW)
+            errors.require_range("size × samples", side * self.samples, 1, MAX_SAMPLES_PER_ROW)
 
     @property
     def shape(self) -> tuple[int, int]:

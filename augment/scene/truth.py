@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from renderer.errors import InputError
+
 # Label of an entry of `Truth` without an object, in images with fewer objects than others.
 NO_OBJECT = -1
 # A pixel belongs to an object that covers at least this fraction of it.
@@ -75,6 +77,14 @@ class Truth(Rows):
             {"boxes": boxes[used], "labels": labels[used], "masks": masks[used]}
             for used, boxes, labels, masks in images
         ]
+
+    def first_boxes(self) -> Float[Tensor, "E V 4"]:
+        """Return the box of the first object of each example, which must be in each view."""
+        boxes = self.boxes[..., 0, :]
+        for example, view in (~boxes.any(-1)).nonzero().tolist():
+            reason = f"the object of example {example} is not visible in its view {view}"
+            raise InputError(f"{reason}: turn the camera to it, or remove the view")
+        return boxes
 
 
 def unlabeled(label: str | int) -> int:

@@ -20,15 +20,7 @@ from torch import Tensor
 
 from augment.network import unwrapped
 from augment.scene.truth import Truth
-from augment.tasks.task import (
-    NO_CLASS,
-    GetTruth,
-    ObjectCriterion,
-    Task,
-    stored_names,
-    unique_names,
-    visible_boxes,
-)
+from augment.tasks.task import NO_CLASS, GetTruth, ObjectCriterion, Task, stored_names, unique_names
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
@@ -198,7 +190,7 @@ class Detection(Task):
         """Return the criterion of an untargeted attack on the first object of each example."""
         if self.goal == MISLABEL and class_count < 2:
             raise InputError("goal='mislabel' needs a second class: name it, or leave the goal out")
-        boxes = visible_boxes(truth())
+        boxes = truth().first_boxes()
         return DetectionCriterion(source, task=self, class_count=class_count, boxes=boxes)
 
     def as_found(

@@ -19,7 +19,7 @@ from torch import Tensor
 from augment.network import plain_outputs, unwrapped
 from augment.scene.truth import Truth
 from augment.tasks.detection import log_odds_of
-from augment.tasks.task import GetTruth, ObjectCriterion, Reader, Task, stored_names, visible_boxes
+from augment.tasks.task import GetTruth, ObjectCriterion, Reader, Task, stored_names
 from renderer.errors import InputError, describe, require_number
 
 # Class of the pixels that show no object, and the least fraction of an image that shows one.
@@ -103,7 +103,7 @@ class Segmentation(Task):
         """Return the criterion of an untargeted attack on the first object of each example."""
         positions = truth()
         # This raises InputError if a view does not show its object.
-        visible_boxes(positions)
+        positions.first_boxes()
         return SegmentationCriterion(source, task=self, masks=positions.masks[..., 0, :, :])
 
     def as_found(

@@ -131,15 +131,6 @@ class ObjectCriterion(Criterion):
         return torch.where(own >= limit, self.source, best)
 
 
-def visible_boxes(truth: Truth) -> Float[Tensor, "E V 4"]:
-    """Return the box of the first object of each example, which must be in each view."""
-    boxes = truth.boxes[..., 0, :]
-    for example, view in (~boxes.any(-1)).nonzero().tolist():
-        reason = f"the object of example {example} is not visible in its view {view}"
-        raise InputError(f"{reason}: turn the camera to it, or remove the view")
-    return boxes
-
-
 class Task(ABC):
     """What the outputs of a network mean. A subclass is a task, such as detection.
 

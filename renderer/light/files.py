@@ -23,16 +23,9 @@ from renderer.errors import InputError
 from renderer.image import LUMINANCE, to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
-from renderer.light import harmonics
+from renderer.light import environment, harmonics
 from renderer.light.basis import COEFFICIENTS, DEGREE, HARMONICS, Harmonics, LocalBasis
-from renderer.light.environment import (
-    FEWEST_ROWS,
-    SUFFIXES,
-    read_map,
-    read_panorama,
-    to_map,
-    write_map,
-)
+from renderer.light.environment import SUFFIXES
 from renderer.light.ringing import window_without_ringing
 from renderer.mesh import Y_UP_TO_Z_UP
 
@@ -94,11 +87,11 @@ def save_light(
     errors.require_bounded(coefficients=coefficients)
     errors.require_shape("coefficients", coefficients, basis.size, 3)
     if isinstance(basis, Harmonics) and is_map:
-        errors.require_whole("height", height, FEWEST_ROWS, MAX_MAP_HEIGHT)
+        errors.require_whole("height", height, environment.FEWEST_ROWS, MAX_MAP_HEIGHT)
         # A map cannot have negative radiance, so a light without it is written.
         physical = basis.project_nonnegative(coefficients)
-        write_map(path, to_map(physical, height).clamp(min=0))
-        written = harmonics.project(read_map(path), basis.degree).to(coefficients)
+        environment.write_map(path, environment.to_map(physical, height).clamp(min=0))
+        written = harmonics.project(environment.read_map(path), basis.degree).to(coefficients)
         return float(harmonics.irradiance_error(written, coefficients))
     description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
     picture = basis.picture(coefficients)
@@ -285,7 +278,7 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
 
     `roughness` is that of the smoothest surface, whose highlights must not get dark rings, or None.
     """
-    coefficients = harmonics.project(read_panorama(path), degree)
+    coefficients = harmonics.project(environment.read_panorama(path), degree)
     if roughness is not None:
         coefficients = coefficients * window_without_ringing(coefficients, roughness)[:, None]
     luminance = mean_luminance(coefficients)

@@ -10,16 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from renderer.visibility import numpy as exact
 from renderer.visibility.fragments import block_size
-from renderer.visibility.numpy import (
-    EMPTY_KEY,
-    FACE_BITS,
-    FAR,
-    SUBSAMPLES,
-    depth_planes,
-    doubled_areas,
-    next_sample,
-)
+from renderer.visibility.numpy import EMPTY_KEY, FACE_BITS, FAR, SUBSAMPLES
 
 # Faces of all views that are prepared at once, and smallest number of pairs of a face and a sample
 # that are tested at once. A face takes up to 700 bytes, and a pair 200.
@@ -67,13 +60,14 @@ def _triangles(
     rows, columns = shape
     positions, depths = to_fixed_point(points, shape)
     # A closed mesh shows only faces that are counter-clockwise in the image.
-    areas = doubled_areas(_by_corner(positions, faces))
+    areas = exact.doubled_areas(_by_corner(positions, faces))
     is_drawn = areas < 0 if closed else areas != 0
     # Corners are sorted, so that two faces with the same corners get exactly the same depth.
     corners = faces.sort(dim=1).values
     triangles = _by_corner(positions, corners)
-    areas = doubled_areas(triangles)
-    planes = depth_planes(triangles.double(), depths[:, corners].flatten(0, 1).T, areas.double())
+    areas = exact.doubled_areas(triangles)
+    corner_depths = depths[:, corners].flatten(0, 1).T
+    planes = exact.depth_planes(triangles.double(), corner_depths, areas.double())
     x, y = triangles
     first_column, widths = _covered_range(x, columns)
     first_row, heights = _covered_range(y, rows)
@@ -143,6 +137,6 @@ def _by_corner(positions: Int[Tensor, "N V 2"], faces: Int[Tensor, "F 3"]) -> In
 
 def _covered_range(positions: Int[Tensor, "3 M"], count: int) -> tuple[Tensor, Tensor]:
     """Find the first row, or column, that each triangle can cover, and the number of them."""
-    low, high = (next_sample(limits) for limits in positions.aminmax(dim=0))
+    low, high = (exact.next_sample(limits) for limits in positions.aminmax(dim=0))
     first = low.clamp(min=0)
     return first, (high.clamp(max=count) - first).clamp(min=0)
