@@ -32,6 +32,8 @@ MAX_FOV = 172.0
 # Smallest depth that a perspective camera can show, divided by the distance between camera and
 # origin. A mesh with a smaller depth raises an error.
 MIN_NEAR_RATIO = 0.01
+# End of errors about cameras that are too close.
+IN_FRONT = "give cameras that have the whole mesh in front of them"
 # Smallest and largest values of fields that are lengths, ratios or angles.
 _POSITIVE = (1 / errors.MAX_MAGNITUDE, errors.MAX_MAGNITUDE)
 _TURNS = (-MAX_TURN, MAX_TURN)
@@ -170,10 +172,9 @@ class Camera(ABC):
         if self.has_perspective:
             distance = self.distance - back
             if not distance > 0:
-                raise errors.InputError(
-                    f"cameras: the center {np.round(center, 3).tolist()} of the mesh lies behind a "
-                    "camera: give cameras that have the whole mesh in front of them"
-                )
+                place = np.round(center, 3).tolist()
+                fault = f"the center {place} of the mesh lies behind a camera"
+                raise errors.InputError(f"cameras: {fault}: {IN_FRONT}")
             changed["distance"] = scale * distance
             changed["width"] = scale * self.width * (distance / self.distance)
         return replace(self, **changed)
@@ -404,11 +405,10 @@ class PerspectiveCamera(Camera):
         is_behind = depths < cameras[0]._limits(cameras, depths)[0]
         if is_behind.any():
             camera = cameras[int(is_behind.any(1).nonzero()[0][0])]
-            raise errors.InputError(
-                f"the mesh reaches the camera at {camera.pose()[:3, 3].round(3).tolist()} or lies "
-                "behind it: normalize the mesh, increase the distance (by a smaller fov or a "
-                "larger width), or give cameras that have the whole mesh in front of them"
-            )
+            place = camera.pose()[:3, 3].round(3).tolist()
+            fault = f"the mesh reaches the camera at {place} or lies behind it: normalize the mesh"
+            advice = f"increase the distance (by a smaller fov or a larger width), or {IN_FRONT}"
+            raise errors.InputError(f"{fault}, {advice}")
         return depths
 
     @staticmethod

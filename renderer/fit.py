@@ -182,11 +182,10 @@ def fit_scene(
     require_shape("photograph", photograph, CHANNELS, size, size)
     require_shape("mask", mask, size, size)
     if mask.sum() < MIN_COVERED_PIXELS or mask.max() <= HALF_PIXEL:
-        raise InputError(
-            f"the mask covers {float(mask.sum()):.0f} pixels of {size} × {size}, and the largest "
-            f"share of a pixel is {float(mask.max()):.2g}: give a mask that is 1 where the object "
-            f"is, in at least {MIN_COVERED_PIXELS} pixels"
-        )
+        covered = f"covers {float(mask.sum()):.0f} pixels of {size} × {size}"
+        fault = f"{covered}, and the largest share of a pixel is {float(mask.max()):.2g}"
+        advice = f"is 1 where the object is, in at least {MIN_COVERED_PIXELS} pixels"
+        raise InputError(f"the mask {fault}: give a mask that {advice}")
     # Arguments of `render` and `precompute_transfer` for all images that are compared.
     surface = {"albedo_scale": albedo_scale, "encoding": encoding, "normals": normals}
     options: dict[str, Any] = {**surface, "rasterizer": rasterizer, "samples": SAMPLES}

@@ -40,7 +40,7 @@ from renderer.image import decode, encode, to_bytes
 from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.io.mitsuba_entries import Scene, environment, integrator, sensor_of
-from renderer.light.basis import LocalBasis
+from renderer.light.basis import LitBasis
 from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.mesh import Mesh, by_material
@@ -248,7 +248,7 @@ def write_mitsuba_scene(
     cameras: Sequence[Camera],
     settings: ImageSettings,
     light: str,
-    local_lights: Sequence[tuple[LocalBasis, torch.Tensor]] = (),
+    local_lights: Sequence[LitBasis] = (),
 ) -> None:
     """Write a scene file for Mitsuba, with the mesh and texture files that it refers to.
 
@@ -305,9 +305,7 @@ def _as_text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _local_emitters(
-    folder: Path, lights: Sequence[tuple[LocalBasis, torch.Tensor]], albedo_scale: float
-) -> list[Scene]:
+def _local_emitters(folder: Path, lights: Sequence[LitBasis], albedo_scale: float) -> list[Scene]:
     """Describe local lights for Mitsuba, and write the patterns of projectors as .exr files."""
     emitters: list[Scene] = []
     for basis, coefficients in lights:

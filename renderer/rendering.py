@@ -21,7 +21,7 @@ from renderer import errors
 from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import InputError
 from renderer.image import as_background, composite, encode
-from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
+from renderer.light.basis import HARMONICS, Basis, LitBasis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
 from renderer.mesh import NO_TEXTURE, Mesh, require_mesh
 from renderer.modes import without_autocast
@@ -41,7 +41,7 @@ from renderer.visibility.fragments import Fragments, build_fragments, views_at_o
 
 # Type of a local light for `render`: a `Lamps` or a `Projector` object, alone or in a pair with its
 # coefficients.
-LocalLight = LocalBasis | tuple[LocalBasis, Tensor]
+LocalLight = LocalBasis | LitBasis
 # Largest albedo that `render` accepts: 1 and a margin for rounding errors.
 MAX_ALBEDO = 1 + 1e-4
 # Words with which errors ask for the argument `lights` of `render`.
@@ -226,7 +226,7 @@ def render(
     return images[0][0] if isinstance(cameras, Camera) else torch.cat(images)
 
 
-def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
+def _with_coefficients(light: LocalLight) -> LitBasis:
     """Split a light into basis and coefficients, which are white at full power by default."""
     pair = light if isinstance(light, tuple) else (light, None)
     if len(pair) != 2:
@@ -401,18 +401,15 @@ def _as_albedo(albedo: object, mesh: Mesh) -> Tensor:
     values = errors.as_tensor("albedo", albedo)
     errors.require_bounded(albedo=values)
     if values.numel() and not (values.min() >= 0 and values.max() <= MAX_ALBEDO):
-        raise InputError(
-            f"albedo has values from {values.min().item():g} to {values.max().item():g}: "
-            "give values from 0 to 1, and set albedo_scale for brighter surfaces"
-        )
+        fault = f"albedo has values from {values.min().item():g} to {values.max().item():g}"
+        advice = "give values from 0 to 1, and set albedo_scale for brighter surfaces"
+        raise InputError(f"{fault}: {advice}")
     # A texture of any resolution may replace the only texture of the mesh.
     is_texture = values.ndim == 3 and values.shape[2] == 3 and len(mesh.textures) == 1
     if values.shape != mesh.faces.shape and not is_texture:
-        raise InputError(
-            f"albedo has shape {tuple(values.shape)}, which does not fit the mesh: give one color "
-            f"per face, {tuple(mesh.faces.shape)}, or a texture (H, W, 3) if the mesh has one "
-            "texture"
-        )
+        fault = f"albedo has shape {tuple(values.shape)}, which does not fit the mesh"
+        colors = f"give one color per face, {tuple(mesh.faces.shape)}"
+        raise InputError(f"{fault}: {colors}, or a texture (H, W, 3) if the mesh has one texture")
     return values
 
 

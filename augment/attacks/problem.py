@@ -1,7 +1,7 @@
 """All parameters that an attack changes, as one vector of values."""
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import torch
@@ -73,9 +73,7 @@ class SceneProblem:
         """
         if examples is None:
             examples = self.all_examples
-        groups: Iterable[Tensor] = examples.split(self.group_size)
-        if len(examples) > self.group_size:
-            groups = progress(groups, "images")
+        groups = progress(examples.split(self.group_size), "images")
         return torch.cat([self.render(values[group], group, is_draft=False) for group in groups])
 
     def truth(self, values: Values, examples: Examples) -> Truth:

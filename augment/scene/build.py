@@ -40,7 +40,7 @@ from renderer.errors import InputError
 from renderer.image import clamp, encode
 from renderer.io.images import gray_or_image
 from renderer.light import harmonics, ringing
-from renderer.light.basis import DEGREE, Basis, LocalBasis, harmonics_of, with_local_lights
+from renderer.light.basis import DEGREE, Basis, LitBasis, harmonics_of, with_local_lights
 from renderer.light.environment import SUFFIXES
 from renderer.light.files import load_light
 from renderer.light.lamps import LOCAL_LIGHTS
@@ -274,7 +274,7 @@ def _build_lights(
     return with_local_lights(environment * settings.given_exposure, local)
 
 
-def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
+def build_local_light(settings: Any) -> LitBasis:
     """Build a local light, which is a projector or a group of lamps.
 
     Return its basis and its RGB coefficients: the pixels of the projector or the powers of the

@@ -27,7 +27,7 @@ from torch import Tensor
 from augment.network import straight_through
 from augment.scene import loops, patterns, surfaces
 from augment.scene.surfaces import Range, limits
-from renderer.errors import InputError, as_list, require_choice, require_number
+from renderer.errors import as_list, require_choice, require_number
 from renderer.settings import Size, height_and_width
 
 # Ranges of the numbers that several models have.
@@ -148,9 +148,8 @@ class LightModel:
         mean = light._replace(field=light.field.mean((2, 3), keepdim=True)).total()
         gray = patterns.luminance(mean) if mean.shape[1] == 3 else mean
         # The last number is the exposure in stops. After it, the mean luminance is 2^stops.
-        return light.scaled(
-            torch.exp2(strength * drawn.numbers[-1]) / gray.clamp(min=patterns.DARKEST)
-        )
+        exposure = torch.exp2(strength * drawn.numbers[-1])
+        return light.scaled(exposure / gray.clamp(min=patterns.DARKEST))
 
     def camera(
         self, radiance: Float[Tensor, "B C H W"], drawn: Drawn, strength: float, white: Tensor
@@ -359,8 +358,6 @@ class CastShadow(LightModel):
     def __post_init__(self) -> None:
         for kind in as_list("kinds", self.kinds, str, "a list of names"):
             require_choice("kinds", kind, SHADOWS)
-        if not self.kinds:
-            raise InputError("kinds is empty: name at least one kind of shadow")
 
     def light(self, drawn: Drawn) -> Illumination:
         """Compute the light of the sun and of the sky."""

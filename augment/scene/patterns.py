@@ -444,9 +444,7 @@ LINE_LENGTH = 24
 LINE_SPACING = 1.2
 
 
-def _stripes(
-    positions: Float[Tensor, " ..."], rng: np.random.Generator, widest: float = 0.5
-) -> Tensor:
+def _stripes(positions: Tensor, rng: np.random.Generator, widest: float = 0.5) -> Tensor:
     """Draw stripes with a random width and a random position. Row 0 is the position across."""
     scaled = positions / rng.uniform(0.12, widest)
     return stripes(scaled, shift=rng.uniform(), bright=rng.uniform(0.3, 0.7))

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.light.basis import Harmonics, LocalBasis
+from renderer.light.basis import Harmonics, LitBasis
 from renderer.light.harmonics import cache_tensors, degree_of
 from renderer.mesh import Mesh
 from renderer.operators.rays import NO_FACE, Rays, sphere, unoccluded
@@ -132,7 +132,7 @@ def irradiance(
     image: ImageSettings,
     sky: Float[Tensor, "K 3"],
     lamp: Float[Tensor, " 3"],
-    lights: Sequence[tuple[LocalBasis, Tensor]] = (),
+    lights: Sequence[LitBasis] = (),
 ) -> Float[Tensor, "3 height width"]:
     """Compute an image of the irradiance of a table and a wall, with the shadow of an object.
 
@@ -195,7 +195,7 @@ def _from_lamp(room: Room, seen: _SeenPoints, lamp: Float[Tensor, " 3"]) -> Floa
 
 
 def _from_local_lights(
-    room: Room, seen: _SeenPoints, lights: Sequence[tuple[LocalBasis, Tensor]]
+    room: Room, seen: _SeenPoints, lights: Sequence[LitBasis]
 ) -> Float[Tensor, "S P 3"]:
     """Compute the irradiance of points on a table and a wall from projector and lamps.
 

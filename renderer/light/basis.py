@@ -320,6 +320,10 @@ class LocalBasis(Basis):
         return nearest_in_box(coefficients, 0, self.power, within)
 
 
+# A lamp or projector with its RGB coefficients (size, 3).
+LitBasis = tuple[LocalBasis, Tensor]
+
+
 @dataclass(frozen=True)
 class SumBasis(Basis):
     """Basis of lights that are sums of lights of several bases.
@@ -374,7 +378,7 @@ class SplitLight(NamedTuple):
     """
 
     environment: Tensor | None
-    local_lights: list[tuple[LocalBasis, Tensor]]
+    local_lights: list[LitBasis]
 
     @property
     def basis(self) -> SumBasis:
@@ -394,9 +398,7 @@ def split_light(basis: Basis, coefficients: Float[Tensor, "*views size 3"]) -> S
     )
 
 
-def with_local_lights(
-    sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]
-) -> tuple[Basis, Tensor]:
+def with_local_lights(sky: Tensor, lights: Sequence[LitBasis]) -> tuple[Basis, Tensor]:
     """Combine environment light and local lights to one basis with its coefficients.
 
     The environment light comes first.

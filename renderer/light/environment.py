@@ -71,9 +71,7 @@ def to_map(coefficients: Tensor, height: int) -> Float[Tensor, "height _ _"]:
     return light_radiance(coefficients, directions)
 
 
-def light_radiance(
-    coefficients: Tensor, directions: Float[Tensor, "... 3"]
-) -> Float[Tensor, " ..."]:
+def light_radiance(coefficients: Tensor, directions: Float[Tensor, "... 3"]) -> Tensor:
     """Compute the radiance of environment light from directions (toward the light, any length)."""
     degree = math.isqrt(len(coefficients)) - 1
     # Each block is a list of directions, shape (N, 3). The leading axes are restored at the end.

@@ -205,10 +205,9 @@ class Lamps(LocalBasis):
         positions = as_array("positions", self.positions)
         is_triple = positions.shape[1:] == (3,) and (positions != 0).any(axis=1).all()
         if not is_triple or not (np.abs(positions) <= MAX_SCALE).all():
-            raise InputError(
-                f"lamps.positions={self.positions} are no positions of lamps: give [x, y, z] for "
-                f"each lamp, with magnitudes up to {MAX_SCALE:g}, and no lamp at the origin"
-            )
+            fault = f"lamps.positions={self.positions} are no positions of lamps"
+            limits = f"with magnitudes up to {MAX_SCALE:g}, and no lamp at the origin"
+            raise InputError(f"{fault}: give [x, y, z] for each lamp, {limits}")
         # Plain assignment to a field of a frozen dataclass raises an error.
         object.__setattr__(self, "positions", tuple(map(tuple, positions.tolist())))
         require_number("lamps.power", self.power, 1 / MAX_SCALE, MAX_SCALE)

@@ -187,9 +187,7 @@ def _as_parameters(
     return [*angles, tensors["turbidity"].to(like.dtype)]
 
 
-def _chebyshev(
-    x: Float[Tensor, " ..."], slope: Tensor | float, count: int
-) -> tuple[Tensor, Tensor]:
+def _chebyshev(x: Tensor, slope: Tensor | float, count: int) -> tuple[Tensor, Tensor]:
     """Evaluate Chebyshev polynomials of x(p), and their derivatives with respect to p.
 
     `slope` is the derivative of x with respect to p. Axis -1 of the results is for T_0 to

@@ -356,10 +356,9 @@ def build_transport(
     without environment light. Bounces with local lights raise `InputError`.
     """
     if basis.local_lights and settings.bounces:
-        raise InputError(
-            f"bounces={settings.bounces} is not possible with {basis}, because only environment "
-            "light can bounce: set bounces=0, and shadows=true if you want shadows"
-        )
+        fault = f"bounces={settings.bounces} is not possible with {basis}"
+        advice = "set bounces=0, and shadows=true if you want shadows"
+        raise InputError(f"{fault}, because only environment light can bounce: {advice}")
     environment = basis.environment
     if environment is None or not settings.global_illumination:
         return None

@@ -69,10 +69,9 @@ class TransferOperators(Sequence[TransferOperator]):
         for operator in self._operators:
             is_same = operator.settings == first.settings and operator.basis == first.basis
             if not is_same or operator.transfer.dtype != first.transfer.dtype:
-                raise InputError(
-                    "operators differ in image settings, basis of light or dtype: compute all "
-                    "operators with the same settings, basis and dtype"
-                )
+                fault = "operators differ in image settings, basis of light or dtype"
+                advice = "compute all operators with the same settings, basis and dtype"
+                raise InputError(f"{fault}: {advice}")
 
     @overload
     def __getitem__(self, index: int) -> TransferOperator: ...
@@ -138,10 +137,9 @@ class TransferOperators(Sequence[TransferOperator]):
         first = self._operators[0]
         lights = first.require_lights(lights)
         if light_per_view and (lights.ndim < 3 or len(lights) != len(self)):
-            raise InputError(
-                f"lights has shape {tuple(lights.shape)}, but light_per_view=True needs the shape "
-                f"({len(self)}, ..., {first.basis.size}, 3) for {len(self)} views"
-            )
+            given = f"lights has shape {tuple(lights.shape)}, but light_per_view=True"
+            shape = f"({len(self)}, ..., {first.basis.size}, 3)"
+            raise InputError(f"{given} needs the shape {shape} for {len(self)} views")
         # One entry along the first axis for each view.
         view_lights = lights if light_per_view else lights.expand(len(self), *lights.shape)
         image_shape = (*view_lights.shape[:-2], COLORS, *first.settings.shape)

@@ -132,10 +132,9 @@ class Gloss:
             has_right_shape = values.shape in ((), (1,), (faces,))
             # A comparison with NaN is False, so `not` also finds NaN.
             if not has_right_shape or not (values.min() >= 0 and values.max() <= 1):
-                raise InputError(
-                    f"gloss: {name} has shape {tuple(values.shape)} or values outside [0, 1]: "
-                    f"give one number, or {faces} numbers (one per face), in [0, 1]"
-                )
+                fault = f"{name} has shape {tuple(values.shape)} or values outside [0, 1]"
+                advice = f"give one number, or {faces} numbers (one per face), in [0, 1]"
+                raise InputError(f"gloss: {fault}: {advice}")
             checked.append(values.reshape(-1))
         return checked
 
@@ -327,11 +326,9 @@ def sample_gloss(
         roughness = roughness * roughness_factor
         metallic = metallic * metallic_factor
     if (roughness < MIN_ROUGHNESS).any():
-        warnings.warn(
-            f"Roughness below {MIN_ROUGHNESS} is shaded as {MIN_ROUGHNESS}, "
-            "the smallest roughness that light of degree 40 shows.",
-            stacklevel=2,
-        )
+        shaded = f"Roughness below {MIN_ROUGHNESS} is shaded as {MIN_ROUGHNESS}"
+        reason = "the smallest roughness that light of degree 40 shows."
+        warnings.warn(f"{shaded}, {reason}", stacklevel=2)
     return SampleGloss(roughness.clamp(min=MIN_ROUGHNESS), metallic, specular_factor)
 
 
