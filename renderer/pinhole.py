@@ -390,9 +390,8 @@ def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
         is_affine = np.array_equal(matrix[3:], np.eye(4)[3 : len(matrix)])
         if error <= MATRIX_TOLERANCE and np.linalg.det(rotation) > 0 and is_affine:
             return rotation, matrix[:3, 3]
-    fault = f"view={matrix.tolist()} is not a rotation with a translation"
     advice = "give the matrix (4, 4) or (3, 4) from world to camera coordinates"
-    raise InputError(f"{fault}: {advice}")
+    raise InputError(f"view={matrix.tolist()} is not a rotation with a translation: {advice}")
 
 
 def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:

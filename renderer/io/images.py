@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont, ImageOps, features
+from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont, ImageOps
 from PIL.TiffImagePlugin import BITSPERSAMPLE, PHOTOMETRIC_INTERPRETATION, TiffImageFile
 
 from renderer.errors import InputError, keyed, reading, require_file
@@ -36,21 +36,14 @@ from renderer.settings import REC_709, Size, height_and_width
 if TYPE_CHECKING:
     from torch import Tensor
 
-# Old versions of Pillow do not know AVIF.
-_HAS_AVIF = "avif" in features.modules
 # Suffixes of the files in a folder that count as images.
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif"),
-    *(".jp2", ".ppm", ".pgm"),
-    *([".avif"] if _HAS_AVIF else []),
+    *(".jp2", ".ppm", ".pgm", ".avif"),
 )
 # Formats of Pillow that are read, whatever the name of the file. Others can run programs:
 # Pillow passes an EPS file to Ghostscript. "TGA" is last, because it has no signature.
-FORMATS = [
-    *("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "JPEG2000", "PPM"),
-    *(["AVIF"] if _HAS_AVIF else []),
-    "TGA",
-]
+FORMATS = ["PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "JPEG2000", "PPM", "AVIF", "TGA"]
 # A large JPEG file is decoded at a reduced size before it is
 # resized to a small square. The sides of the decoded image
 # are at least this many times as long as those of the square.
