@@ -21,7 +21,7 @@ from torch.nn.modules.module import register_module_forward_pre_hook
 from augment.distributed import rank
 from augment.progress import progress
 from renderer.errors import InputError, is_out_of_memory
-from renderer.image import to_bytes, to_unit
+from renderer.image import straight_through, to_bytes, to_unit
 from renderer.settings import Size, height_and_width
 
 # Number of images that a network sees at a time if nothing else is said.
@@ -193,13 +193,6 @@ class Quantization(nn.Module):
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N 3 H W"]:
         return straight_through(images, lambda exact: to_unit(to_bytes(exact)).to(exact))
-
-
-def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
-    """Apply a function, which need not be differentiable, with the gradient of the identity."""
-    # The difference is computed from detached images, so it has no gradient.
-    detached = images.detach()
-    return images + (change(detached) - detached)
 
 
 class Function(nn.Module):

@@ -6,7 +6,7 @@ Linear RGB has the primaries of Rec. 709 with D65; `to_rec709` converts others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -170,6 +170,13 @@ def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
     """Convert image values in [0, 1] to 8-bit values."""
     # `round_` rounds in place, which saves the memory of a copy.
     return (image * 255).round_().to(torch.uint8)
+
+
+def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
+    """Apply a function, which need not be differentiable, with the gradient of the identity."""
+    # The difference is computed from detached images, so it has no gradient.
+    detached = images.detach()
+    return images + (change(detached) - detached)
 
 
 def require_unit_range(images: Float[Tensor, " ..."]) -> None:

@@ -22,7 +22,7 @@ from functools import cache, partial
 from inspect import formatannotation
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from renderer import errors
+import renderer.errors as errors
 from renderer.errors import InputError
 
 # Type variable for any settings class.

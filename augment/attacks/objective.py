@@ -25,13 +25,13 @@ from PIL import Image
 from torch import Generator, Tensor, nn
 
 from augment.attack_settings import AttackSettings, EOTSettings
-from augment.network import BatchSize, Network, Quantization, eval_mode, straight_through
+from augment.network import BatchSize, Network, Quantization, eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator
 from augment.scene.truth import Rows
 from augment.tasks.task import NO_GRADIENT, Criterion, gradient_of
 from renderer.errors import InputError
-from renderer.image import clamp, to_bytes, to_unit
+from renderer.image import clamp, straight_through, to_bytes, to_unit
 
 # Attack values of E examples, the indices of examples, and images of their V views.
 Values = Float[Tensor, "E D"]

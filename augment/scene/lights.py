@@ -24,10 +24,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.network import straight_through
 from augment.scene import loops, patterns, surfaces
 from augment.scene.surfaces import Range, limits
 from renderer.errors import as_list, require_choice, require_number
+from renderer.image import straight_through
 from renderer.settings import Size, height_and_width
 
 # Ranges of the numbers that several models have.
