@@ -183,16 +183,21 @@ class SceneSettings(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.exposure != AUTO:
+        if not self.adapts_exposure:
             require_range("exposure", self.exposure, 1 / MAX_SCALE, MAX_SCALE)
         for name, kind in LOCAL_LIGHT_SETTINGS.items():
             if getattr(self, name) is not None:
                 setattr(self, name, base.settings_from(kind, getattr(self, name), name))
 
     @property
+    def adapts_exposure(self) -> bool:
+        """Whether the exposure is chosen for each mesh."""
+        return self.exposure == AUTO
+
+    @property
     def given_exposure(self) -> float:
         """The exposure, or 1 if it is chosen for each mesh."""
-        return 1.0 if self.exposure == AUTO else float(self.exposure)
+        return 1.0 if self.adapts_exposure else float(self.exposure)
 
 
 @dataclass

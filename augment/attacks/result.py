@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import ImageOps
-from torch import Tensor, nn
+from torch import Tensor
 
 from augment.attack_settings import AttackSettings
 from augment.attacks.loop import Minimum
@@ -149,9 +149,9 @@ class AttackResult(ShortRepr):
         """
         return self.logits_in_views.squeeze(1)
 
-    def objective(self, network: nn.Module | None = None) -> Objective:
-        """Return the objective of the attack, also against another network of the same classes."""
-        return Objective(network or self.classifier, self.criterion, self.settings, self.seed)
+    def objective(self) -> Objective:
+        """Return the objective of the attack."""
+        return Objective(self.classifier, self.criterion, self.settings, self.seed)
 
     @property
     def success(self) -> Tensor:

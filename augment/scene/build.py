@@ -27,13 +27,7 @@ from augment.scene import objects as placed
 from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import unlabeled
-from augment.settings import (
-    AUTO,
-    LOCAL_LIGHT_SETTINGS,
-    ObjectSettings,
-    RendererSettings,
-    SceneSettings,
-)
+from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
 from renderer import errors
 from renderer.camera import Camera, orbit_cameras
 from renderer.errors import InputError
@@ -191,7 +185,7 @@ def build_scene(
         basis=basis,
         lights_of_degree=lights_of_degree,
     )
-    return expose(built) if settings.exposure == AUTO else built
+    return expose(built) if settings.adapts_exposure else built
 
 
 def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:

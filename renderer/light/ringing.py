@@ -64,7 +64,7 @@ _FRACTION_TO_BOUNDARY = 0.99
 # divided by the mean squared length of a row of the matrix.
 _START = 0.1
 # `required_degree` leaves out the degrees of a light whose amplitude in a highlight
-# is at most this fraction of the amplitude of degree 0, by default.
+# is at most this fraction of the amplitude of degree 0.
 AMPLITUDE = 0.1
 # Highlights at grazing angles are narrower than highlights along the normal.
 # `window_without_ringing` therefore also tests a highlight whose width α = roughness² is
@@ -228,19 +228,18 @@ def irradiance_weights(degree: int) -> Tensor:
 
 
 @cache
-def required_degree(roughness: float, amplitude: float = AMPLITUDE) -> int:
+def required_degree(roughness: float) -> int:
     """Find the degree of environment light that the highlights of a material need.
 
     The highlight is the specular lobe of a metal for a camera that looks along
     the surface normal. It multiplies the coefficients of degree l of the light by
-    an amplitude. All degrees with a larger amplitude than `amplitude` are needed.
-    `amplitude` is a fraction of the amplitude of degree 0, and the result is at most
-    MAX_DEGREE.
+    an amplitude. All degrees with a larger amplitude than AMPLITUDE are needed, which is a
+    fraction of the amplitude of degree 0. The result is at most MAX_DEGREE.
     """
     amplitudes = _amplitudes(max(roughness, MIN_ROUGHNESS), MAX_DEGREE)
     # The amplitudes fall with the degree. If n degrees from 1 on exceed the limit, these
     # are the degrees 1 to n.
-    return int(np.count_nonzero(amplitudes[1:] > amplitude))
+    return int(np.count_nonzero(amplitudes[1:] > AMPLITUDE))
 
 
 def window_without_ringing(
