@@ -20,6 +20,12 @@ NO_CLASS_PIXEL = 255
 PYTHON = "python:"
 
 
+def split_function(name: str) -> tuple[str, str]:
+    """Split "package.module:function" or "package.module.function" into module and function."""
+    module, _, function = name.rpartition(":" if ":" in name else ".")
+    return module, function
+
+
 @dataclass
 class MeshSettings(Settings):
     """A mesh and its material."""

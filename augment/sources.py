@@ -23,7 +23,7 @@ from augment import network as wrappers
 from augment.classifier import Classifier, Normalization, as_network, mean_and_std
 from augment.files import NetworkFacts, State
 from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network, unwrapped
-from augment.settings import PYTHON, NormalizeLight
+from augment.settings import PYTHON, NormalizeLight, split_function
 from augment.tasks.classification import nearest
 from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
@@ -271,8 +271,7 @@ def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
 
 def import_function(name: str) -> Callable[..., Any]:
     """Import "package.module:function" of the user, also from the current folder."""
-    separator = ":" if ":" in name else "."
-    module_name, _, function_name = name.rpartition(separator)
+    module_name, function_name = split_function(name)
     # Installed packages come first. The current folder may be a clone of this library.
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
@@ -292,7 +291,7 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     """
     full_name = f"{PYTHON}{name}"
     # Part of the name before the function. A missing module of this name gets its own advice.
-    module_name = name.rpartition(":" if ":" in name else ".")[0]
+    module_name, _ = split_function(name)
     try:
         network, size, classes = import_function(name)()
     except InputError:

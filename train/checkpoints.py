@@ -145,15 +145,7 @@ def load_network(
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     options: dict[str, Any] = {"normalize_light": normalize_light, "trust_code": trust_code}
     if name.startswith(SWITCHES):
-        prefix, _, names = name.partition(":")
-        plain, plus, other = names.rpartition("+")
-        if f"+{RUN}" in names and not is_classifier(other):
-            # A folder that a sweep has named may have a "+" in its name.
-            plain, _, folder_name = names.rpartition(f"+{RUN}")
-            other = RUN + folder_name
-        if not plus:
-            reason = f"name={name} names one network: give {prefix}:NETWORK+OTHER_NETWORK"
-            raise InputError(reason, "name")
+        plain, other = split_switch(name)
         network = load_network(plain, weights, trust_code=trust_code, **facts)
         if not other.startswith(RUN):
             options |= {"weights": weights, **facts}
@@ -178,6 +170,20 @@ def load_network(
     with keyed(run="name"):
         classifier = load_run(name.removeprefix(RUN), weights, trust_code=trust_code)
     return classifier.normalizing_light(normalize_light)
+
+
+def split_switch(name: str) -> tuple[str, str]:
+    """Split dim:NETWORK+OTHER_NETWORK, or lit:, into the names of both networks."""
+    prefix, _, names = name.partition(":")
+    plain, plus, other = names.rpartition("+")
+    if f"+{RUN}" in names and not is_classifier(other):
+        # A folder that a sweep has named may have a "+" in its name.
+        plain, _, folder_name = names.rpartition(f"+{RUN}")
+        other = RUN + folder_name
+    if not plus:
+        reason = f"name={name} names one network: give {prefix}:NETWORK+OTHER_NETWORK"
+        raise InputError(reason, "name")
+    return plain, other
 
 
 def load_chosen(settings: TaskSettings) -> Any:

@@ -10,7 +10,7 @@ import hashlib
 import os
 import platform
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields
 from functools import cache
@@ -22,7 +22,7 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from augment.settings import PYTHON
+from augment.settings import PYTHON, split_function
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.run_folder import opened_text
@@ -184,13 +184,19 @@ def require_same(
         if old != new and not is_permitted(key, old, new):
             advice = f"set it so, or another {elsewhere}"
             raise InputError(f"{folder} was made with {key}={old}, not {new}: {advice}")
-    # Fingerprints of the input files at that time, by path.
-    hashes = config.get("inputs") or {}
+    require_same_inputs(folder, settings, config, elsewhere)
+    return config
+
+
+def require_same_inputs(
+    folder: Path, settings: Any, recorded: Mapping[Any, Any], elsewhere: str
+) -> None:
+    """Check that input files are as when a folder began, by the fingerprints in its facts."""
+    hashes = recorded.get("inputs") or {}
     for path, fingerprint in fingerprints(settings).items():
         if hashes.get(path, fingerprint) != fingerprint:
             advice = f"put it back, or set another {elsewhere}"
             raise InputError(f"{path} has changed since {folder} began: {advice}")
-    return config
 
 
 def mapped(value: Any, change: Callable[[str], str]) -> Any:
@@ -209,13 +215,15 @@ def fingerprints(settings: Any) -> dict[str, str]:
     """Compute the fingerprint of each input file and folder that the settings of a command name.
 
     The fingerprint of a training run covers its selected network, that of a mesh its materials and
-    textures, and that of a network python:MODULE:FUNCTION the file of the module.
+    textures, and that of a function, such as python:MODULE:FUNCTION, the file of its module.
     """
     # Values of the settings by their dotted keys. Those of INPUTS may name files.
     values = dict(dotted(asdict(settings)))
     # The folders of photos={NAME: FOLDER} have keys such as photos.NAME.
-    folders = [value for key, value in values.items() if key.startswith("photos.")]
-    texts = _collect_texts([*(values.get(key) for key in INPUTS), *folders]) - {""}
+    others = [value for key, value in values.items() if key.startswith("photos.")]
+    if values.get("decode"):
+        others.append(f"{PYTHON}{values['decode']}")
+    texts = _collect_texts([*(values.get(key) for key in INPUTS), *others]) - {""}
     paths = {text.removeprefix("run:"): _path_of(text) for text in sorted(texts)}
     return {name: _fingerprint(path) for name, path in paths.items() if path.exists()}
 
@@ -223,10 +231,16 @@ def fingerprints(settings: Any) -> dict[str, str]:
 def _collect_texts(value: Any) -> set[str]:
     """Collect the texts in a setting that may be paths of input files.
 
-    An object can have a "mesh" and "others", which are other objects beside it.
+    An object can have a "mesh" and "others", which are other objects beside it. A text such as
+    dim:A+B names two networks.
     """
+    from augment.switch import SWITCHES
+    from train.checkpoints import split_switch
+
     if isinstance(value, dict):
         value = [value.get("mesh"), value.get("others")]
+    if isinstance(value, str) and value.startswith(SWITCHES):
+        value = [*split_switch(value)]
     if isinstance(value, list):
         return set().union(*map(_collect_texts, value))
     return {value} if isinstance(value, str) else set()
@@ -237,10 +251,10 @@ def _path_of(text: str) -> Path:
     if text.startswith(PYTHON):
         # `find_spec` imports the packages above the module, which can raise errors of any type.
         with suppress(Exception):
-            spec = find_spec(text.split(":")[1])
+            spec = find_spec(split_function(text.removeprefix(PYTHON))[0])
             if spec and spec.origin:
                 return Path(spec.origin)
-    return published_folder(Path(text.removeprefix("run:")))
+    return published_folder(Path(text.removeprefix("run:").removeprefix("hf:")))
 
 
 def _fingerprint(path: Path) -> str:

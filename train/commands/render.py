@@ -15,6 +15,7 @@ from train.command_settings import RenderSettings
 from train.data.annotations import DATA_SET
 from train.data.formats import FORMATS
 from train.device import choose_device, choose_rasterizer
+from train.run_config import fingerprints, require_same_inputs
 from train.run_folder import read_json, writable_folder, write_json
 from train.settings import label_names, read_objects
 
@@ -87,12 +88,15 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
         facts["shards"] = settings.shards  # A tar file has renders of one shard.
     # JSON makes the settings comparable with those in the file: tuples become lists.
     facts = json.loads(json.dumps(facts | {"classes": classes}, default=str))
-    if path.exists():
+    if all(path.name in (DATA_SET, LAUNCHER) for path in folder.iterdir()):
+        # A command that failed before its first render may have left settings, which do not count.
+        facts["inputs"] = fingerprints(settings)
+        write_json(path, facts, indent=1)
+    elif path.exists():
         found = read_json(path)
         changed = [key for key in facts if found.get(key) != facts[key]]
         if changed:
             raise InputError(f"out={folder} has another {changed[0]}: choose another folder", "out")
-    elif any(path.name not in (DATA_SET, LAUNCHER) for path in folder.iterdir()):
-        raise InputError(f"out={folder} is not empty: choose a new folder", "out")
+        require_same_inputs(folder, settings, found, "out=")
     else:
-        write_json(path, facts, indent=1)
+        raise InputError(f"out={folder} is not empty: choose a new folder", "out")

@@ -170,6 +170,28 @@ def test_a_data_set_of_other_settings_is_not_continued(meshes, written, changed)
         write(meshes, written, maps=MAPS, **changed)
 
 
+def test_a_data_set_of_a_mesh_that_changed_is_not_continued(tmp_path):
+    mesh = tmp_path / "mesh.ply"
+    trimesh.creation.box().export(mesh)
+    one = [{"mesh": str(mesh), "label": "one"}]
+    folder = write(one, tmp_path / "out", count=1, maps=[])
+    # Earlier versions wrote no fingerprints.
+    path = folder / "data_set.json"
+    described = json.loads(path.read_text())
+    assert described.pop("inputs").keys() == {str(mesh)}
+    trimesh.creation.icosphere(1).export(mesh)
+    with pytest.raises(InputError, match=f"{mesh} has changed since"):
+        write(one, folder, count=1, maps=[])
+    path.write_text(json.dumps(described))
+    write(one, folder, count=1, maps=[])
+
+
+def test_a_command_that_failed_before_its_first_render_can_be_corrected(meshes, tmp_path):
+    with pytest.raises(InputError, match="absent"):
+        write(["absent.ply"], tmp_path / "out")
+    assert len(pictures(write(meshes[:1], tmp_path / "out", count=1, maps=[]))) == 1
+
+
 def test_a_folder_of_other_files_is_refused(meshes, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="not empty"):
