@@ -3,6 +3,7 @@
 This module imports neither torch nor NumPy; see `renderer.settings`.
 """
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from itertools import accumulate
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 from augment import augmentation_settings as augmentation
 from augment import settings as scenes
-from augment.attack_settings import AttackSettings, RelightingSettings
+from augment.attack_settings import PARAMETER_NAMES, AttackSettings, RelightingSettings
 from augment.settings import LampsSettings, RendererSettings, SceneSettings
 from renderer import errors
 from renderer import settings as base
@@ -35,10 +36,17 @@ PATTERNS = (*TRAINED_PATTERNS, *OTHER_PATTERNS, SLIDES)
 # Layouts of the data sets of pnb-render, and the maps that it writes for each render.
 DATA_SET_FORMATS = ("imagefolder", "coco", "yolo", "webdataset")
 DATA_SET_MAPS = ("mask", "depth", "normals")
+OF_NETWORK = tuple(field.name for field in fields(TaskSettings))
 # Settings of pnb-attack that count for photographs, besides those of the network.
 OF_RELIGHTING = (
     *("seed", "out", "overwrite", "unlabeled"),
     *("attack.relighting", "attack.batch_size", "attack.sensor_noise"),
+)
+# Settings of pnb-render that it shares with other commands, and that count without a network.
+# Attacked parameters are then drawn from their norm-balls.
+OF_RENDERS = (
+    *("size", "device", "augment.vary", "augment.random_light", "augment.attack.allow_negative"),
+    *(f"augment.attack.{name}" for name in PARAMETER_NAMES),
 )
 # The objects that pnb-lab renders by default: six oranges, and ten other objects.
 LAB_MESHES = [
@@ -146,7 +154,8 @@ class AttackExperimentSettings(TaskSettings):
         if self.unlabeled is not None and (attacked or self.reload):
             raise InputError("attack=relighting takes no meshes: remove the others", "attack")
         if self.unlabeled is not None:
-            self._require_relighting_alone()
+            counting = (*OF_RELIGHTING, *OF_NETWORK)
+            require_counting(self, AttackExperimentSettings(), counting, "for attack=relighting")
         # An attacked light that the scene lacks, such as a projector, is added with default
         # settings. An attack on the positions of lamps needs lamps that shine.
         for light, settings_class in scenes.LOCAL_LIGHT_SETTINGS.items():
@@ -157,15 +166,14 @@ class AttackExperimentSettings(TaskSettings):
         if "pose" in attacked:
             self.renderer.silhouettes = True
 
-    def _require_relighting_alone(self) -> None:
-        """Refuse settings that do not count for photographs and differ from their defaults."""
-        default = dict(common.dotted(asdict(AttackExperimentSettings())))
-        counting = (*OF_RELIGHTING, *(field.name for field in fields(TaskSettings)))
-        for key, value in common.dotted(asdict(self)):
-            counts = any(f"{key}.".startswith(f"{name}.") for name in counting)
-            if not counts and value != default.get(key):
-                fault = f"{key}={value} does not count for attack=relighting"
-                raise InputError(f"{fault}: leave it out", key)
+
+def require_counting(given: Any, default: Any, names: Iterable[str], use: str) -> None:
+    """Refuse settings that differ from their defaults, except for those of some names."""
+    defaults = dict(common.dotted(asdict(default)))
+    for key, value in common.dotted(asdict(given)):
+        counts = any(f"{key}.".startswith(f"{name}.") for name in names)
+        if not counts and value != defaults.get(key):
+            raise InputError(f"{key}={value} does not count {use}: leave it out", key)
 
 
 @dataclass
@@ -424,7 +432,17 @@ class RenderSettings(TaskSettings):
         parts = [*self.splits.values()] if isinstance(self.splits, dict) else []
         if not all(is_number(part) and part >= 0 for part in parts) or not sum(parts):
             raise self.wrong("splits", "must be parts and their fractions, such as {train: 1}")
-        self.augment.mode = "adversarial" if self.network else "random"
+        # The default depends on the network. `require_counting` refuses other modes.
+        if self.network and self.augment.mode == "random":
+            self.augment.mode = "adversarial"
+
+    def require_counting(self) -> None:
+        """Refuse settings that do not count, such as those of a network if there is none."""
+        own = {field.name for field in fields(self)}.difference(OF_NETWORK, ["augment"])
+        names, use = [*own, *OF_RENDERS], "without network"
+        if self.network:
+            names, use = [*names, *OF_NETWORK, "augment.attack", "augment.init"], "for pnb-render"
+        require_counting(self, RenderSettings(out=self.out, network=self.network), names, use)
 
     @property
     def split_counts(self) -> dict[str, int]:

@@ -28,9 +28,12 @@ DEFAULT_SIZE = 224
 
 def run(settings: RenderSettings) -> None:
     """Render a data set, or what a stopped command left to do, and print a summary."""
+    settings.require_counting()
     objects = [*read_objects(settings.meshes, "", "meshes").values()]
-    # An object without a label gets the first label, or else the class that its mesh is named by.
-    default = None if settings.label is None else label_names(settings.label)[0]
+    default, *more = [None] if settings.label is None else label_names(settings.label)
+    if more:
+        raise settings.wrong("label", "is several classes: give each mesh its own, {mesh, label}")
+    # An object without a label gets the given one, or else the class that its mesh is named by.
     for item in objects:
         item.label = item.label or default or name_of_mesh(item.mesh)
     labels = [of.label for item in objects for of in (item, *item.others)]

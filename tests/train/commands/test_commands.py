@@ -24,6 +24,12 @@ from train.run_folder import LOCK, sole_writer
 EVALUATE = ["evaluate", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
 EVALUATE_CLASSIFIER = [*EVALUATE, "run=null"]
 ATTACK = ["attack", "network=run:pretrained/none", "device=cpu", "renderer.rasterizer=numpy"]
+RENDER = ["render", "out=out", "device=cpu", "meshes=[solid:orange]"]
+# Settings that nothing reads in a data set that is rendered without a network.
+OF_NETWORKS = (
+    *("weights=b", "classes=['a', 'b']", "decode=a:b", "threshold=0.5", "augment.init=random"),
+    *("augment.attack.max_steps=3", "augment.attack.eot.draws=2", "augment.regenerate_every=9"),
+)
 
 
 @pytest.fixture
@@ -91,6 +97,11 @@ MISTAKES = [
     ([*EVALUATE, "weights=b"], "weights=b"),
     (["compare", "runs=[2024]"], "runs: 2024 holds no run"),
     (["lab", "out=file/out"], "out=file/out"),
+    ([*RENDER, "augment.mode=folder", "augment.folder=2024"], "augment.mode=folder does not"),
+    ([*RENDER, "augment.mode=none", "network=best"], "augment.mode=none does not"),
+    ([*RENDER, "augment.examples=5", "network=best"], "augment.examples=5 does not"),
+    *(([*RENDER, word], f"{word} does not count") for word in OF_NETWORKS),
+    ([*RENDER, "label=[a,b]"], "label=['a', 'b']"),
     ([*ATTACK, "transfer.networks=[resnet18]"], "transfer.networks=resnet18"),
     ([*ATTACK, "transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "'paer' is not a class"),
     ([*ATTACK, "attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry"),
