@@ -21,8 +21,7 @@ from renderer.errors import InputError
 from renderer.image import require_unit_range
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
-# normalization="imagenet" stands for the following mean and standard deviation of red, green and
-# blue, which most networks use that were trained on ImageNet.
+# normalization="imagenet": mean and standard deviation of most networks trained on ImageNet.
 IMAGENET = "imagenet"
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -30,8 +29,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 UNIT_RANGE = (0.0, 1.0)
 # Pixels per side of the images of most networks that were trained on ImageNet.
 USUAL_SIZE = 224
-# Number of images with which a network is called to count its outputs. With a single image, logits
-# could look like probabilities by chance.
+# Number of images that count the outputs. Logits of one could look like probabilities by chance.
 CHECKED_COUNT = 2
 # Names of module classes of torchvision, kornia and this library that normalize images.
 NORMALIZING = frozenset({"Normalize", "ChannelNormalization"})
@@ -259,7 +257,7 @@ class TaskNetwork(CheckedNetwork):
         recognizer = getattr(lit, "recognizer", None)
         if recognizer is None:
             name = getattr(lit, "title", "lit")
-            raise InputError(f"{name} recognizes no light: train it with recognize=true")
+            raise InputError(f"{name} recognizes no light: give one trained with recognize")
         return self._with_other(lit, "lit", recognizer, LIT_NAME)
 
     def _with_other(self, other: Self, key: str, chooses: Chooser, prefix: str) -> Self:

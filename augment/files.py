@@ -120,7 +120,7 @@ def require_no_facts(name: str, facts: NetworkFacts) -> None:
     for setting, value in vars(facts).items():
         if value is not None:
             reason = f"{setting} cannot be set for {name}, because this network already defines it"
-            raise InputError(f"{reason}: leave {setting} out", setting)
+            raise InputError(f"{reason}: leave it out", setting)
 
 
 def is_network_file(name: str) -> bool:

@@ -191,8 +191,8 @@ def load_chosen(settings: TaskSettings) -> Any:
     names = ("weights", "classes", "size", "normalization", "normalize_light", "prompt")
     given = {name: getattr(settings, name) for name in names}
     task = _task_that_decodes(settings)
-    # Error messages about the argument `name` begin with the setting `network` instead.
-    with keyed(name="network"):
+    # Error messages about the arguments `name` and `task` begin with these settings instead.
+    with keyed(name="network", task="decode"):
         network = load_network(str(settings.network), trust_code=settings.trust, task=task, **given)
     return with_task(network, settings)
 
@@ -251,8 +251,8 @@ def load_run(
         The network.
 
     Raises:
-        InputError: If there is no such network, if `weights` is not None, or if `model` or
-            `trust_code` is missing.
+        InputError: If there is no such network, if `weights` is not None, if `model` or
+            `trust_code` is missing, or if `model` is another function.
 
     Example:
         >>> import norm_balls as nb
@@ -269,6 +269,8 @@ def load_run(
     if name.startswith(PYTHON) and name != model and not trust_code:
         advice = "set trust=true (trust_code=True in Python) to run that code"
         raise InputError(f"{path} is built by {name}: {advice}")
+    if model not in (None, name):
+        raise InputError(f"{path} is built by {name}, not by {model}: leave {model} out")
     with checks_architecture(path):
         size = int(shape.pop("size"))
         classes = tuple(map(str, shape.pop("classes")))

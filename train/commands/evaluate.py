@@ -41,6 +41,8 @@ def run(settings: EvaluateSettings) -> None:
         # are therefore an error here.
         facts = settings.classes, settings.size, settings.normalization, settings.prompt
         require_no_facts(f"run={settings.run}", as_facts(*facts))
+        if settings.decode is not None:
+            raise settings.wrong("decode", "is for a file, and not for a run: leave it out")
         loaded = load_run(settings.run, settings.weights, settings.network, settings.trust)
         # The returned copy normalizes the light of each image, unless the setting is None.
         network = with_task(loaded.normalizing_light(settings.normalize_light), settings)
