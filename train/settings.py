@@ -189,8 +189,8 @@ class NetworkSettings(Settings):
     normalize_light: Any = setting(
         None,
         "Normalize the light of each image before the network sees it: true, or "
-        "{white_balance, percentile, level, gamma}. A training sees such images, too, and its "
-        "network remembers it. null: as the network does. This is not `normalization`.",
+        "{white_balance, percentile, level, gamma, average}. A training sees such images, too, and "
+        "its network remembers it. null: as the network does. This is not `normalization`.",
     )
     trust: bool = setting(
         False,

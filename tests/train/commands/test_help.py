@@ -1,18 +1,22 @@
 """--help, shell completion and the words that start an installed command."""
 
 import os
+import re
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
 
+from augment.settings import NormalizedLightSettings
+from renderer.settings import facts_of
 from scripts.attack import main as attack
 from train.__main__ import main as train
 from train.cli import USER_ERROR
 from train.run_config import format_command
-from train.settings import dotted
+from train.settings import NetworkSettings, dotted
 
 ROOT = Path(__file__).parents[3]
 
@@ -21,6 +25,11 @@ ROOT = Path(__file__).parents[3]
 def test_help_shows_each_setting(command):
     shown = {line.strip().partition("=")[0] for line in command.format_help().splitlines()}
     assert {key for key, _ in dotted(OmegaConf.to_container(command.compose()))} <= shown
+
+
+def test_help_names_each_field_of_normalize_light():
+    [named] = re.findall("{(.*)}", facts_of(NetworkSettings, "normalize_light").about)
+    assert {*named.split(", ")} == {field.name for field in fields(NormalizedLightSettings)}
 
 
 def start_without_torch(*words: str) -> subprocess.CompletedProcess:
