@@ -127,8 +127,10 @@ class GltfFile:
     def _buffers(self) -> list[memoryview]:
         """Bytes of all buffers."""
         buffers = []
+        chunk = self._binary_chunk
         for buffer in self.tree.get("buffers", []):
-            content = self._resource(buffer["uri"]) if "uri" in buffer else self._binary_chunk
+            content = self._resource(buffer["uri"]) if "uri" in buffer else chunk
+            chunk = None  # Only the first buffer can be that chunk (3.6.1.2).
             if content is None or len(content) < buffer["byteLength"]:
                 raise ValueError("the bytes of a buffer are missing: export the file again")
             buffers.append(memoryview(content))
@@ -228,7 +230,8 @@ IOR = "KHR_materials_ior"
 READ = {TRANSFORM, QUANTIZATION, SPECULAR_GLOSSINESS, SPECULAR, IOR}
 READ |= {WEBP, VISIBILITY}
 # Extensions by which a mesh has copies, or compressed arrays.
-REFUSED = {"EXT_mesh_gpu_instancing", "EXT_meshopt_compression", "KHR_draco_mesh_compression"}
+REFUSED = {"EXT_mesh_gpu_instancing", "KHR_draco_mesh_compression"}
+REFUSED |= {"EXT_meshopt_compression", "KHR_meshopt_compression"}
 # Beginnings of the names of extensions that may be required by a
 # file but ignored, because they change neither shape nor color.
 HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation_")

@@ -199,7 +199,7 @@ def export_mesh(
         corner_values = np.concatenate([column[is_written] for column in columns], axis=-1)
         values, corners = np.unique(corner_values.reshape(-1, 9), axis=0, return_inverse=True)
         attributes = {
-            "POSITION": mesh.vertices[values[:, 0].astype(np.int64)] @ rotation,
+            "POSITION": (mesh.vertices - mesh.origin)[values[:, 0].astype(np.int64)] @ rotation,
             # v points down in glTF.
             "TEXCOORD_0": values[:, 4:6] * [1, -1] + [0, 1],
             "COLOR_0": decode(torch.from_numpy(values[:, 1:4]), "srgb").numpy(),
@@ -211,7 +211,10 @@ def export_mesh(
             "material": _add_material(tree, mesh, texture_id, gloss),
         }
         primitives.append(primitive)
-    tree.add("nodes", {"mesh": tree.add("meshes", {"primitives": primitives})})
+    node: dict[str, Any] = {"mesh": tree.add("meshes", {"primitives": primitives})}
+    if mesh.origin.any():
+        node["translation"] = (mesh.origin @ rotation).tolist()
+    tree.add("nodes", node)
     for index, camera in enumerate(cameras):
         # The axes of a camera in glTF are the same as ours: right, up and back. glTF stores
         # matrices column by column.

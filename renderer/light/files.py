@@ -50,7 +50,8 @@ def save_light(
     mean, so its irradiance can differ from that of the light.
 
     Args:
-        path: Path of a .json file or, for spherical harmonics, of a map.
+        path: Path of a .json file or, for spherical harmonics, of a map. Its folder
+            is created.
         coefficients: RGB coefficients of the light, shape (size, 3) with the
             number `basis.size` of functions of the basis.
         basis: Basis of the light. The default is spherical harmonics of degree 6.
@@ -78,12 +79,12 @@ def save_light(
     """
     path = errors.as_path("path", path)
     is_map = path.suffix.lower() in SUFFIXES and isinstance(basis, Harmonics)
-    if path.suffix != ".json" and not is_map:
+    if path.suffix.lower() != ".json" and not is_map:
         fault = f"path={path} is neither a .json file nor, for spherical harmonics, a map"
         raise InputError(f"{fault}: use one of the suffixes .json, {', '.join(SUFFIXES)}")
     expected = "Harmonics(degree), or lamps or a projector"
     errors.require_kind("basis", basis, Harmonics | LocalBasis, expected)
-    coefficients = errors.as_tensor("coefficients", coefficients)
+    coefficients = errors.as_tensor("coefficients", coefficients).detach()
     errors.require_bounded(coefficients=coefficients)
     errors.require_shape("coefficients", coefficients, basis.size, 3)
     if isinstance(basis, Harmonics) and is_map:
@@ -95,6 +96,7 @@ def save_light(
         return float(harmonics.irradiance_error(written, coefficients))
     description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
     picture = basis.picture(coefficients)
+    path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, json.dumps(description, allow_nan=False) + "\n")
     if picture is not None:
         write_image(path.with_suffix(".png"), to_bytes(picture.clamp(0, 1)).numpy())

@@ -84,7 +84,8 @@ class Gltf:
         return json.dumps(self.tree | {"buffers": [{"byteLength": len(self.buffer), "uri": uri}]})
 
     def glb(self) -> bytes:
-        text = json.dumps(self.tree | {"buffers": [{"byteLength": len(self.buffer)}]}).encode()
+        buffers = [{"byteLength": len(self.buffer)}, *self.tree.get("buffers", ())]
+        text = json.dumps(self.tree | {"buffers": buffers}).encode()
         text += b" " * (-len(text) % 4)
         chunks = struct.pack("<I4s", len(text), b"JSON") + text
         chunks += struct.pack("<I4s", len(self.buffer), b"BIN\0") + self.buffer

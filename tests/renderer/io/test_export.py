@@ -75,6 +75,18 @@ def read_glb(path: Path) -> list[trimesh.Trimesh]:
     return list(trimesh.load(path, force="scene", process=False).geometry.values())
 
 
+def test_a_mesh_far_from_the_origin_keeps_its_shape_for_every_reader(tmp_path):
+    """float32 numbers near 4.5e6 are half a unit apart, more than the width of the faces."""
+    near = solid("orange")
+    offset = np.array([4.5e6, -3e5, 120])
+    export_mesh(replace(near, vertices=near.vertices + offset), tmp_path / "mesh.glb")
+    loaded = load_mesh(tmp_path / "mesh.glb")
+    by_trimesh = trimesh.load(tmp_path / "mesh.glb", force="scene", process=False).to_mesh()
+    x, y, z = np.moveaxis(by_trimesh.triangles, -1, 0)
+    for corners in (corners_of(loaded), np.stack([x, -z, y], axis=-1)):
+        assert_allclose(corners - offset, corners_of(near), rtol=0, atol=1e-6)
+
+
 def test_a_glb_has_y_up_linear_colors_and_diffuse_materials_seen_from_both_sides(tmp_path):
     mesh = painted(box(), 1)
     export_mesh(mesh, tmp_path / "mesh.glb")

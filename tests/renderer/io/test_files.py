@@ -157,6 +157,13 @@ def test_a_map_of_light_negative_in_places_has_its_flux_and_tells_the_error(suff
     assert found == pytest.approx(float(error) / root_mean_square, abs=0.005)
 
 
+@pytest.mark.parametrize("name", ["light.json", "light.JSON"])
+def test_a_light_with_a_gradient_is_written_without_a_warning_to_a_new_folder(tmp_path, name):
+    path = tmp_path / "new" / name
+    renderer.save_light(path, LIGHT.clone().requires_grad_())
+    assert torch.equal(renderer.load_light(path), LIGHT)
+
+
 def test_coefficients_beyond_the_power_of_a_projector_are_white_in_the_image(tmp_path):
     projector = Projector(4, power=2.0)
     coefficients = torch.full((projector.size, 3), 2.1)

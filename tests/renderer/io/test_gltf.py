@@ -421,6 +421,14 @@ def test_data_uris_have_the_encodings_of_rfc_2397(tmp_path, form):
     assert_allclose(corners_of(load_mesh(tmp_path / "mesh.gltf", up="z")), [POINTS[:3]])
 
 
+def test_only_the_first_buffer_of_a_glb_is_its_binary_chunk(tmp_path):
+    gltf = plain()
+    gltf.tree["buffers"] = [{"byteLength": len(gltf.buffer)}]
+    gltf.tree["bufferViews"][0]["buffer"] = 1
+    with pytest.raises(InputError, match=r"mesh\.glb"):
+        load_mesh(gltf.write(tmp_path / "mesh.glb"))
+
+
 def test_a_text_file_reads_its_buffer_and_its_images_below_its_folder(tmp_path):
     gltf = masked(hole(8, -1), "OPAQUE")
     folder = tmp_path / "mesh"
@@ -607,6 +615,7 @@ REFUSED = {
     "EXT_meshopt_compression": with_entries(
         plain(), extensionsRequired=["EXT_meshopt_compression"]
     ),
+    "KHR_meshopt_compression": with_entries(plain(), extensionsUsed=["KHR_meshopt_compression"]),
     "KHR_texture_basisu": basis_texture(),
     "two parents": two_parents(),
     "child of itself": with_entries(plain(), nodes=[{"mesh": 0}, {"children": [1]}]),
