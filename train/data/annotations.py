@@ -158,10 +158,12 @@ def _annotated(
     return Annotated(path, name, size, table[:, 1:5], table[:, 0].astype(int), table[:, 5] > 0)
 
 
-def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, "H W"]:
+def fit_mask(
+    path: Path, fitted: Fitted, class_count: int, seen: set[int]
+) -> UInt8[np.ndarray, "H W"]:
     """Read the classes of the pixels of a photograph, and bring them to its size for the network.
 
-    Pixels of borders are NO_CLASS_PIXEL.
+    Pixels of borders are NO_CLASS_PIXEL. The values of the file are added to `seen`.
     """
     with explained(f"{path} cannot be read", "replace it"), open_image(path) as image:
         labels = np.array(image)
@@ -174,6 +176,7 @@ def fit_mask(path: Path, fitted: Fitted, class_count: int) -> UInt8[np.ndarray, 
     if highest >= class_count:
         advice = f"use 0 to {class_count - 1}, and {NO_CLASS_PIXEL} for pixels that do not count"
         raise InputError(f"{path} has the value {highest}: {advice}")
+    seen.update(np.unique(labels).tolist())
     # Width and height of the photograph in the image of the network, without borders.
     shown = (fitted.scale * fitted.size).round().astype(int)
     reduced = Image.fromarray(labels.astype(np.uint8)).resize((*shown,), Image.Resampling.NEAREST)
@@ -299,16 +302,17 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
     if paths:
         console.info("%s: the images of its entry val are read", named)
     photographs = []
-    # Label files that exist.
-    read: list[Path] = []
+    # Label files that exist, and the number of their lines that repeat another.
+    read: dict[Path, int] = {}
     for path in paths or [folder / item.path for item in find_unlabeled(folder)]:
         # A photograph can have a label file in several places. The first that exists counts.
         labels = next(filter(Path.is_file, _label_files(path)), None)
         rows = []
         if labels is not None:
-            read.append(labels)
+            found = [*_yolo_rows(labels, len(classes), has_keypoints)]
             # A line that stands twice is one object, as for Ultralytics.
-            rows = [*dict.fromkeys(_yolo_rows(labels, len(classes), has_keypoints))]
+            rows = [*dict.fromkeys(found)]
+            read[labels] = len(found) - len(rows)
         name = path.relative_to(folder) if path.is_relative_to(folder) else path
         # Coordinates are fractions, so the image has the width and height 1.
         photographs.append(_annotated(path, str(name), (1, 1), rows))
@@ -316,7 +320,9 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
         first = _label_files(photographs[0].path.absolute())[0]
         fault = f"photos={folder} has neither a COCO file nor label files of YOLO"
         raise InputError(f"{fault}: add some, such as {first}", "photos")
-    return Annotations(folder, photographs, classes, _labels_without_image(photographs, read))
+    if repeated_count := sum(read.values()):
+        console.warning("%s: %d lines that repeat another are left out", folder, repeated_count)
+    return Annotations(folder, photographs, classes, _labels_without_image(photographs, [*read]))
 
 
 def _labels_without_image(photographs: Sequence[Annotated], labels: Sequence[Path]) -> list[str]:

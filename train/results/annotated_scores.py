@@ -300,16 +300,22 @@ def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> Segm
     photographs, masks, missing = annotated.read_masks(folder)
     pictures: dict[str, Tensor] = {}
     count = 0
+    # Values of all masks.
+    seen: set[int] = set()
 
     # Pairs are read one after the other, so that not all masks are in memory.
     def pairs() -> Iterator[tuple[ClassMap, ClassMap]]:
         nonlocal count
         for item, fitted, output in _outputs(network, photographs, how, pictures):
             count += 1
-            mask = annotated.fit_mask(masks[item.name], fitted, len(network.classes))
+            mask = annotated.fit_mask(masks[item.name], fitted, len(network.classes), seen)
             yield output.argmax(0).cpu().numpy(), mask
 
     miou, by_class = mean_iou(pairs(), len(network.classes))
+    # A mask of 0 and 255 marks its object as pixels that do not count.
+    if NO_CLASS_PIXEL in seen and len(seen) < 3:
+        fault = f"the masks of {folder} have only the values {sorted(seen)}, and 255 does not count"
+        raise InputError(f"{fault}: write 1 for the object, or the index of its class", "photos")
     named = zip(network.classes, by_class, strict=True)
     # The IoU of a class that no pixel has is NaN.
     known = {name: iou for name, iou in named if np.isfinite(iou)}

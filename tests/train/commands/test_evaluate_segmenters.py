@@ -97,6 +97,14 @@ def test_a_mask_of_other_classes_or_of_another_size_is_refused(folder, mask, mes
         nb.evaluate(_by_brightness, folder, classes=CLASSES, size=SIZE)
 
 
+def test_masks_of_0_and_255_which_mark_no_object_are_refused(folder):
+    """A network that finds background alone would have the IoU 1."""
+    for path in (folder / "masks").rglob("*.png"):
+        Image.fromarray(np.where(_read(path) == 2, 255, 0).astype(np.uint8)).save(path)
+    with pytest.raises(InputError, match="255"):
+        nb.evaluate(_by_brightness, folder, classes=CLASSES, size=SIZE)
+
+
 def test_a_folder_without_masks_is_refused(folder):
     with pytest.raises(InputError, match="lacks images/ or masks/"):
         nb.evaluate(_by_brightness, folder / "images", classes=CLASSES, size=SIZE)

@@ -160,11 +160,12 @@ def test_images_of_val_may_lie_in_another_folder_than_data_yaml(tmp_path):
     assert (len(read.photographs), read.missing) == (1, [])
 
 
-def test_a_line_of_yolo_that_stands_twice_is_one_object(tmp_path):
+def test_a_line_of_yolo_that_stands_twice_is_one_object_which_is_said(tmp_path, caplog):
     _draw(tmp_path / "a.png")
     (tmp_path / "a.txt").write_text("1 0.5 0.4 0.5 0.4\n0 0.5 0.4 0.5 0.4\n1 0.50 0.4 0.5 0.4\n")
     (tmp_path / "classes.txt").write_text("cat\ndog\n")
     assert read_annotations(tmp_path).photographs[0].labels.tolist() == [1, 0]
+    assert "1 lines" in caplog.text
 
 
 @pytest.mark.parametrize("shape", [[2, 2], [2, 3]])
