@@ -25,7 +25,7 @@ import numpy as np
 import safetensors.torch
 import torch
 from torch import Tensor, nn
-from torch.utils._pytree import tree_leaves
+from torch.utils._pytree import tree_leaves, tree_map
 
 from augment import classifier as classifiers
 from augment import network as wrappers
@@ -44,6 +44,8 @@ State = Mapping[str, Tensor]
 
 EXPORTED = ".pt2"
 ONNX = ".onnx"
+# Types of the images that a file of ONNX may take, in the words of onnxruntime.
+ONNX_TYPES = {"tensor(float16)": "f2", "tensor(float)": "f4", "tensor(double)": "f8"}
 # Endings of the names of files that may be TorchScript.
 TORCHSCRIPT = (".pt", ".pth", ".ts", ".jit", ".torchscript")
 # Endings of the names of all files that contain a network.
@@ -210,6 +212,9 @@ def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
     # Show the first image beside the second and then beside the third. Its logits must not change.
     with torch.no_grad():
         outputs = [classifier.network(images[[0, other]]) for other in (1, 2)]
+    if isinstance(outputs[0], tuple) and len(outputs[0]) > 1:
+        of_first = f"the first is used, with {len(classifier.classes)} classes"
+        say_once(f"{name} has {len(outputs[0])} outputs: {of_first}")
     first, second = (wrappers.plain_outputs(output).float() for output in outputs)
     if (first[0] - second[0]).abs().max() > MAX_CHANGE * (first.max() - first.min()):
         raise name_error(name, IN_TRAINING_MODE)
@@ -333,14 +338,13 @@ class InBatches(Network):
         self.batch_size = batch_size
 
     def forward(self, images: Tensor) -> Any:
-        """Compute the outputs of images (N, 3, H, W): a tensor, or a tuple of tensors."""
+        """Compute the outputs of images (N, 3, H, W). A list of outputs becomes a tuple."""
         # Number of copies that fill up the last batch.
         missing_count = -len(images) % self.batch_size
         filled = torch.cat([images, images[:1].expand(missing_count, -1, -1, -1)])
         parts = [self.network(part) for part in filled.split(self.batch_size)]
-        if isinstance(parts[0], Tensor):
-            return torch.cat(parts)[: len(images)]
-        return tuple(torch.cat(outputs)[: len(images)] for outputs in zip(*parts, strict=True))
+        joined = tree_map(lambda *of: torch.cat(of)[: len(images)], *parts)
+        return tuple(joined) if isinstance(joined, list) else joined
 
 
 def _read_onnx(path: Path) -> Content:
@@ -381,7 +385,7 @@ class Converted(Network):
 def read_onnx(path: Path) -> tuple[wrappers.Function, list[int | None], bool]:
     """Read a file of ONNX with onnxruntime, on the CPU.
 
-    The network has no gradients. Its one input is images of float32. Several outputs are a tuple.
+    The network has no gradients. Its one input is images. Several outputs are a tuple.
     Return also the sizes of images (N, 3, H, W), and whether the file has channels last, as those
     of TensorFlow have.
     """
@@ -389,7 +393,10 @@ def read_onnx(path: Path) -> tuple[wrappers.Function, list[int | None], bool]:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # Log errors and fatal errors.
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    [images] = session.get_inputs()
+    images, *others = session.get_inputs()
+    if others or images.type not in ONNX_TYPES:
+        given = ", ".join(f"{entry.name} of {entry.type}" for entry in (images, *others))
+        raise name_error(path, f"takes {given}: export it with one input of float32")
     sizes = [size if isinstance(size, int) else None for size in images.shape]
     is_last = sizes[3] == 3 != sizes[1]
     if is_last:
@@ -397,7 +404,7 @@ def read_onnx(path: Path) -> tuple[wrappers.Function, list[int | None], bool]:
 
     def outputs(batch: np.ndarray) -> Any:
         batch = batch.transpose(0, 2, 3, 1) if is_last else batch
-        found = session.run(None, {images.name: batch.astype(np.float32)})
+        found = session.run(None, {images.name: batch.astype(ONNX_TYPES[images.type])})
         return found[0] if len(found) == 1 else tuple(map(torch.from_numpy, found))
 
     return wrappers.Function(outputs, wrappers.ARRAYS), sizes, is_last

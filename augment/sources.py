@@ -245,8 +245,8 @@ def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
     def build(facts: NetworkFacts) -> Classifier:
         options: dict[str, Any] = {"pretrained": downloads}
         # timm would give downloaded weights a random last layer for another number of classes.
-        if facts.classes is not None and not downloads:
-            options["num_classes"] = len(facts.classes)
+        if not downloads and (facts.classes or (weights and not is_on_hub)):
+            options["num_classes"] = len(facts.classes or imagenet_classes())
         with files.reading_network(name, "cannot be built or downloaded", "set weights=FILE"):
             network = timm.create_model(model, **options)
             published = network.pretrained_cfg

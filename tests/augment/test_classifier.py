@@ -1,6 +1,7 @@
 import re
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -305,6 +306,41 @@ def test_onnx_gives_the_scores_of_its_graph_and_a_size_that_it_tells_is_not_assu
     fixed, free = said()
     assert "64 × 64 pixels, stated by the file; not normalized, assumed" in fixed
     assert "224 × 224 pixels, assumed; not normalized, assumed" in free
+
+
+def save_onnx(path: Path, kind: str, inputs: tuple[str, ...] = ("x",), outputs: str = "y") -> str:
+    """Write a graph of the means of the channels of x, which is of a kind such as FLOAT16."""
+    pytest.importorskip("onnxruntime")
+    onnx = pytest.importorskip("onnx")
+    helper, kinds = onnx.helper, onnx.TensorProto
+    nodes = [helper.make_node("Cast", ["x"], ["images"], to=kinds.FLOAT)]
+    options = {"axes": [2, 3], "keepdims": 0}
+    nodes += [helper.make_node("ReduceMean", ["images"], [name], **options) for name in outputs]
+    shape = ["n", 3, SIZE, SIZE]
+    given = [helper.make_tensor_value_info(name, getattr(kinds, kind), shape) for name in inputs]
+    found = [helper.make_tensor_value_info(name, kinds.FLOAT, ["n", 3]) for name in outputs]
+    graph = helper.make_graph(nodes, "graph", given, found)
+    opsets = [helper.make_opsetid("", 13)]
+    onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
+    return str(path)
+
+
+@pytest.mark.parametrize("kind", ["FLOAT16", "DOUBLE"])
+def test_onnx_gets_images_of_its_own_precision(tmp_path, images, kind):
+    classifier = nb.load_classifier(save_onnx(tmp_path / "network.onnx", kind))
+    torch.testing.assert_close(classifier(images), images.mean((2, 3)), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize(("kind", "inputs"), [("UINT8", ("x",)), ("FLOAT", ("x", "size"))])
+def test_onnx_of_bytes_or_of_two_inputs_is_refused_with_a_remedy(tmp_path, kind, inputs):
+    with pytest.raises(InputError, match="one input of float32"):
+        nb.load_classifier(save_onnx(tmp_path / "network.onnx", kind, inputs))
+
+
+def test_onnx_of_two_outputs_says_that_the_first_is_used(tmp_path, caplog):
+    say_once.cache_clear()
+    nb.load_classifier(save_onnx(tmp_path / "network.onnx", "FLOAT", outputs="yz"))
+    assert "2 outputs" in caplog.text
 
 
 @pytest.mark.parametrize("is_last", [False, True])

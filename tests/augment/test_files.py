@@ -28,6 +28,18 @@ def save_torchscript(network: nn.Module, folder: Path) -> Path:
     return path
 
 
+class Structured(nn.Module):
+    """The small network, whose logits are in a structure such as a dictionary."""
+
+    def __init__(self, structure):
+        super().__init__()
+        self.network = small_network()
+        self.structure = structure
+
+    def forward(self, images: torch.Tensor):
+        return self.structure(self.network(images))
+
+
 def save_exported(network: nn.Module, folder: Path) -> Path:
     path = folder / "network.pt2"
     # The batch has one image, as in torch's own examples.
@@ -48,6 +60,15 @@ def test_a_file_gives_the_logits_and_the_gradient_of_its_network(tmp_path, save)
     (gradient,) = torch.autograd.grad(found.sum(), images)
     (expected_gradient,) = torch.autograd.grad(expected.sum(), images)
     torch.testing.assert_close(gradient, expected_gradient, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("structure", [lambda x: {"logits": x}, lambda x: (x, x), lambda x: [x]])
+def test_an_exported_network_of_one_image_may_return_a_structure(tmp_path, structure):
+    path = save_exported(Structured(structure).eval(), tmp_path)
+    classifier = load_classifier(str(path), size=SIZE, trust_code=True)
+    images = torch.rand(3, 3, SIZE, SIZE)
+    torch.testing.assert_close(classifier(images), small_network()(images))
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -245,6 +245,19 @@ def test_a_function_that_makes_no_classifier_is_refused(own_networks, name, mess
         load_classifier(f"python:{name}")
 
 
+@pytest.mark.parametrize("model", ["eva02_tiny_patch14_224", "tiny_vit_5m_224"])
+def test_weights_tell_the_classes_of_a_network_that_was_published_with_others(tmp_path, model):
+    """timm builds these without classes, and with 21,841, if nothing else is said."""
+    timm = pytest.importorskip("timm")
+    network = timm.create_model(model, num_classes=2).eval()
+    torch.save(network.state_dict(), tmp_path / "own.pth")
+    mean, std = (torch.tensor(network.pretrained_cfg[key]) for key in ("mean", "std"))
+    images = random_images(224, 1)
+    expected = network((images - mean.view(3, 1, 1)) / std.view(3, 1, 1))
+    classifier = load_classifier(f"timm:{model}", tmp_path / "own.pth")
+    torch.testing.assert_close(classifier(images), expected)
+
+
 def test_a_network_of_timm_comes_from_a_repository_of_the_hub(tmp_path, monkeypatch, caplog):
     timm = pytest.importorskip("timm")
     hub = importlib.import_module("timm.models._hub")
@@ -267,5 +280,8 @@ def test_a_network_of_timm_comes_from_a_repository_of_the_hub(tmp_path, monkeypa
     std = torch.tensor(published.pretrained_cfg["std"]).view(3, 1, 1)
     expected = published((images - torch.tensor([0.1, 0.2, 0.3]).view(3, 1, 1)) / std)
     torch.testing.assert_close(classifier(images), expected)
+    torch.save(published.state_dict(), tmp_path / "own.pth")
+    own = load_classifier("timm:hf-hub:someone/tiny", tmp_path / "own.pth")
+    assert list(own.classes) == names
     with pytest.raises(InputError, match="has 3 classes"):
         load_classifier("timm:hf-hub:someone/tiny", classes=["orange", "apple"])
