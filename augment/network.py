@@ -321,7 +321,7 @@ class Remembered(Network):
         new_images = {key: index for index, key in enumerate(keys) if key not in self.outputs}
         if new_images:
             indices = torch.tensor(list(new_images.values()), device=images.device)
-            outputs = self.network(images.detach()[indices])
+            outputs = plain_outputs(self.network(images.detach()[indices]))
             self.outputs.update(zip(new_images, outputs.detach(), strict=True))
         return torch.stack([self.outputs[key] for key in keys]).to(images)
 
