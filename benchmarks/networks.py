@@ -40,7 +40,7 @@ from renderer.settings import height_and_width
 from train.auditing.lights import AMPLITUDE, Views
 from train.commands.audit import NEGATIVE_SOLIDS
 from train.data.photo import TABLE
-from train.data.photographs import find_photographs
+from train.data.photographs import find_photographs, folder_names
 from train.results.scoring import Predictor, score
 from train.results.tables import Estimate, Table, format_interval, write_csv
 from train.settings import OTHER_PREFIX, published_folder
@@ -170,7 +170,11 @@ def score_photographs(
     predictions = real_light.predict(network, folder, [label])
     counts, units = folder.draw(label), folder.units(label)
     scores: Scores = {}
-    words = [f"{title}={light}" for title, light in lights.items()]
+    words = []
+    for title, light in lights.items():
+        # Several lights may be fewer in a folder. A folder without any of them is refused.
+        shown = [each for each in light.split("+") if each in folder.lights]
+        words.append(f"{title}={'+'.join(shown) or light}")
     for title, rows in real_light.choose_lights(folder, words).items():
         draws = real_light.measure(predictions, folder.objects, counts, rows)
         units_of_metrics = real_light.count_units(predictions, units, rows)
@@ -197,14 +201,16 @@ def real_folders(real: Path | None) -> dict[str, Path]:
     return {path.name: path for path in paths if path.is_dir()}
 
 
-def score_network(network: Classifier, renders: Path, folders: Mapping[str, Path]) -> Scores:
-    """Score a network in all lights. Projected objects count if it has all of their classes."""
-    scores = score_renders(network, renders)
+def score_real(network: Classifier, folders: Mapping[str, Path]) -> Scores:
+    """Score a network in real light. Projected objects count if it has all of their classes."""
+    scores: Scores = {}
     if path := folders.get("low_light"):
-        scores |= score_photographs(network, path, LABEL, REAL, True)
+        scores = score_photographs(network, path, LABEL, REAL, True)
     if path := folders.get("projector"):
-        shown = [each.name for each in path.iterdir() if each.is_dir()]
-        if {*shown} <= {*network.classes}:
+        shown = folder_names(path)
+        if unknown := {*shown} - {*network.classes}:
+            print(f"{network.title} has no score in {PROJECTED}: it has no class {min(unknown)}")
+        else:
             found = score_photographs(network, path, shown[0], {PROJECTED: STRIPES}, False)
             scores[PROJECTED] = {TOP1: found[PROJECTED][TOP1]}
     return scores
@@ -259,13 +265,14 @@ def add(options: argparse.Namespace) -> None:
     rows = read(options.scores)
     folders = real_folders(options.real)
     networks = {name: load(name) for name in options.networks}
+    real = {name: score_real(network, folders) for name, network in networks.items()}
     with tempfile.TemporaryDirectory() as temporary:
         renders = options.renders or Path(temporary) / "renders"
         # The table of the last light is written last.
         if not (renders / [*RELIT][-1] / TABLE).exists():
             write_renders(renders)
         for name, network in networks.items():
-            rows[name] = rows_of(name, score_network(network, renders, folders))
+            rows[name] = rows_of(name, score_renders(network, renders) | real[name])
             # The scores of a network are kept if a later network cannot be scored.
             write_csv(options.out, [HEADER, *(row for each in rows.values() for row in each)])
     for name in options.networks:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.stats import rankdata
 
 from benchmarks import networks
@@ -75,6 +76,43 @@ def test_the_page_shows_the_table_of_the_file(capsys):
     networks.main(["table"])
     page = networks.SCORES.with_suffix(".md").read_text()
     assert capsys.readouterr().out in page
+
+
+@pytest.fixture
+def real(tmp_path):
+    """Return a function that writes photographs of two classes in projected light."""
+
+    def write(light, other):
+        for label, level in (("orange", 40), (other, 200)):
+            path = tmp_path / f"real/projector/{label}/{light}__1.png"
+            path.parent.mkdir(parents=True)
+            Image.fromarray(np.full((8, 8, 3), level, np.uint8)).save(path)
+        return tmp_path / "real"
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("light", "other", "top1"), [("stripes_coarse", "other", [1]), ("stripes_fine", "mug", [])]
+)
+def test_stripes_of_any_width_are_scored_by_networks_with_all_classes(
+    real, capsys, light, other, top1
+):
+    folders = networks.real_folders(real(light, other))
+    found = networks.score_real(darker_than(0.5), folders)
+    assert [each[networks.TOP1].value for each in found.values()] == top1
+    # A class that leaves the column out is named.
+    assert (other in capsys.readouterr().out) == (not top1)
+
+
+def test_photographs_that_cannot_be_scored_end_a_command_before_the_renders(
+    add, real, tmp_path, capsys
+):
+    words = ["--real", str(real("dim", "other")), "--renders", str(tmp_path / "renders")]
+    with pytest.raises(SystemExit, match="2"):
+        networks.main(["add", "half", *words])
+    assert "error: " in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "renders").exists()
 
 
 @pytest.mark.slow
