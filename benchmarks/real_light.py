@@ -40,7 +40,9 @@ from scipy.stats import spearmanr
 import norm_balls as nb
 from augment.classifier import Classifier
 from augment.exposure import IsDim
+from augment.network import say_once
 from augment.switch import SWITCHES
+from augment.tasks.classification import nearest
 from renderer.errors import InputError, require_whole
 from renderer.image import to_unit
 from renderer.io.images import write_image
@@ -51,6 +53,7 @@ from train.data.photo import Photograph
 from train.data.photographs import (
     find_photographs,
     find_unlabeled,
+    folder_names,
     load_photographs,
     unsupported_files,
 )
@@ -69,6 +72,7 @@ from train.results.tables import (
 from train.settings import OTHER_PREFIX
 
 DRAWS = 2000
+MIN_NETWORKS = 6  # Smallest number of networks whose rank correlation has an interval.
 METRICS = ("top-1", "recall", "recall at 5% FPR", "FPR", "AUC")
 HEADER = ["network", "light", *METRICS]
 NORMALIZED = "normalized:"
@@ -151,11 +155,12 @@ class Folder:
     def names(self) -> np.ndarray:
         """Name of the photograph without its light, so that it is the same in each light."""
         names = []
-        for item in self.photographs:
+        for item, light in zip(self.photographs, self.lights, strict=True):
             name = item.path.stem.partition("__")[2] or item.path.stem
             # Crops of a photograph may lie in folders of several classes.
             photograph = re.sub(r"_\d+$", "", name) if self.has_crops else f"{item.label}/{name}"
-            names.append("/".join([*item.path.parts[1:-1], photograph]))
+            folders = [part for part in item.path.parts[1:-1] if part != light]
+            names.append("/".join([*folders, photograph]))
         return np.array(names)
 
     def units(self, label: str) -> np.ndarray:
@@ -200,6 +205,8 @@ def predict(network: Classifier, folder: Folder, labels: Sequence[str]) -> Predi
     for item in photographs:
         name = item.label.removeprefix(OTHER_PREFIX)
         known = name if name in network.classes else item.label
+        if known != item.label:
+            say_once(f"{network.title}: photographs of {item.label} count as {known}")
         shown.append(Photograph(item.path, known, item.source, mesh=item.mesh))
     logits = compute_logits(network, images, len(network.classes), "cpu")
     return rank_classes(shown, logits, network.classes, labels)
@@ -253,17 +260,20 @@ def count_units(predictions: Predictions, units: np.ndarray, rows: np.ndarray) -
 def estimate(draws: np.ndarray, units: int, is_change: bool = False) -> Estimate:
     """Return the first value with the 95% interval of the other values, which may be NaN.
 
-    If hardly a draw differs, the interval is Wilson's for so many units, or that of no change.
+    If hardly a draw differs, the interval is Wilson's for so many units, or that of no change. At
+    0 and 1, the interval of a value also contains Wilson's.
     """
     value = float(draws[0])
     if np.isnan(value):
         return Estimate()
     low, high = np.nanquantile(draws[1:], [0.025, 0.975])
-    if high - low < 1e-9:
+    is_same = high - low < 1e-9
+    if is_change and is_same:
         margin = wilson(0.0, units, NORMAL_QUANTILE)[1]
-        low, high = wilson(value, units, NORMAL_QUANTILE)
-        if is_change:
-            low, high = np.clip([value - margin, value + margin], -1, 1)
+        low, high = np.clip([value - margin, value + margin], -1, 1)
+    elif is_same or (not is_change and min(value, 1 - value) < 1e-9):
+        ends = wilson(value, units, NORMAL_QUANTILE)
+        low, high = min(low, ends[0]), max(high, ends[1])
     return Estimate(value, float(low), float(high))
 
 
@@ -302,6 +312,8 @@ def print_tables(
 ) -> list[list[str]]:
     """Print the metrics, the gains over the first network and the changes from the first light.
 
+    Gains in top-1 are those on the classes that both networks have.
+
     Args:
         label: Positive class.
         predictions: Predictions of each seed by the title of the network.
@@ -336,9 +348,12 @@ def print_tables(
         pair = rows, groups[first_light]
         both = np.isin(folder.objects, np.intersect1d(*(folder.objects[side] for side in pair)))
         pairs[light] = rows & both, groups[first_light] & both
+    is_known = {title: np.isfinite(each[0].true_rank) for title, each in predictions.items()}
     for (title, light), values in results.items():
         if title != first_network:
-            gains[title, light] = values - results[first_network, light]
+            gain = gains[title, light] = values - results[first_network, light]
+            rows = groups[light] & is_known[title] & is_known[first_network]
+            gain[0] = statistics(title, rows)[0] - statistics(first_network, rows)[0]
         if light != first_light:
             now, before = (statistics(title, rows) for rows in pairs[light])
             changes[title, light] = now - before
@@ -350,6 +365,8 @@ def print_tables(
         for (title, light), values in table.items():
             rows = pairs[light][0] if table is changes else groups[light]
             unit_counts = count_units(predictions[title][0], units, rows)
+            if table is gains:
+                unit_counts[0] = len({*units[rows & is_known[title] & is_known[first_network]]})
             shown = zip(values, unit_counts, strict=True)
             estimates = [estimate(row, count, bool(suffix)) for row, count in shown]
             cells = [format_interval(item, "+" if suffix else "") for item in estimates]
@@ -362,6 +379,10 @@ def print_tables(
         is_positive = rows & predictions[first_network][0].positive
         every, positives = (len({*units[side]}) for side in (rows, is_positive))
         print(f"{light}: {rows.sum()} images, {every} {what}, {positives} of them with {label}")
+        of_both = rows | groups[first_light]
+        if left_out := {*folder.objects[of_both & ~np.any(pairs[light], axis=0)]}:
+            names = ", ".join(sorted(left_out))
+            print(f"{light} minus {first_light} leaves out objects that one of them lacks: {names}")
     return absolute
 
 
@@ -390,11 +411,16 @@ def choose_lights(folder: Folder, words: Sequence[str]) -> Mapping[str, np.ndarr
 
 def simulate(options: argparse.Namespace) -> None:
     """Write the photographs of some classes as they are, and in simulated light."""
-    found = find_photographs(options.photos, options.classes, options.classes[0])
+    folders = folder_names(options.photos)
+    for name in options.classes:
+        if folders and not {name, f"{OTHER_PREFIX}{name}"} & {*folders}:
+            choices = nearest(name, folders)
+            raise InputError(f"--classes: {options.photos} has no folder {name}: give {choices}")
+    found = find_photographs(options.photos, [*options.classes, *folders], options.classes[0])
     names = {*options.classes, *(f"{OTHER_PREFIX}{name}" for name in options.classes)}
     chosen = [item for item in found if item.label in names and item.source not in options.exclude]
     if not chosen:
-        raise InputError(f"{options.photos} has no folder of {', '.join(options.classes)}")
+        raise InputError(f"--exclude leaves no photograph of {options.photos}: exclude fewer")
     require_whole("size", options.size, 1, MAX_SIZE)
     if options.folder.is_dir() and any(options.folder.iterdir()):
         raise InputError(f"{options.folder} is not empty: choose a new folder")
@@ -427,7 +453,7 @@ def read_scores(words: Sequence[str], label: str, metric: str) -> dict[str, dict
             if missing := {"label", "network", "light", metric}.difference(table.fieldnames or ()):
                 raise InputError(f"{path} has no column {min(missing)}: give a file of score --out")
             for row in table:
-                if row["label"] == label and row[metric]:
+                if row["label"] == label and row[metric] not in {"", "-"}:
                     column = scores.setdefault(f"{title}: {row['light']}", {})
                     # A cell is a value, mostly with an interval behind it.
                     column[row["network"]] = float(row[metric].split()[0].replace("−", "-"))
@@ -438,17 +464,22 @@ def rank_correlation(first: Mapping[str, float], second: Mapping[str, float]) ->
     """Compute Spearman's correlation over the networks of both, with a 95% interval.
 
     The interval is that of Bonett and Wright (2000): z = artanh ρ has the standard error
-    sqrt((1 + ρ² / 2) / (n − 3)). It treats the networks as independent, and some share weights.
+    sqrt((1 + ρ² / 2) / (n − 3)). It treats the networks as independent, and some share weights. In
+    z, |ρ| is at most 1 − 12 / (n³ − n), the largest below 1 without ties. Few networks have none.
     """
     shared = sorted(first.keys() & second.keys())
     values = [[scores[name] for name in shared] for scores in (first, second)]
     # Networks that are all equal in a light have no ranks.
     if len(shared) < 4 or min(map(len, map(set, values))) < 2:
         return Estimate()
-    value = float(spearmanr(*values)[0])
-    z = np.arctanh(np.clip(value, -1 + 1e-12, 1 - 1e-12))
-    margin = NORMAL_QUANTILE * np.sqrt((1 + value**2 / 2) / (len(shared) - 3))
-    return Estimate(value, float(np.tanh(z - margin)), float(np.tanh(z + margin)))
+    value, count = float(spearmanr(*values)[0]), len(shared)
+    if count < MIN_NETWORKS:
+        return Estimate(value)
+    limit = 1 - 12 / (count**3 - count)
+    z = np.arctanh(np.clip(value, -limit, limit))
+    margin = NORMAL_QUANTILE * np.sqrt((1 + value**2 / 2) / (count - 3))
+    low, high = map(float, np.tanh([z - margin, z + margin]))
+    return Estimate(value, min(low, value), max(high, value))
 
 
 def rank(options: argparse.Namespace) -> None:

@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 from scipy.stats import binomtest
 
+from augment.network import say_once
 from benchmarks import real_light
 from tests.helpers import darker_than
 from train.data.photo import Photograph
@@ -106,6 +107,7 @@ def test_photographs_of_an_excluded_source_are_not_simulated(tmp_path):
         "rank a=given.csv --label orange",
         "rank given.csv --label orange",
         "simulate given out --classes pear --lights low_light",
+        "simulate given out --classes orange ornge --lights low_light",
         "dim missing",
         "dim broken",
     ],
@@ -175,6 +177,7 @@ def test_networks_that_two_lights_rank_alike_have_a_rank_correlation_of_one(tmp_
     values = {"a": 0.2, "b": 0.3, "c": 0.7, "d": 0.9, "e": 0.95}
     for title, power in (("real", 1), ("alike", 3), ("other", -1)):
         cells = {name: f"{x**power:.4f} [0, 1]" for name, x in values.items()}
+        cells["unknown"] = "-"
         rows = [["orange", name, "dim", *[""] * 4, cell] for name, cell in cells.items()]
         real_light.write_csv(tmp_path / title, [["label", *real_light.HEADER], *rows])
     words = [f"{title}={tmp_path / title}" for title in ("real", "alike", "other")]
@@ -195,6 +198,25 @@ def test_the_interval_of_a_rank_correlation_is_that_of_bonett_and_wright():
     assert estimate.value == pytest.approx(expected)
     assert estimate.low == pytest.approx(math.tanh(math.atanh(expected) - half), abs=1e-6)
     assert estimate.high == pytest.approx(math.tanh(math.atanh(expected) + half), abs=1e-6)
+
+
+def test_the_interval_of_a_rank_correlation_holds_the_true_one_also_if_all_ranks_agree():
+    draw, correlation = np.random.default_rng(0), 0.95
+    # Pearson (1907): ρ of Spearman for normal values.
+    true = 6 / math.pi * math.asin(correlation / 2)
+    covariance = [[1, correlation], [correlation, 1]]
+    hits = []
+    for _ in range(300):
+        pair = draw.multivariate_normal([0, 0], covariance, 6).T
+        found = real_light.rank_correlation(*(dict(enumerate(values)) for values in pair))
+        hits.append(found.low <= true <= found.high)
+    # The standard error of a fraction of 0.95 is 0.013.
+    assert np.mean(hits) > 0.95 - 2 * 0.013
+
+
+def test_a_rank_correlation_of_few_networks_has_no_interval():
+    found = real_light.rank_correlation(*[dict(zip("abcde", range(5), strict=True))] * 2)
+    assert (found.value, found.low, found.high) == (pytest.approx(1), None, None)
 
 
 def folder_of(*rows):
@@ -265,6 +287,43 @@ def test_photographs_of_nested_folders_are_different_photographs():
     assert [*folder_of(*rows).names] == ["a/orange/1", "a/orange/1", "b/orange/1", "b/orange/1"]
 
 
+def test_a_folder_of_a_light_is_no_part_of_the_name_of_a_photograph():
+    rows = [(f"orange/{light}/{light}__1.png", None) for light in ("plain", "dim")]
+    assert [*folder_of(*rows).names] == ["orange/1", "orange/1"]
+
+
+def test_gains_in_top_1_are_those_on_the_classes_of_both_networks(capsys):
+    """Both networks call everything an orange, and the first one has no class for the pears."""
+    folder = folder_of(
+        *((f"{name}/{n}.png", None) for name in ("orange", "other_pear") for n in "12")
+    )
+    known = {"first": ("orange", "fig"), "second": ("orange", "pear")}
+    predictions = {}
+    for title, classes in known.items():
+        labels = ["orange"] * 2 + [classes[1].replace("fig", "other_pear")] * 2
+        shown = [Photograph(PurePosixPath(name), name, None) for name in labels]
+        logits = torch.tensor([[1.0, 0.0]] * 4)
+        predictions[title] = [rank_classes(shown, logits, classes, ["orange"])]
+    rows = real_light.print_tables("orange", predictions, folder, {"plain": np.ones(4, bool)})
+    assert [float(row[2].split()[0]) for row in rows] == [1, 0.5]
+    gain = capsys.readouterr().out.partition("minus first")[2].partition("second")[2].split("|")[2]
+    margin = binomtest(0, 2).proportion_ci(method="wilson").high
+    assert gain.strip() == f"+0.000 [{-margin:+.3f}, {margin:+.3f}]"
+
+
+def test_a_class_that_counts_although_its_folder_is_called_other_is_named(folder, caplog):
+    found = real_light.find_photographs(folder, ["orange"], "orange")
+    for name, is_named in (("ball", True), ("pear", False)):
+        say_once.cache_clear()
+        caplog.clear()
+        network = darker_than(0.5)
+        network.classes = ("orange", name)
+        shown = real_light.predict(network, real_light.Folder(folder, found), ["orange"])
+        is_other = np.array([item.label.startswith("other_") for item in found])
+        assert np.isfinite(shown.true_rank[is_other]).all() == is_named
+        assert ("other_ball" in caplog.text) == is_named
+
+
 def test_changes_between_lights_are_those_of_the_objects_in_both(tmp_path, monkeypatch, capsys):
     """Only oranges are recognized, and low light shows no other object."""
     for number in range(3):
@@ -272,7 +331,10 @@ def test_changes_between_lights_are_those_of_the_objects_in_both(tmp_path, monke
         save(tmp_path / f"other/plain__{number}.png", 40)
         save(tmp_path / f"orange/low_light__{number}.png", 40)
     score(tmp_path, monkeypatch, "half")
-    change = capsys.readouterr().out.partition("minus plain")[2].partition("half")[2]
+    printed = capsys.readouterr().out
+    # The object that is left out is named.
+    assert printed.split()[-1] == "other"
+    change = printed.partition("minus plain")[2].partition("half")[2]
     assert change.split("|")[2].split()[0] == "+0.000"
 
 
@@ -288,3 +350,13 @@ def test_the_interval_of_hardly_varying_draws_is_that_of_the_units_that_decide()
     found = real_light.estimate(draws, 2)
     expected = binomtest(2, 2).proportion_ci(method="wilson")
     assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+
+
+@pytest.mark.parametrize("low", [0.978, 0.1])
+def test_the_interval_of_a_perfect_score_holds_those_of_wilson_and_of_the_bootstrap(low):
+    draws = np.ones(2001)
+    draws[1:200] = low
+    found = real_light.estimate(draws, 15)
+    expected = binomtest(15, 15).proportion_ci(method="wilson")
+    assert found.low == pytest.approx(min(expected.low, low))
+    assert real_light.estimate(1 - draws, 15).high == pytest.approx(1 - found.low)
