@@ -14,18 +14,25 @@ The truth is the metric of a population whose effects and noise are equally spac
     python -m benchmarks.coverage --like out/predictions.csv --label orange
 
 tells how large and how skewed effects and noise are in a table of predictions with a column `mesh`.
+
+    python -m benchmarks.coverage --bootstrap --draws 200
+
+measures the coverage of the bootstrap intervals of `benchmarks.real_light`.
 """
 
 import argparse
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy.special import ndtr, ndtri, stdtrit
 from scipy.stats import skew
 
+from benchmarks import real_light
+from train.data.photo import Photograph
 from train.results.intervals import (
     Jackknife,
     Units,
@@ -39,6 +46,7 @@ from train.results.intervals import (
 )
 from train.results.metrics import ROC_METRICS
 from train.results.predictions import read_predictions
+from train.results.scoring import rank_classes
 from train.results.tables import Table
 
 METRICS = (*ROC_METRICS, "recall", "FPR", "top-1")
@@ -142,6 +150,16 @@ SETUPS = [
         for objects in ((55, 55), (54, 40), (200, 200))
         for name, changes in {"typical": {}, **OTHER}.items()
     ),
+]
+
+# Sets like those of `benchmarks.real_light`. A photograph has crops of both kinds.
+BETWEEN = (0.0, -1.0)
+BOOTSTRAPPED = [
+    Setup("15 photographs", (15, 15), 4, BETWEEN),
+    Setup("15 photographs, three runs", (15, 15), 4, BETWEEN, gain_spread=(0.4, 0.6, 0.4), seeds=3),
+    Setup("25 photographs", (25, 25), 4, BETWEEN),
+    Setup("5 and 5 objects, 3 views", (5, 5), 3, BETWEEN),
+    Setup("10 and 10 objects, 4 views", (10, 10), 4, BETWEEN),
 ]
 
 
@@ -285,6 +303,38 @@ def measure(setup: Setup, draws: int, seed: int = 0) -> dict[str, np.ndarray]:
     return {name: np.concatenate(item, axis=-1).mean(axis=-1) for name, item in rows.items()}
 
 
+def measure_bootstrap(setup: Setup, draws: int) -> np.ndarray:
+    """Measure the coverage of `real_light.METRICS` but top-1, and of gains in them."""
+    has_objects = "objects" in setup.name
+    meshes = [str(unit) if has_objects else None for unit in range(max(setup.objects))]
+    photographs = [
+        Photograph(PurePosixPath(label, f"{unit}_{image}.png"), label, None, mesh=meshes[unit])
+        for label, count in zip(("orange", "pear"), setup.objects, strict=True)
+        for unit, image in np.ndindex(count, setup.images)
+    ]
+    folder = real_light.Folder(Path(), photographs, not has_objects)
+    counts, units = folder.draw("orange"), folder.units("orange")
+    rows = np.ones(len(photographs), bool)
+    order = [METRICS.index(name) for name in ("recall", ROC_METRICS[1], "FPR", "auc")]
+    before, after = true_values(setup)[:, order, 0]
+    covered = []
+    for index in range(draws):
+        runs = []
+        for groups in simulate(setup, 1, np.random.default_rng(index)).runs:
+            logits = torch.tensor([[score, 0.0] for score in np.concatenate(groups, axis=1)[0]])
+            chosen = rank_classes(photographs, logits, ("orange", "pear"), ["orange"])
+            runs.append(real_light.measure(chosen, folder.objects, counts, rows))
+        unit_counts = real_light.count_units(chosen, units, rows)[1:]
+        second = real_light.over_seeds(runs[1:])
+        found = [*map(real_light.estimate, second[1:], unit_counts)]
+        changes = zip((second - runs[0])[1:], unit_counts, strict=True)
+        found += [real_light.estimate(*change, is_change=True) for change in changes]
+        true = np.concatenate([after, after - before])
+        low, high = np.array([(one.low, one.high) for one in found]).T
+        covered.append((low - 1e-12 <= true) & (true <= high + 1e-12))
+    return np.mean(covered, axis=0)
+
+
 def describe(path: Path, label: str) -> Table:
     """Measure the effects of objects and the noise of images on the log-odds of a label."""
     objects: dict[tuple[bool, str | None], list[float]] = {}
@@ -316,11 +366,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", default="", help="text in the titles of the setups to measure")
     parser.add_argument("--like", type=Path, help="describe the effects in this predictions.csv")
     parser.add_argument("--label", default="orange", help="positive class in this table")
+    parser.add_argument("--bootstrap", action="store_true", help="measure those of real_light")
     options = parser.parse_args(arguments)
     if options.like:
         print(describe(options.like, options.label))
         return
     rows = []
+    if options.bootstrap:
+        for setup in BOOTSTRAPPED:
+            coverage = measure_bootstrap(setup, options.draws)
+            rows.append([setup.name, *(f"{value:.3f}" for value in coverage)])
+        names = real_light.METRICS[1:]
+        print(Table("coverage", ["units", *names, *(f"gain in {name}" for name in names)], rows))
+        return
     for seed, setup in enumerate(SETUPS):
         title = f"{setup.name}, {setup.objects[0]} and {setup.objects[1]}"
         if options.only not in title:
