@@ -11,11 +11,10 @@ direction in which its radiance has a local minimum and is negative.
 minimizes the error of the irradiance, Σ A_l² (x − v)², with the factors A_l of
 `lambertian_factors`. Coefficients with A_l = 0 get a small weight instead (see
 `irradiance_weights`), so of all lights with the same irradiance, the
-nearest one is chosen. The program is solved for the directions of a grid and of the negative minima
-that are found. If negative minima are left after a few solutions, the light times
-`nonnegative_window` is mixed in to remove them. This windowed light is
-non-negative if the given light is a physical light that was cut off at a degree.
-Without a fixed mean, the nearest coefficients would
+nearest one is chosen. Above degree _COARSE_GRID_DEGREE, the program would take long. The
+light times `nonnegative_window` is then mixed in until no negative minima are left. This
+windowed light is non-negative if the given light is a physical light that was cut off at a
+degree. Without a fixed mean, the nearest coefficients would
 brighten the whole sky to remove the negative minima beside a bright source.
 
 `nearest_nonnegative` is used after each step of an attack. For coefficients v,
@@ -55,11 +54,10 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 from torch import Tensor
 
 from renderer.light.harmonics import bands, cache_tensors, gradient_matrices, monomial_coefficients
-from renderer.light.ringing import irradiance_weights, nonnegative_window, shortest
+from renderer.light.ringing import irradiance_weights, least_distance, nonnegative_window
 from renderer.vectors import Ball, tangent_axes
 
 Array = NDArray[Any]
@@ -78,9 +76,6 @@ _DARK_FRACTION = 1e-6
 # Largest number of rounds of the exchange method. A round adds constraints in the
 # directions with negative radiance, and solves again. Ten to twenty rounds are usual.
 _MAX_ROUNDS = 50
-# `project_nonnegative` solves its quadratic program at most this many times. Negative
-# radiance that is left is then removed by adding a smoothed version of the light.
-_MAX_SOLUTIONS = 4
 # Number of color channels for which `project_nonnegative` keeps its results in a cache.
 _MAX_CACHED_CHANNELS = 256
 # A solution x counts as lying on the sphere |x - c| = r if |x - c| differs from r by
@@ -154,30 +149,27 @@ def _project_channel(channel: bytes) -> Array:
     if mean <= rounding_radiance:
         return uniform
     degree = math.isqrt(len(light)) - 1
-    weights = irradiance_weights(degree).numpy()
+    if degree <= _COARSE_GRID_DEGREE:
+        # Only the mean, which is the first coefficient, is bounded.
+        ends = np.full((2, len(light)), [[-np.inf], [np.inf]])
+        ends[:, 0] = mean
+        program = _QuadraticProgram(light[None], *ends, weights=irradiance_weights(degree).numpy())
+        _solve([program])
+        return program.nearest[0]
     windowed = nonnegative_window(degree).numpy() * light
     # Harmonics in the directions in which the radiance must not be negative, one row
     # for each direction.
     constraints = _grid(degree, _COARSE_SUBDIVISIONS).harmonics.T
     nearest = light
-    # The time of a program grows with the sixth power of the degree: a minute at degree 39.
-    solution_count = _MAX_SOLUTIONS if degree <= _COARSE_GRID_DEGREE else 0
-    for number in range(_MAX_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         _, new_constraints = _find_negative_minima(nearest[None], rounding_radiance, _LOWEST_STARTS)
         if not len(new_constraints):
             break
-        if number < solution_count:
-            constraints = np.concatenate([constraints, new_constraints])
-            # `shortest` minimizes the length of the weighted change of the coefficients.
-            # This length is the error of the irradiance.
-            weighted_change = shortest(constraints[:, 1:] / weights[1:], -constraints @ light)
-            nearest = np.concatenate([[mean], light[1:] + weighted_change / weights[1:]])
-        else:
-            # Mix uniform light into the windowed light until its radiance is not negative in
-            # any direction that was found. Then mix the result into the nearest light.
-            filler = _mix_to_nonnegative(windowed, uniform, constraints)
-            filler = _mix_to_nonnegative(filler, uniform, new_constraints)
-            nearest = _mix_to_nonnegative(nearest, filler, new_constraints)
+        # Mix uniform light into the windowed light until its radiance is not negative in
+        # any direction that was found. Then mix the result into the nearest light.
+        filler = _mix_to_nonnegative(windowed, uniform, constraints)
+        filler = _mix_to_nonnegative(filler, uniform, new_constraints)
+        nearest = _mix_to_nonnegative(nearest, filler, new_constraints)
     return nearest
 
 
@@ -219,11 +211,15 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
             _QuadraticProgram(light, center=center, radius=within.radius)
             for light, center in zip(original.reshape(shape), centers, strict=True)
         ]
-    # Few starts find most minima, and many find the rest.
-    for starts in (_LOWEST_STARTS, _MANY_STARTS):
-        _exchange(programs, starts)
+    _solve(programs)
     nearest = np.concatenate([program.nearest for program in programs])
     return torch.from_numpy(nearest).view(coefficients.mT.shape).to(coefficients).mT
+
+
+def _solve(programs: "list[_QuadraticProgram]") -> None:
+    """Solve programs with the exchange method. Few starts find most minima, and many the rest."""
+    for starts in (_LOWEST_STARTS, _MANY_STARTS):
+        _exchange(programs, starts)
 
 
 def _exchange(programs: "list[_QuadraticProgram]", starts: float) -> None:
@@ -268,7 +264,8 @@ class _QuadraticProgram:
     ball. The number t from 0 to 1 is chosen so that the solution lies in the ball.
 
     The arrays `original` (v), `nearest` (the solution), `low`, `high` and `center` have the
-    shape (C, K), or the last three are numbers.
+    shape (C, K), or the last three are numbers. Without a ball, `weights` may weight the
+    distance of each coefficient.
     """
 
     def __init__(
@@ -278,11 +275,13 @@ class _QuadraticProgram:
         high: Array | float = np.inf,
         center: Array | float = 0.0,
         radius: float = np.inf,
+        weights: Array | float = 1.0,
     ):
         """Solve the program without constraints on the radiance, within the bounds or the ball."""
         self.original = original
         self._center = center
         self._radius = radius
+        self._weights = weights
         self._offset = original - center
         self._low = np.broadcast_to(low, original.shape)
         self._high = np.broadcast_to(high, original.shape)
@@ -315,7 +314,7 @@ class _QuadraticProgram:
         for _ in range(_MAX_RADIUS_STEPS):
             target = self._unconstrained_point()
             channels = zip(target, constraints, self._low, self._high, strict=True)
-            solutions = [_least_distance(*channel) for channel in channels]
+            solutions = [_nearest(*channel, self._weights) for channel in channels]
             nearest = np.stack([solution for solution, _ in solutions])
             self._active_constraints = [active for _, active in solutions]
             displacement = nearest - self._center
@@ -363,26 +362,19 @@ def _differentiate(offset: Array, correction: Array, active_rows: Array) -> tupl
     return offset + active_rows.T @ rates, multipliers, rates
 
 
-def _least_distance(
-    original: Array, harmonics: Array, low: Array, high: Array
+def _nearest(
+    original: Array, harmonics: Array, low: Array, high: Array, weights: Array | float
 ) -> tuple[Array, Array]:
     """Find the nearest light x with harmonics · x ≥ 0 and low ≤ x ≤ high.
 
-    For the difference d = x - original, the constraints are G d ≥ h with a matrix
-    G and a vector h. Algorithm LDP of Lawson and Hanson (1974, chapter 23) finds
-    the shortest d. It stacks Gᵀ and the row hᵀ to a matrix E, and minimizes
-    |E u − f| over all u ≥ 0, with f = (0, ..., 0, 1). With the residual r = E u − f
-    of size K + 1, the result is d_j = −r_j / r_(K+1). A bound may be infinite. The result is x
+    The distance is the length of the difference d = x - original, times the weights. The
+    constraints are G d ≥ h with a matrix G and a vector h. A bound may be infinite. The result is x
     and the rows of `harmonics` with positive multipliers.
     """
     if not len(harmonics):
         return original, harmonics
-    size = len(original)
-    # The right sides h of the constraints are divided by this norm, so that they are not much
-    # larger than 1. The result d is then divided by it, too.
-    norm = np.linalg.norm(original)
     is_bounded = np.isfinite(low)
-    axes = np.eye(size)[is_bounded]
+    axes = np.eye(len(original))[is_bounded]
     # Matrix G of the constraints G d ≥ h. First come the rows for the radiance in M
     # directions, then those for the lower bounds, and then those for the upper bounds.
     left_sides = np.concatenate([harmonics, axes, -axes])
@@ -390,17 +382,12 @@ def _least_distance(
     from_high = (original - high)[is_bounded]
     # Vector h of the constraints G d ≥ h, in the order of the rows of G.
     right_sides = np.concatenate([-harmonics @ original, from_low, from_high])
-    # Matrix E of the problem of non-negative least squares.
-    dual_matrix = np.concatenate([left_sides.T, right_sides[None] / norm])
-    # Vector f = (0, ..., 0, 1).
-    last_unit_vector = np.eye(size + 1)[size]
-    multipliers, _ = nnls(dual_matrix, last_unit_vector)
-    residual = dual_matrix @ multipliers
-    residual[size] -= 1
-    if residual[size] > -(_MIN_DEPTH**2):
+    norm = float(np.linalg.norm(original))
+    direction, rest, multipliers = least_distance(left_sides / weights, right_sides / norm)
+    if rest < _MIN_DEPTH**2:
         # Only one point satisfies the constraints, up to rounding.
         return original.clip(low, high), harmonics
-    nearest = original - residual[:size] / residual[size] * norm
+    nearest = original + direction / rest * norm / weights
     is_active = multipliers[: len(harmonics)] > 0
     return nearest.clip(low, high), harmonics[is_active]
 

@@ -35,6 +35,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.polynomial import legendre
+from scipy.optimize import nnls
 from torch import Tensor
 
 from renderer.light.environment import FEWEST_ROWS, to_map
@@ -48,21 +49,6 @@ _MAX_ROUNDS = 100
 # `best_window` stops if the lobe that it makes non-negative is nowhere below minus this
 # fraction of its largest value.
 _MAX_DEPTH = 1e-9
-# `shortest` stops if two errors are at most this number. The first is the violation of the
-# inequalities, relative to their right sides. The second is the duality gap (the sum of
-# the products of slacks and multipliers), relative to the squared length of y.
-_TOLERANCE = 1e-9
-# At the optimum, the shortest vector y is matrixᵀ multipliers. `shortest` only stops if the
-# length of the difference is at most this number times the length of y.
-_STATIONARITY_TOLERANCE = 1e-6
-# Largest number of steps of `shortest`. 15 to 40 are usual.
-_MAX_STEPS = 80
-# A step goes this fraction of the way to the point at which a slack or a multiplier
-# becomes 0.
-_FRACTION_TO_BOUNDARY = 0.99
-# Smallest slack at the start of `shortest`. The multipliers start with this number,
-# divided by the mean squared length of a row of the matrix.
-_START = 0.1
 # `required_degree` leaves out the degrees of a light whose amplitude in a highlight
 # is at most this fraction of the amplitude of degree 0.
 AMPLITUDE = 0.1
@@ -123,7 +109,10 @@ def best_window(
         # of the factors must add at least the negative of this value. The error is the squared
         # length of the vector with the entries root_weight_l (w_l - 1), so the shortest one is
         # searched.
-        weighted_change = shortest(terms[:, 1:] / root_weight[1:], -terms.sum(1))
+        values = terms.sum(1)
+        scale = np.abs(values).max()
+        direction, rest, _ = least_distance(terms[:, 1:] / root_weight[1:], -values / scale)
+        weighted_change = direction / rest * scale
         factors = np.concatenate([[1.0], 1 + weighted_change / root_weight[1:]])
         # Legendre coefficients of the windowed lobe.
         series = odd_numbers * spectrum * factors
@@ -141,74 +130,23 @@ def best_window(
     return torch.from_numpy(factors)[bands(degree)]
 
 
-def shortest(
+def least_distance(
     matrix: Float[np.ndarray, "M n"], lower_bounds: Float[np.ndarray, " M"]
-) -> Float[np.ndarray, " n"]:
+) -> tuple[Float[np.ndarray, " n"], float, Float[np.ndarray, " M"]]:
     """Find the shortest vector y with `matrix` y ≥ `lower_bounds`, a least distance program.
 
-    This is a convex quadratic program. With slacks s = matrix y - lower_bounds
-    and multipliers μ, the vector y is optimal if y = matrixᵀ μ, s ≥ 0, μ ≥ 0, and
-    s_i μ_i = 0 for each inequality i. The predictor-corrector method solves
-    these conditions (Mehrotra 1992, "On the implementation of a primal-dual
-    interior point method"). The computing time does not depend on how many
-    inequalities hold with equality. Some y must satisfy all inequalities strictly, and
-    y = 0 must violate one of them. They hold up to 10⁻⁹ of the largest bound.
+    Algorithm LDP of Lawson and Hanson (1974, chapter 23) stacks matrixᵀ and the row
+    `lower_bounds` to a matrix E, and minimizes |E μ − (0, ..., 0, 1)| over all multipliers μ ≥ 0.
+    Then y is matrixᵀ μ divided by the number 1 − `lower_bounds` · μ, which is 0 if no y satisfies
+    the inequalities. The bounds should not be much larger than 1. The results are matrixᵀ μ, the
+    number and μ.
     """
-    # Only imported when it is needed, because scipy.linalg takes 0.1 s.
-    from scipy.linalg import cho_factor, cho_solve
-
-    # Scaling the bounds to a maximum of 1 makes the tolerances relative. y is scaled back at the
-    # end.
-    scale = np.abs(lower_bounds).max()
-    bounds = lower_bounds / scale
-    y = np.zeros(matrix.shape[1])
-    slacks = np.maximum(-bounds, _START)
-    multipliers = np.full(len(matrix), _START / np.square(matrix).sum(1).mean())
-    for _ in range(_MAX_STEPS):
-        # At the optimum, both residuals and the gap are 0.
-        dual_residual = y - matrix.T @ multipliers
-        primal_residual = matrix @ y - slacks - bounds
-        gap = slacks @ multipliers
-        is_gap_closed = gap < _TOLERANCE * (y @ y)
-        is_stationary = np.linalg.norm(dual_residual) < _STATIONARITY_TOLERANCE * np.linalg.norm(y)
-        if is_gap_closed and is_stationary and np.abs(primal_residual).max() < _TOLERANCE:
-            break
-        # The matrix of the linear system is matrixᵀ diag(μ / s) matrix + identity.
-        weighted_rows = matrix * np.sqrt(multipliers / slacks)[:, None]
-        system = weighted_rows.T @ weighted_rows + np.eye(len(y))
-        try:
-            factor = cho_factor(system, overwrite_a=True, check_finite=False)
-        except np.linalg.LinAlgError:
-            # Near the optimum, multipliers divided by slacks may differ so much in
-            # magnitude that rounding errors prevent another step.
-            break
-        # The predictor is a Newton step toward products s_i μ_i of 0, which is not taken. Its
-        # length, up to which no slack or multiplier is negative, decides how small the
-        # products shall become: the longer, the smaller. The corrector is a Newton step
-        # toward these equal products. It also removes the second-order error of the predictor.
-        products = slacks * multipliers
-        reductions = products
-        for is_predictor in (True, False):
-            # Eliminating the slacks and the multipliers leaves a linear system for y.
-            eliminated = (multipliers * primal_residual + reductions) / slacks
-            right_side = -dual_residual - matrix.T @ eliminated
-            y_change = cho_solve(factor, right_side, check_finite=False)
-            slack_change = matrix @ y_change + primal_residual
-            multiplier_change = -(reductions + multipliers * slack_change) / slacks
-            # Largest fractions of their values that a slack and a multiplier lose.
-            decreases = (-slack_change / slacks).max(), (-multiplier_change / multipliers).max()
-            longest = 1 / max(*decreases, _FRACTION_TO_BOUNDARY)
-            if is_predictor:
-                predicted_slacks = slacks + longest * slack_change
-                predicted_gap = predicted_slacks @ (multipliers + longest * multiplier_change)
-                target_product = (predicted_gap / gap) ** 3 * gap / len(matrix)
-                reductions = products + slack_change * multiplier_change - target_product
-        # Slacks and multipliers stay positive, and a step is never longer than a Newton step.
-        length = min(_FRACTION_TO_BOUNDARY * longest, 1)
-        y = y + length * y_change
-        slacks = slacks + length * slack_change
-        multipliers = multipliers + length * multiplier_change
-    return y * scale
+    stacked = np.vstack([matrix.T, lower_bounds])
+    target = np.zeros(len(stacked))
+    target[-1] = 1
+    multipliers, _ = nnls(stacked, target)
+    reached = stacked @ multipliers
+    return reached[:-1], 1 - reached[-1], multipliers
 
 
 @cache_tensors
