@@ -197,8 +197,9 @@ class Fragments:
             row = row % rows
         # The image is divided into square cells of width 2 / columns. A sample is the center of
         # its cell.
-        ends = torch.stack([2 * column + 1, 2 * (rows - row) - 1]).T / columns
-        return ends - ends.new_tensor([1, rows / columns])
+        x = (2 * column + 1) / columns - 1
+        y = (2 * (rows - row) - 1) / columns - rows / columns
+        return torch.stack([x, y]).T
 
     def by_sample(self) -> "Fragments":
         """Return a copy for a finer image, in which each sample is a pixel.

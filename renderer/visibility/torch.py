@@ -90,9 +90,11 @@ def to_fixed_point(
     """Convert points to integers and depths, as `renderer.visibility.numpy` does."""
     rows, columns = shape
     # As on GPUs, positions in samples are computed with one multiplication and one addition, and
-    # rounded to float32. x points to the right and y down.
-    halves = points.new_tensor([columns / 2, rows / 2])
-    window = points[..., :2].float() * points.new_tensor([columns / 2, -columns / 2]) + halves
+    # rounded to float32. x points to the right and y down. A tensor of constants would be copied
+    # to the GPU.
+    x, y = points[..., :2].float().to(points.dtype).unbind(-1)
+    coordinates = x * (columns / 2) + columns / 2, y * (-columns / 2) + rows / 2
+    window = torch.stack(coordinates, dim=-1)
     positions = (window.float() * SUBSAMPLES).round().long() - SUBSAMPLES // 2
     return positions, (points[..., 2] + 1) / 2 * FAR
 

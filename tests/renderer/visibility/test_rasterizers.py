@@ -1,6 +1,7 @@
 """All rasterizers against one contract, a brute-force reference and each other."""
 
 import tracemalloc
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from ctypes.util import find_library
 from fractions import Fraction
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 
 from renderer.errors import InputError
 from renderer.visibility import SPAN, Rasterizer, choose, opengl
+from renderer.visibility.torch import rasterize
 
 HAS_NUMBA = find_spec("numba") is not None
 needs_numba = pytest.mark.skipif(not HAS_NUMBA, reason="numba is not installed")
@@ -254,6 +256,15 @@ def test_torch_draws_the_same_faces_in_small_tiles(monkeypatch, closed):
         choose(name).rasterize(points, faces, 33, closed) for name in ("numpy", "torch")
     )
     np.testing.assert_array_equal(tiled, plain)
+
+
+def test_torch_waits_for_a_gpu_once_and_copies_no_constants_there():
+    points, faces = map(torch.from_numpy, random_triangles(3, 40))
+    with torch.autograd.profiler.profile() as profile:
+        rasterize(points, faces, (33, 20), closed=False)
+    names = Counter(event.name for event in profile.function_events)
+    assert names["aten::_local_scalar_dense"] == 1
+    assert names["aten::mul"] > 0 == names["aten::lift_fresh"]
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
