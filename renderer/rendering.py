@@ -163,6 +163,7 @@ def render(
         # In coordinates of the earth, float32 would round vertices to meters.
         like = like.double()
     light = None if light is None else light.to(like)
+    albedo = None if albedo is None else albedo.to(like.device)
     split = SplitLight(light, [(basis, values.to(like)) for basis, values in local_lights])
 
     is_moved = vertices is not None

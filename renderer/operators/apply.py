@@ -297,13 +297,13 @@ class TransferOperator:
             lights: Coefficients, shape (..., coefficients, 3).
 
         Returns:
-            Coefficients as a tensor of floating-point numbers.
+            Coefficients as a tensor of floating-point numbers on the device of the operator.
 
         Raises:
             InputError: If `lights` has NaN or another number of coefficients
                 than the basis.
         """
-        lights = errors.as_tensor("lights", lights)
+        lights = errors.as_tensor("lights", lights).to(self.transfer.device)
         if lights.shape[-2:] != (self.basis.size, COLORS):
             errors.require_shape(f"lights of {self.basis}", lights, "...", self.basis.size, COLORS)
         # The sum of squares is faster to check than each value. If it is too large or NaN,
