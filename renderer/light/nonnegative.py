@@ -123,7 +123,7 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
         return F.pad(projected, (0, 0, 0, coefficients.shape[-2] - low))
     # Find the distinct channels, so that the equal channels of a gray light are projected
     # only once.
-    channels = _split_channels(coefficients)[:, 0]
+    channels = _split_channels(coefficients)[0][:, 0]
     unique_channels, unique_index = np.unique(channels, axis=0, return_inverse=True)
     rounding_radiance = _rounding_radiance(unique_channels)
     light_of_minimum, _ = _find_negative_minima(unique_channels, rounding_radiance, _LOWEST_STARTS)
@@ -197,23 +197,23 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
     taken over all channels of a light together. The radiance of a channel is at least
     -`TOLERANCE` times its largest one.
     """
-    original = _split_channels(coefficients)
-    if within is None:
-        programs = [_QuadraticProgram(channel) for channel in original]
-    elif within.norm == "linf":
-        bounds = map(_split_channels, within.ends)
-        programs = [_QuadraticProgram(*arrays) for arrays in zip(original, *bounds, strict=True)]
+    if within is None or within.norm == "linf":
+        bounds = () if within is None else within.ends
+        channels = _split_channels(coefficients, *bounds)
+        programs = [_QuadraticProgram(*arrays) for arrays in zip(*channels, strict=True)]
     else:
         # An L2 ball couples the channels of a light, which become one block (C, K).
-        shape = coefficients.mT.shape
-        centers = _split_channels(within.center).reshape(shape)
+        channels = _split_channels(coefficients, within.center)
+        blocks = (each.reshape(coefficients.mT.shape) for each in channels)
         programs = [
             _QuadraticProgram(light, center=center, radius=within.radius)
-            for light, center in zip(original.reshape(shape), centers, strict=True)
+            for light, center in zip(*blocks, strict=True)
         ]
     _solve(programs)
     nearest = np.concatenate([program.nearest for program in programs])
-    return torch.from_numpy(nearest).view(coefficients.mT.shape).to(coefficients).mT
+    # The copy to a GPU does not wait. The driver buffers the array before this function ends.
+    rows = torch.from_numpy(nearest).to(coefficients, non_blocking=True)
+    return rows.view(coefficients.mT.shape).mT
 
 
 def _solve(programs: "list[_QuadraticProgram]") -> None:
@@ -248,10 +248,13 @@ def _rounding_radiance(channels: Array) -> Array:
     return _DARK_FRACTION * np.linalg.norm(channels, axis=1)
 
 
-def _split_channels(coefficients: Float[Tensor, "... K C"]) -> Array:
-    """Convert lights to an array (R, 1, K) of the R color channels of all of them."""
-    rows = coefficients.detach().mT.flatten(0, -2)
-    return rows[:, None].cpu().double().numpy()
+def _split_channels(*coefficients: Float[Tensor, "... K C"]) -> Array:
+    """Convert tensors of lights to arrays (R, 1, K) of the R color channels of all lights.
+
+    All tensors are copied from a GPU together, so that the CPU waits once.
+    """
+    rows = torch.stack(coefficients).detach().mT.flatten(1, -2)
+    return rows[:, :, None].cpu().double().numpy()
 
 
 class _QuadraticProgram:

@@ -1,5 +1,6 @@
 """Training on a GPU agrees with training on a CPU. The tests are skipped without one."""
 
+import warnings
 from itertools import count
 
 import pytest
@@ -7,6 +8,8 @@ import torch
 
 import norm_balls as nb
 from augment.attacks import loop as attack_loop
+from renderer.light.nonnegative import nearest_nonnegative
+from renderer.vectors import Ball
 from tests.runs import completed_run
 from train import checkpoints, run_folder
 from train.run_folder import read_metrics
@@ -82,6 +85,17 @@ def test_no_step_of_an_attack_on_lighting_waits_for_the_gpu(monkeypatch):
     settings = nb.AttackSettings(lighting=steps, margin=1e4, allow_negative=True)
     nb.attack(network, scene, settings=settings, force=True)
     assert next(calls) > 20
+
+
+@pytest.mark.parametrize("norm", ["linf", "l2"])
+def test_lights_that_the_cpu_makes_nonnegative_are_waited_for_once(norm, recwarn):
+    center = nearest_nonnegative(nb.load_light("grace"))[None].cuda()
+    # Warnings are off by default after the first from a line.
+    warnings.simplefilter("always")
+    torch.cuda.set_sync_debug_mode("warn")
+    nearest_nonnegative(2 * center - 1, Ball(center, 0.1, norm))
+    torch.cuda.set_sync_debug_mode("default")
+    assert len(recwarn) == 1
 
 
 @pytest.mark.parametrize("albedo", [None, torch.full((5120, 3), 0.5), [[0.5, 0.2, 0.1]] * 5120])
