@@ -224,12 +224,14 @@ def _renders(
     def index_of(label: str | int) -> int:
         return NO_OBJECT if label in NAMELESS else names.index(label)
 
-    # So many at once that image, truth and maps are of the same rasterized views. With operators,
-    # the last bits of an image depend on which others are rendered with it.
+    # So many at once that image, truth and maps are of the same rasterized views.
     kept = KEPT_SAMPLES // (scene.settings.pixel_count * scene.settings.samples**2)
-    for some in rows.split(max(1, kept) if scene.one_light else 1):
+    for some in rows.split(max(1, kept)):
         conditions = problem.conditions(values[some], some)
-        images = to_bytes(problem.images(values, some)[:, 0]).cpu()
+        # With operators, the last bits of an image depend on which others are rendered with it.
+        parts = some.split(len(some) if scene.one_light else 1)
+        images = torch.cat([to_bytes(problem.images(values, part)[:, 0]) for part in parts]).cpu()
+        lights = scene.exposed(conditions.light, some).cpu()
         truths = scene.truth(index_of, some, conditions).map(Tensor.cpu)
         maps_of = scene.surface_maps(conditions, some)[:, 0] if maps else None
         for row, example in enumerate(some.tolist()):
@@ -243,9 +245,8 @@ def _renders(
             normals = None if maps_of is None else maps_of[row, 1:]
             seen = labels, boxes, masks, visible, depth, normals
             shown = scene.examples[example]
-            light = scene.exposed(conditions.light[row].cpu(), example)
             name = scene.objects[shown.object].name
-            yield LabeledRender(start + example, images[row], *seen, facts, light, name)
+            yield LabeledRender(start + example, images[row], *seen, facts, lights[row], name)
 
 
 def describe_camera(camera: Camera, shape: tuple[int, int]) -> dict[str, Any]:

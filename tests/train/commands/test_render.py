@@ -14,6 +14,7 @@ from torchvision.datasets import ImageFolder
 import norm_balls as nb
 from augment import dataset
 from augment.dataset import describe_camera, render_dataset
+from augment.scene.scene import Scene
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
 from scripts.render import name_light
@@ -134,6 +135,22 @@ def test_views_of_one_light_each_are_shaded_as_operators_shade_them(meshes):
     [direct], [operator] = (render_dataset(ball, 24, 1, views=views, fov=30.0) for views in (2, 1))
     assert (direct.image.int() - operator.image.int()).abs().max() <= 1
     assert torch.equal(direct.masks, operator.masks)
+
+
+def test_masks_are_found_for_all_renders_of_a_block_together(meshes, monkeypatch):
+    counts = []
+    find = Scene.truth
+
+    def counted(scene, index_of, *chosen):
+        if len(chosen) == 2:  # with conditions, as building a scene gives none
+            counts.append(len(chosen[0]))
+        return find(scene, index_of, *chosen)
+
+    monkeypatch.setattr(Scene, "truth", counted)
+    # One view in a block of four renders has an operator.
+    ball = [(meshes[1]["mesh"], "ball")]
+    assert len(list(render_dataset(ball, 12, COUNT, views=1))) == COUNT
+    assert counts == [4, 4, 3]
 
 
 def test_a_tar_file_has_the_same_pictures_as_a_folder(meshes, written, tmp_path):
