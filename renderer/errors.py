@@ -508,6 +508,16 @@ def late_checks(checks: list[Check] | None) -> Iterator[None]:
         _LATE.reset(token)
 
 
+@contextmanager
+def joint_checks() -> Iterator[None]:
+    """Decide the checks of `require` together at the end, unless `late_checks` collects them."""
+    checks: list[Check] = []
+    late = _LATE.get()
+    with late_checks(checks if late is None else late):
+        yield
+    raise_first(checks)
+
+
 def raise_first(checks: list[Check]) -> None:
     """Raise the error of the first check that failed, and empty the list."""
     import torch

@@ -77,15 +77,18 @@ def as_background(
     `like`.
     """
     shape = height_and_width(size)
-    values = as_tensor("background", background).to(like)
+    # If values from the CPU were checked on a GPU, the CPU would wait for it.
+    values = as_tensor("background", background).to(like.dtype)
+    expected = f"a gray value, a color (3,) or images {(3, *shape)}, in [0, 1]"
+    fault = f"background has values outside [0, 1]: give {expected}"
+    if values.numel():
+        require((values.min() >= 0) & (values.max() <= 1), lambda: InputError(fault))
+    values = values.to(like.device)
     if values.ndim < 2:
         # A gray value or a color becomes an image of equal pixels.
         values = values.view(-1, 1, 1).expand(-1, *shape)
-    expected = f"a gray value, a color (3,) or images {(3, *shape)}, in [0, 1]"
     if values.ndim < 3 or values.shape[-3:] not in ((1, *shape), (3, *shape)):
         raise InputError(f"background has shape {tuple(values.shape)}: give {expected}")
-    if values.numel() and not (values.min() >= 0 and values.max() <= 1):
-        raise InputError(f"background has values outside [0, 1]: give {expected}")
     return values.expand(*values.shape[:-3], 3, *shape)
 
 

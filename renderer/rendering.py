@@ -197,33 +197,34 @@ def render(
     images = []
     # Only silhouettes use the camera, and they have single views.
     cameras_of_views = all_cameras[::at_once]
-    for camera, view, behind in zip(cameras_of_views, views, backgrounds_of_views, strict=True):
-        fragments = view.to(like.device)
-        indirect = None
-        if transport:
-            surface = Surface(moved_mesh, view.to("cpu"), settings, given_gloss=gloss)
-            # Function of the albedo and the environment light. It returns the radiance that shadows
-            # and bounces add to the pixels.
-            indirect = partial(transport.radiance, surface)
-        lamp_view = None
-        if local_lights:
-            on_cpu = fragments.to("cpu")
-            lamp_view = LocalLightView(rays, Surface(mesh, on_cpu, settings, vertices, gloss))
-        shaded_view = ShadedView(
-            mesh=mesh,
-            fragments=fragments,
-            settings=settings,
-            vertices=vertices,
-            albedo=_sample_albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale,
-            light=split,
-            lamp_view=lamp_view,
-            gloss=gloss,
-            indirect=indirect,
-        )
-        tall = behind.transpose(0, 1).flatten(1, 2)
-        seen = shaded_view.pixel_radiance(camera, tall.flatten(1))
-        image = composite(seen.radiance, seen.coverage, seen.pixels, tall, encoding)
-        images.append(image.unflatten(1, (len(behind), -1)).transpose(0, 1).to(image_dtype))
+    with errors.joint_checks():
+        for camera, view, behind in zip(cameras_of_views, views, backgrounds_of_views, strict=True):
+            fragments = view.to(like.device)
+            indirect = None
+            if transport:
+                surface = Surface(moved_mesh, view.to("cpu"), settings, given_gloss=gloss)
+                # Function of the albedo and the environment light. It returns the radiance that
+                # shadows and bounces add to the pixels.
+                indirect = partial(transport.radiance, surface)
+            lamp_view = None
+            if local_lights:
+                on_cpu = fragments.to("cpu")
+                lamp_view = LocalLightView(rays, Surface(mesh, on_cpu, settings, vertices, gloss))
+            shaded_view = ShadedView(
+                mesh=mesh,
+                fragments=fragments,
+                settings=settings,
+                vertices=vertices,
+                albedo=_sample_albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale,
+                light=split,
+                lamp_view=lamp_view,
+                gloss=gloss,
+                indirect=indirect,
+            )
+            tall = behind.transpose(0, 1).flatten(1, 2)
+            seen = shaded_view.pixel_radiance(camera, tall.flatten(1))
+            image = composite(seen.radiance, seen.coverage, seen.pixels, tall, encoding)
+            images.append(image.unflatten(1, (len(behind), -1)).transpose(0, 1).to(image_dtype))
     return images[0][0] if isinstance(cameras, Camera) else torch.cat(images)
 
 
@@ -401,7 +402,7 @@ def _as_albedo(albedo: object, mesh: Mesh) -> Tensor:
     """Convert the argument `albedo` to a tensor, and check its shape and its values."""
     values = errors.as_tensor("albedo", albedo)
     errors.require_bounded(albedo=values)
-    if values.numel() and not (values.min() >= 0 and values.max() <= MAX_ALBEDO):
+    if values.numel() and not ((values.min() >= 0) & (values.max() <= MAX_ALBEDO)):
         fault = f"albedo has values from {values.min().item():g} to {values.max().item():g}"
         advice = "give values from 0 to 1, and set albedo_scale for brighter surfaces"
         raise InputError(f"{fault}: {advice}")

@@ -403,13 +403,14 @@ def normals_in_sight(
     faces, normal_ids = (torch.from_numpy(ids).to(moved.device) for ids in arrays)
     # All first corners of the seen faces, then all second and third corners.
     seen_ids = normal_ids.index_select(0, fragments.faces).T.flatten()
-    count = int(normal_ids.max()) + 1
+    count = int(mesh.normal_ids.max()) + 1
     is_seen = torch.zeros(count, dtype=torch.bool, device=faces.device)
     is_seen[seen_ids] = True
     # A normal is an average over all faces that share it, so these are all needed.
     is_needed = is_seen.index_select(0, normal_ids.flatten()).view(-1, 3).any(1)
+    needed = is_needed.nonzero().squeeze(1)
     vertices = moved.to(torch.promote_types(moved.dtype, torch.float32))
-    normals = vertex_normals(vertices, faces[is_needed], normal_ids[is_needed], count)
+    normals = vertex_normals(vertices, faces[needed], normal_ids[needed], count)
     return normals.T.index_select(1, seen_ids).unflatten(1, (3, -1)).permute(2, 1, 0)
 
 

@@ -83,3 +83,16 @@ def test_a_gpu_starts_as_many_operations_for_twelve_views_as_for_three(part, opt
             nb.render(mesh, cameras, LIGHT, 64, rasterizer="torch", **options)
         counts.append(operations.count)
     assert counts[1] < 1.1 * counts[0]
+
+
+@pytest.mark.parametrize("options", MATTE, ids=str)
+def test_checks_of_many_views_wait_for_a_gpu_as_often_as_those_of_two(options):
+    mesh = nb.solid("pear")
+    vertices = torch.from_numpy(mesh.vertices)
+    counts = []
+    for count in (2, 5):
+        with torch.autograd.profiler.profile() as profile:
+            nb.render(mesh, PARTS[0][:count], LIGHT, 128, vertices=vertices, **options)
+        names = [event.name for event in profile.function_events]
+        counts.append(names.count("aten::_local_scalar_dense"))
+    assert counts[0] == counts[1] > 0
