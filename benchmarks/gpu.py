@@ -4,9 +4,10 @@
 
 The answer to each question is a few lines of JSON. A line compares one way with
 another, and the two take turns. The command first runs the tests of
-tests/train/test_gpu.py, and then measures. If a question fails, its line
-has the error, and the command continues with the next question. Meshes, data
-and networks are the project's own. If there are several GPUs, `training` runs
+tests/train/test_gpu.py, and then measures. Each question is answered by a
+process of its own, which is stopped after --minutes. If a question fails, its
+line has the error, and the command continues with the next question. Meshes,
+data and networks are the project's own. If there are several GPUs, `training` runs
 on one and on all of them. --device cpu rehearses the questions that need no
 CUDA.
 
@@ -19,6 +20,10 @@ A machine without access to a package index installs wheels that
 import argparse
 import json
 import multiprocessing
+import os
+import resource
+import signal
+import statistics
 import subprocess
 import sys
 import time
@@ -26,9 +31,11 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Event
 from unittest.mock import patch
 
 import numpy as np
@@ -40,7 +47,15 @@ from augment.augmentation_settings import TrainingAttackSettings
 from augment.dataset import render_dataset
 from augment.lighting import RandomLighting
 from augment.scene.lights import MODELS
-from benchmarks.common import Row, machine, medians, record
+from benchmarks.common import (
+    Row,
+    machine,
+    medians,
+    quartiles,
+    quartiles_of_ratio,
+    record,
+    times_in_turn,
+)
 from benchmarks.training import last_epoch, precompute
 from renderer.visibility import choose
 from train.checkpoints import load_run
@@ -73,6 +88,10 @@ FLOP_PER_IMAGE = 2.5e9
 PAPER_EPOCHS = 150
 # Longest text of an error, or of the end of an output, in characters.
 MAX_TEXT = 2000
+# Seconds between two readings of the used memory of a GPU.
+READING_SECONDS = 0.1
+# Seconds that a process has to stop what it started.
+STOP_SECONDS = 10.0
 ROOT = Path(__file__).parents[1]
 SHAPE = {"geometry": StepSettings("linf", 0.002, "sign", 0.001)}
 
@@ -116,12 +135,16 @@ def compare_calls(
         device: Device that the calls use.
 
     Yields:
-        A row for each call but the first, with times in milliseconds.
+        A row for each call but the first, with medians of times in milliseconds, and with the
+        first quartile, the median and the third quartile of times and of their ratio.
     """
-    times = medians(calls, ROUNDS, device)
+    times = times_in_turn(calls, ROUNDS, device)
     first_way, *other_ways = times
+    middle = {way: statistics.median(values) for way, values in times.items()}
     for way in other_ways:
-        yield compare_values(question, way, times[way], first_way, times[first_way])
+        row = compare_values(question, way, middle[way], first_way, middle[first_way])
+        row |= {"quartiles": quartiles(times[way]), "than_quartiles": quartiles(times[first_way])}
+        yield row | {"ratio_quartiles": quartiles_of_ratio(times[way], times[first_way])}
 
 
 def load_on(device: str) -> MixedPrecision:
@@ -403,15 +426,34 @@ def rate(question: str, way: str, count: int, call: Callable[[], object], device
         device: Device that it uses.
 
     Returns:
-        Row with things per second.
+        Row with things per second. The memory is that of torch on a GPU, and of `used_memory` on
+        a CPU.
     """
     call()
     if device != "cpu":
         torch.cuda.reset_peak_memory_stats()
-    milliseconds = medians({way: call}, ROUNDS, device)[way]
-    peak = 0 if device == "cpu" else torch.cuda.max_memory_allocated()
-    row = {"question": question, "way": way, "per_second": 1e3 * count / milliseconds}
+    milliseconds = times_in_turn({way: call}, ROUNDS, device)[way]
+    peak = used_memory(device) if device == "cpu" else torch.cuda.max_memory_allocated()
+    rates = quartiles([1e3 * count / each for each in milliseconds])
+    row = {"question": question, "way": way, "per_second": rates[1], "quartiles": rates}
     return row | {"count": count, "peak_bytes": peak}
+
+
+def used_memory(device: str) -> int:
+    """Return the used bytes of a GPU, or the peak of this process and those that it waited for."""
+    if device == "cpu":
+        processes = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
+        return 1024 * max(resource.getrusage(each).ru_maxrss for each in processes)
+    free, total = torch.cuda.mem_get_info()
+    return total - free
+
+
+def watch_memory(device: str, is_over: Event) -> int:
+    """Return the largest `used_memory` until an event."""
+    peak = 0
+    while not is_over.wait(READING_SECONDS):
+        peak = max(peak, used_memory(device))
+    return max(peak, used_memory(device))
 
 
 def regeneration(device: str) -> Iterator[Row]:
@@ -554,35 +596,80 @@ NEED_CUDA = ("tests", "synchronizations")
 # ---------------------------------------------------------------------------- command
 
 
-def answers(questions: Sequence[str], device: str, minutes: float) -> Iterator[Row]:
+def answers(
+    questions: Sequence[str],
+    device: str,
+    minutes: float,
+    ask: Callable[[str, float], Iterator[Row]],
+) -> Iterator[Row]:
     """Answer questions one after the other.
 
     Args:
         questions: Keys of `QUESTIONS`.
         device: Device. On "cpu", the questions that need CUDA are left out.
         minutes: Time after which no other question begins.
+        ask: Function that answers a question within the minutes that are left.
 
     Yields:
-        A row that describes the machine, and the rows of the questions. The last row of
-        a question has its seconds. If it fails, the row before it has the error.
+        A row that describes the machine, and the rows of the questions.
     """
     yield {"machine": machine(device)}
     start = time.monotonic()
     for name in questions:
         if device == "cpu" and name in NEED_CUDA:
             continue
-        begin = time.monotonic()
-        if begin - start > 60 * minutes:
-            yield {"left": name}
-            continue
+        left = minutes - (time.monotonic() - start) / 60
+        yield from ask(name, left) if left > 0 else [{"left": name}]
+
+
+def answer(device: str, name: str, _minutes: float) -> Iterator[Row]:
+    """Answer a question in this process, without a limit of time.
+
+    Yields:
+        The rows of the question. The last one has its seconds and the peak of the memory, on a
+        GPU that of all processes. If the question fails, the last one has the error.
+    """
+    begin = time.monotonic()
+    is_over = Event()
+    with ThreadPoolExecutor(1) as pool:
+        peak = pool.submit(watch_memory, device, is_over)
         try:
             yield from QUESTIONS[name](device)
         except Exception as error:
             # An error in one question must not end a session on a GPU.
             message = f"{type(error).__name__}: {error}"
             yield {"question": name, "error": message[:MAX_TEXT]}
-            continue
-        yield {"answered": name, "seconds": round(time.monotonic() - begin)}
+            return
+        finally:
+            is_over.set()
+    seconds = round(time.monotonic() - begin)
+    yield {"answered": name, "seconds": seconds, "peak_bytes": peak.result()}
+
+
+def answer_apart(device: str, out: Path | None, name: str, minutes: float) -> Iterator[Row]:
+    """Answer a question in a process of its own, which writes its rows to the file.
+
+    An error of the GPU ends that process alone. After the minutes, it is stopped with all that
+    it started.
+
+    Yields:
+        A row with an error if the process did not end by itself.
+    """
+    command = [sys.executable, "-m", "benchmarks.gpu", "--here", "--device", device]
+    command += ["--questions", name, *(["--out", str(out)] if out else [])]
+    process = subprocess.Popen(command, start_new_session=True)
+    try:
+        if process.wait(60 * minutes):
+            yield {"question": name, "error": f"the process ended with {process.returncode}"}
+    except subprocess.TimeoutExpired:
+        yield {"question": name, "error": f"stopped after the {minutes:.1f} minutes that were left"}
+    finally:
+        # torchrun stops its workers, which are no part of the group, if it gets some time.
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGTERM)
+            time.sleep(STOP_SECONDS)
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 def answered(path: Path | None) -> set[str]:
@@ -607,7 +694,8 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     )
     parser.add_argument("--device", default="cuda", help="cpu: a rehearsal")
     parser.add_argument("--questions", nargs="+", choices=QUESTIONS, default=list(QUESTIONS))
-    parser.add_argument("--minutes", type=float, default=9.0, help="no question begins later")
+    parser.add_argument("--minutes", type=float, default=9.0, help="no question takes longer")
+    parser.add_argument("--here", action="store_true", help="in this process, without that limit")
     parser.add_argument("--out", type=Path, help="a .jsonl file, to which lines are added")
     options = parser.parse_args(arguments)
     if options.out and options.out.suffix != ".jsonl":
@@ -619,7 +707,9 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
         )
     known = answered(options.out)
     questions = [name for name in options.questions if name not in known]
-    rows = answers(questions, options.device, options.minutes)
+    apart = partial(answer_apart, options.device, options.out)
+    ask = partial(answer, options.device) if options.here else apart
+    rows = answers(questions, options.device, options.minutes, ask)
     return record(rows, options.out, options.device)
 
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import time
 from pathlib import Path
 
 import pytest
@@ -169,13 +170,27 @@ def test_questions_about_a_gpu_are_answered_over_several_runs(tmp_path, monkeypa
 
     monkeypatch.setattr(gpu, "QUESTIONS", {"fails": fails, "works": lambda device: [{"value": 2}]})
     out = tmp_path / "new" / "gpu.jsonl"
-    words = ["--device", "cpu", "--out", str(out), "--questions"]
+    words = ["--here", "--device", "cpu", "--out", str(out), "--questions"]
     gpu.main([*words, "fails", "works", "--minutes", "-1"])
     gpu.main([*words, "fails"])
     gpu.main([*words, "fails", "works"])
     rows = [json.loads(line) for line in out.read_text().splitlines()]
     assert [row["left"] for row in rows if "left" in row] == ["fails", "works"]
-    assert [row["answered"] for row in rows if "answered" in row] == ["works"]
+    [works] = [row for row in rows if "answered" in row]
+    assert works["answered"] == "works"
+    # Python with torch takes more than 100 MB.
+    assert works["peak_bytes"] > 1e8
     # A question that failed is asked again.
     assert [row["value"] for row in rows if "value" in row] == [1, 1, 2]
     assert [row["error"] for row in rows if "error" in row] == ["RuntimeError: out of memory"] * 2
+
+
+def test_a_question_about_a_gpu_is_stopped_after_its_minutes(tmp_path, monkeypatch):
+    monkeypatch.setattr(gpu, "STOP_SECONDS", 0.1)
+    out = tmp_path / "gpu.jsonl"
+    start = time.monotonic()
+    gpu.main(["--device", "cpu", "--out", str(out), "--questions", "paper", "--minutes", "0.01"])
+    assert time.monotonic() - start < 30
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["question"] for row in rows if "error" in row] == ["paper"]
+    assert not any("answered" in row for row in rows)
