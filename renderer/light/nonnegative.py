@@ -151,9 +151,10 @@ def _project_channel(channel: bytes) -> Array:
     degree = math.isqrt(len(light)) - 1
     if degree <= _COARSE_GRID_DEGREE:
         # Only the mean, which is the first coefficient, is bounded.
-        ends = np.full((2, len(light)), [[-np.inf], [np.inf]])
-        ends[:, 0] = mean
-        program = _QuadraticProgram(light[None], *ends, weights=irradiance_weights(degree).numpy())
+        low = np.concatenate([[mean], np.full(len(light) - 1, -np.inf)])
+        high = np.where(low == mean, mean, np.inf)
+        weights = irradiance_weights(degree).numpy()
+        program = _QuadraticProgram(light[None], low, high, weights=weights)
         _solve([program])
         return program.nearest[0]
     windowed = nonnegative_window(degree).numpy() * light
