@@ -138,6 +138,8 @@ class ImageFiles:
         """
         errors: ReadErrors = {}
         options: dict[str, Any] = {"num_workers": self.workers, "collate_fn": _collate}
+        # Otherwise, each loader draws from the global generator, also when a run is resumed.
+        options["generator"] = torch.Generator()
         loader: DataLoader = DataLoader(_Reader(self), batch_sampler=list(batches), **options)
         for images, errors_in_batch in loader:
             errors |= errors_in_batch

@@ -32,7 +32,14 @@ from train.data.photographs import find_photographs, load_photographs
 from train.data.rendered_shapes import cache_folder, load_shapes
 from train.device import choose_rasterizer, main_process_first
 from train.networks import CLASSIFIER, describe
-from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, label_names
+from train.settings import (
+    MIN_SIZE,
+    OTHER,
+    UNLABELED,
+    ExperimentSettings,
+    label_names,
+    published_folder,
+)
 
 # Default fraction of the training images that validate the network.
 VALIDATION = 0.1
@@ -388,7 +395,7 @@ def load_renders(settings: ExperimentSettings, data: sets.DataSet) -> tuple[Tens
 
     A label is the index of a class, or the complementary label in a subfolder that is no class.
     """
-    folder = Path(str(settings.augment.folder))
+    folder = published_folder(Path(str(settings.augment.folder)))
     positive_classes = label_names(settings.label)
     label_of_class = {name: index for index, name in enumerate(data.classes)}
     label_of_negative = complementary_label(label_of_class[positive_classes[0]])

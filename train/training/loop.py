@@ -116,12 +116,14 @@ class TrainingStep:
             is_compiled = False
             self._loss = DetectionLoss(replica, settings, teacher, service.task).compute
         else:
-            # Module that computes the logits of the teacher. It may take the features from
-            # the network in training.
-            pupil: nn.Module | None = teacher
-            if teacher is not None and not is_compiled:
-                pupil = recipe.share_layers(settings, model, teacher, self.size)
-            loss = recipe.TrainingLoss(replica, settings, classes, pupil, self.labeled)
+            if settings.augmentation == "pgd" and not self.labeled:
+                fault = "augmentation=pgd attacks labels, which the photographs lack"
+                raise InputError(f"{fault}: choose another", "augmentation")
+            loss = recipe.TrainingLoss(replica, settings, classes, teacher, self.labeled)
+            sees_same = loss.learns_unchanged or not settings.consistency_weight
+            if teacher is not None and sees_same and not is_compiled:
+                # The teacher takes the features from the network in training, if they are equal.
+                loss.teacher = recipe.share_layers(settings, model, teacher, self.size)
             self._loss = loss.compute
         if is_compiled:
             # torch limits the number of compiled functions in a process. Those of an

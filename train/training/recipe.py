@@ -235,6 +235,13 @@ class TrainingLoss:
     teacher: nn.Module | None
     labeled: bool = True
 
+    @property
+    def learns_unchanged(self) -> bool:
+        """Whether the network learns from images before the augmentation, too."""
+        # Without labels, renders and distillation, only the augmented photographs are learned.
+        weight = self.settings.distillation_weight
+        return bool(self.labeled or self.positive_classes or weight)
+
     def compute(
         self,
         images: UInt8[Tensor, "B 3 H W"],
@@ -248,9 +255,7 @@ class TrainingLoss:
         correct predictions.
         """
         settings = self.settings
-        # Without labels, renders and distillation, only the augmented photographs are learned.
-        learns_unchanged = self.labeled or self.positive_classes or settings.distillation_weight
-        shown = images if augmented is None or learns_unchanged else augmented
+        shown = images if augmented is None or self.learns_unchanged else augmented
         logits = self.model(to_unit(shown))
         teacher_logits = None
         if self.teacher is not None:

@@ -64,6 +64,12 @@ def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_proc
     assert (spans[1] > 0).all()  # No crop is upside down.
 
 
+def test_reading_images_draws_nothing_from_the_global_generator(files):
+    before = torch.get_rng_state()
+    list(files.squares([torch.arange(2)]))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_a_broken_file_is_named_or_another_of_its_folder_stands_in(tmp_path, caplog):
     for name, color in (("lemon", "yellow"), ("orange", "red")):
         (tmp_path / name).mkdir()

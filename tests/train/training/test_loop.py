@@ -52,7 +52,9 @@ def color_network() -> nn.Sequential:
     return nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(3, 3))
 
 
-def make_trainer(folder, network=None, precision="float32", has_initial=True, **settings):
+def make_trainer(
+    folder, network=None, precision="float32", has_initial=True, labeled=True, **settings
+):
     torch.manual_seed(0)
     network = network or WideResNet(3, 10, 1, dropout=0.0)
     model = MixedPrecision(network, precision)
@@ -61,7 +63,7 @@ def make_trainer(folder, network=None, precision="float32", has_initial=True, **
     no_labels = torch.zeros(0, dtype=torch.int64)
     none = AugmentationSettings(mode="none")
     no_renders = AugmentationService(none, None, no_labels, 0, Phases())
-    return Trainer(recipe, model, ARCHITECTURE, no_renders, folder, has_initial=has_initial)
+    return Trainer(recipe, model, ARCHITECTURE, no_renders, folder, labeled, has_initial)
 
 
 def fit(trainer: Trainer, trained: Split, validated: Split) -> list[dict]:
@@ -361,3 +363,23 @@ def test_the_checkpoint_of_another_run_is_refused(tmp_path, changes, settings):
     sentence = str(refused.value)
     assert str(tmp_path) in sentence
     assert "\n" not in sentence
+
+
+def test_the_last_layer_learns_from_augmented_photographs_alike_if_the_others_are_frozen(tmp_path):
+    """The network has no other layer with weights, so that freezing them changes nothing."""
+    settings = {"eval_mode": True, "consistency_weight": 1.0, "augmentation": "low_light"}
+    weights = []
+    for frozen in (None, "all_but_last"):
+        options = settings | {"labeled": False, "freeze": frozen}
+        trainer = make_trainer(tmp_path, color_network(), **options)
+        before = copy.deepcopy(trainer.model.state_dict())
+        fit(trainer, single_colors(TRAINED), single_colors(VALIDATED))
+        weights.append(trainer.model.state_dict())
+        assert not torch.equal(weights[-1]["network.2.weight"], before["network.2.weight"])
+    torch.testing.assert_close(*weights, rtol=0, atol=0)
+
+
+def test_an_attack_on_the_labels_of_photographs_without_labels_is_refused(tmp_path):
+    options = {"labeled": False, "consistency_weight": 1.0, "augmentation": "pgd"}
+    with pytest.raises(InputError, match="pgd"):
+        make_trainer(tmp_path, color_network(), **options)
