@@ -161,7 +161,7 @@ class AugmentationSettings(Settings):
     init: str = setting("scene", "Light at the start of attacks.", choices=("scene", "random"))
     warm_start: bool = setting(False, "Start each attack where the previous one ended.")
     regenerate_every: int | None = setting(
-        None, "Training images between regenerations. null: an epoch.", within=(1, 10**9)
+        None, "Maximum number of images between regenerations. null: an epoch.", within=(1, 10**9)
     )
     vary: VariationSettings = setting(VariationSettings, "What is drawn anew for each render.")
     random_light: RandomLightSettings = setting(

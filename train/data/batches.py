@@ -75,7 +75,8 @@ def rounds_of_epoch(
     shown_images = torch.randperm(image_count, generator=draws)[:images_per_epoch]
     # Renders are numbered after the images of the data set.
     render_numbers = torch.arange(image_count, image_count + render_count)
-    parts = shown_images.split(images_per_round or len(shown_images))
+    round_count = math.ceil(len(shown_images) / (images_per_round or len(shown_images)))
+    parts = shown_images.tensor_split(round_count)  # Their sizes differ by at most one.
     rounds = []
     for index, part in enumerate(parts):
         # Numbers of the images and renders of a round, in ascending order.

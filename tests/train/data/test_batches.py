@@ -127,11 +127,13 @@ def test_an_epoch_continues_from_any_batch_as_if_one_split_held_its_rows_and_ren
 
 
 class TestRounds:
-    def test_divide_the_images_of_an_epoch_and_each_has_all_renders(self):
-        rounds = batches.rounds_of_epoch(100, 7, 0, 4, 50, 20)
-        assert [(part.number, part.epoch) for part in rounds] == [(12, 4), (13, 4), (14, 4)]
+    @pytest.mark.parametrize(("limit", "counts"), [(20, [17, 17, 16]), (49, [25, 25])])
+    def test_divide_the_images_of_an_epoch_evenly_and_each_has_all_renders(self, limit, counts):
+        rounds = batches.rounds_of_epoch(100, 7, 0, 4, 50, limit)
+        numbers = range(4 * len(counts), 5 * len(counts))
+        assert [(part.number, part.epoch) for part in rounds] == [(n, 4) for n in numbers]
         images = []
-        for part, image_count in zip(rounds, [20, 20, 10], strict=True):
+        for part, image_count in zip(rounds, counts, strict=True):
             rows = part.rows.tolist()
             assert rows == sorted(rows)
             assert rows[image_count:] == list(range(100, 107))

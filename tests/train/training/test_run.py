@@ -102,7 +102,7 @@ def test_a_signal_ends_a_run_after_the_step_and_resuming_ends_as_if_it_had_not_c
     tiny, finished, tmp_path, number, average
 ):
     """Epochs have rounds of 2, 2 and 1 steps, through which lights, dropout and teacher go on."""
-    rounds = ("augment.regenerate_every=16", "train.images_per_epoch=40")
+    rounds = ("augment.regenerate_every=16", "train.images_per_epoch=38")
     teacher = ("train.distillation_weight=2", f"network={finished}")
     settings = tiny("train.epochs=2", "train.resume=true", *rounds, *teacher, average)
     whole = tmp_path / "whole"
