@@ -125,6 +125,7 @@ def training_batches(
             shown = torch.empty(own_size, *split.images.shape[1:], dtype=torch.uint8)
             shown[~is_render[index]] = next(crops)
             shown = shown.to(device)
+            shown = torch.where(flip[:, None, None, None], shown.flip(3), shown)
         else:
             shown = crop_and_flip(split.images, row, shift, flip)
         labels = split.labels[row]

@@ -127,7 +127,7 @@ class ImageFiles:
         return self._read([(row, None) for row in batch.tolist()] for batch in rows)
 
     def crops(self, batches: Iterable[tuple[Tensor, Tensor]]) -> Iterator[Tensor]:
-        """Read random crops of images by indices and seeds. A random half of them is flipped."""
+        """Read random crops of images by indices and seeds."""
         return self._read([*zip(row.tolist(), seed.tolist(), strict=True)] for row, seed in batches)
 
     def _read(self, batches: Iterable[list[Key]]) -> Iterator[Tensor]:
@@ -167,8 +167,7 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
         self._files = files
         area = (MIN_CROP_AREA, 1.0)
         bicubic = v2.InterpolationMode.BICUBIC
-        crop = v2.RandomResizedCrop(files.size, area, interpolation=bicubic)
-        self._crop = v2.Compose([crop, v2.RandomHorizontalFlip()])
+        self._crop = v2.RandomResizedCrop(files.size, area, interpolation=bicubic)
 
     def __getitem__(self, key: Key) -> tuple[Tensor, ReadErrors]:
         """Read an image, or another image of its subfolder if it cannot be read.

@@ -81,20 +81,28 @@ def test_shifts_and_flips_are_all_drawn_about_equally_often(size, largest_shift,
     assert chisquare(occurrences).pvalue > 1e-4
 
 
-def mirrored_rows(now: batches.Round) -> torch.Tensor:
-    """Return for each of 40 images whether the round shows it mirrored."""
-    ramp = torch.arange(11, dtype=torch.uint8).expand(40, 3, 11, 11)
-    shown = batches.training_batches(numbered(ramp), 40, 0, now, "alternating")
+def mirrored_rows(images: torch.Tensor | ImageFiles, now: batches.Round) -> torch.Tensor:
+    """Return for each of 40 images, which grow brighter to the right, whether it is mirrored."""
+    split = Split(images, torch.arange(40))
+    no_renders = Split(images[:0], split.labels[:0])
+    shown = batches.training_batches(
+        batches.TrainingImages(split, split.labels, no_renders), 40, 0, now, "alternating"
+    )
     ((images, labels, _),) = shown
     is_flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
     return is_flipped[labels.argsort()]
 
 
-def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
-    first = mirrored_rows(epoch_round(40, 0))
+@pytest.mark.parametrize("is_on_disk", [False, True])
+def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch(is_on_disk, tmp_path):
+    images = torch.arange(0, 220, 20, dtype=torch.uint8).expand(40, 3, 11, 11)
+    if is_on_disk:
+        Image.fromarray(images[0].permute(1, 2, 0).numpy()).save(tmp_path / "a.png")
+        images = ImageFiles(tmp_path, (PurePosixPath("a.png"),) * 40, 11, workers=0, skip=False)
+    first = mirrored_rows(images, epoch_round(40, 0))
     assert 0 < first.sum() < 40
-    assert torch.equal(mirrored_rows(epoch_round(40, 1)), ~first)
-    assert torch.equal(mirrored_rows(epoch_round(40, 2)), first)
+    assert torch.equal(mirrored_rows(images, epoch_round(40, 1)), ~first)
+    assert torch.equal(mirrored_rows(images, epoch_round(40, 2)), first)
 
 
 def test_an_epoch_shows_every_image_once_and_fills_the_last_batch_with_the_first_images():

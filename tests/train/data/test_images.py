@@ -60,8 +60,7 @@ def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_proc
     areas = (spans[0] * spans[1]).abs()
     assert 0.31 < areas.min() < 0.45  # The smallest crops have 35 % of the area.
     assert 0.9 < areas.max() <= 1
-    assert 70 < (spans[0] < 0).sum() < 130
-    assert (spans[1] > 0).all()  # No crop is upside down.
+    assert (torch.stack(spans) > 0).all()  # No crop is mirrored or upside down.
 
 
 def test_reading_images_draws_nothing_from_the_global_generator(files):
