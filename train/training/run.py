@@ -73,7 +73,16 @@ class Run:
         # if it was not computed.
         self._initial_predictions: Tensor | None = None
         inputs.require_label(settings, self.data)
+        data = settings.data
+        is_folder = data.name == "folder" or not self.data.labeled
+        trained = Path(data.path if self.data.labeled else str(settings.unlabeled)).resolve()
+        if data.name == "folder" and (trained / "train").is_dir():
+            trained /= "train"  # The images beside it, in "test", are not trained on.
         for name, scored in self.scored_folders.items():
+            real = scored.resolve()
+            if is_folder and (real.is_relative_to(trained) or trained.is_relative_to(real)):
+                fault = f"photos={scored} has images of {trained}, which is trained on"
+                wrappers.say_once(f"{fault}: score other photographs")
             photographs.require_outside(folder / name, scored)
             with keyed("photos"):
                 labels = photographs.choose_labels(scored, self.data.classes, settings.label)

@@ -290,6 +290,35 @@ def test_folders_of_photographs_are_scored_for_each_class_with_a_folder(tiny, ph
     assert not (run / "photographs").exists()
 
 
+@pytest.mark.parametrize(
+    ("source", "scored", "is_warned"),
+    [
+        ("unlabeled={}/train", "train", True),
+        ("unlabeled={}/train", "link", True),
+        ("unlabeled={}/train/orange", "train", True),
+        ("unlabeled={}", "test", True),
+        ("unlabeled={}/train", "test", False),
+        ("data.path={}", "train", True),
+        ("data.path={}", "test", False),
+        ("data.path={}/test", "test", True),
+    ],
+)
+def test_a_run_warns_if_it_would_score_images_that_it_trains_on(
+    tiny, finished, tmp_path, caplog, source, scored, is_warned
+):
+    images = tmp_path / "images"
+    rng = np.random.default_rng(0)
+    for split, name in itertools.product(("train", "test"), ("apple", "orange", "pear")):
+        for number in range(3):
+            save_noise(images / split / name / f"{number}.png", rng, (16, 16))
+    (images / "link").symlink_to(images / "train")
+    options = source.format(images), f"photos={images / scored}", f"network={finished}"
+    recipe = "train.distillation_weight=1", "data.test_fraction=0.3", "size=16", "label=orange"
+    name = "folder" if source.startswith("data") else "unlabeled"
+    loaded_run(tiny(f"data={name}", *options, *recipe, *WITHOUT_RENDERS), tmp_path / "run")
+    assert ("which is trained on" in caplog.text) == is_warned
+
+
 def test_the_network_best_on_validation_is_scored_once_after_the_last_epoch(tiny, tmp_path):
     data = load_data(tiny())
     epochs_of_looks = []
