@@ -182,7 +182,7 @@ def user_message(error: BaseException) -> str | None:
             return str(error)
         case OSError() if error.errno in NO_ROOM:
             fault = f"{error.filename or 'the output'} cannot be written ({error.strerror})"
-            return f"{fault}: make room and start again"
+            return f"{fault}: make room and try again"
         case OSError() if error.filename is not None:
             return f"{error.filename} cannot be read or written: {error.strerror}"
         # NCCL and Gloo connect processes. Gloo has no class of errors; its messages contain the

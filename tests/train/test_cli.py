@@ -1,3 +1,4 @@
+import errno
 import io
 import os
 import re
@@ -165,15 +166,19 @@ def test_a_stopped_run_is_resumed_by_folder(call, capsys, no_report, tmp_path, t
 
 
 @pytest.mark.parametrize(
-    ("function", "has_trained"),
-    [("train.training.inputs.load_data", False), ("train.training.run.evaluate_photographs", True)],
+    ("function", "has_trained", "error", "code"),
+    [
+        ("inputs.load_data", False, KeyboardInterrupt(), 128 + signal.SIGINT),
+        ("run.evaluate_photographs", True, KeyboardInterrupt(), 128 + signal.SIGINT),
+        ("run.evaluate_photographs", True, OSError(errno.ENOSPC, "full"), USER_ERROR),
+    ],
 )
-def test_ctrl_c_tells_how_to_resume_if_there_is_a_checkpoint(
-    call, capsys, monkeypatch, tmp_path, tiny_npz, photos, function, has_trained
+def test_ctrl_c_and_a_full_disk_tell_how_to_resume_if_there_is_a_checkpoint(
+    call, capsys, monkeypatch, tmp_path, tiny_npz, photos, function, has_trained, error, code
 ):
-    monkeypatch.setattr(function, Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(f"train.training.{function}", Mock(side_effect=error))
     data = "data=npz", f"data.path={tiny_npz}", f"photos={photos}"
-    assert call("train", "out=here", *data, *SMALL) == 128 + signal.SIGINT
+    assert call("train", "out=here", *data, *SMALL) == code
     last_line = capsys.readouterr().out.splitlines()[-1]
     assert (tmp_path / "here" / LAST).is_file() == has_trained
     assert ("train.resume=true" in last_line) == has_trained

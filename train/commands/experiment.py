@@ -42,7 +42,7 @@ from train.results.store import is_finished, summarize
 from train.run_config import CONFIG, format_command, require_same_run, resume_config
 from train.run_folder import FAILURE, locked, sole_writer, state, writable_folder
 from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings, NetworkSettings
-from train.system import is_verbose, program, shortened, user_message
+from train.system import NO_ROOM, is_verbose, program, shortened, user_message
 from train.training.inputs import load_inputs, with_label
 from train.training.run import Run
 
@@ -148,7 +148,9 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, resume: 
                 console.debug("\n%s\n", format_comparison(summaries))
                 console.info("%s\n", format_short_comparison(summaries))
                 console.info("%s", report_of([folder], folder))
-        except (Interrupted, KeyboardInterrupt) as stop:
+        except (Interrupted, KeyboardInterrupt, OSError) as stop:
+            if isinstance(stop, OSError) and stop.errno not in NO_ROOM:
+                raise
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
             advice = "no checkpoint yet: start again"
             # The first training on photographs may have ended before the main one.
