@@ -395,8 +395,11 @@ def write_laboratory(settings: LabSettings) -> int:
         rows = []
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
             for group in groups:
-                # Successive shots show successive meshes of a group.
-                subject = group[number % len(group)]
+                # Each round shows every mesh of a group once. In a fixed order, a mesh would always
+                # have about the same brightness if a lighting has one shot for each mesh.
+                turn, place = divmod(number, len(group))
+                rng = np.random.default_rng(stream_seed(settings.seed, "meshes", turn))
+                subject = group[rng.permutation(len(group))[place]]
                 path = _write_render(settings, subject, shot, number)
                 brightness = f"{shot.brightness:.4f}"
                 # A row of photos.csv. Images of one shot have its number.

@@ -2,7 +2,7 @@
 
 import csv
 import shutil
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from renderer.errors import InputError
 from renderer.mesh import Mesh
 from renderer.solids import SOLIDS, solid
 from train.command_settings import LabSettings
+from train.commands.audit import NEGATIVE_SOLIDS
 from train.data.photographs import find_photographs, load_photographs
 from train.laboratory import laboratory as lab
 from train.laboratory.laboratory import FOV, Shot, draw_shots, lab_parts, path_traced
@@ -75,12 +76,34 @@ def test_a_laboratory_is_a_folder_of_photographs_with_the_pattern_as_the_source(
 
 def test_a_setup_shows_an_object_of_the_label_and_another_one_in_the_same_light(laboratory):
     pairs = [{"solid:orange:7", "solid:lemon:7"}, {"solid:orange:8", "solid:pear:7"}]
+    shown = []
     for setup, source in enumerate(["stripes", "stripes", "half", "half"]):
         first, second = [row for row in rows(laboratory) if row["setup"] == str(setup)]
-        assert {first["mesh"], second["mesh"]} == pairs[setup % 2]
+        shown.append({first["mesh"], second["mesh"]})
         assert first["source_tag"] == second["source_tag"] == source
         assert first["brightness"] == second["brightness"]
         assert 0.2 <= float(first["brightness"]) <= 2.5
+    for of_lighting in (shown[:2], shown[2:]):
+        assert sorted(map(sorted, of_lighting)) == sorted(map(sorted, pairs))
+
+
+@pytest.mark.parametrize("shots", [1, 5, 6])
+def test_every_mesh_is_shown_in_dim_and_in_bright_light(tmp_path, monkeypatch, shots):
+    """A lighting has as many shots as there are hard negatives, one less or a single one."""
+    monkeypatch.setattr(lab, "_write_render", lambda settings, subject, *_: subject.mesh)
+    names = ["solid:orange:0", *(f"solid:{name}:0" for name in NEGATIVE_SOLIDS)]
+    setups = shots * len(LAB_PATTERNS)
+    lab.write_laboratory(settings(tmp_path, meshes=names, setups=setups, patterns=[*LAB_PATTERNS]))
+    brightness = defaultdict(list)
+    for row in rows(tmp_path):
+        brightness[row["mesh"]].append(float(row["brightness"]))
+    del brightness["solid:orange:0"]
+    counts = [len(values) for values in brightness.values()]
+    assert len(counts) == len(NEGATIVE_SOLIDS)
+    assert max(counts) - min(counts) <= (setups % len(counts) > 0)
+    # The brightness has the median √(0.2 · 2.5).
+    if shots > 1:
+        assert all(min(values) < 0.5 < 1 < max(values) for values in brightness.values())
 
 
 def test_only_the_object_distinguishes_the_label_from_a_hard_negative(tmp_path):
