@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from train.results import store
 from train.results.intervals import Jackknife, change
-from train.results.metrics import COUNTED_EACH, METRICS, TITLES, Pool, Pooled
+from train.results.metrics import COUNTED_EACH, METRICS, TITLES, TOP_RANKS, Pool, Pooled
 from train.results.predictions import PREDICTIONS
 from train.results.store import INITIAL, Methods, RunSummary, Scored, ScoredRun
 from train.results.tables import RANGE, Estimate, Table, describe_intervals, format_interval
@@ -192,8 +192,13 @@ def difference(
 
     The 95% interval is paired: both methods are measured without the same objects. With several
     seeds, it is also over seeds. With one seed, it says nothing about other seeds. The value is
-    `evaluations` minus `reference`. None if the metric of a run is unknown.
+    `evaluations` minus `reference`. None if the metric of a run is unknown, or on other images.
     """
+    pools = [pool for item in (*evaluations, *reference) if (pool := item.find(subset))]
+    shown = {tuple(item.path for item in pool.classified.photograph) for pool in pools}
+    # The top-1 accuracies of networks with different classes can be of different images.
+    if name in TOP_RANKS and len(shown) > 1:
+        return None
     after = _jackknives(evaluations, subset, name)
     before = _jackknives(reference, subset, name)
     # A run whose metric is unknown has no jackknife.

@@ -15,7 +15,7 @@ from train.results.metrics import Pool, Pooled
 from train.results.page import write_report
 from train.results.predictions import Predictions, write_predictions
 from train.results.scoring import rank_classes
-from train.results.store import ScoredRun, summarize
+from train.results.store import RunSummary, ScoredRun, summarize
 
 # Scores of oranges and scores of other things, by source.
 Scores = dict[str | None, tuple[Sequence[float], Sequence[float]]]
@@ -39,14 +39,14 @@ def rows_of(scores: Scores) -> Rows:
     return rows
 
 
-def predictions_of(rows: Rows) -> Predictions:
+def predictions_of(rows: Rows, other: str = "pear") -> Predictions:
     """Make the predictions of a network that knows two fruits, by the sign of the score."""
     photographs = [
         Photograph(PurePosixPath(f"{label}/{index:03}.png"), label, source)
         for index, (label, source, _) in enumerate(rows)
     ]
     logits = torch.tensor([[score, 0.0] for *_, score in rows], dtype=torch.float64)
-    return rank_classes(photographs, logits, ["orange", "pear"], ["orange"])
+    return rank_classes(photographs, logits, ["orange", other], ["orange"])
 
 
 @pytest.fixture
@@ -202,6 +202,21 @@ def test_without_the_metric_of_one_seed_there_is_no_difference(scored_run):
         assert comparison.difference(*pair, comparison.ALL, "auc") is None
     first = comparison.difference(lacking[:1], whole[:1], comparison.ALL, "auc")
     assert (first.before, first.value, first.after) == (0, 0.5, 0.5)
+
+
+@pytest.mark.parametrize("apples", [7, 5])
+def test_networks_with_different_classes_have_no_difference_of_top_1_on_different_images(apples):
+    rows = [(*shown, 1.0) for shown in [("orange", "web")] * 9 + [("pear", "web")] * 7]
+    rows += [("apple", "web", -1.0)] * apples
+    run = RunSummary(Path("run"), "", {}, {}, None)
+    one, same, other = (
+        [comparison.Evaluation(run, Pooled(predictions_of(rows, name)))]
+        for name in ("pear", "pear", "apple")
+    )
+    for metric in ("class_top1", "class_top5"):
+        assert comparison.difference(other, one, comparison.ALL, metric) is None
+        assert comparison.difference(same, one, comparison.ALL, metric).value == 0
+    assert comparison.difference(other, one, comparison.ALL, "recall").value == 0
 
 
 def test_a_difference_of_three_seeds_is_that_of_their_means_and_paired(scored_run):
