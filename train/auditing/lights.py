@@ -345,7 +345,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     Frame i of n has the light start + i / (n - 1) · (end - start). If the attack may use two
     lights, it may use all lights between them, too. "classes" are the right class and the
     CLASS_COUNT - 1 most probable others. Each of "frames" has "image", "ball" (a white ball in the
-    same light), both JPEG in base64, and "probabilities" of these classes.
+    same light), both JPEG in base64, "probabilities" of these classes, and "predicted".
     """
     start, end = result.problem.start[example], result.minimum.values[example]
     # Shape (FRAME_COUNT, 1): 0 is the start and 1 the end of the attack.
@@ -358,6 +358,10 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
         conditions = result.problem.conditions(values, examples)
         evidence = result.objective().select(examples).evidence(images)[:, 0]
     probabilities = result.classifier.task.confidences(evidence).cpu()
+    criterion = result.criterion.map(lambda rows: rows[[example] * FRAME_COUNT, 0])
+    predicted = criterion.predicted(evidence)
+    classes = result.classifier.classes
+    predictions = result.classifier.task.found(evidence, predicted, classes)["predicted"]
     label = int(result.criterion.source[example, 0])
     # Classes by their highest probability in any frame.
     ranked = probabilities.amax(dim=0).argsort(descending=True).tolist()
@@ -369,8 +373,9 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
         shown = [round(value, 4) for value in probabilities[index, shown_classes].tolist()]
         image = _encode_jpeg(result.drawn(images[index, 0]), SIDE)
         ball_image = _encode_jpeg(ball, BALL_SIDE)
-        frames.append({"image": image, "ball": ball_image, "probabilities": shown})
-    names = [result.classifier.classes[index] for index in shown_classes]
+        frame = {"image": image, "ball": ball_image, "probabilities": shown}
+        frames.append(frame | {"predicted": predictions[index]})
+    names = [classes[index] for index in shown_classes]
     return {"classes": names, "label": names[0], "frames": frames}
 
 

@@ -12,6 +12,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from train.auditing import lights
 from train.auditing import network as audited
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS, VIEWS
@@ -163,6 +165,10 @@ def _slider(networks: Networks) -> dict[str, Any]:
         for kind, counts in network.counts.items():
             if "slider" in counts:
                 classes = [in_words(label) for label in counts["slider"]["classes"]]
+                for frame in counts["slider"]["frames"]:
+                    # Files of earlier versions lack the prediction.
+                    highest = classes[np.argmax(frame["probabilities"])]
+                    frame["predicted"] = in_words(frame.get("predicted", highest))
                 named = {"network": network.name, "light": KINDS[kind].title, "classes": classes}
                 return counts["slider"] | named
     return {}

@@ -11,10 +11,10 @@ function show() {
     find("bar" + index).style.width = 100 * probability + "%";
     find("value" + index).textContent = percent;
   });
-  const highest = frame.probabilities.indexOf(Math.max(...frame.probabilities));
-  const name = data.classes[highest];
-  find("predicted").textContent = (highest === 0 ? "✓ " : "✗ ") + name;
-  find("predicted").className = highest === 0 ? "right" : "wrong";
+  const name = frame.predicted;
+  const isRight = name === data.classes[0];
+  find("predicted").textContent = (isRight ? "✓ " : "✗ ") + name;
+  find("predicted").className = isRight ? "right" : "wrong";
   slider.setAttribute("aria-valuetext", name);
 }
 slider.addEventListener("input", show);

@@ -117,6 +117,7 @@ def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views, l
     ends = [slider["frames"][index]["probabilities"] for index in (0, -1)]
     expected = [result.logits_before[example], result.logits[example]]
     assert slider["classes"] == ["orange", "other"]
+    assert [slider["frames"][index]["predicted"] for index in (0, -1)] == slider["classes"]
     for probabilities, logits in zip(ends, expected, strict=True):
         np.testing.assert_allclose(probabilities, logits.softmax(0), atol=1e-4)
 

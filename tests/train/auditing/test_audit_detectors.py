@@ -47,6 +47,19 @@ def test_recall_on_renders_is_the_part_of_views_in_which_the_object_is_found(mon
     assert recalls == sorted(recalls)
 
 
+def test_the_slider_shows_what_a_detector_predicts_at_its_threshold(monkeypatch):
+    """The only detection keeps the largest score, but this falls below the threshold."""
+    monkeypatch.setattr(engine, "FRAME_COUNT", 3)
+    monkeypatch.setattr(engine, "STEPS", 5)
+    network = as_network(find_red, 16, ["orange", "apple"], task=nb.Detection(threshold=0.9))
+    item = load_object(ObjectSettings("solid:orange:0", label="orange"))
+    views = Views([item], 1, 0, torch.device("cpu"), exposure=0.7)
+    frames = engine.frames_of(engine.adversaries(network, views, "lamps"), 0)["frames"]
+    for frame in frames:
+        assert frame["predicted"] == ("orange" if frame["probabilities"][0] >= 0.9 else "nothing")
+    assert (frames[0]["predicted"], frames[-1]["predicted"]) == ("orange", "nothing")
+
+
 def test_metrics_of_a_detector_that_finds_nothing_are_zero_and_explained(monkeypatch, tmp_path):
     monkeypatch.setattr(engine, "KINDS", {})
 
