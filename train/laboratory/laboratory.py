@@ -395,11 +395,12 @@ def write_laboratory(settings: LabSettings) -> int:
         rows = []
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
             for group in groups:
-                # Each round shows every mesh of a group once. In a fixed order, a mesh would always
-                # have about the same brightness if a lighting has one shot for each mesh.
-                turn, place = divmod(number, len(group))
-                rng = np.random.default_rng(stream_seed(settings.seed, "meshes", turn))
-                subject = group[rng.permutation(len(group))[place]]
+                # The shots of a lighting go from dim to bright. Each round of n shots shows all n
+                # meshes of a group, and in n rounds each mesh takes each place once.
+                count, (turn, place) = len(group), divmod(number, len(group))
+                rng = np.random.default_rng(stream_seed(settings.seed, "meshes", turn // count))
+                places, turns = rng.permutation(count), rng.permutation(count)
+                subject = group[(places[place] + turns[turn % count]) % count]
                 path = _write_render(settings, subject, shot, number)
                 brightness = f"{shot.brightness:.4f}"
                 # A row of photos.csv. Images of one shot have its number.
