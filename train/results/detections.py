@@ -18,6 +18,8 @@ from train.results.tables import Estimate
 
 # What the intervals are over.
 PHOTOGRAPHS = "photographs"
+# An interval over fewer units says nothing. With two, its t distribution has one degree of freedom.
+MIN_UNITS = 3
 # Index of the object of a detection: it is of no object, or of a crowd, which does not count.
 NO_OBJECT, CROWD = -1, -2
 # Fields of `Matches` that have an entry for each detection, and those with one for each object.
@@ -258,8 +260,8 @@ def estimate(
 ) -> Estimate:
     """Compute a statistic in [0, 1] with its 95% interval over units of images, or over images.
 
-    The groups have the indices of all images. The interval is unknown if a group has one unit, or
-    if the statistic is unknown without some units.
+    The groups have the indices of all images. The interval is unknown if the first group has
+    fewer than MIN_UNITS units, if another has one, or if the statistic is unknown without some.
     """
 
     image_count = sum(map(len, groups))
@@ -281,7 +283,8 @@ def estimate(
     if all((item == result.value).all() for item in result.without[1:]):
         count = int(unit_of_image[0].max()) + 1
         result = replace(result, without=result.without[:1], unit_count=count)
-    if result.unit_count < 2 or not all(np.isfinite(item).all() for item in result.without):
+    is_known = all(np.isfinite(item).all() for item in result.without)
+    if result.unit_count < 2 or result.without[0].shape[-1] < MIN_UNITS or not is_known:
         return Estimate(float(result.value))
     return result.estimate
 

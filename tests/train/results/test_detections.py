@@ -145,6 +145,17 @@ def test_photographs_without_objects_do_not_change_the_interval_of_the_recall(is
             assert ends == pytest.approx([expected.value, expected.low, expected.high], abs=2e-3)
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_fewer_than_three_photographs_have_no_interval(count):
+    """With two, the t distribution has one degree of freedom, and intervals reach everywhere."""
+    far = _found([[60, 60, 80, 80]], [0], [0.9])
+    found = [_found([], [], []), *[far] * (count - 1)]
+    metrics = detections.score(_match(found, [_marked(BOX, [0])] * count), [0], 0.4)
+    assert metrics.false_per_image.value == pytest.approx((count - 1) / count)
+    for metric in (metrics.recall, metrics.ap50, metrics.false_per_image):
+        assert (metric.low is None) == (metric.high is None) == (count < 3)
+
+
 def test_no_false_detection_has_an_upper_limit_like_the_rule_of_three():
     matches = _match([_found([], [], [])] * 100, [_marked([], [])] * 100)
     metrics = detections.score(matches, [0], 0.4)
