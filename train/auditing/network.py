@@ -45,7 +45,7 @@ BOTH = "hardening and normalized light"
 # What a user does for each remedy.
 CHECK = "Choose its threshold and check it on your own photographs first."
 ADVICE = {
-    ORIGINAL: "Keep the original network: no remedy that was tested is proven to help.",
+    ORIGINAL: "Keep the original network.",
     LIGHT_ALONE: "Recommended: the network as it is, with normalize_light=true.",
     HARDENING: f"Recommended: the hardened network. {CHECK}",
     BOTH: f"Recommended: the hardened network, with normalize_light=true. {CHECK}",
@@ -58,6 +58,11 @@ NEXT_HARDENING = (
 NEXT_DATA = (
     "Next: harden with more meshes of the class and photographs of the place of use, and audit "
     "again."
+)
+# What a user does first if the network knows no view of the class.
+NEXT_TRAINING = (
+    "First, train the network on these objects in natural light: most of the gain of hardening "
+    "comes from seeing the objects at all."
 )
 # Remedies are compared by top-1 accuracy if there are several positive classes.
 TOP1 = "class_top1"
@@ -258,7 +263,8 @@ class AuditedNetwork:
         # Faults in renders of few views may be chance.
         if faults and not rests_on_images and view_count < MIN_VIEWS:
             reasons = "; ".join(faults)
-            return "Perhaps not", f"Perhaps not: {reasons}. Only {view_count} views were attacked."
+            views = "view was" if view_count == 1 else "views were"
+            return "Perhaps not", f"Perhaps not: {reasons}. Only {view_count} {views} attacked."
         if faults:
             return "No", f"No: {'; '.join(faults)}."
         answer = "No fault is shown, but so few images leave room for one."

@@ -24,7 +24,7 @@ from train.results.metrics import Metrics
 from train.results.page import scores_section, write_page
 from train.results.pictures import Picture, plot_by_radius, plot_curves, read_square
 from train.results.predictions import SUMMARY, Predictions
-from train.results.tables import Estimate, Table, format_interval, fraction
+from train.results.tables import Estimate, Table, describe_intervals, format_interval, fraction
 from train.run_config import CONFIG, read_config
 from train.run_folder import read_json
 from train.settings import in_words
@@ -121,11 +121,17 @@ def write_audit_page(
             for name, key in remedies.items()
         }
         recommendation = audited.recommend(evaluations)
+    is_unknown = networks[0].verdict[0] == "Unknown"
+    if is_unknown and recommendation is not None and recommendation.remedy is None:
+        first = audited.NEXT_TRAINING
+        recommendation = replace(recommendation, advice=first, sentence=first)
     advice = []
     if recommendation is not None:
         # The top of the report shows the gain by hardening already.
         is_shown = recommendation.remedy == audited.HARDENING
         advice = [recommendation.advice if is_shown else recommendation.sentence]
+    elif is_unknown:
+        advice = [audited.NEXT_TRAINING]
     elif screen.answer in (VERDICTS["No"], VERDICTS["Perhaps not"]):
         advice = [audited.NEXT_HARDENING]
     note = [f"These are first results. Not measured yet: {missing}."] if missing else []
@@ -228,7 +234,8 @@ def screen_of_one(network: AuditedNetwork, metrics: Metrics) -> first_screen.Fir
     sentences = [plain_sentence(network)]
 
     def show(title: str, value: Estimate, note: str = "higher is better") -> None:
-        numbers.append(first_screen.ShownMetric(title, note, None, value))
+        interval = describe_intervals([value])
+        numbers.append(first_screen.ShownMetric(title, note, None, value, interval=interval))
 
     show("Views recognized in plain light", fraction(network.plain.recognized, network.plain.n))
     kind = network.strongest_kind

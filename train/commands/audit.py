@@ -40,6 +40,7 @@ from train.auditing.network import CLASSIFIER, HARDENED, IN_WORDS, AuditReport
 from train.checkpoints import load_chosen, load_network
 from train.command_settings import ENVIRONMENTS, AuditSettings, LabSettings
 from train.data.annotations import read_annotations
+from train.data.photo import DESCRIPTION
 from train.data.photographs import find_photographs, find_unlabeled
 from train.device import choose_device
 from train.laboratory.laboratory import write_laboratory
@@ -225,6 +226,11 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
     # Renders of an earlier, stopped audit are used again, and need no Mitsuba.
     has_renders = renders.exists() and not settings.overwrite
     if plan is not None and plan.has_classes and LABORATORY not in plan.image_folders:
+        if has_renders:
+            rendered, size = read_json(renders / DESCRIPTION)["size"], largest_size(networks)
+            if height_and_width(rendered) != height_and_width(size):
+                fault = f"hardened needs test images of {size} pixels, but {renders} has {rendered}"
+                raise InputError(f"{fault}: choose another out, or set overwrite=true", "hardened")
         try:
             # `mitsuba` raises an InputError if Mitsuba, which renders, is not installed.
             with nullcontext() if has_renders else mitsuba():
@@ -366,6 +372,14 @@ class _Plan:
         for name in settings.environments:
             load_light(name)
         self.environments = [UNIFORM, *settings.environments]
+        # Results are kept by the name of their light. Patterns are lights of rendered test images.
+        patterns = PATTERNS if self.has_classes and not settings.laboratory else ()
+        names = [Path(name).stem for name in (*patterns, *settings.environments)]
+        names += [UNIFORM] * (UNIFORM not in settings.environments)
+        if len({*names}) < len(names) or any(name.startswith(lights.RANDOM) for name in names):
+            others = f"{', '.join([*patterns, UNIFORM])} or {lights.RANDOM}1"
+            fault = f"environments={settings.environments} must have different names"
+            raise InputError(f"{fault}, and none of {others}: rename a file", "environments")
         self.random_light_count = settings.scale(RANDOM_LIGHT_COUNT)
         positives = objects[: len(meshes)]
         self.negatives = objects[len(meshes) :]
@@ -429,11 +443,8 @@ class _Plan:
                 _write_json(results / lights.DETECTED, lights.find_in_lights, *lit)
         if later:
             yield later[0], self.measured_folders()
-            # The test images are rendered for the network with the largest images.
-            sizes = [network.size for network in networks.values()]
-            size = max(sizes, key=lambda size: math.prod(height_and_width(size)))
             renders = self.image_folders[LABORATORY]
-            _write_folder(renders, partial(_write_renders, settings, self, size))
+            _write_folder(renders, partial(_write_renders, settings, self, largest_size(networks)))
             self._score(networks, out)
 
     def _score(self, networks: Networks, out: Path) -> None:
@@ -447,6 +458,12 @@ class _Plan:
             if self.annotations is not None:
                 write_scores = partial(lights.score_photographs, network, self.annotations)
                 _write_folder(out / key / lights.BOXED, write_scores)
+
+
+def largest_size(networks: Networks) -> Size:
+    """Return the size of the largest images of the networks, which the test images get."""
+    sizes = [network.size for network in networks.values()]
+    return max(sizes, key=lambda size: math.prod(height_and_width(size)))
 
 
 def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:

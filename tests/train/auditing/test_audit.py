@@ -16,14 +16,16 @@ from augment.scene import patterns
 from augment.scene.objects import Conditions, load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
+from renderer.io.images import write_image
 from renderer.light.files import load_light
 from tests.helpers import darker_than
 from train.auditing import lights
-from train.auditing.network import RECOGNIZED, AuditedNetwork
+from train.auditing.network import NEXT_HARDENING, NEXT_TRAINING, RECOGNIZED, AuditedNetwork
 from train.command_settings import AuditSettings
 from train.commands import audit
 from train.commands.audit import run_audit
 from train.results.tables import fraction
+from train.run_config import write_config
 from train.settings import LABORATORY
 
 CLASSES = ("orange", "other")
@@ -139,7 +141,7 @@ def test_classifiers_of_all_sizes_get_the_same_views_unlike_those_of_another_see
         np.testing.assert_array_equal(one.mesh.vertices, other.mesh.vertices)
 
 
-CLASSIFIERS = {"dark": darker_than(0.5), "guessing": guessing()}
+CLASSIFIERS = {"dark": darker_than(0.5), "guessing": guessing(), "large": darker_than(0.5, 16)}
 
 
 @pytest.fixture
@@ -249,6 +251,27 @@ def test_an_audit_without_mitsuba_says_that_it_has_no_laboratory(given, tmp_path
     assert not (tmp_path / "audit/classifier/laboratory").exists()
 
 
+@pytest.mark.parametrize("has_images", [False, True])
+def test_a_network_that_knows_no_view_is_to_be_trained_first(
+    given, tmp_path, monkeypatch, has_images
+):
+    for label in CLASSES if has_images else ():
+        (tmp_path / "renders" / label).mkdir(parents=True)
+        write_image(tmp_path / "renders" / label / "1.png", np.zeros((8, 8, 3), np.uint8))
+        given |= {"laboratory": str(tmp_path / "renders"), "hard_negatives": [], "label": "orange"}
+    counts = {"n": 2, "correct": 0}
+    for method in ("adversarial", "random"):
+        counts |= {method: [0, 0, 0, 0], f"{method}_without_noise": [0, 0, 0, 0]}
+    monkeypatch.setattr(audit, "mitsuba", Mock(side_effect=InputError("Mitsuba is missing")))
+    monkeypatch.setattr(lights, "success_by_light", lambda *_: iter([counts, counts]))
+    audited = run_audit(AuditSettings(**given), {audit.CLASSIFIER: darker_than(-1)})
+    assert (audited.recommendation is not None) == has_images
+    assert audited.screen.sentences[-1] == NEXT_TRAINING
+    assert NEXT_HARDENING not in audited.path.read_text()
+    for number in audited.screen.numbers:
+        assert number.interval.endswith(f"over {number.after.over}")
+
+
 ORANGE_PEAR = {"mesh": "solid:pear", "label": "orange"}
 
 
@@ -263,12 +286,48 @@ ORANGE_PEAR = {"mesh": "solid:pear", "label": "orange"}
         ({"meshes": [{"msh": "a.glb"}]}, "msh"),
         ({"environments": ["nowhere.hdr"]}, "nowhere.hdr"),
         ({"laboratory": "nowhere"}, "laboratory=nowhere"),
+        # Results are kept by the name of a light, and one of two with the same name would be lost.
+        ({"environments": ["map.npy", "other/map.npy"]}, "different names"),
+        ({"environments": ["grace", "grace"]}, "different names"),
+        ({"environments": ["uniform.npy"]}, "different names"),
+        ({"environments": ["random 1.npy"]}, "different names"),
+        ({"environments": ["rings.npy"]}, "different names"),
     ],
 )
-def test_what_cannot_be_audited_is_refused_and_nothing_written(given, tmp_path, changes, message):
+def test_what_cannot_be_audited_is_refused_and_nothing_written(
+    given, tmp_path, monkeypatch, changes, message
+):
+    monkeypatch.chdir(tmp_path)
+    Path("other").mkdir()
+    for name in ("map", "other/map", "uniform", "random 1", "rings"):
+        np.save(f"{name}.npy", np.ones((8, 16, 3), np.float32))
     with pytest.raises(InputError, match=message):
         run_audit(AuditSettings(**given | changes))
     assert not (tmp_path / "audit").exists()
+
+
+@pytest.mark.parametrize("rest", [{"laboratory": "renders"}, {"environments": ["uniform"]}])
+def test_lights_are_audited_whose_names_no_other_light_has(given, tmp_path, monkeypatch, rest):
+    """No patterns are rendered with a given laboratory, and uniform light is there in any case."""
+    monkeypatch.chdir(tmp_path)
+    np.save("rings.npy", np.ones((8, 16, 3), np.float32))
+    Path("renders/orange").mkdir(parents=True)
+    write_image(Path("renders/orange/1.png"), np.zeros((8, 8, 3), np.uint8))
+    changes = {"environments": ["rings.npy"], "hard_negatives": [], "label": "orange", **rest}
+    settings = AuditSettings(**given | changes)
+    plan = audit._Plan(settings, {audit.CLASSIFIER: CLASSIFIERS["dark"]}, torch.device("cpu"))
+    assert {*plan.environments} == {"uniform", *settings.environments}
+
+
+def test_test_images_of_another_size_than_a_later_network_needs_are_refused(given, tmp_path):
+    out = tmp_path / "audit"
+    (out / "renders").mkdir(parents=True)
+    (out / "renders" / "lab.json").write_text(json.dumps({"size": 8}))
+    write_config(out, audit.complete(AuditSettings(**given), CLASSES))
+    with pytest.raises(InputError, match=r"hardened.*16.* 8") as raised:
+        run_audit(AuditSettings(**given, hardened="large"))
+    assert raised.value.argument == "hardened"
+    assert not (out / "classifier").exists()
 
 
 def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None:
