@@ -11,10 +11,11 @@ direction in which its radiance has a local minimum and is negative.
 minimizes the error of the irradiance, Σ A_l² (x − v)², with the factors A_l of
 `lambertian_factors`. Coefficients with A_l = 0 get a small weight instead (see
 `irradiance_weights`), so of all lights with the same irradiance, the
-nearest one is chosen. Above degree _COARSE_GRID_DEGREE, the program would take long. The
-light times `nonnegative_window` is then mixed in until no negative minima are left. This
-windowed light is non-negative if the given light is a physical light that was cut off at a
-degree. Without a fixed mean, the nearest coefficients would
+nearest one is chosen. If negative minima are left after some solutions, the light times
+`nonnegative_window` is mixed in to remove them. This windowed light is non-negative if the
+given light is a physical light that was cut off at a degree. Above degree
+_COARSE_GRID_DEGREE, the program would take long, and the window alone is used. Without a
+fixed mean, the nearest coefficients would
 brighten the whole sky to remove the negative minima beside a bright source.
 
 `nearest_nonnegative` is used after each step of an attack. For coefficients v,
@@ -76,6 +77,9 @@ _DARK_FRACTION = 1e-6
 # Largest number of rounds of the exchange method. A round adds constraints in the
 # directions with negative radiance, and solves again. Ten to twenty rounds are usual.
 _MAX_ROUNDS = 50
+# `project_nonnegative` solves its quadratic program at most this many times. Negative
+# radiance that is left is then removed by adding a smoothed version of the light.
+_MAX_SOLUTIONS = 80
 # Number of color channels for which `project_nonnegative` keeps its results in a cache.
 _MAX_CACHED_CHANNELS = 256
 # A solution x counts as lying on the sphere |x - c| = r if |x - c| differs from r by
@@ -149,19 +153,19 @@ def _project_channel(channel: bytes) -> Array:
     if mean <= rounding_radiance:
         return uniform
     degree = math.isqrt(len(light)) - 1
+    nearest = light
     if degree <= _COARSE_GRID_DEGREE:
         # Only the mean, which is the first coefficient, is bounded.
         low = np.concatenate([[mean], np.full(len(light) - 1, -np.inf)])
         high = np.where(low == mean, mean, np.inf)
         weights = irradiance_weights(degree).numpy()
         program = _QuadraticProgram(light[None], low, high, weights=weights)
-        _solve([program])
-        return program.nearest[0]
+        _exchange([program], _LOWEST_STARTS, _MAX_SOLUTIONS)
+        nearest = program.nearest[0]
     windowed = nonnegative_window(degree).numpy() * light
     # Harmonics in the directions in which the radiance must not be negative, one row
     # for each direction.
     constraints = _grid(degree, _COARSE_SUBDIVISIONS).harmonics.T
-    nearest = light
     for _ in range(_MAX_ROUNDS):
         _, new_constraints = _find_negative_minima(nearest[None], rounding_radiance, _LOWEST_STARTS)
         if not len(new_constraints):
@@ -210,22 +214,20 @@ def nearest_nonnegative(coefficients: Tensor, within: Ball | None = None) -> Ten
             _QuadraticProgram(light, center=center, radius=within.radius)
             for light, center in zip(*blocks, strict=True)
         ]
-    _solve(programs)
+    # Few starts find most minima, and many find the rest.
+    for starts in (_LOWEST_STARTS, _MANY_STARTS):
+        _exchange(programs, starts)
     nearest = np.concatenate([program.nearest for program in programs])
     # The copy to a GPU does not wait. The driver buffers the array before this function ends.
     rows = torch.from_numpy(nearest).to(coefficients, non_blocking=True)
     return rows.view(coefficients.mT.shape).mT
 
 
-def _solve(programs: "list[_QuadraticProgram]") -> None:
-    """Solve programs with the exchange method. Few starts find most minima, and many the rest."""
-    for starts in (_LOWEST_STARTS, _MANY_STARTS):
-        _exchange(programs, starts)
-
-
-def _exchange(programs: "list[_QuadraticProgram]", starts: float) -> None:
+def _exchange(
+    programs: "list[_QuadraticProgram]", starts: float, rounds: int = _MAX_ROUNDS
+) -> None:
     """Solve programs until no negative minimum is found, see `_find_negative_minima`."""
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(rounds):
         # Channels of all programs that are still negative somewhere, one below the other.
         nearest = np.concatenate([program.nearest for program in programs])
         original = np.concatenate([program.original for program in programs])
