@@ -444,6 +444,8 @@ def _state_dict(content: Any) -> State:
         if not inner:
             raise TypeError(f"it contains no weights, but {', '.join(map(str, content))}")
         content = inner[0]
+    if not isinstance(content, Mapping):
+        raise TypeError(f"it contains a value of type {type(content).__name__}")
     return content
 
 

@@ -323,6 +323,8 @@ def _read_transforms(path: Path, whole: bool) -> dict[str, PinholeCamera]:
         scene = json.loads(text)
         for frame in scene["frames"]:
             # A frame is an image of the scene. Its entries override those of the scene.
+            if not isinstance(frame["file_path"], str):
+                raise TypeError(f"file_path is {frame['file_path']}")
             entries = {**scene, **frame}
             if not {"w", "h", "fl_x", "fl_y", "cx", "cy"} & entries.keys():
                 entries |= _size_of_image(path.parent / frame["file_path"])

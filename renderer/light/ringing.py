@@ -35,7 +35,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.polynomial import legendre
-from scipy.optimize import nnls
 from torch import Tensor
 
 from renderer.light.environment import FEWEST_ROWS, to_map
@@ -141,6 +140,9 @@ def least_distance(
     the inequalities. The bounds should not be much larger than 1. The results are matrixᵀ μ, the
     number and μ.
     """
+    # Only imported when it is needed, because it takes 0.2 s.
+    from scipy.optimize import nnls
+
     stacked = np.vstack([matrix.T, lower_bounds])
     target = np.zeros(len(stacked))
     target[-1] = 1

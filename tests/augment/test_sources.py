@@ -160,6 +160,8 @@ class Harmful:
     ("content", "message"),
     [
         (Harmful(), "cannot be read"),
+        (None, "a value of type NoneType"),
+        (torch.zeros(3), "a value of type Tensor"),
         # Weights whose last bias has ten values.
         ({"classifier.1.bias": torch.zeros(10)}, "torchvision:squeezenet1_1"),
     ],

@@ -51,12 +51,10 @@ def run(settings: RenderSettings) -> None:
     shards = shard_indices(settings)
     # Classes of `FORMATS` write the files of a data set, whose parts are such as "train".
     data = FORMATS[settings.format](folder, classes, settings.split_counts, shards, settings.maps)
-    _describe(settings, folder, classes)
     # Indices of the renders of this process, and of those that a stopped command has finished.
     indices = shards[settings.shard]
     finished = {index for index in indices if data.last_file(index).exists()}
     missing = len(indices) - len(finished)
-    print(f"{folder}: {missing} of {settings.count} renders to do")
     options: dict[str, Any] = {"settings": settings.augment, "network": network, "device": device}
     options |= {"scene": settings.scene, "renderer": settings.renderer, "seed": settings.seed}
     options |= {"first": indices.start, "skip": finished, "views": settings.scene.views}
@@ -67,6 +65,9 @@ def run(settings: RenderSettings) -> None:
     keys = keys_of("scene", settings.scene) | keys_of("renderer", settings.renderer)
     with keyed("scene", **keys):
         renders = dataset.render_dataset(objects, settings.size, len(indices), **options)
+    # A command whose meshes cannot be read leaves no settings in the folder.
+    _describe(settings, folder, classes)
+    print(f"{folder}: {missing} of {settings.count} renders to do")
     data.write(progress(renders, "renders", missing))
     # Of several processes, the one that finishes last writes the files about all renders.
     if data.is_finished():
@@ -91,15 +92,13 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
         facts["shards"] = settings.shards  # A tar file has renders of one shard.
     # JSON makes the settings comparable with those in the file: tuples become lists.
     facts = json.loads(json.dumps(facts | {"classes": classes}, default=str))
-    if all(path.name in (DATA_SET, LAUNCHER) for path in folder.iterdir()):
-        # A command that failed before its first render may have left settings, which do not count.
-        facts["inputs"] = fingerprints(settings)
-        write_json(path, facts, indent=1)
-    elif path.exists():
+    if path.exists():
         found = read_json(path)
         changed = [key for key in facts if found.get(key) != facts[key]]
         if changed:
             raise InputError(f"out={folder} has another {changed[0]}: choose another folder", "out")
         require_same_inputs(folder, settings, found, "out=")
-    else:
+    elif any(path.name != LAUNCHER for path in folder.iterdir()):
         raise InputError(f"out={folder} is not empty: choose a new folder", "out")
+    else:
+        write_json(path, facts | {"inputs": fingerprints(settings)}, indent=1)

@@ -62,6 +62,12 @@ class Round(NamedTuple):
     rows: Int[Tensor, " M"]
 
 
+def round_size(image_count: int, images_per_epoch: int | None, per_round: int | None) -> int:
+    """Return the largest number of images of the data set in a round, see `rounds_of_epoch`."""
+    shown = min(image_count, images_per_epoch or image_count)
+    return math.ceil(shown / math.ceil(shown / (per_round or shown)))
+
+
 def rounds_of_epoch(
     image_count: int, render_count: int, seed: int, epoch: int, *limits: int | None
 ) -> list[Round]:
@@ -70,13 +76,13 @@ def rounds_of_epoch(
     `limits` are the largest numbers of images of the data set in the epoch and in a round. A limit
     of None shows all images in the epoch, or in a single round.
     """
-    images_per_epoch, images_per_round = limits
     draws = generator(seed, epoch, "rounds")
-    shown_images = torch.randperm(image_count, generator=draws)[:images_per_epoch]
+    shown_images = torch.randperm(image_count, generator=draws)[: limits[0]]
     # Renders are numbered after the images of the data set.
     render_numbers = torch.arange(image_count, image_count + render_count)
-    round_count = math.ceil(len(shown_images) / (images_per_round or len(shown_images)))
-    parts = shown_images.tensor_split(round_count)  # Their sizes differ by at most one.
+    size = round_size(image_count, *limits)
+    # The sizes of the parts differ by at most one.
+    parts = shown_images.tensor_split(math.ceil(len(shown_images) / size))
     rounds = []
     for index, part in enumerate(parts):
         # Numbers of the images and renders of a round, in ascending order.

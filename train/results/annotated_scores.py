@@ -313,7 +313,7 @@ def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> Segm
 
     miou, by_class = mean_iou(pairs(), len(network.classes))
     # A mask of 0 and 255 marks its object as pixels that do not count.
-    if NO_CLASS_PIXEL in seen and len(seen) < 3:
+    if NO_CLASS_PIXEL in seen and seen <= {0, NO_CLASS_PIXEL}:
         fault = f"the masks of {folder} have only the values {sorted(seen)}, and 255 does not count"
         raise InputError(f"{fault}: write 1 for the object, or the index of its class", "photos")
     named = zip(network.classes, by_class, strict=True)

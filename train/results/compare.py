@@ -194,11 +194,12 @@ def difference(
     seeds, it is also over seeds. With one seed, it says nothing about other seeds. The value is
     `evaluations` minus `reference`. None if the metric of a run is unknown, or on other images.
     """
-    pools = [pool for item in (*evaluations, *reference) if (pool := item.find(subset))]
-    shown = {tuple(item.path for item in pool.classified.photograph) for pool in pools}
-    # The top-1 accuracies of networks with different classes can be of different images.
-    if name in TOP_RANKS and len(shown) > 1:
-        return None
+    if name in TOP_RANKS:
+        # The accuracies of networks with different classes can be of different images.
+        pools = [pool for item in (*evaluations, *reference) if (pool := item.find(subset))]
+        shown = {tuple(item.path for item in pool.classified.photograph) for pool in pools}
+        if len(shown) > 1:
+            return None
     after = _jackknives(evaluations, subset, name)
     before = _jackknives(reference, subset, name)
     # A run whose metric is unknown has no jackknife.

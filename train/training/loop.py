@@ -29,7 +29,14 @@ from augment.tasks.detection import Detection
 from renderer.errors import InputError, explained, keyed, require_memory
 from renderer.image import to_bytes, to_unit
 from train import checkpoints, console, run_folder
-from train.data.batches import Batch, Round, TrainingImages, rounds_of_epoch, training_batches
+from train.data.batches import (
+    Batch,
+    Round,
+    TrainingImages,
+    round_size,
+    rounds_of_epoch,
+    training_batches,
+)
 from train.data.sets import Split
 from train.device import MixedPrecision, SignalHandler, all_reduce_sum, compiles, wrap_ddp
 from train.settings import TrainSettings
@@ -248,7 +255,7 @@ class Trainer:
         train = torch.nonzero(~held_out).squeeze(1)
         validation = torch.nonzero(held_out).squeeze(1)
         # The batch size is limited to the images of a round and to the memory.
-        in_round = min([len(train), *filter(None, self._limits)]) + len(self.service)
+        in_round = round_size(len(train), *self._limits) + len(self.service)
         batch_size = fitting_batch_size(self.settings, self.model, in_round, split.images.shape[-1])
         self.settings = replace(self.settings, batch_size=batch_size)
         with SignalHandler() as signals:

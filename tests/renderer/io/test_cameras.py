@@ -141,6 +141,16 @@ def test_points_are_where_cameras_of_nerfstudio_see_them(tmp_path):
     require_expected(tmp_path / "a.json", focal_y=FOCAL_X)
 
 
+def test_an_image_of_cameras_must_have_a_name(tmp_path):
+    path = tmp_path / "transforms.json"
+    write_transforms(path, fl_x=FOCAL_X, fl_y=FOCAL_Y, cx=CENTER_X, cy=CENTER_Y)
+    scene = json.loads(path.read_text())
+    scene["frames"][0]["file_path"] = None
+    path.write_text(json.dumps(scene))
+    with pytest.raises(InputError, match="file_path"):
+        renderer.load_cameras(path)
+
+
 @pytest.mark.parametrize("suffix", [".png", ""])
 def test_without_a_size_that_of_the_images_counts_or_that_of_both_angles(tmp_path, suffix):
     """Without both, images are square. A camera of an image shows its central square."""

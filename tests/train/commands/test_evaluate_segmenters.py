@@ -105,6 +105,12 @@ def test_masks_of_0_and_255_which_mark_no_object_are_refused(folder):
         nb.evaluate(_by_brightness, folder, classes=CLASSES, size=SIZE)
 
 
+def test_masks_of_one_class_and_a_border_of_255_are_scored(folder):
+    for path in (folder / "masks").rglob("*.png"):
+        Image.fromarray(np.where(_read(path) == 2, 255, 1).astype(np.uint8)).save(path)
+    assert nb.evaluate(_by_brightness, folder, classes=CLASSES, size=SIZE).by_class
+
+
 def test_a_folder_without_masks_is_refused(folder):
     with pytest.raises(InputError, match="lacks images/ or masks/"):
         nb.evaluate(_by_brightness, folder / "images", classes=CLASSES, size=SIZE)

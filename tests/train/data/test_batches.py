@@ -138,6 +138,7 @@ class TestRounds:
     @pytest.mark.parametrize(("limit", "counts"), [(20, [17, 17, 16]), (49, [25, 25])])
     def test_divide_the_images_of_an_epoch_evenly_and_each_has_all_renders(self, limit, counts):
         rounds = batches.rounds_of_epoch(100, 7, 0, 4, 50, limit)
+        assert batches.round_size(100, 50, limit) == max(counts)
         numbers = range(4 * len(counts), 5 * len(counts))
         assert [(part.number, part.epoch) for part in rounds] == [(n, 4) for n in numbers]
         images = []
