@@ -378,7 +378,7 @@ class Converted(Network):
 
     def forward(self, images: Tensor) -> Any:
         """Compute the outputs of images (N, 3, H, W)."""
-        outputs = self.network(images.permute(0, 2, 3, 1) if self.is_last else images)
+        outputs: Any = self.network(images.permute(0, 2, 3, 1) if self.is_last else images)
         # Several outputs are a list of onnx2torch.
         outputs = tuple(outputs) if isinstance(outputs, list) else outputs
         return wrappers.log_probabilities(outputs) if self.has_probabilities else outputs
