@@ -15,8 +15,8 @@ The renderers differ in these ways:
 - Specular reflection is the plugin `principled`, with the same lobe. Below its
   coat, the diffuse reflection does not lose the light that the coat reflects.
   The color is therefore multiplied by the fraction of the light that passes the
-  coat on average. A difference of 1 to 3% remains, and
-  of up to 6% with metallic textures.
+  coat on average. A difference of 1 to 3% remains. With metallic textures, it is
+  up to 6%.
 
 Both renderers return radiance that is premultiplied with the coverage.
 """

@@ -15,8 +15,8 @@ nearest one is chosen. If negative minima are left after some solutions, the lig
 `nonnegative_window` is mixed in to remove them. This windowed light is non-negative if the
 given light is a physical light that was cut off at a degree. Above degree
 _COARSE_GRID_DEGREE, the program would take long, and the window alone is used. Without a
-fixed mean, the nearest coefficients would
-brighten the whole sky to remove the negative minima beside a bright source.
+fixed mean, the nearest coefficients would brighten the whole sky to remove the negative
+minima beside a bright source.
 
 `nearest_nonnegative` is used after each step of an attack. For coefficients v,
 it solves

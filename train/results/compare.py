@@ -192,7 +192,7 @@ def difference(
 
     The 95% interval is paired: both methods are measured without the same objects. With several
     seeds, it is also over seeds. With one seed, it says nothing about other seeds. The value is
-    `evaluations` minus `reference`. None if the metric of a run is unknown, or on other images.
+    `evaluations` minus `reference`. None if a run has no such metric, or has it for other images.
     """
     if name in TOP_RANKS:
         # The accuracies of networks with different classes can be of different images.
