@@ -22,7 +22,7 @@ main = Command(
         "pnb-render --multirun shard=0,1 shards=2 launcher=joblib count=1000 out=renders",
     ],
     common=["out", "format", "count", "meshes", "size", "network", "scene.light", "maps"],
-    groups=["launcher"],
+    groups=["attack@augment.attack", "launcher"],
     rewrite=name_light,
 )
 

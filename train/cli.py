@@ -175,8 +175,11 @@ class Command:
                 return hydra.compose(self.name, words)
             with initialize_config_module("conf", version_base="1.3"):
                 return hydra.compose(self.name, words)
-        except (HydraException, OmegaConfBaseException, AssertionError) as error:
-            raise InputError(explain(error, self.keys, words) or str(error)) from error
+        except Exception as error:
+            sentence = explain(error, self.keys, words)
+            if sentence is None:
+                raise
+            raise InputError(sentence) from error
 
     def read(self, overrides: Sequence[str] = (), as_typed: bool = True) -> Any:
         """Return the settings that the command would have with the arguments of `compose`."""
@@ -457,10 +460,17 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
         text = re.split(r"\n *(?:full_key|Config search path|See https)", str(wrong))[0]
         sentence = " ".join(text.split())
         return f"{key}: {sentence}" if key else sentence
-    if isinstance(wrong, AssertionError):
-        # OmegaConf does not name a group that is null, such as attack.geometry.
-        groups = [word.partition("=")[0].rpartition(".")[0] for word in words]
-        unset = [group for group in groups if NoneType in get_args(keys.get(group))]
+    if isinstance(wrong, AssertionError) or "full_key" in str(wrong):
+        # OmegaConf neither names a group that is null, such as attack.geometry, nor merges a
+        # mapping into it.
+        given = [word.partition("=")[0] for word in words]
+        groups = [*given, *(key.rpartition(".")[0] for key in given)]
+        hints = {group: keys.get(group) for group in groups}
+        unset = [
+            group
+            for group, hint in hints.items()
+            if NoneType in get_args(hint) and is_dataclass(without_none(hint))
+        ]
         return f"{unset[0]} is null: choose it first, as --help shows" if unset else None
     return None
 

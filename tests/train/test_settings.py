@@ -64,6 +64,7 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["out="], "out is empty"),
         (["scene.ground=[a]"], "scene.ground[0]"),
         (["augment.attack.geometry.radius=1"], "augment.attack.geometry is null"),
+        (["train.epochs=2", "augment.attack.geometry={radius: 1}"], "augment.attack.geometry is"),
         (
             ["attack@augment.attack=[geometry]", "augment.attack.geometry.radius=-1"],
             "augment.attack.geometry.radius=-1.0 must be at least 0",
