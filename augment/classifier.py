@@ -543,8 +543,7 @@ def require_evaluation_mode(network: object, argument: str) -> None:
         return
     # A module of torch.export has its own attribute `eval`, which raises an error.
     if "eval" in vars(network):
-        advice = "save it by torch.export.save, and load it by nb.load_classifier"
-        raise InputError(f"{argument} is of torch.export, which has no eval(): {advice}")
+        raise InputError(f"{argument} {wrappers.NO_EVAL}")
     raise InputError(f"{argument} is a network in training mode: call its method eval() first")
 
 

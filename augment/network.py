@@ -38,6 +38,12 @@ MEANS = ("mean", "image_mean", "pixel_mean")
 # What a function takes: tensors, arrays of float32, or tensors without gradients.
 TENSORS, ARRAYS, DETACHED = "tensors", "arrays", "detached tensors"
 
+# End of a sentence about a network of torch.export in training mode.
+NO_EVAL = (
+    "is of torch.export, which has no eval(): save it by torch.export.save, and load it by "
+    "nb.load_classifier"
+)
+
 Result = TypeVar("Result")
 
 
@@ -86,6 +92,9 @@ class Network(nn.Module):
 
     def __init__(self, network: Callable[[Any], Any], transforms: Sequence[nn.Module] = ()):
         super().__init__()
+        if isinstance(network, nn.parallel.DistributedDataParallel):
+            # Its passes wait for those of the other processes, which may make fewer of them.
+            network = network.module
         module = network if isinstance(network, nn.Module) else Function(network)
         self.transforms = nn.ModuleList(transforms)
         self.network: Any = module
@@ -418,6 +427,8 @@ def eval_mode(network: Any) -> Iterator[None]:
     flags = [module.training for module in modules]
     # `eval` of a large network takes as long as rendering an image, so call it only if needed.
     if any(flags):
+        if any("eval" in vars(module) for module in modules):
+            raise InputError(f"the network {NO_EVAL}")
         network.eval()
     try:
         yield
@@ -442,7 +453,9 @@ def frozen_eval_mode(network: nn.Module) -> Iterator[None]:
     gpus = {parameter.device for parameter in network.parameters() if parameter.is_cuda}
     random_state = torch.random.fork_rng(devices=sorted(gpus, key=str))
     with gradient_flags_kept(network), eval_mode(network), random_state:
-        network.requires_grad_(False)
+        # Modules of TorchScript lack `requires_grad_`.
+        for parameter in network.parameters():
+            parameter.requires_grad_(False)
         yield
 
 

@@ -202,3 +202,43 @@ def test_pixels_without_a_class_count_as_background(images, label):
 def test_label_maps_of_other_classes_are_refused(images, label):
     with pytest.raises(InputError, match="classes"):
         segment(images, torch.full((8, 16, 16), label))
+
+
+@pytest.fixture
+def one_process():
+    torch.distributed.init_process_group(
+        "gloo", store=torch.distributed.HashStore(), rank=0, world_size=1
+    )
+    yield
+    torch.distributed.destroy_process_group()
+
+
+def test_the_search_makes_no_passes_of_ddp_which_wait_for_other_processes(images, one_process):
+    model = nn.parallel.DistributedDataParallel(Mean())
+    model.register_forward_pre_hook(lambda *_: pytest.fail("a pass of DDP"))
+    torch.manual_seed(0)
+    found = nb.AdversarialLighting(model)(images, torch.zeros(8, dtype=torch.int64))
+    torch.manual_seed(0)
+    alone = nb.AdversarialLighting(model.module)(images, torch.zeros(8, dtype=torch.int64))
+    assert torch.equal(found, alone)
+
+
+class Flat(nn.Sequential):
+    def __init__(self):
+        super().__init__(nn.Flatten(), nn.Linear(3 * 16 * 16, 2))
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script:FutureWarning")
+def test_scripted_networks_are_searched_like_others(images):
+    model, labels = Flat(), torch.zeros(8, dtype=torch.int64)
+    found = []
+    for network in (model, torch.jit.script(model)):
+        torch.manual_seed(0)
+        found.append(nb.AdversarialLighting(network)(images, labels))
+    assert torch.equal(*found)
+
+
+def test_networks_of_torch_export_are_refused_with_the_remedy(images):
+    model = torch.export.export(Flat(), (torch.rand(8, 3, 16, 16),)).module()
+    with pytest.raises(InputError, match="load_classifier"):
+        nb.AdversarialLighting(model)(images, torch.zeros(8, dtype=torch.int64))
