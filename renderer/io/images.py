@@ -103,14 +103,19 @@ def identify(file: BinaryIO) -> Image.Image:
     image = Image.open(file, formats=FORMATS)
     key = image.info.get("transparency")
     if image.format == "PNG" and key is not None:
-        # Pillow expands gray pixels of 2 and 4 bits, and keeps the upper 8 of 16 bits
-        # of colors, but does not do the same with the transparent color.
-        layout = image.tile[0][3]
-        if layout in ("L;2", "L;4"):
-            image.info["transparency"] = key * {"L;2": 85, "L;4": 17}[layout]
-        elif layout == "RGB;16B":
+        # Pillow keeps the upper 8 of 16 bits of colors, and multiplies gray values, but does not do
+        # the same with the transparent color.
+        if gray_factor(image) > 1:
+            image.info["transparency"] = key * gray_factor(image)
+        elif image.tile[0][3] == "RGB;16B":
             image.info["transparency"] = tuple(value >> 8 for value in key)
     return image
+
+
+def gray_factor(image: Image.Image) -> int:
+    """Return by what Pillow multiplies gray values of 2 or 4 bits, so that white is 255."""
+    layout = image.tile[0][3] if image.tile else ""
+    return {"L;2": 85, "L;4": 17}.get(str(layout), 1)
 
 
 def read_rgb(path: str | Path, min_side: int) -> Image.Image:
@@ -307,11 +312,11 @@ def draw_grid(
     bottom = max(tops[-1] - GAP, first_top)
     sheet = Image.new("RGB", (right + MARGIN, bottom + MARGIN), PAPER)
     draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default(TITLE_SIZE)
+    font = _font(TITLE_SIZE)
     draw.text((MARGIN, MARGIN), heading, INK, font)
     for title, left in zip(titles, lefts, strict=False):
         draw.text((left, first_top - TITLE_HEIGHT), title, INK, font)
-    font = ImageFont.load_default(CAPTION_SIZE)
+    font = _font(CAPTION_SIZE)
     for row, top in zip(rows, tops, strict=False):
         for tile, left in zip(row, lefts, strict=False):
             sheet.paste(Image.fromarray(tile.image), (left, top))
@@ -322,9 +327,17 @@ def draw_grid(
     return sheet
 
 
+@lru_cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    """Load the font of matplotlib, since that of Pillow has the letters of ASCII alone."""
+    import matplotlib as mpl
+
+    return ImageFont.truetype(f"{mpl.get_data_path()}/fonts/ttf/DejaVuSans.ttf", size)
+
+
 def _text_width(text: str, size: int) -> int:
     """Compute the width of a line of text in pixels, rounded up. It is 0 without text."""
-    return round(ImageFont.load_default(size).getlength(text) + 0.5) if text else 0
+    return round(_font(size).getlength(text) + 0.5) if text else 0
 
 
 # Gamma and primaries of Adobe RGB (1998).

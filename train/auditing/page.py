@@ -133,7 +133,7 @@ def write_audit_page(
     elif is_unknown:
         advice = [audited.NEXT_TRAINING]
     elif screen.answer in (VERDICTS["No"], VERDICTS["Perhaps not"]):
-        advice = [audited.NEXT_HARDENING]
+        advice = [audited.NEXT_DATA if len(networks) > 1 else audited.NEXT_HARDENING]
     note = [f"These are first results. Not measured yet: {missing}."] if missing else []
     screen = replace(screen, sentences=[*note, *screen.sentences, *advice])
     slider = _slider(networks)
@@ -181,19 +181,34 @@ def _slider(networks: Networks) -> dict[str, Any]:
 
 
 def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_screen.FirstScreen:
-    """Make the top of the report from two networks' scores, or else from the first network."""
-    if not folders:
-        return screen_of_one(networks[0], Metrics())
-    images, folder = next(iter(folders.items()))
-    evaluations = [network.evaluation(images) for network in networks]
-    if len(networks) > 1:
+    """Make the top of the report from the scores of one or two networks, or from their attacks."""
+    images, folder = next(iter(folders.items()), (None, None))
+    evaluations = [network.evaluation(images) for network in networks] if images else []
+    if len(evaluations) > 1:
         names = (f"before: {networks[0].name}", f"after: {networks[1].name}")
         # Each side of the comparison is a list of evaluations, one for each seed.
         before, after = ([evaluation] for evaluation in evaluations)
         screen = first_screen.compare_networks(before, after, names, folder, folder.name)
         if screen is not None:
             return screen
-    return screen_of_one(networks[0], evaluations[0].pooled.all.metrics)
+    metrics = [item.pooled.all.metrics for item in evaluations] or [Metrics()] * len(networks)
+    first, *others = map(screen_of_one, networks, metrics)
+    if not others:
+        return first
+    # The answer is that of the hardened network.
+    [last] = others
+    sentences = [
+        f"{screen.names[0]}: {sentence}"
+        for screen in (first, last)
+        for sentence in screen.sentences
+    ]
+    known = {number.title: number.after for number in first.numbers}
+    numbers = [
+        replace(number, before=known[number.title])
+        for number in last.numbers
+        if number.title in known
+    ]
+    return replace(last, sentences=sentences, numbers=numbers, names=[*first.names, *last.names])
 
 
 def _score_sections(

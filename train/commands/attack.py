@@ -432,8 +432,8 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
     for result in transfers:
         # Such as "classifier" and "resnet50".
         kind, name = next(iter(result.items()))
-        is_correct = torch.tensor(result["clean_correct"])
-        rate = _success_rate(torch.tensor(result["success"])[is_correct])
+        is_correct = torch.tensor(result["clean_correct"], dtype=torch.bool)
+        rate = _success_rate(torch.tensor(result["success"], dtype=torch.bool)[is_correct])
         without_noise = torch.tensor(result[f"success{WITHOUT_NOISE}"])[is_correct].sum()
         lines.append(json.dumps({kind: name, **asdict(rate), **result}) + "\n")
         correct = f"{rate.n} of {len(is_correct)}"

@@ -19,7 +19,7 @@ from PIL import ExifTags, Image
 
 from augment.settings import NO_CLASS_PIXEL
 from renderer.errors import InputError, explained
-from renderer.io.images import SUFFIXES, open_image, read_rgb
+from renderer.io.images import SUFFIXES, gray_factor, open_image, read_rgb
 from train import console
 from train.data.photographs import find_unlabeled, visible_files
 
@@ -166,7 +166,8 @@ def fit_mask(
     Pixels of borders are NO_CLASS_PIXEL. The values of the file are added to `seen`.
     """
     with explained(f"{path} cannot be read", "replace it"), open_image(path) as image:
-        labels = np.array(image)
+        factor = gray_factor(image)
+        labels = np.array(image) // factor
     width, height = fitted.size
     if labels.shape != (height, width):
         advice = f"give a gray or palette image of {width:g} × {height:g} indices of classes"

@@ -17,7 +17,14 @@ from train.results.metrics import Pool
 from train.results.pictures import Picture, read_square
 from train.results.predictions import Predictions
 from train.results.store import RunSummary
-from train.results.tables import Estimate, Table, describe_intervals, format_interval, join_words
+from train.results.tables import (
+    IMAGES,
+    Estimate,
+    Table,
+    describe_intervals,
+    format_interval,
+    join_words,
+)
 from train.run_folder import read_json
 from train.settings import KEPT_ASIDE, PHOTOGRAPHS, in_words
 
@@ -214,8 +221,11 @@ def _describe_images(pool: Pool, labels: Sequence[str]) -> str:
     others = {item.path: item.mesh or item.path for item in shown if item.label not in labels}
     scored = pool.metrics.auc
     label = join_words([in_words(item) for item in labels], "or")
-    positives = f"{scored.positives:,} images of {label} ({scored.positive_objects:,} objects)"
-    negatives = f"{len(others):,} of other objects ({len({*others.values()}):,} objects)"
+    # Without the names of the objects, the interval is over images.
+    counts = (scored.positive_objects, len({*others.values()}))
+    objects = ["" if scored.over == IMAGES else f" ({count:,} objects)" for count in counts]
+    positives = f"{scored.positives:,} images of {label}{objects[0]}"
+    negatives = f"{len(others):,} of other objects{objects[1]}"
     text = f"Scored on {positives} and {negatives}."
     if len(labels) > 1:
         text += " For each class, the images of the other classes count as other objects, too."

@@ -276,7 +276,13 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     # The key of a group is the text of the settings without the seed.
     groups: dict[str, list[RunSummary]] = {}
     for run in (*initial.values(), *runs):
-        groups.setdefault(repr({**run.settings, "seed": None}), []).append(run)
+        group = groups.setdefault(repr({**run.settings, "seed": None}), [])
+        # A repeated seed would make intervals over seeds too narrow.
+        first = next((other for other in group if other.seed == run.seed), None)
+        if first is not None and run.seed is not None:
+            console.warning("left out: %s (repeats seed of %s)", run.folder, first.folder)
+        else:
+            group.append(run)
     # Runs of a group differ only in their seed. The first one stands for all.
     heads = [group[0] for group in groups.values()]
     if len(heads) == 2 and heads[0].mode == INITIAL and heads[1].mode != "none":

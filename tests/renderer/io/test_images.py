@@ -14,7 +14,7 @@ from oracles import linear_of, srgb_of
 from PIL import Image, ImageCms, features
 
 from renderer.errors import InputError
-from renderer.io.images import read_image, read_rgb
+from renderer.io.images import Tile, draw_grid, gray_factor, open_image, read_image, read_rgb
 
 # CIE chromaticities of red, green, blue and white (SMPTE EG 432-1, Adobe RGB (1998),
 # ISO 22028-2 and ITU-R BT.2020).
@@ -289,6 +289,25 @@ def test_the_transparent_gray_of_a_png_file_is_transparent(tmp_path, depth, pixe
     content = png((len(expected), 2), depth, 0, 2 * row, tRNS=struct.pack(">H", key))
     (tmp_path / "a.png").write_bytes(content)
     np.testing.assert_array_equal(read(tmp_path / "a.png")[..., 1], [expected, expected])
+
+
+@pytest.mark.parametrize("depth", [1, 2, 4, 8])
+def test_the_numbers_that_a_gray_png_file_stores_are_found_again(tmp_path, depth):
+    rows = np.arange(16).reshape(2, 8) % 2**depth
+    content = b"".join(
+        int("".join(f"{number:0{depth}b}" for number in row), 2).to_bytes(depth, "big")
+        for row in rows.tolist()
+    )
+    (tmp_path / "a.png").write_bytes(png((8, 2), depth, 0, content))
+    with open_image(tmp_path / "a.png") as image:
+        factor = gray_factor(image)
+        np.testing.assert_array_equal(np.array(image) // factor, rows)
+
+
+def test_letters_outside_of_ascii_are_drawn():
+    tile = np.zeros((1, 1, 3), np.uint8)
+    drawn = [np.array(draw_grid([[Tile(tile, [text])]])) for text in ("ä", "ü", "ж", "×")]
+    assert len({image.tobytes() for image in drawn}) == len(drawn)
 
 
 def test_the_transparent_color_of_16_bits_is_transparent(tmp_path):

@@ -8,6 +8,7 @@ import torch
 import augment
 from renderer.io.images import write_image
 from tests.helpers import darker_than
+from train.auditing import page
 from train.auditing.network import (
     BOTH,
     HARDENING,
@@ -20,10 +21,12 @@ from train.auditing.network import (
 from train.command_settings import AuditSettings
 from train.commands import audit
 from train.data.photo import Photograph
+from train.results import first_screen
 from train.results.compare import Evaluation
 from train.results.metrics import Pooled
 from train.results.scoring import rank_classes
 from train.results.store import RunSummary
+from train.results.tables import fraction
 
 COUNT = 60
 
@@ -103,3 +106,15 @@ def test_an_audit_of_a_hardened_network_warns_without_photographs_of_others(tmp_
     settings = AuditSettings(network="x", label="orange", meshes=["solid:orange"], photos=photos)
     plan = audit._Plan(settings, given, torch.device("cpu"))
     assert (audit.NO_PHOTOGRAPHS in audit._caveats(settings, given, plan)) == (len(shown) < 2)
+
+
+def test_without_scored_images_the_first_screen_shows_both_networks(monkeypatch):
+    def screen_of(name, _):
+        shown = first_screen.ShownMetric("recognized", "", None, fraction(len(name), 4))
+        return first_screen.FirstScreen("No", [], [shown], [name])
+
+    monkeypatch.setattr(page, "screen_of_one", screen_of)
+    screen = page._first_screen(["a", "bcd"], {})
+    assert screen.names == ["a", "bcd"]
+    [shown] = screen.numbers
+    assert (shown.before.value, shown.after.value) == (1 / 4, 3 / 4)

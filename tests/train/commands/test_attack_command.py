@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 import norm_balls as nb
 from renderer.visibility import choose
 from tests.helpers import find_red
-from train.commands.attack import format_reloaded
+from train.commands.attack import WITHOUT_NOISE, format_reloaded, write_transfers
 
 PRETRAINED = Path(__file__).parents[3] / "pretrained"
 SMALL = [
@@ -129,6 +129,13 @@ def test_success_by_radius_is_a_table_and_a_figure_of_meshes_by_their_names(run,
         hits = [int(by_key[mesh, method, radius]["hits"]) for mesh in (first, second)]
         assert int(by_key["all", method, radius]["hits"]) == sum(hits)
     assert (tmp_path / "out" / "sweep.png").is_file()
+
+
+def test_no_adversary_is_shown_if_no_attack_succeeds(tmp_path):
+    none = {"network": "other", "clean_correct": [], "success": [], f"success{WITHOUT_NOISE}": []}
+    table = write_transfers([none], tmp_path / "transfer.jsonl")
+    assert "0 of 0" in table
+    assert read_lines(tmp_path / "transfer.jsonl")[0]["n"] == 0
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 from renderer.errors import InputError
 from tests.train.helpers import read_markdown
 from train.results.compare import format_comparison
-from train.results.store import finished_runs, summarize
+from train.results.store import finished_runs, group_by_method, summarize
 from train.results.tables import format_interval, fraction
 
 
@@ -73,6 +73,13 @@ def test_seeds_are_rows_above_their_mean_and_columns_have_a_known_value(folder):
     assert tables[""][4][:3] == [short, "3 seeds", "0.765 ± 0.000"]
     _, *rows = tables["settings in which the methods differ"]
     assert rows == [["random, epochs=3", "3"], ["random, epochs=9", "9"]]
+
+
+def test_a_repeated_seed_counts_once(made_up_run, tmp_path):
+    for name, seed in ("first", 0), ("second", 1), ("copy of first", 0):
+        made_up_run(tmp_path / name, "random", {}, f"seed={seed}")
+    [runs] = group_by_method(finished_runs([tmp_path])).values()
+    assert sorted(run.seed for run in runs) == [0, 1]
 
 
 def test_scores_of_a_run_are_read_and_compared_without_torch(folder):
