@@ -83,7 +83,8 @@ class AttackResult(ShortRepr):
             the success of these images without noise.
         queries: Number of images of each example that the attack showed to the
             classifier, (E,) int64. Images with sensor noise, which decide about
-            successes, are included. An image that is shown again counts once.
+            successes, are included. A candidate that equals an earlier image in 8
+            bits counts, too, although the classifier does not get it again.
         seconds: Seconds of the attack in total, and of its parts by name.
     """
 

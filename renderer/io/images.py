@@ -114,8 +114,8 @@ def identify(file: BinaryIO) -> Image.Image:
 
 def gray_factor(image: Image.Image) -> int:
     """Return by what Pillow multiplies gray values of 2 or 4 bits, so that white is 255."""
-    layout = image.tile[0][3] if image.tile else ""
-    return {"L;2": 85, "L;4": 17}.get(str(layout), 1)
+    tiles = getattr(image, "tile", [])
+    return {"L;2": 85, "L;4": 17}.get(str(tiles[0][3]), 1) if tiles else 1
 
 
 def read_rgb(path: str | Path, min_side: int) -> Image.Image:

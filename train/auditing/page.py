@@ -182,21 +182,24 @@ def _slider(networks: Networks) -> dict[str, Any]:
 
 def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_screen.FirstScreen:
     """Make the top of the report from the scores of one or two networks, or from their attacks."""
-    images, folder = next(iter(folders.items()), (None, None))
-    evaluations = [network.evaluation(images) for network in networks] if images else []
-    if len(evaluations) > 1:
+    metrics = [Metrics()] * len(networks)
+    # Only the first folder is shown here.
+    for images, folder in list(folders.items())[:1]:
+        evaluations = [network.evaluation(images) for network in networks]
+        metrics = [item.pooled.all.metrics for item in evaluations]
+        if len(networks) == 1:
+            continue
         names = (f"before: {networks[0].name}", f"after: {networks[1].name}")
         # Each side of the comparison is a list of evaluations, one for each seed.
         before, after = ([evaluation] for evaluation in evaluations)
         screen = first_screen.compare_networks(before, after, names, folder, folder.name)
         if screen is not None:
             return screen
-    metrics = [item.pooled.all.metrics for item in evaluations] or [Metrics()] * len(networks)
     first, *others = map(screen_of_one, networks, metrics)
     if not others:
         return first
     # The answer is that of the hardened network.
-    [last] = others
+    last = others[-1]
     sentences = [
         f"{screen.names[0]}: {sentence}"
         for screen in (first, last)

@@ -278,9 +278,9 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     for run in (*initial.values(), *runs):
         group = groups.setdefault(repr({**run.settings, "seed": None}), [])
         # A repeated seed would make intervals over seeds too narrow.
-        first = next((other for other in group if other.seed == run.seed), None)
-        if first is not None and run.seed is not None:
-            console.warning("left out: %s (repeats seed of %s)", run.folder, first.folder)
+        repeated = next((other for other in group if other.seed == run.seed), None)
+        if repeated is not None and run.seed is not None:
+            console.warning("left out: %s (repeats seed of %s)", run.folder, repeated.folder)
         else:
             group.append(run)
     # Runs of a group differ only in their seed. The first one stands for all.
