@@ -211,7 +211,8 @@ class AdversarialLighting:
             is_wrong &= (targets >= 0) & (targets != NO_CLASS_PIXEL)
         if is_wrong.any():
             label = int(targets[is_wrong][0])
-            raise InputError(f"targets has the label {label}: give those of {count} classes")
+            last = f" to {count - 1}" if self.classes else ""
+            raise InputError(f"targets has the label {label}: give labels from 0{last}")
         if not is_map:
             return F.one_hot(targets, count).float(), self.classes
         # The class is the last axis of `one_hot`, but the first axis of the outputs of an image.

@@ -388,8 +388,9 @@ class RenderSettings(TaskSettings):
     label: Any = text("Class of the meshes. null: what the name of each file tells.")
     format: str = setting("imagefolder", "Layout of the data set.", choices=DATA_SET_FORMATS)
     count: int = setting(100, "Number of renders.", within=(1, MAX_SEED))
+    # A mapping would be merged into a default that is a mapping.
     splits: Any = setting(
-        {"train": 0.8, "val": 0.1, "test": 0.1}, "Parts of the data set, and their fractions."
+        None, "Parts of the data set, and their fractions. null: {train: 0.8, val: 0.1, test: 0.1}."
     )
     maps: list[str] = setting(
         list(DATA_SET_MAPS), "Further images of each render.", choices=DATA_SET_MAPS
@@ -429,6 +430,8 @@ class RenderSettings(TaskSettings):
         super().__post_init__()
         if self.shard >= self.shards:
             raise self.wrong("shard", f"must be less than shards={self.shards}")
+        if self.splits is None:
+            self.splits = {"train": 0.8, "val": 0.1, "test": 0.1}
         parts = [*self.splits.values()] if isinstance(self.splits, dict) else []
         if not all(is_number(part) and part >= 0 for part in parts) or not sum(parts):
             raise self.wrong("splits", "must be parts and their fractions, such as {train: 1}")

@@ -124,7 +124,7 @@ def audit(
             in a pair with its class, or if its name is the class, as in
             "orange.glb".
         hard_negatives: Meshes of other classes, rendered in the same lighting,
-            with or without a class. None for generated fruit and balls.
+            with or without a class. Empty for generated fruit and balls.
         hardened: Hardened network, which is audited in the same way and shown
             beside `network`. None to audit one network.
         classes: Names of the classes of plain networks, in the order of their

@@ -121,7 +121,7 @@ def evaluate(
         by: Groups of photographs that are scored one by one, in addition to all
             photographs: "class", or a column of the file photos.csv in `photos`,
             "source" or "mesh".
-        calibrate: Folder like `folder`. The threshold on the log-odds of each
+        calibrate: Folder like `photos`. The threshold on the log-odds of each
             positive class is chosen on its photographs, so that their
             false-positive rate is `false_positive_rate`. None for the thresholds
             that are stored with the network, if any.

@@ -17,7 +17,7 @@ from augment.dataset import describe_camera, render_dataset
 from augment.scene.scene import Scene
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
-from scripts.render import name_light
+from scripts.render import main, name_light
 from train.command_settings import RenderSettings
 from train.commands.render import run
 
@@ -289,6 +289,10 @@ def test_pycocotools_and_torchvision_read_boxes_and_masks(groups, tmp_path):
 
 @pytest.mark.ecosystem
 @pytest.mark.filterwarnings("ignore")
+def test_the_parts_of_the_command_line_replace_those_of_the_default():
+    assert main.read(["out=out", "splits={train: 1}"]).splits == {"train": 1}
+
+
 @pytest.mark.parametrize("splits", [{"train": 2, "val": 1}, {"train": 1}])
 def test_ultralytics_reads_boxes_and_classes(groups, tmp_path, splits):
     pytest.importorskip("ultralytics")
