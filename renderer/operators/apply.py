@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ from renderer.image import as_background, background_term, composite, encode, en
 from renderer.light.basis import HARMONICS, Basis
 from renderer.modes import once_differentiable, without_autocast
 from renderer.settings import ImageSettings
+from renderer.visibility.fragments import on_device
 
 # Number of color channels.
 COLORS = 3
@@ -395,12 +396,7 @@ class TransferOperator:
             InputError: If there is no such device.
         """
         device = errors.as_device(device)
-        if device == self.transfer.device:
-            return self
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        tensors = {k: v for k, v in values.items() if isinstance(v, Tensor | SparseTransfer)}
-        moved: dict[str, Any] = {name: tensor.to(device) for name, tensor in tensors.items()}
-        return replace(self, **moved)
+        return self if device == self.transfer.device else on_device(self, device)
 
     @property
     def by_channel(self) -> Tensor:

@@ -276,12 +276,15 @@ class Fragments:
 
     def to(self, device: torch.device | str) -> "Fragments":
         """Return the fragments with all tensors on a device."""
-        if self.pixels.device == torch.device(device):
-            return self
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
-        moved: dict[str, Any] = {name: tensor.to(device) for name, tensor in tensors.items()}
-        return replace(self, **moved)
+        is_there = self.pixels.device == torch.device(device)
+        return self if is_there else on_device(self, device)
+
+
+def on_device(parts: Any, device: torch.device | str) -> Any:
+    """Return a copy of a dataclass with all tensors on a device."""
+    values = {field.name: getattr(parts, field.name) for field in fields(parts)}
+    moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
+    return replace(parts, **moved)
 
 
 def split_views(
