@@ -410,10 +410,7 @@ def build_fragments(
     if isinstance(vertices, Tensor):
         points = vertices.detach()
         points = points.double() if points.is_cuda else points.cpu().double().numpy()
-    # Axes: camera, coordinate, vertex. In this order, each coordinate is contiguous in
-    # memory.
-    coordinates = torch.as_tensor(project_views(cameras, points)).mT
-    projected = coordinates.mT
+    projected = torch.as_tensor(project_views(cameras, points))
     # The third coordinate is the depth. It is less than -1 in front of the near plane,
     # which would cut the mesh open.
     is_uncut = bool((projected[..., 2] >= -1).all())
