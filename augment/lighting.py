@@ -356,11 +356,8 @@ def _apply_to_pil(image: Image.Image, lights: Sequence[Light | None], depth: Any
         # torch has no numbers with the highest byte first.
         if array.dtype.byteorder == ">" or (image.mode == "I" and not is_wide):
             array = array.astype(np.uint16)
-        tensor = torch.from_numpy(array)
-        tensor = tensor[None] if tensor.ndim == 2 else tensor.permute(2, 0, 1)
-        relit = _apply_to_tensor(tensor, lights, depth).permute(1, 2, 0).numpy()
-        relit = relit[..., 0] if relit.shape[2] == 1 else relit
-        made = Image.fromarray(np.ascontiguousarray(relit.astype(np.array(image).dtype)))
+        relit = _apply_to_array(array, lights, depth)
+        made = Image.fromarray(relit.astype(np.array(image).dtype))
     elif image.mode in CONVERTED:
         mode = "RGBA" if "transparency" in image.info else CONVERTED[image.mode]
         made = _apply_to_pil(image.convert(mode), lights, depth)
@@ -372,6 +369,14 @@ def _apply_to_pil(image: Image.Image, lights: Sequence[Light | None], depth: Any
         raise InputError(f"the image has the mode {image.mode}: convert it to RGB")
     made.info.update({key: value for key, value in image.info.items() if key != "transparency"})
     return made
+
+
+def _apply_to_array(array: np.ndarray, lights: Sequence[Light | None], depth: Any) -> np.ndarray:
+    """Relight an image of shape (H, W) or (H, W, C)."""
+    pixels = torch.from_numpy(np.ascontiguousarray(array))
+    image = pixels[None] if pixels.ndim == 2 else pixels.permute(2, 0, 1)
+    relit = _apply_to_tensor(image, lights, depth).permute(1, 2, 0).numpy()
+    return np.ascontiguousarray(relit).reshape(array.shape)
 
 
 def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) -> Tensor:
@@ -563,10 +568,7 @@ def _albumentations_class() -> Any:
 
         def apply(self, img: np.ndarray, lights: Sequence[Light | None], **_: Any) -> np.ndarray:
             """Relight an array."""
-            image = torch.from_numpy(np.ascontiguousarray(img))
-            image = image[None] if image.ndim == 2 else image.permute(2, 0, 1)
-            relit = _apply_to_tensor(image, lights, None).permute(1, 2, 0).numpy()
-            return np.ascontiguousarray(relit).reshape(img.shape)
+            return _apply_to_array(img, lights, None)
 
         def get_transform_init_args(self) -> dict[str, Any]:
             """Return the arguments for `to_dict`: names of models that have no settings."""
