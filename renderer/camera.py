@@ -460,11 +460,11 @@ def _as_scalar(name: str, value: Any) -> Any:
     """Convert a camera's field to a number, or a tensor to shape (), which keeps its gradient."""
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.reshape(())
-    elif isinstance(value, np.ndarray | list | tuple) and np.size(value) == 1:
+    elif isinstance(value, np.generic | np.ndarray | list | tuple) and np.size(value) == 1:
         value = np.asarray(value).item()
     if not errors.is_number(value):
         raise errors.InputError(f"{name} is {errors.describe(value)}: give one number")
-    return value.item() if isinstance(value, np.generic | np.ndarray) else value
+    return value
 
 
 def _like(array: np.ndarray, points: Points) -> Points:

@@ -339,7 +339,7 @@ class Material:
         # belongs to a texture. Textures that will be extended need the same size.
         is_extended = placement.wraps != (REPEAT, REPEAT)
         shape = texels.shape[:2] if is_extended else (1, 1)
-        material = self.with_placement(placement, (shape[0], shape[1]))
+        material = self.with_placement(placement, shape)
         texture = material.texture
         assert texture is not None
         if is_extended:
@@ -351,11 +351,10 @@ class Material:
         return replace(material, texture=texture, gloss_texture=texels)
 
 
-def _resized(texture: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+def _resized(texture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Resize the channels of a texture to a width and a height."""
     planes = [Image.fromarray(plane) for plane in np.moveaxis(texture, 2, 0)]
-    shape = size[0], size[1]
-    resized = [np.array(plane.resize(shape, Image.Resampling.BILINEAR)) for plane in planes]
+    resized = [np.array(plane.resize(size, Image.Resampling.BILINEAR)) for plane in planes]
     return np.stack(resized, axis=-1)
 
 
