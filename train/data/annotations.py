@@ -41,6 +41,8 @@ CLASS_FILES = ("classes.txt", "obj.names")
 MASK_FOLDERS = (("images", "masks"), ("JPEGImages", "SegmentationClass"))
 # Coordinates may leave the image by this fraction of a side.
 ROUNDING = 1e-3
+# Number of photographs that a network sees at a time.
+BATCH = 16
 # Images are read at full size.
 FULL_SIZE = 2**16
 # From the coordinates (x, y) in a stored image, as fractions of its sides, to those in the upright
@@ -481,16 +483,12 @@ def _is_similar(one: Float[np.ndarray, "2"], other: Float[np.ndarray, "2"]) -> b
 
 
 def fit_batches(
-    photographs: Sequence[Annotated],
-    size: tuple[int, int],
-    how: str,
-    batch_size: int,
-    skip_unreadable: bool = False,
+    photographs: Sequence[Annotated], size: tuple[int, int], how: str, skip_unreadable: bool = False
 ) -> Iterator[list[tuple[Annotated, Fitted]]]:
     """Yield photographs in batches. Unreadable ones are skipped, or raise InputError."""
     with ThreadPoolExecutor() as pool:
-        for start in range(0, len(photographs), batch_size):
-            batch = photographs[start : start + batch_size]
+        for start in range(0, len(photographs), BATCH):
+            batch = photographs[start : start + BATCH]
             futures = [pool.submit(fit, item, size, how) for item in batch]
             fitted = []
             for item, future in zip(batch, futures, strict=True):

@@ -29,8 +29,6 @@ from train.results.pictures import evenly_spaced
 from train.results.predictions import CONTACT_SHEET, begin_scores, write_summary
 from train.results.tables import Estimate, Table
 
-# Number of photographs that a network sees at a time.
-BATCH = 16
 # Photographs with what is found on the contact sheet, and in each of its rows.
 SHOWN, COLUMNS = 24, 4
 # Name of the metrics of all classes.
@@ -187,9 +185,9 @@ def _outputs(
     shown = {item.name for item in evenly_spaced(photographs, SHOWN)}
     outputs: Any = None
     # Skipped photographs can leave a batch empty.
-    for batch in filter(None, fit_batches(photographs, size, how.fit, BATCH, how.skip_unreadable)):
+    for batch in filter(None, fit_batches(photographs, size, how.fit, how.skip_unreadable)):
         images = torch.from_numpy(np.stack([fitted.pixels for _, fitted in batch])).to(how.device)
-        outputs = compute_outputs(network, images, BATCH)
+        outputs = compute_outputs(network, images)
         for (item, fitted), image, output in zip(batch, images, outputs, strict=True):
             if item.name in shown:
                 drawn[item.name] = network.task.draw(to_unit(image), output, network.classes).cpu()

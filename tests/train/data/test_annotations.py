@@ -295,7 +295,7 @@ def test_boxes_of_an_image_with_another_aspect_ratio_are_refused(tmp_path):
     _draw(tmp_path / "a.png")
     _write_coco(tmp_path / "a.json", size=(80, 80))
     with pytest.raises(InputError, match="80 × 40 pixels, but its boxes are for 80 × 80"):
-        [*fit_batches(read_annotations(tmp_path).photographs, (8, 8), LETTERBOX, 2)]
+        [*fit_batches(read_annotations(tmp_path).photographs, (8, 8), LETTERBOX)]
 
 
 def test_boxes_count_within_the_photograph_only(tmp_path):
@@ -314,6 +314,6 @@ def test_an_unreadable_photograph_is_an_error_or_skipped(tmp_path):
     _write_coco(tmp_path / "a.json", ["a.png", "b.png"])
     photographs = read_annotations(tmp_path).photographs
     with pytest.raises(InputError, match=r"b\.png cannot be read"):
-        [*fit_batches(photographs, (8, 8), LETTERBOX, 2)]
-    ((pair,),) = fit_batches(photographs, (8, 8), LETTERBOX, 2, skip_unreadable=True)
+        [*fit_batches(photographs, (8, 8), LETTERBOX)]
+    ((pair,),) = fit_batches(photographs, (8, 8), LETTERBOX, skip_unreadable=True)
     assert pair[0].name == "a.png"
