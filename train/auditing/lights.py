@@ -497,7 +497,7 @@ def find_in_lights(
     if not isinstance(task, Detection):
         return {"metrics": metrics, "curve": []}
     not_attacked = ("plain light", "environments", "random light")
-    every = [pair for title in not_attacked for _, pair in groups.get(title, [])]
+    every = [pair for title in not_attacked for _, pair in groups[title]]
     return {"metrics": metrics, "curve": _curve(_match(every, task.iou).of([label]))}
 
 

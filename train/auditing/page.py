@@ -12,8 +12,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from train.auditing import lights
 from train.auditing import network as audited
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS, VIEWS
@@ -156,7 +154,7 @@ def write_audit_page(
         script=SLIDER_SCRIPT if slider else "",
         photographs=_score_sections(by_key, remedies, out),
         recommendation=recommendation,
-        worst=_worst(networks, folders) if folders else {},
+        worst=_worst(networks, folders),
         screen=screen,
         lead=[*caveats, *unreadable],
         detections=detection_sections(results, in_words(label)),
@@ -172,9 +170,7 @@ def _slider(networks: Networks) -> dict[str, Any]:
             if "slider" in counts:
                 classes = [in_words(label) for label in counts["slider"]["classes"]]
                 for frame in counts["slider"]["frames"]:
-                    # Files of earlier versions lack the prediction.
-                    highest = classes[np.argmax(frame["probabilities"])]
-                    frame["predicted"] = in_words(frame.get("predicted", highest))
+                    frame["predicted"] = in_words(frame["predicted"])
                 named = {"network": network.name, "light": KINDS[kind].title, "classes": classes}
                 return counts["slider"] | named
     return {}
