@@ -305,12 +305,12 @@ def ball_from_above(size: int) -> tuple[Tensor, Tensor]:
     return torch.stack([x, y, z], dim=2), z > 0.3
 
 
-def test_a_light_sphere_shows_a_lamp_by_the_inverse_square_law():
-    """A lamp of power P at distance d adds the irradiance P cos θ / d². The ball has faces."""
+def test_a_light_sphere_shows_the_irradiance_of_environment_light_and_lamps():
+    """The irradiance is π times uniform radiance, and P cos θ / d² for a lamp of power P."""
     position = torch.tensor([0.3, -0.4, 2.5], dtype=torch.float64)
     power = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
-    soft_front_light = ambient(torch.full((3,), 0.1))
-    light = torch.cat([soft_front_light, power[None].float()])
+    environment = ambient(torch.full((3,), 0.03))
+    light = torch.cat([environment, power[None].float()])
     lamp = Lamps((tuple(position.tolist()),))
     camera = renderer.OrthographicCamera(0.0, 0.0, 2.0)
     image = light_sphere(light, 64, camera, SumBasis((HARMONICS, lamp)))
@@ -320,7 +320,7 @@ def test_a_light_sphere_shows_a_lamp_by_the_inverse_square_law():
     distance = toward_lamp.norm(dim=2)
     cosine = (toward_lamp * normals).sum(2) / distance
     arriving = cosine.clamp(min=0) / distance**2
-    linear = 0.1 + power[:, None, None] * arriving
+    linear = 0.03 * torch.pi + power[:, None, None] * arriving
     expected = encode(linear.clamp(max=1), "srgb").float()
     assert expected[:, is_inside].std() > 0.05
     torch.testing.assert_close(image[:, is_inside], expected[:, is_inside], rtol=0, atol=6e-3)
