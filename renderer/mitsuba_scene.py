@@ -8,8 +8,9 @@ The renderers differ in these ways:
 
 - The radiance of a diffuse surface is the irradiance times albedo / π in
   Mitsuba, and the irradiance times the albedo in our renderer. The lights for
-  Mitsuba are therefore multiplied by π. They are also multiplied by the albedo
-  scale. In the materials, the albedo scale would apply again at each bounce.
+  Mitsuba are therefore multiplied by π. Without bounces, they are also multiplied
+  by the albedo scale. With bounces, the colors of the materials are, because the
+  albedo scale applies again at each bounce.
 - Mitsuba always has shadows. If our render has none, a concave mesh is darker in
   Mitsuba.
 - Specular reflection is the plugin `principled`, with the same lobe. Below its
@@ -71,7 +72,7 @@ PLUGINS = {
 }
 PLUGIN_TAGS = {plugin: tag for tag, plugins in PLUGINS.items() for plugin in plugins}
 # Smallest number by which specular factors are divided.
-# They are divided by the albedo scale, which can be 0.
+# They are divided by the scale of the lights, which can be 0.
 MIN_DIVISOR = 1e-6
 # Smallest parameter `specular` of Mitsuba's material
 # "principled". With 0, metals would reflect nothing.
@@ -256,9 +257,10 @@ def write_mitsuba_scene(
     coefficients (N, 3).
     """
     folder.mkdir(parents=True, exist_ok=True)
-    local_emitters = _local_emitters(folder, local_lights, albedo_scale)
-    # The first lines of this module explain both factors.
-    sky = environment({"filename": light}, math.pi * albedo_scale)
+    # The first lines of this module explain these factors.
+    color_scale, light_scale = (albedo_scale, 1.0) if settings.bounces else (1.0, albedo_scale)
+    local_emitters = _local_emitters(folder, local_lights, light_scale)
+    sky = environment({"filename": light}, math.pi * light_scale)
     # Rays with random directions from surfaces find the environment
     # with little noise. The rays that are aimed at emitters are
     # therefore all aimed at local lights, if there are any.
@@ -267,7 +269,7 @@ def write_mitsuba_scene(
     sensors = [{**sensor_of(camera, settings.size), "sampler": sampler} for camera in cameras]
     normals = mesh.written_normals(settings.normals)
     shapes = [
-        _write_part(folder, number, part, settings.encoding, albedo_scale)
+        _write_part(folder, number, part, settings.encoding, light_scale, color_scale)
         for number, part in enumerate(split_parts(mesh, normals, settings.encoding))
     ]
     method = integrator(settings.bounces, emitter_samples=1 if local_emitters else 0)
@@ -319,15 +321,21 @@ def _local_emitters(folder: Path, lights: Sequence[LitBasis], albedo_scale: floa
     return emitters
 
 
-def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_scale: float) -> Scene:
-    """Write a part to files such as part_0.ply and texture_0.png, and return its Mitsuba entry."""
+def _write_part(
+    folder: Path, number: int, part: Part, encoding: str, light_scale: float, color_scale: float
+) -> Scene:
+    """Write a part to files such as part_0.ply and texture_0.png, and return its Mitsuba entry.
+
+    Lights are multiplied by `light_scale`, and the colors of the part by `color_scale`.
+    """
     import trimesh
 
     # A surface whose metallic value and specular factor are 0 is matte.
     gloss = part.gloss if part.gloss is not None and part.gloss[1:].any() else None
     # Factor for the albedo, because less light is reflected below a coat.
     albedo_factor = 1.0 if gloss is None else _reflected_albedo(gloss)
-    corner_values = np.concatenate([part.uvs, albedo_factor * part.colors], axis=-1)
+    color_factor = color_scale * albedo_factor
+    corner_values = np.concatenate([part.uvs, color_factor * part.colors], axis=-1)
     corner_values = corner_values.reshape(-1, 5).astype(np.float32)
     # Each corner of each face is a vertex of its own.
     surface = trimesh.Trimesh(
@@ -349,16 +357,21 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_sca
 
     albedo: Scene = {"type": "mesh_attribute", "name": "vertex_color"}
     if part.texture is not None:
-        linear = albedo_factor * decode(torch.from_numpy(part.texture) / 255, encoding)
-        texture = to_bytes(encode(linear, encoding)).numpy()
-        albedo = bitmap("texture", texture, raw=encoding == "linear")
+        linear = color_factor * decode(torch.from_numpy(part.texture) / 255, encoding)
+        if color_scale == 1:
+            texture = to_bytes(encode(linear, encoding)).numpy()
+            albedo = bitmap("texture", texture, raw=encoding == "linear")
+        else:  # Scaled values may exceed 1.
+            file = f"texture_{number}.exr"
+            write_map(folder / file, linear)
+            albedo = {"type": "bitmap", "filename": file, "raw": True}
     material: Scene = {"type": "diffuse", "reflectance": albedo}
     if gloss is not None:
         roughness, metallic, specular_factor = gloss.tolist()
         # Mitsuba's reflectance at normal incidence is 0.08 · specular. It must be 0.04 times the
-        # specular factor, for a refractive index of 1.5. The lights of the scene are multiplied by
-        # the albedo scale, so the reflectance is divided by it.
-        specular = specular_factor / 2 / max(albedo_scale, MIN_DIVISOR)
+        # specular factor, for a refractive index of 1.5. If the lights of the scene are multiplied
+        # by the albedo scale, the reflectance is divided by it.
+        specular = specular_factor / 2 / max(light_scale, MIN_DIVISOR)
         specular = min(max(specular, MIN_SPECULAR), 1.0)
         material = {"type": "principled", "base_color": albedo, "specular": specular}
         # A metal has no coat and needs the full albedo, but the albedo was multiplied by a factor.

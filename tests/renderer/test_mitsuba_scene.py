@@ -71,6 +71,37 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, enc
         assert radiance_error.square().mean().sqrt() < 0.005
 
 
+def nook() -> Mesh:
+    """A floor with a texture and a wall without one, between which light bounces."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 2], [-1, 1, 2]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 5], [0, 5, 4]])
+    colors = np.where(np.arange(4)[:, None, None] < 2, 1.0, [0.8, 0.7, 0.5])
+    mesh = replace(Mesh.plain(corners, faces), corner_colors=np.float32(colors + np.zeros((3, 1))))
+    texture = np.random.default_rng(0).integers(160, 220, (9, 6, 3), dtype=np.uint8)
+    return textured(mesh, corners[faces][..., :2] / 2 + 0.5, texture, [0, 0, -1, -1])
+
+
+def black_mirror() -> Mesh:
+    return Gloss(0.4).on(mesh_of(trimesh.creation.icosphere(subdivisions=3), (0, 0, 0)))
+
+
+@pytest.mark.parametrize("make_mesh", [nook, black_mirror])
+def test_mitsuba_scales_the_albedo_at_each_bounce(tmp_path, make_mesh):
+    """Values of the scaled texture exceed 1. Specular reflection is not scaled."""
+    mesh = normalize(make_mesh())
+    light = load_light("st_peters") / 3
+    settings = ImageSettings(24, 2, "srgb", bounces=3)
+    write_mitsuba_scene(tmp_path / "mitsuba", mesh, 3.0, CAMERAS[:1], settings, "../light.exr")
+    write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
+    [expected] = render_mitsuba_scene(tmp_path / "mitsuba" / SCENE, 1, (24, 24)).double()
+    [operator] = build_operators(mesh, CAMERAS[:1], settings, choose("numpy"), 3.0)
+    found = image_of(operator, light)
+    is_inside = (found[3] == 1) & (expected[3] == 1)
+    assert is_inside.sum() > 100
+    found_mean, expected_mean = (image[:3, is_inside].mean() for image in (found, expected))
+    assert abs(found_mean / expected_mean - 1) < 0.02
+
+
 def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
     """Dielectrics agree within 10%, because `principled` has another diffuse part."""
     with_texture = normalize(ball())
