@@ -410,13 +410,17 @@ def build_fragments(
     if isinstance(vertices, Tensor):
         points = vertices.detach()
         points = points.double() if points.is_cuda else points.cpu().double().numpy()
+    all_faces = torch.as_tensor(faces, device=torch.as_tensor(points).device)
+    if any(camera.has_perspective for camera in cameras):
+        # A vertex that no face uses may lie behind a camera. The first corner takes its place.
+        corners = all_faces.flatten()
+        points = points[corners[:1].repeat(len(points)).index_copy_(0, corners, corners)]
     projected = torch.as_tensor(project_views(cameras, points))
     # The third coordinate is the depth. It is less than -1 in front of the near plane,
     # which would cut the mesh open.
     is_uncut = bool((projected[..., 2] >= -1).all())
     shape = tuple(side * settings.samples for side in settings.shape)
     face_ids = rasterizer.rasterize(projected, faces, shape, closed and is_uncut)
-    all_faces = torch.as_tensor(faces, device=projected.device)
     views = []
     for first in range(0, len(cameras), at_once):
         some = slice(first, first + at_once)

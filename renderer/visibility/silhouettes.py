@@ -349,7 +349,9 @@ class _Silhouettes:
         # Positions are rounded to subsamples as in rasterizers.
         rows, columns = sample_grid.shape
         self.places = to_fixed_point(points, (rows, columns))[0].T.double() / SUBSAMPLES
-        self.ends = _silhouette_edges(self.places, faces)
+        self.ends, all_ends = _silhouette_edges(self.places, faces)
+        # Vertices that no face uses do not count.
+        self.nearness_range = nearness[all_ends].max() - nearness[all_ends].min()
         if len(fragments.sample_to_seen_face) == 0:
             self.ends = self.ends[:, :0]  # If no sample shows the mesh, no silhouette is visible.
         # An edge (a, b) with y down has the normal (b, a) with y up.
@@ -385,7 +387,7 @@ class _Silhouettes:
         # An edge is hidden if the surfaces at both samples beside it are nearer to the camera.
         # It counts as hidden, too, if no sample beside it shows a surface. If one of them
         # shows no surface, the minimum is minus infinity, and the edge is in front.
-        tolerance = VISIBILITY_TOLERANCE * (self.nearness.max() - self.nearness.min())
+        tolerance = VISIBILITY_TOLERANCE * self.nearness_range
         is_in_front = edge_nearness >= surface_nearness.amin(0) - tolerance
         is_visible = (samples != NOT_COVERED).any(0) & is_in_front
         # Distance from the sample with the farther surface, plus the same number for all cuts
@@ -461,8 +463,8 @@ def _cut_edges(
 
 def _silhouette_edges(
     places: Float[Tensor, "2 V"], faces: Int[np.ndarray, "F 3"]
-) -> Int[Tensor, "2 N"]:
-    """Find the vertices of edges whose faces all lie on one side of the edge in the image."""
+) -> tuple[Int[Tensor, "2 N"], Int[Tensor, "2 E"]]:
+    """Find the vertices of edges whose faces all lie on one side in the image, and of all edges."""
     key = np.ascontiguousarray(faces, dtype=np.int64).tobytes()
     ends, edge_of_side, direction, face_count = _edges(key, places.device)
     corners = torch.from_numpy(faces).to(places.device).T
@@ -473,7 +475,7 @@ def _silhouette_edges(
     side_sums = places.new_zeros(len(face_count)).index_add_(0, edge_of_side, side_of_face)
     # All n faces of an edge lie on the same side if the sum is n or -n. It is n - 1 or
     # 1 - n if one of them is seen edge-on, because this face counts 0.
-    return ends[:, side_sums.abs() > face_count - 2]
+    return ends[:, side_sums.abs() > face_count - 2], ends
 
 
 @lru_cache(maxsize=4)

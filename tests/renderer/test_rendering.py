@@ -144,14 +144,30 @@ def test_a_lamp_lights_a_mesh_far_from_the_origin_as_at_the_origin():
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"shadows": True}, {"lights": [Lamps(((1.0, 1.0, 2.0),))]}]
+    "camera",
+    [
+        renderer.OrthographicCamera(55.0, 20.0, 2.3),
+        renderer.PerspectiveCamera(55.0, 20.0, 2.3, distance=4.0),
+        renderer.PinholeCamera(55.0, 20.0, 2.3, distance=4.0),
+    ],
 )
-def test_vertices_that_no_face_uses_change_neither_images_nor_normalized_meshes(options):
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"shadows": True}, {"silhouettes": True}, {"lights": [Lamps(((1.0, 1.0, 2.0),))]}],
+)
+def test_vertices_that_no_face_uses_change_neither_images_nor_gradients(camera, options):
+    """The vertex lies behind the camera."""
     cup = renderer.normalize(renderer.solid("cup"))
-    more = replace(cup, vertices=np.vstack([cup.vertices, [[-3e4, 0.0, 0.0]]]))
-    camera, light = renderer.OrthographicCamera(55.0, 20.0, 2.3), load_light("grace")
-    expected = renderer.render(cup, camera, light, 24, **options)
-    assert torch.equal(renderer.render(more, camera, light, 24, **options), expected)
+    more = replace(cup, vertices=np.vstack([cup.vertices, [[3e4, 0.0, 0.0]]]))
+    images, gradients = [], []
+    for mesh in (cup, more):
+        vertices = torch.from_numpy(mesh.vertices).requires_grad_()
+        changed = {"vertices": vertices, **options}
+        images.append(renderer.render(mesh, camera, load_light("grace"), 24, **changed))
+        gradients.append(torch.autograd.grad(images[-1][:, :12].sum(), vertices)[0])
+    assert torch.equal(*images)
+    assert gradients[0].any()
+    assert torch.equal(gradients[1], torch.cat([gradients[0], torch.zeros(1, 3)]))
     assert np.array_equal(renderer.normalize(more).vertices[:-1], renderer.normalize(cup).vertices)
 
 
