@@ -50,11 +50,11 @@ class LabeledRender:
         masks: Pixels of which each covers half or more, bool, shape (n, H, W).
         visible: Fraction of each object that nothing hides, shape (n,).
         depth: Distance from the camera along the viewing direction in world
-            units, at the nearest sample of each pixel. 0 where nothing is
-            rendered, as in front of a background. Float32, shape (H, W). None
-            without maps.
+            units, at the nearest sample of each pixel. 0 in pixels of which less
+            than half is covered. Float32, shape (H, W). None without maps.
         normals: Unit normals there, along the axes right, up and back of the
-            camera, float32, shape (3, H, W). None without maps.
+            camera, and 0 in the same pixels. Float32, shape (3, H, W). None
+            without maps.
         camera: Camera as numbers: "pose" (4 × 4, from the camera's axes right, up
             and back to the world), and "fx", "fy", "cx", "cy" in pixels, or
             "width" of an orthographic image in world units.
