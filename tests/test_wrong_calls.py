@@ -176,6 +176,7 @@ LIGHTS = [
     *calls_of("light", renderer.load_light, None, "sunset"),
     *calls_of("missing.hdr", renderer.load_light, "missing.hdr"),
     *calls_of("degree", lambda x: renderer.load_light("grace", x), 2.5, -1, 41),
+    *by_name(partial(renderer.load_light, "grace"), roughness=[-0.1, 2.0, NAN, "0.5"]),
     *calls_of("coefficients", lambda x: renderer.save_light("l.json", x), LIGHT[:9], LIGHT * NAN),
     *calls_of("basis", lambda x: renderer.save_light(Path("l.json"), LIGHT, x), "harmonics"),
     *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, "light.png"),

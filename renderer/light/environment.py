@@ -136,7 +136,7 @@ def read_panorama(path: str | Path) -> Float[Tensor, "H W 3"]:
     height, width = radiance.shape[:2]
     if height < FEWEST_ROWS or abs(width - 2 * height) > height // 8:
         fault = f"environment map {path} has {width} × {height} texels"
-        shape = f"which is twice as wide as high, with at least {FEWEST_ROWS} rows"
+        shape = f"which is about twice as wide as high, with at least {FEWEST_ROWS} rows"
         raise InputError(f"{fault}: give an equirectangular map, {shape}")
     minimum = radiance.min()
     if minimum < -NEGATIVE * radiance.max():

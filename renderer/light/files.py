@@ -170,7 +170,8 @@ def load_light(
 
     Raises:
         InputError: If the name is unknown, if the file does not exist or holds no
-            light, or if the light has a higher degree than `degree`.
+            light, if the light has a higher degree than `degree`, or if `roughness`
+            is not in [0, 1].
 
     Example:
         >>> import norm_balls as nb
@@ -184,6 +185,7 @@ def load_light(
     light = str(light)
     if degree is not None:
         harmonics.require_degree(degree)
+    errors.require_range("roughness", roughness, 0, 1)
     suffix = Path(light).suffix.lower()
     if light in _PUBLISHED_PROBES:
         coefficients = probe(light)

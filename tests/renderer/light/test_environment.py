@@ -289,9 +289,17 @@ def test_a_hdr_file_with_its_bottom_row_first_is_refused(tmp_path):
         read_map(tmp_path / "map.hdr")
 
 
-@pytest.mark.parametrize("size", [(4, 8), (48, 64)])
+@pytest.mark.parametrize("size", [(4, 8), (48, 64), (96, 179), (96, 205)])
 def test_a_map_with_few_texels_or_another_aspect_ratio_is_refused(tmp_path, size):
     """With few rows, even radiance would get a direction. A mirror ball's map is square."""
     np.save(tmp_path / "map.npy", np.ones((*size, 3)))
     with pytest.raises(InputError, match=r"map\.npy"):
         load_light(str(tmp_path / "map.npy"))
+
+
+@pytest.mark.parametrize("width", [180, 204])
+def test_a_map_whose_width_differs_by_a_sixteenth_is_read(tmp_path, width):
+    np.save(tmp_path / "map.npy", np.ones((96, width, 3)))
+    light = load_light(str(tmp_path / "map.npy"))
+    assert light[0].min() > 0.1
+    assert light[1:].abs().max() < 1e-3
