@@ -6,6 +6,7 @@ operators, which compute images under many lights without rasterizing again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -336,9 +337,9 @@ def light_sphere(
 ) -> Tensor:
     """Render a white diffuse ball under a light, to show the light as an image.
 
-    The ball has radius 1, lies at the origin and fills the image. As in `render`, a
-    pixel is the irradiance, and `nb.load_light("uniform")` shows a white ball. (A
-    mirror ball would also show coefficients that no diffuse surface reflects.)
+    The ball has radius 1, lies at the origin and fills the image. Under uniform
+    light of radiance 1, the ball is white. (A mirror ball would also show
+    coefficients that no diffuse surface reflects.)
 
     Args:
         light: Coefficients of the light, shape (basis.size, 3).
@@ -361,7 +362,8 @@ def light_sphere(
     """
     light = errors.as_tensor("light", light)
     errors.require_shape("light", light, basis.size, 3)
-    sky, local = split_light(basis, light.detach().cpu().float())
+    # Uniform light of radiance 1 has the irradiance π.
+    sky, local = split_light(basis, light.detach().cpu().float() / math.pi)
     camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)
     return render(
         _white_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy"

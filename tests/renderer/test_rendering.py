@@ -321,11 +321,11 @@ def ball_from_above(size: int) -> tuple[Tensor, Tensor]:
     return torch.stack([x, y, z], dim=2), z > 0.3
 
 
-def test_a_light_sphere_shows_the_irradiance_of_environment_light_and_lamps():
-    """The irradiance is π times uniform radiance, and P cos θ / d² for a lamp of power P."""
+def test_a_light_sphere_shows_environment_light_and_lamps_in_one_unit():
+    """Uniform radiance L and a lamp of power P are shown as L and as P cos θ / (π d²)."""
     position = torch.tensor([0.3, -0.4, 2.5], dtype=torch.float64)
-    power = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
-    environment = ambient(torch.full((3,), 0.03))
+    power = torch.pi * torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
+    environment = ambient(torch.full((3,), 0.1))
     light = torch.cat([environment, power[None].float()])
     lamp = Lamps((tuple(position.tolist()),))
     camera = renderer.OrthographicCamera(0.0, 0.0, 2.0)
@@ -336,7 +336,7 @@ def test_a_light_sphere_shows_the_irradiance_of_environment_light_and_lamps():
     distance = toward_lamp.norm(dim=2)
     cosine = (toward_lamp * normals).sum(2) / distance
     arriving = cosine.clamp(min=0) / distance**2
-    linear = 0.03 * torch.pi + power[:, None, None] * arriving
+    linear = 0.1 + power[:, None, None] * arriving / torch.pi
     expected = encode(linear.clamp(max=1), "srgb").float()
     assert expected[:, is_inside].std() > 0.05
     torch.testing.assert_close(image[:, is_inside], expected[:, is_inside], rtol=0, atol=6e-3)

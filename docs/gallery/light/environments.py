@@ -2,8 +2,8 @@
 Environment lighting
 ====================
 
-Four environment lights are installed. A white ball shows each of them at half its brightness.
-The same pear looks different in each light.
+Four environment lights are installed. A white ball shows each of them. The same pear looks
+different in each light.
 """
 
 import matplotlib.pyplot as plt
@@ -15,7 +15,7 @@ pear = nb.solid("pear")
 [camera] = nb.orbit_cameras(1, width=2.2)
 names = ["uniform", "grace", "eucalyptus", "st_peters"]
 lights = [nb.load_light(name) for name in names]
-balls = torch.cat([nb.light_sphere(light / 2, 128) for light in lights], 2)
+balls = torch.cat([nb.light_sphere(light, 128) for light in lights], 2)
 images = [nb.render(pear, camera, light, 128, 1.0, encoding="srgb") for light in lights]
 pears = torch.cat(images, 2)
 

@@ -15,7 +15,7 @@ orange = nb.solid("orange")
 [camera] = nb.orbit_cameras(1, width=2.2)
 zeniths = [10.0, 40.0, 60.0, 75.0, 85.0]
 lights = [nb.skylight.coefficients(zenith, 60.0, 3.0).float() for zenith in zeniths]
-lights = [light * 0.4 / light[0].mean() for light in lights]
+lights = [light * 0.8 / light[0].mean() for light in lights]
 images = [nb.render(orange, camera, light, 128, 1.0, encoding="srgb") for light in lights]
 oranges = torch.cat(images, 2)
 balls = torch.cat([nb.light_sphere(light, 128) for light in lights], 2)
