@@ -262,7 +262,7 @@ def rank(scores: Mapping[str, Sequence[float]]) -> dict[str, tuple[int, int, int
 
 def add(options: argparse.Namespace) -> None:
     """Score networks, write a file with their rows, and print their ranks."""
-    rows = read(options.scores)
+    rows = read(options.scores) | (read(options.out) if options.out.exists() else {})
     folders = real_folders(options.real)
     networks = {name: load(name) for name in options.networks}
     real = {name: score_real(network, folders) for name, network in networks.items()}

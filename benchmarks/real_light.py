@@ -26,6 +26,7 @@ A row of another network may stand in a further file of the same title.
 import argparse
 import csv
 import itertools
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -490,7 +491,9 @@ def rank(options: argparse.Namespace) -> None:
         raise InputError(f"no file has {options.metric} for the label {options.label}")
     first = next(iter(scores.values()))
     networks = dict.fromkeys(name for column in scores.values() for name in column)
-    ordered = sorted(networks, key=lambda name: -first.get(name, -1.0))
+    # Of the metrics, the false-positive rate alone is better if it is lower.
+    sign = 1 if options.metric == "FPR" else -1
+    ordered = sorted(networks, key=lambda name: sign * first.get(name, sign * math.inf))
     lines = [
         [name, *(f"{column[name]:.3f}" if name in column else "" for column in scores.values())]
         for name in ordered

@@ -403,7 +403,8 @@ class _Target(NamedTuple):
         _, light, coverage = self.fit_light(camera, WHOLE_PIXEL, FINAL_GRID)
         image = render(self.mesh, camera, light, self.size, self.gray, **self.options)
         rendered = decode(image, self.options["encoding"]).flatten(1)
-        is_inside = self.mask > WHOLE_PIXEL
+        # The background of the render is none of the photograph.
+        is_inside = torch.minimum(self.mask, coverage) > WHOLE_PIXEL
         error = (rendered - self.image)[:, is_inside].norm() / self.image[:, is_inside].norm()
         union = torch.maximum(coverage, self.mask).sum()
         # Fraction of the union of the render and the mask that both cover.

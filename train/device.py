@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from augment import distributed
-from augment.network import Network, plain_outputs
+from augment.network import Network, eval_mode, plain_outputs
 from augment.progress import progress_message
 from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, keyed, keys_of, require_choice
@@ -239,18 +239,27 @@ def all_reduce_sum(values: Tensor) -> Tensor:
     return values
 
 
-def wrap_ddp(model: nn.Module) -> nn.Module:
+def wrap_ddp(model: nn.Module, size: int | None) -> nn.Module:
     """Wrap a model so that its gradients are averaged over all processes of a run.
 
     On GPUs, layers of batch normalization are replaced in `model` by layers that compute their
     statistics over the batch of all processes. On CPUs, each process has its own statistics. A
-    single process returns the model itself.
+    single process returns the model itself. `size` is that of images, or None for a detector.
     """
     if distributed.world_size() == 1:
         return model
     if next(model.parameters()).is_cuda:
         nn.SyncBatchNorm.convert_sync_batchnorm(model)
-    return DistributedDataParallel(model)
+    gradients: tuple[Tensor | None, ...] = ()
+    if size is not None:
+        # The outputs may not depend on some weights, such as those of the encoder of texts of CLIP.
+        weights = [weight for weight in model.parameters() if weight.requires_grad]
+        images = torch.full((1, 3, size, size), 0.5, device=weights[0].device)
+        with eval_mode(model):
+            outputs = plain_outputs(model(images))
+        gradients = torch.autograd.grad(outputs.sum(), weights, allow_unused=True)
+    has_unused = any(gradient is None for gradient in gradients)
+    return DistributedDataParallel(model, find_unused_parameters=has_unused)
 
 
 class Interrupted(SystemExit):

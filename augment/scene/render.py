@@ -394,7 +394,10 @@ class DirectRenderer:
             alone = [build_fragments(mesh.vertices, faces, *shown) for faces in parts]
             counts_alone = torch.tensor([[len(each.sample_numbers) for each in of] for of in alone])
         visible = visible_counts / counts_alone.to(ends.device).clamp(min=1)
-        return (counts >= COVERED * self.settings.samples**2).transpose(0, 1), visible.T
+        masks = counts >= COVERED * self.settings.samples**2
+        # A pixel that two objects share equally belongs to the first.
+        masks &= masks.cumsum(0) == 1
+        return masks.transpose(0, 1), visible.T
 
     def surface_maps(self, group: Group) -> Float[Tensor, "N 4 height width"]:
         """Find depth and unit normal of the nearest sample in pixels of coverage >= COVERED.

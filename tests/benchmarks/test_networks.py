@@ -61,6 +61,10 @@ def test_a_network_that_is_added_again_has_the_same_scores(add, tmp_path):
     once = add(networks.SCORES, tmp_path / "once.csv")
     shutil.rmtree(tmp_path / "renders")
     assert add(tmp_path / "once.csv", tmp_path / "again.csv") == once
+    text = (tmp_path / "once.csv").read_text()
+    (tmp_path / "once.csv").write_text(text.replace("half", "other"))
+    kept = {key for key in rows_in(tmp_path / "once.csv") if key[0] == "other"}
+    assert add(networks.SCORES, tmp_path / "once.csv").keys() == once.keys() | kept
     assert {key: once[key] for key in before} == before
     own = {key[1] for key in once.keys() - before.keys()}
     assert own == {light for light in networks.LIGHTS if not light.endswith("real")}

@@ -1,5 +1,6 @@
 import csv
 import math
+import re
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -186,6 +187,20 @@ def test_networks_that_two_lights_rank_alike_have_a_rank_correlation_of_one(tmp_
     assert real == values
     assert real_light.rank_correlation(real, alike).value == pytest.approx(1)
     assert real_light.rank_correlation(real, other).value == pytest.approx(-1)
+
+
+@pytest.mark.parametrize(("metric", "best"), [("FPR", "low"), ("AUC", "high")])
+def test_the_best_network_is_ranked_first(tmp_path, capsys, metric, best):
+    header = ["label", *real_light.HEADER]
+    rows = []
+    for name, value in (("middle", 0.5), ("low", 0.1), ("high", 0.9)):
+        row = {"label": "orange", "network": name, "light": "dim", metric: f"{value} [0, 1]"}
+        rows.append([row.get(column, "") for column in header])
+    real_light.write_csv(tmp_path / "scores.csv", [header, *rows])
+    words = [f"scores={tmp_path / 'scores.csv'}", "--label", "orange", "--metric", metric]
+    real_light.main(["rank", *words])
+    found = re.findall("middle|low|high", capsys.readouterr().out)
+    assert found[0] == best
 
 
 def test_the_interval_of_a_rank_correlation_is_that_of_bonett_and_wright():

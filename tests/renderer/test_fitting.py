@@ -130,3 +130,16 @@ def test_a_mask_of_nothing_is_refused(share):
     mesh = renderer.normalize(renderer.solid("apple"))
     with pytest.raises(InputError, match="mask"):
         fit_scene(torch.zeros(3, 32, 32), torch.full((32, 32), share), mesh)
+
+
+@pytest.mark.slow
+def test_the_error_of_a_fit_does_not_depend_on_the_brightness_of_the_photograph():
+    """Black surroundings of a dark object are not compared with a background of the fit."""
+    mesh = renderer.normalize(renderer.solid("pear", 3))
+    mask = (coverage_of(mesh, FAR, 24) > 0.5).float()
+    errors = []
+    for brightness in (0.8, 0.02):
+        light = brightness * load_light("uniform")
+        image = renderer.render(mesh, FAR, light, 24, 0.0)
+        errors.append(fit_scene(image, mask, mesh, start=FAR).error)
+    assert max(errors) < 2 * min(errors)

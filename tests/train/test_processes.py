@@ -20,7 +20,7 @@ from augment.scene.scene import Scene
 from tests.runs import completed_run
 from train import checkpoints, run_folder
 from train.cli import read_settings
-from train.device import SignalHandler, process_group
+from train.device import SignalHandler, process_group, wrap_ddp
 from train.run_folder import read_metrics
 from train.settings import ExperimentSettings
 
@@ -42,6 +42,7 @@ def one_of_two(index: int, port: int, folder: Path) -> None:
         run_from_file(folder / "config.yaml", folder / "two")
         random_mode(folder / f"random_{index}.pt")
         folder_mode(folder / f"folder_{index}.pt")
+        spare_weights(folder / f"spare_{index}.pt")
 
 
 def run_from_file(config: Path, folder: Path) -> None:
@@ -78,6 +79,17 @@ def folder_mode(file: Path) -> None:
     service = AugmentationService(settings, None, labels, 0, Phases(), *process, images)
     made = service.regenerate(linear(), 1)
     torch.save((made.images, made.labels, torch.tensor(made.diagnostics["attack_success"])), file)
+
+
+def spare_weights(file: Path) -> None:
+    """Compute gradients twice with a layer that the outputs do not use."""
+    model = linear()
+    model.spare = torch.nn.ModuleList([torch.nn.Linear(2, 2)])
+    model.forward = lambda images: model[1](model[0](images))
+    wrapped = wrap_ddp(model, 8)
+    for _ in range(2):
+        wrapped(torch.full((1, 192), 1.0 + distributed.rank())).sum().backward()
+    torch.save(model[1].weight.grad, file)
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +144,13 @@ def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of
     whole = torch.load(runs / "folder.pt")
     for index in range(2):
         assert all(map(torch.equal, torch.load(runs / f"folder_{index}.pt"), whole))
+
+
+@pytest.mark.slow
+def test_gradients_are_averaged_also_if_a_layer_has_none(runs):
+    """The gradients of a pass are the inputs, 1 and 2, so that of two passes is 2 · 1.5."""
+    for index in range(2):
+        assert torch.load(runs / f"spare_{index}.pt").eq(3).all()
 
 
 @pytest.mark.slow

@@ -107,7 +107,7 @@ class TrainingStep:
         device = next(model.parameters()).device
         # `wrap_ddp` may replace layers of the network. The optimizer is built
         # afterwards, so that it has the parameters of the new layers.
-        replica = wrap_ddp(model)
+        replica = wrap_ddp(model, None if isinstance(service.task, Detection) else self.size)
         # The first optimizer of a process imports the compiler of torch, which takes seconds.
         with progress_message("loading the optimizer"):
             self.optimizer = recipe.build_optimizer(model, settings)
@@ -497,13 +497,15 @@ def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict
     # Each of n processes scores every n-th image.
     own_rows = rows.to(device)[distributed.rank() :: distributed.world_size()]
     batches = own_rows.split(EVALUATION_BATCH)
-    shown = progress(split.squares(batches), f"{len(rows)} images", len(batches))
-    logits = compute_outputs(model, shown, EVALUATION_BATCH, device)
-    labels = split.labels[own_rows]
-    loss_sum = F.cross_entropy(logits, labels, reduction="sum")
-    hits = (logits.argmax(1) == labels).sum()
-    # Sums over all processes.
-    loss_sum, hits = all_reduce_sum(torch.stack([loss_sum, hits])).tolist()
+    sums = torch.zeros(2, device=device)
+    # With few images, a process has none, and not every network takes an empty batch.
+    if len(own_rows):
+        shown = progress(split.squares(batches), f"{len(rows)} images", len(batches))
+        logits = compute_outputs(model, shown, EVALUATION_BATCH, device)
+        labels = split.labels[own_rows]
+        loss_sum = F.cross_entropy(logits, labels, reduction="sum")
+        sums = torch.stack([loss_sum, (logits.argmax(1) == labels).sum()])
+    loss_sum, hits = all_reduce_sum(sums).tolist()
     return {"loss": loss_sum / len(rows), "accuracy": hits / len(rows)}
 
 

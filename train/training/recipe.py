@@ -338,7 +338,8 @@ class SharedTeacher(nn.Module):
         self.hook = layer.register_forward_pre_hook(self._store_features)
 
     def _store_features(self, _: nn.Module, inputs: tuple[Any, ...]) -> None:
-        self.features = inputs[0].detach()
+        # A parametrization of the layer is called without inputs.
+        self.features = inputs[0].detach() if inputs else None
 
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B classes"]:
         """Return the logits of the teacher for the images with which the pupil was called last."""

@@ -133,6 +133,15 @@ def test_a_step_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tm
     torch.testing.assert_close(linear.bias, parameters[1])
 
 
+def test_a_process_without_validation_images_shows_the_network_none(monkeypatch):
+    monkeypatch.setattr(loop.distributed, "world_size", lambda: 2)
+    monkeypatch.setattr(loop.distributed, "rank", lambda: 1)
+    monkeypatch.setattr(loop, "all_reduce_sum", lambda own: own + torch.tensor([0.5, 1.0]))
+    network = color_network()
+    network.register_forward_pre_hook(lambda *_: pytest.fail("an empty batch"))
+    assert loop.evaluate(network, single_colors(1)) == {"loss": 0.5, "accuracy": 1.0}
+
+
 @pytest.mark.parametrize(("settings", "expected"), [({}, 40), ({"images_per_epoch": 9}, 9)])
 def test_a_batch_larger_than_the_data_is_the_data(tmp_path, settings, expected):
     trainer = make_trainer(tmp_path, color_network(), epochs=1, batch_size=960_000, **settings)

@@ -334,6 +334,18 @@ def test_a_teacher_with_other_features_or_more_layers_computes_its_own(changes, 
     assert recipe.share_layers(settings, pupil, teacher, TINY) is teacher
 
 
+def test_a_last_layer_with_a_parametrization_has_a_teacher_of_its_own():
+    pupil, teacher = (weight_norm_at_last(network) for network in pair())
+    assert recipe.share_layers(TrainSettings(**LAST_LAYER_ONLY), pupil, teacher, TINY) is teacher
+
+
+def weight_norm_at_last(network: MixedPrecision) -> MixedPrecision:
+    nn.utils.parametrizations.weight_norm(network.network[3])
+    for parameter in network.network[:3].parameters():
+        parameter.requires_grad_(False)
+    return network
+
+
 class ByText(nn.Module):
     """Zero-shot network: logits are the scaled cosines of an image and a text for each class."""
 
