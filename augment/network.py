@@ -425,12 +425,13 @@ def eval_mode(network: Any) -> Iterator[None]:
     """
     modules = [*network.modules()] if isinstance(network, nn.Module) else []
     flags = [module.training for module in modules]
-    # `eval` of a large network takes as long as rendering an image, so call it only if needed.
-    if any(flags):
-        if any("eval" in vars(module) for module in modules):
-            raise InputError(f"the network {NO_EVAL}")
-        network.eval()
     try:
+        # `eval` of a large network takes as long as rendering an image, so call it only if needed.
+        if any(flags):
+            try:
+                network.eval()
+            except NotImplementedError as error:
+                raise InputError(f"the network {NO_EVAL}") from error
         yield
     finally:
         if any(flags):

@@ -106,8 +106,9 @@ class FittedScene(NamedTuple):
         light: SH coefficients of environment light without negative radiance,
             shape (49, 3).
         error: Root mean square difference between the linear values of the
-            render and of the photograph, over the pixels of the object, divided
-            by the root mean square of the photograph.
+            render and of the photograph, over the pixels that the object covers
+            in both, divided by the root mean square of the photograph there.
+            Infinite without such pixels.
         overlap: Intersection over union of the silhouettes in the render and in
             the mask.
     """
@@ -406,6 +407,8 @@ class _Target(NamedTuple):
         # The background of the render is none of the photograph.
         is_inside = torch.minimum(self.mask, coverage) > WHOLE_PIXEL
         error = (rendered - self.image)[:, is_inside].norm() / self.image[:, is_inside].norm()
+        if not is_inside.any():
+            error = torch.tensor(math.inf)
         union = torch.maximum(coverage, self.mask).sum()
         # Fraction of the union of the render and the mask that both cover.
         overlap = torch.minimum(coverage, self.mask).sum() / union

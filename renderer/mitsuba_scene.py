@@ -358,10 +358,10 @@ def _write_part(
     albedo: Scene = {"type": "mesh_attribute", "name": "vertex_color"}
     if part.texture is not None:
         linear = color_factor * decode(torch.from_numpy(part.texture) / 255, encoding)
-        if color_scale == 1:
+        if linear.max() <= 1:
             texture = to_bytes(encode(linear, encoding)).numpy()
             albedo = bitmap("texture", texture, raw=encoding == "linear")
-        else:  # Scaled values may exceed 1.
+        else:
             file = f"texture_{number}.exr"
             write_map(folder / file, linear)
             albedo = {"type": "bitmap", "filename": file, "raw": True}

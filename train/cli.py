@@ -464,7 +464,8 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
         # OmegaConf neither names a group that is null, such as attack.geometry, nor merges a
         # mapping into it.
         given = [word.partition("=")[0] for word in words]
-        groups = [*given, *(key.rpartition(".")[0] for key in given)]
+        found = re.search(r"full_key: (\S+)", str(wrong))
+        groups = [found[1]] if found else [key.rpartition(".")[0] for key in given]
         hints = {group: keys.get(group) for group in groups}
         unset = [
             group

@@ -435,6 +435,8 @@ class RenderSettings(TaskSettings):
         parts = [*self.splits.values()] if isinstance(self.splits, dict) else []
         if not all(is_number(part) and part >= 0 for part in parts) or not sum(parts):
             raise self.wrong("splits", "must be parts and their fractions, such as {train: 1}")
+        if "pose" in self.augment.attack.parameters:
+            self.renderer.silhouettes = True
         # The default depends on the network. `require_counting` refuses other modes.
         if self.network and self.augment.mode == "random":
             self.augment.mode = "adversarial"

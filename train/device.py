@@ -251,9 +251,9 @@ def wrap_ddp(model: nn.Module, size: int | None) -> nn.Module:
     if next(model.parameters()).is_cuda:
         nn.SyncBatchNorm.convert_sync_batchnorm(model)
     gradients: tuple[Tensor | None, ...] = ()
-    if size is not None:
+    weights = [weight for weight in model.parameters() if weight.requires_grad]
+    if size is not None and weights:
         # The outputs may not depend on some weights, such as those of the encoder of texts of CLIP.
-        weights = [weight for weight in model.parameters() if weight.requires_grad]
         images = torch.full((1, 3, size, size), 0.5, device=weights[0].device)
         with eval_mode(model):
             outputs = plain_outputs(model(images))

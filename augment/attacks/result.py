@@ -81,10 +81,10 @@ class AttackResult(ShortRepr):
             the attack changes shape or colors, the images of the search have
             the shadows and bounces of the original shape. `minimum.success` is
             the success of these images without noise.
-        queries: Number of images of each example that the attack showed to the
-            classifier, (E,) int64. Images with sensor noise, which decide about
-            successes, are included. A candidate that equals an earlier image in 8
-            bits counts, too, although the classifier does not get it again.
+        queries: Number of images of each example that the attack evaluated, (E,)
+            int64. Images with sensor noise, which decide about successes, are
+            included, and so are images that a classifier without gradients does
+            not get again.
         seconds: Seconds of the attack in total, and of its parts by name.
     """
 

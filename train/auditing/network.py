@@ -1,7 +1,7 @@
 """Results of an audit for one network: read once, judged, and as `nb.audit` returns them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -226,8 +226,13 @@ class AuditedNetwork:
 
     @property
     def plain(self) -> PlainViews:
-        """The plain light in which all networks of the audit are tested."""
-        return PlainViews(**read_json(self.folder.parent / CLASSIFIER / PLAIN))
+        """The plain light in which all networks are tested, and what this one recognizes there."""
+        plain = PlainViews(**read_json(self.folder.parent / CLASSIFIER / PLAIN))
+        if self.folder.name == CLASSIFIER:
+            return plain
+        # The light was chosen for the first network. Attacks on the lighting start in it.
+        own = self.counts["lighting"]["correct"]
+        return replace(plain, recognized=own, recognized_as_given=own)
 
     def evaluation(self, images: str) -> Evaluation:
         """Predictions for a folder of test images in groups, for comparisons."""

@@ -119,7 +119,7 @@ def write_audit_page(
             for name, key in remedies.items()
         }
         recommendation = audited.recommend(evaluations)
-    is_unknown = networks[0].verdict[0] == "Unknown"
+    is_unknown = networks[0 if folders else -1].verdict[0] == "Unknown"
     if is_unknown and recommendation is not None and recommendation.remedy is None:
         first = audited.NEXT_TRAINING
         recommendation = replace(recommendation, advice=first, sentence=first)
@@ -191,16 +191,17 @@ def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_scre
         screen = first_screen.compare_networks(before, after, names, folder, folder.name)
         if screen is not None:
             return screen
-    first, *others = map(screen_of_one, networks, metrics)
+    # Both are shown under the kind of lighting that fools the first network most.
+    kind = networks[0].strongest_kind
+    first, *others = (screen_of_one(*each, kind) for each in zip(networks, metrics, strict=True))
     if not others:
         return first
     # The answer is that of the hardened network.
     last = others[-1]
-    sentences = [
-        f"{screen.names[0]}: {sentence}"
-        for screen in (first, last)
-        for sentence in screen.sentences
-    ]
+    sentences = []
+    for screen in (first, last):
+        plain, *more = screen.sentences
+        sentences += [plain, *(f"{screen.names[0]}: {sentence}" for sentence in more)]
     known = {number.title: number.after for number in first.numbers}
     numbers = [
         replace(number, before=known[number.title])
@@ -242,7 +243,9 @@ def plain_sentence(network: AuditedNetwork) -> str:
     return f"{sentence} {found}; {before}. All lights are tested there."
 
 
-def screen_of_one(network: AuditedNetwork, metrics: Metrics) -> first_screen.FirstScreen:
+def screen_of_one(
+    network: AuditedNetwork, metrics: Metrics, kind: str | None
+) -> first_screen.FirstScreen:
     """Make the top of the report of an audit of one network, with its scores on test images."""
     numbers = []
     sentences = [plain_sentence(network)]
@@ -252,8 +255,7 @@ def screen_of_one(network: AuditedNetwork, metrics: Metrics) -> first_screen.Fir
         numbers.append(first_screen.ShownMetric(title, note, None, value, interval=interval))
 
     show("Views recognized in plain light", fraction(network.plain.recognized, network.plain.n))
-    kind = network.strongest_kind
-    if kind is not None:
+    if kind is not None and kind in network.counts:
         light = KINDS[kind]
         # Views that are still recognized at the largest radius.
         kept = network.remaining(kind, "adversarial")[-1]

@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -276,13 +276,7 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     # The key of a group is the text of the settings without the seed.
     groups: dict[str, list[RunSummary]] = {}
     for run in (*initial.values(), *runs):
-        group = groups.setdefault(repr({**run.settings, "seed": None}), [])
-        # A repeated seed would make intervals over seeds too narrow.
-        repeated = next((other for other in group if other.seed == run.seed), None)
-        if repeated is not None and run.seed is not None:
-            console.warning("left out: %s (repeats seed of %s)", run.folder, repeated.folder)
-        else:
-            group.append(run)
+        groups.setdefault(repr({**run.settings, "seed": None}), []).append(run)
     # Runs of a group differ only in their seed. The first one stands for all.
     heads = [group[0] for group in groups.values()]
     if len(heads) == 2 and heads[0].mode == INITIAL and heads[1].mode != "none":
@@ -426,7 +420,23 @@ def find(folders: Sequence[Path]) -> Findings:
     # Runs follow in the order of `MODES`. Runs of any other mode come first.
     order = {mode: number for number, mode in enumerate(MODES)}
     found.runs.sort(key=lambda run: order.get(run.mode, -1))
-    return found
+    return replace(found, runs=_without_repetitions(found.runs))
+
+
+def _without_repetitions(runs: Iterable[RunSummary]) -> list[RunSummary]:
+    """Leave out repetitions and copies of runs, which would make intervals over seeds too narrow.
+
+    A repetition has the settings, the seed and the scores of another run.
+    """
+    kept: list[RunSummary] = []
+    for run in runs:
+        result = run.settings, run.scores, run.photographs
+        same = [one for one in kept if (one.settings, one.scores, one.photographs) == result]
+        if same and run.seed is not None:
+            console.warning("left out: %s (repeats %s)", run.folder, same[0].folder)
+        else:
+            kept.append(run)
+    return kept
 
 
 def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
@@ -445,7 +455,7 @@ def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
         for summary in found.runs:
             # A run that is in several folders counts once.
             runs.setdefault((summary.folder.resolve(), summary.mode), summary)
-    return [*runs.values()]
+    return _without_repetitions(runs.values())
 
 
 def _walk(folder: Path) -> Iterator[Path]:

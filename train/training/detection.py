@@ -216,7 +216,8 @@ def validate(
     own_rows = rows.to(device)[distributed.rank() :: distributed.world_size()]
     # Boxes of the teacher that the network finds, too, and all boxes of the teacher.
     counts = torch.zeros(2, device=device)
-    for images in split.squares(own_rows.split(BATCH)):
+    # With few photographs, a process has none, and not every network takes an empty batch.
+    for images in split.squares(own_rows.split(BATCH) if len(own_rows) else ()):
         pair = (detected(one, images.to(device), task) for one in (teacher, network))
         for expected, found in zip(*pair, strict=True):
             boxes, labels = (found[key].cpu().numpy() for key in ("boxes", "labels"))

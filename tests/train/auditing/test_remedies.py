@@ -1,4 +1,6 @@
+import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -9,11 +11,17 @@ import augment
 from renderer.io.images import write_image
 from tests.helpers import darker_than
 from train.auditing import page
+from train.auditing.lights import KINDS, PlainViews
 from train.auditing.network import (
     BOTH,
+    CLASSIFIER,
+    HARDENED,
     HARDENING,
     LIGHT_ALONE,
     ORIGINAL,
+    PLAIN,
+    RECOGNIZED,
+    AuditedNetwork,
     name_remedies,
     normalizing,
     recommend,
@@ -21,12 +29,10 @@ from train.auditing.network import (
 from train.command_settings import AuditSettings
 from train.commands import audit
 from train.data.photo import Photograph
-from train.results import first_screen
 from train.results.compare import Evaluation
 from train.results.metrics import Pooled
 from train.results.scoring import rank_classes
 from train.results.store import RunSummary
-from train.results.tables import fraction
 
 COUNT = 60
 
@@ -108,13 +114,22 @@ def test_an_audit_of_a_hardened_network_warns_without_photographs_of_others(tmp_
     assert (audit.NO_PHOTOGRAPHS in audit._caveats(settings, given, plan)) == (len(shown) < 2)
 
 
-def test_without_scored_images_the_first_screen_shows_both_networks(monkeypatch):
-    def screen_of(name, _):
-        shown = first_screen.ShownMetric("recognized", "", None, fraction(len(name), 4))
-        return first_screen.FirstScreen("No", [], [shown], [name])
-
-    monkeypatch.setattr(page, "screen_of_one", screen_of)
-    screen = page._first_screen(["a", "bcd"], {})
-    assert screen.names == ["a", "bcd"]
-    [shown] = screen.numbers
-    assert (shown.before.value, shown.after.value) == (1 / 4, 3 / 4)
+def test_without_scored_images_the_first_screen_shows_both_networks_in_one_light(tmp_path):
+    """The first network fails under lamps, and the second in a projector."""
+    networks = []
+    for name, correct, kind, lost in ((CLASSIFIER, 2, "lamps", 2), (HARDENED, 4, "projector", 1)):
+        folder = tmp_path / name
+        folder.mkdir()
+        for each in KINDS:
+            hits = [0] * 3 + [lost if each == kind else 0]
+            counts = {"n": 5, "correct": correct, "adversarial": hits, "random": hits}
+            (folder / f"{each}.json").write_text(json.dumps(counts))
+        views = {"eucalyptus": [True] * correct, "random 1": [True] * correct}
+        (folder / RECOGNIZED).write_text(json.dumps(views))
+        networks.append(AuditedNetwork("orange", name, folder))
+    plain = PlainViews("grace", 1.0, 1.0, recognized=2, n=5, recognized_as_given=2)
+    (tmp_path / CLASSIFIER / PLAIN).write_text(json.dumps(asdict(plain)))
+    screen = page._first_screen(networks, {})
+    assert screen.names == [CLASSIFIER, HARDENED]
+    found = [(shown.before.value, shown.after.value) for shown in screen.numbers]
+    assert found == [(2 / 5, 4 / 5), (0 / 2, 4 / 4)]

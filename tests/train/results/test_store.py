@@ -75,11 +75,20 @@ def test_seeds_are_rows_above_their_mean_and_columns_have_a_known_value(folder):
     assert rows == [["random, epochs=3", "3"], ["random, epochs=9", "9"]]
 
 
-def test_a_repeated_seed_counts_once(made_up_run, tmp_path):
-    for name, seed in ("first", 0), ("second", 1), ("copy of first", 0):
+def test_copies_of_a_run_count_once_and_a_repetition_with_other_scores_is_kept(
+    made_up_run, tmp_path
+):
+    for name, seed in ("first", 0), ("second", 1), ("copy of first", 0), ("again", 0):
         made_up_run(tmp_path / name, "random", {}, f"seed={seed}")
+    (tmp_path / "again/metrics.jsonl").write_text('{"epoch": 1}\n{"test/accuracy": 0.5}\n')
     [runs] = group_by_method(finished_runs([tmp_path])).values()
-    assert sorted(run.seed for run in runs) == [0, 1]
+    assert [(run.folder.name, run.seed) for run in runs] == [
+        ("again", 0),
+        ("copy of first", 0),
+        ("second", 1),
+    ]
+    folders = [tmp_path / "first", tmp_path / "copy of first"]
+    assert [run.folder for run in finished_runs(folders)] == folders[:1]
 
 
 def test_scores_of_a_run_are_read_and_compared_without_torch(folder):
