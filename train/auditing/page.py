@@ -198,10 +198,8 @@ def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_scre
         return first
     # The answer is that of the hardened network.
     last = others[-1]
-    sentences = []
-    for screen in (first, last):
-        plain, *more = screen.sentences
-        sentences += [plain, *(f"{screen.names[0]}: {sentence}" for sentence in more)]
+    # Further sentences say what the numbers show for both.
+    sentences = [first.sentences[0], last.sentences[0]]
     known = {number.title: number.after for number in first.numbers}
     numbers = [
         replace(number, before=known[number.title])
