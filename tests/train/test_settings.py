@@ -66,8 +66,10 @@ def test_training_takes_the_parameters_of_the_attack_command():
         (["augment.attack.geometry.radius=1"], "augment.attack.geometry is null"),
         (["train.epochs=2", "augment.attack.geometry={radius: 1}"], "augment.attack.geometry is"),
         (
-            ["attack@augment.attack=[geometry]", "augment.attack.geometry.radius=1"]
-            + ["augment.attack.lamps={radius: 1}"],
+            [
+                *("attack@augment.attack=[geometry]", "augment.attack.geometry.radius=1"),
+                "augment.attack.lamps={radius: 1}",
+            ],
             "augment.attack.lamps is null",
         ),
         (
