@@ -404,15 +404,16 @@ class _Target(NamedTuple):
         _, light, coverage = self.fit_light(camera, WHOLE_PIXEL, FINAL_GRID)
         image = render(self.mesh, camera, light, self.size, self.gray, **self.options)
         rendered = decode(image, self.options["encoding"]).flatten(1)
-        # The background of the render is none of the photograph.
+        # Where the mesh leaves pixels of the mask, the render shows its own background.
         is_inside = torch.minimum(self.mask, coverage) > WHOLE_PIXEL
-        error = (rendered - self.image)[:, is_inside].norm() / self.image[:, is_inside].norm()
-        if not is_inside.any():
-            error = torch.tensor(math.inf)
+        error = math.inf
+        if is_inside.any():
+            photograph = self.image[:, is_inside]
+            error = float((rendered[:, is_inside] - photograph).norm() / photograph.norm())
         union = torch.maximum(coverage, self.mask).sum()
         # Fraction of the union of the render and the mask that both cover.
         overlap = torch.minimum(coverage, self.mask).sum() / union
-        return FittedScene(camera, light, float(error), float(overlap))
+        return FittedScene(camera, light, error, float(overlap))
 
 
 def _fit_channels(

@@ -461,17 +461,14 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
         sentence = " ".join(text.split())
         return f"{key}: {sentence}" if key else sentence
     if isinstance(wrong, AssertionError) or "full_key" in str(wrong):
-        # OmegaConf neither names a group that is null, such as attack.geometry, nor merges a
-        # mapping into it.
-        given = [word.partition("=")[0] for word in words]
-        found = re.search(r"full_key: (\S+)", str(wrong))
-        groups = [found[1]] if found else [key.rpartition(".")[0] for key in given]
-        hints = {group: keys.get(group) for group in groups}
-        unset = [
-            group
-            for group, hint in hints.items()
-            if NoneType in get_args(hint) and is_dataclass(without_none(hint))
-        ]
+        # For a mapping that is merged into a group that is null, such as attack.geometry, OmegaConf
+        # names the group. For a setting in such a group, it names nothing.
+        named = re.search(r"full_key: (\S+)", str(wrong))
+        parents = [word.partition("=")[0].rpartition(".")[0] for word in words]
+        groups = [named[1]] if named else parents
+        types = {group: keys.get(group) for group in groups}
+        null = [group for group, kind in types.items() if NoneType in get_args(kind)]
+        unset = [group for group in null if is_dataclass(without_none(types[group]))]
         return f"{unset[0]} is null: choose it first, as --help shows" if unset else None
     return None
 

@@ -250,16 +250,23 @@ def wrap_ddp(model: nn.Module, size: int | None) -> nn.Module:
         return model
     if next(model.parameters()).is_cuda:
         nn.SyncBatchNorm.convert_sync_batchnorm(model)
-    gradients: tuple[Tensor | None, ...] = ()
-    weights = [weight for weight in model.parameters() if weight.requires_grad]
-    if size is not None and weights:
-        # The outputs may not depend on some weights, such as those of the encoder of texts of CLIP.
-        images = torch.full((1, 3, size, size), 0.5, device=weights[0].device)
-        with eval_mode(model):
-            outputs = plain_outputs(model(images))
-        gradients = torch.autograd.grad(outputs.sum(), weights, allow_unused=True)
-    has_unused = any(gradient is None for gradient in gradients)
+    has_unused = size is not None and _has_unused_weights(model, size)
     return DistributedDataParallel(model, find_unused_parameters=has_unused)
+
+
+def _has_unused_weights(model: nn.Module, size: int) -> bool:
+    """Return whether the outputs for an image do not depend on some weights that learn.
+
+    An example is the encoder of texts of CLIP.
+    """
+    weights = [weight for weight in model.parameters() if weight.requires_grad]
+    if not weights:
+        return False
+    images = torch.full((1, 3, size, size), 0.5, device=weights[0].device)
+    with eval_mode(model):
+        outputs = plain_outputs(model(images))
+    gradients = torch.autograd.grad(outputs.sum(), weights, allow_unused=True)
+    return any(gradient is None for gradient in gradients)
 
 
 class Interrupted(SystemExit):

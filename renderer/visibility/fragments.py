@@ -414,7 +414,8 @@ def build_fragments(
     if any(camera.has_perspective for camera in cameras):
         # A vertex that no face uses may lie behind a camera. The first corner takes its place.
         corners = all_faces.flatten()
-        points = points[corners[:1].repeat(len(points)).index_copy_(0, corners, corners)]
+        vertex_of_row = corners[:1].repeat(len(points)).index_copy_(0, corners, corners)
+        points = points[vertex_of_row]
     projected = torch.as_tensor(project_views(cameras, points))
     # The third coordinate is the depth. It is less than -1 in front of the near plane,
     # which would cut the mesh open.

@@ -179,18 +179,18 @@ def _slider(networks: Networks) -> dict[str, Any]:
 def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_screen.FirstScreen:
     """Make the top of the report from the scores of one or two networks, or from their attacks."""
     metrics = [Metrics()] * len(networks)
-    # Only the first folder is shown here.
-    for images, folder in list(folders.items())[:1]:
+    if folders:
+        # The first screen shows the first folder alone.
+        images, folder = next(iter(folders.items()))
         evaluations = [network.evaluation(images) for network in networks]
+        if len(networks) > 1:
+            names = (f"before: {networks[0].name}", f"after: {networks[1].name}")
+            # Each side of the comparison is a list of evaluations, one for each seed.
+            before, after = ([evaluation] for evaluation in evaluations)
+            screen = first_screen.compare_networks(before, after, names, folder, folder.name)
+            if screen is not None:
+                return screen
         metrics = [item.pooled.all.metrics for item in evaluations]
-        if len(networks) == 1:
-            continue
-        names = (f"before: {networks[0].name}", f"after: {networks[1].name}")
-        # Each side of the comparison is a list of evaluations, one for each seed.
-        before, after = ([evaluation] for evaluation in evaluations)
-        screen = first_screen.compare_networks(before, after, names, folder, folder.name)
-        if screen is not None:
-            return screen
     # Both are shown under the kind of lighting that fools the first network most.
     kind = networks[0].strongest_kind
     first, *others = (screen_of_one(*each, kind) for each in zip(networks, metrics, strict=True))
@@ -198,7 +198,7 @@ def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_scre
         return first
     # The answer is that of the hardened network.
     last = others[-1]
-    # Further sentences say what the numbers show for both.
+    # The other sentences of both repeat the numbers.
     sentences = [first.sentences[0], last.sentences[0]]
     known = {number.title: number.after for number in first.numbers}
     numbers = [
@@ -244,7 +244,10 @@ def plain_sentence(network: AuditedNetwork) -> str:
 def screen_of_one(
     network: AuditedNetwork, metrics: Metrics, kind: str | None
 ) -> first_screen.FirstScreen:
-    """Make the top of the report of an audit of one network, with its scores on test images."""
+    """Make the top of the report of an audit of one network, with its scores on test images.
+
+    It has the views that are left after attacks with this kind of lighting, if one is given.
+    """
     numbers = []
     sentences = [plain_sentence(network)]
 
@@ -253,7 +256,7 @@ def screen_of_one(
         numbers.append(first_screen.ShownMetric(title, note, None, value, interval=interval))
 
     show("Views recognized in plain light", fraction(network.plain.recognized, network.plain.n))
-    if kind is not None and kind in network.counts:
+    if kind is not None:
         light = KINDS[kind]
         # Views that are still recognized at the largest radius.
         kept = network.remaining(kind, "adversarial")[-1]

@@ -168,6 +168,7 @@ def fit_mask(
     Pixels of borders are NO_CLASS_PIXEL. The values of the file are added to `seen`.
     """
     with explained(f"{path} cannot be read", "replace it"), open_image(path) as image:
+        # Pillow forgets the format of the pixels when it reads them.
         factor = gray_factor(image)
         labels = np.array(image) // factor
     width, height = fitted.size
