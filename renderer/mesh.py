@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from renderer import errors
 from renderer.errors import InputError
+from renderer.image import decode, encode
 from renderer.normals import CREASE, doubled_area_vectors, normal_groups, vertex_normals
 from renderer.settings import MAX_VERTICES, NORMALS
 
@@ -427,25 +428,26 @@ def transformed(mesh: Mesh, matrix: Float[np.ndarray, "4 4"]) -> Mesh:
     return replace(mesh, **arrays)
 
 
-def subdivide(mesh: Mesh, vertices: float) -> Mesh:
+def subdivide(mesh: Mesh, vertices: float, encoding: str = "linear") -> Mesh:
     """Divide all faces of a mesh into four, until the mesh has more than `vertices` vertices.
 
     The surface stays the same. New vertices are the midpoints of edges. Faces
-    that share an edge share the new vertex, so a closed mesh stays closed. The
-    sRGB-encoded colors and the texture coordinates are interpolated. The old
-    vertices keep their indices. Each division replaces face f by the faces 4 f
-    to 4 f + 3.
+    that share an edge share the new vertex, so a closed mesh stays closed. Colors
+    and texture coordinates are interpolated as shading does it. The old vertices
+    keep their indices. Each division replaces face f by the faces 4 f to 4 f + 3.
 
     Args:
         mesh: Mesh to divide.
         vertices: Number of vertices that the result must exceed, from 0 to
             `MAX_VERTICES`.
+        encoding: Encoding of the images that will be rendered, `"linear"` or
+            `"srgb"`. Shading interpolates linear colors.
 
     Returns:
         Divided mesh. The given mesh itself if it already has more vertices.
 
     Raises:
-        InputError: If `vertices` is not whole or out of range.
+        InputError: If `vertices` is not whole or out of range, or if `encoding` is unknown.
 
     Example:
         >>> import norm_balls as nb
@@ -460,11 +462,11 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
         vertices = int(vertices)
     errors.require_whole("vertices", vertices, 0, MAX_VERTICES)
     while len(mesh.vertices) <= vertices:
-        mesh = _quartered(mesh)
+        mesh = _quartered(mesh, encoding)
     return mesh
 
 
-def refine(mesh: Mesh, area: float) -> Mesh:
+def refine(mesh: Mesh, area: float, encoding: str) -> Mesh:
     """Divide the large faces of a mesh into four, until all faces are small enough.
 
     The surface stays the same, but the order of the faces changes. The old
@@ -476,9 +478,9 @@ def refine(mesh: Mesh, area: float) -> Mesh:
     if not is_large.any():
         return mesh
     if is_large.all():
-        return refine(_quartered(mesh), area)
+        return refine(_quartered(mesh, encoding), area, encoding)
     small_faces = select_faces(mesh, ~is_large)
-    divided = refine(_quartered(select_faces(mesh, is_large)), area)
+    divided = refine(_quartered(select_faces(mesh, is_large), encoding), area, encoding)
     arrays: dict[str, Any] = {
         name: np.concatenate([rows, getattr(divided, name)])
         for name, rows in _rows_of_faces(small_faces).items()
@@ -512,7 +514,7 @@ def by_material(mesh: Mesh, *columns: np.ndarray) -> Iterator[tuple[np.ndarray, 
         yield (keys == key).all(axis=1), int(texture_id), group_gloss
 
 
-def _quartered(mesh: Mesh) -> Mesh:
+def _quartered(mesh: Mesh, encoding: str) -> Mesh:
     """Return a copy of a mesh in which each face is divided into four triangles (`subdivide`)."""
     edge_ends, edge_of_side = shared_edges(mesh.faces)
     midpoints = mesh.vertices[edge_ends].mean(axis=1)
@@ -522,11 +524,14 @@ def _quartered(mesh: Mesh) -> Mesh:
     # Two faces share the normal in the middle of an edge if they share the normals at both ends.
     _, normal_of_side = shared_edges(mesh.normal_ids)
     normals = np.concatenate([mesh.normal_ids, mesh.normal_ids.max() + 1 + normal_of_side], axis=1)
+    # Shading interpolates linear colors.
+    linear = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
+    colors = _interpolate_quarters(linear)
     return replace(
         mesh,
         vertices=np.concatenate([mesh.vertices, midpoints]),
         faces=points[:, _QUARTERS].reshape(-1, 3),
-        corner_colors=_interpolate_quarters(mesh.corner_colors),
+        corner_colors=encode(torch.from_numpy(colors), encoding).numpy(),
         corner_uvs=_interpolate_quarters(mesh.corner_uvs),
         texture_ids=mesh.texture_ids.repeat(4),
         gloss=None if mesh.gloss is None else mesh.gloss.repeat(4, axis=0),

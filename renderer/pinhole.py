@@ -359,21 +359,25 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
     if distortion_keys:
         fault = f"the cameras have lens distortion ({', '.join(distortion_keys)})"
         raise InputError(f"{fault}, which is not supported: {UNDISTORT}")
-    if not {"w", "h"} <= entries.keys() and {"fl_x", "fl_y", "cx", "cy"} & entries.keys():
+    has_size = {"w", "h"} <= entries.keys()
+    if not has_size and {"fl_x", "fl_y", "cx", "cy"} & entries.keys():
         raise InputError("the focal length is in pixels, but the image size w and h is missing")
     # Files with fields of view need no image size. One field of view is that of square images.
     tangents = [math.tan(float(entries.get(f"camera_angle_{axis}", 0)) / 2) for axis in "xy"]
     ratio = tangents[1] / tangents[0] if all(tangents) else 1
-    width = int(entries.get("w", errors.MAX_SCALE))
-    height = int(entries.get("h", round(width * ratio)))
-    if not {"w", "h", "camera_angle_y"} & entries.keys():
-        warnings.warn("the cameras have no image size w and h: images are square", stacklevel=4)
+    width = int(entries["w"] if has_size else errors.MAX_SCALE)
+    height = int(entries["h"] if has_size else round(width * ratio))
     focal_lengths = []
     for axis, side in (("x", width), ("y", height)):
         if f"fl_{axis}" in entries:
             focal_lengths.append(float(entries[f"fl_{axis}"]))
         elif f"camera_angle_{axis}" in entries:
             focal_lengths.append(side / 2 / math.tan(float(entries[f"camera_angle_{axis}"]) / 2))
+    if not focal_lengths:
+        keys = "fl_x, fl_y, camera_angle_x or camera_angle_y"
+        raise InputError(f"the cameras have no focal length: give {keys}")
+    if not has_size and not all(tangents):
+        warnings.warn("the cameras have no image size w and h: images are square", stacklevel=4)
     center_x = float(entries.get("cx", width / 2))
     center_y = float(entries.get("cy", height / 2))
     # Pixels are square if only one focal length is given.

@@ -149,7 +149,7 @@ def build_scene(
     renderer_options = {name: options[name] for name in options.keys() - SCENE_OPTIONS}
     settings = replace(scene or SceneSettings(), views=views, **scene_options)
     renderer_settings = replace(renderer or RendererSettings(), **renderer_options)
-    objects = _load_objects(meshes, settings)
+    objects = _load_objects(meshes, settings, renderer_settings.encoding)
     environment: Any = settings.light
     degree = None
     # Loads the lighting again with a higher degree, which a smoother surface may need later. It
@@ -188,7 +188,7 @@ def build_scene(
     return expose(built) if settings.adapts_exposure else built
 
 
-def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
+def _load_objects(meshes: object, settings: SceneSettings, encoding: str) -> list[SceneObject]:
     """Load the entries of the argument `meshes` of `build_scene`, and put a table under each."""
     expected = f"a list of pairs {EXAMPLE}, of nb.ObjectSettings, or of lists of them"
     members = errors.as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
@@ -206,7 +206,7 @@ def _load_objects(meshes: object, settings: SceneSettings) -> list[SceneObject]:
         # All further objects of an entry stand beside its first one.
         first, *others = parts or [_as_object(name, member)]
         together = replace(first, others=[*first.others, *others])
-        item = placed.load_object(together, settings.vertices)
+        item = placed.load_object(together, settings.vertices, encoding)
         objects.append(placed.add_table(item, settings.ground))
     return objects
 

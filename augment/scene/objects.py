@@ -179,13 +179,13 @@ def name_mesh(mesh: Mesh) -> str:
     return name
 
 
-def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
+def load_object(item: ObjectSettings, vertices: int = 0, encoding: str = "linear") -> SceneObject:
     """Load an object and the others beside it.
 
     The first object spans [-1, 1]. It is subdivided until it has more than `vertices` vertices.
     Objects without a position stand to the right and to the left of all before them, by turns.
     """
-    mesh = subdivide(_load(item), vertices)
+    mesh = subdivide(_load(item), vertices, encoding)
     loaded = SceneObject.from_mesh(item.label, mesh, item.albedo_scale, item.mesh)
     if item.azimuth:
         loaded = rotated(loaded, _turn(item.azimuth))
@@ -305,18 +305,20 @@ def _load(item: MeshSettings) -> Mesh:
     else:
         mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
     # Meshes without colors of their own are white.
-    has_colors = bool(mesh.textures) or bool((mesh.corner_colors != 1).any())
+    has_textures = any((texture < 255).any() for texture in mesh.textures)
+    has_colors = has_textures or bool((mesh.corner_colors != 1).any())
     if item.color is not None:
         if has_colors:
             advice = "remove color, and set albedo_scale to make them brighter or darker"
             raise InputError(f"color is set, but {item.mesh} has its own colors: {advice}")
-        colored = Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
-        mesh = replace(colored, gloss=mesh.gloss)
+        colors = Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color)).corner_colors
+        mesh = replace(mesh, corner_colors=colors)
     if item.gloss not in (None, "file"):
         # The order of the values is roughness, metallic, specular factor.
         mesh = Gloss(*(float(value) for value in item.gloss)).on(mesh)
     is_metal = mesh.gloss is not None and mesh.gloss[:, METALLIC].any()
-    if item.gloss is not None and is_metal and item.color is None and not has_colors:
+    has_no_color = item.color is None and not mesh.textures and not has_colors
+    if item.gloss is not None and is_metal and has_no_color:
         advice = "give color=[red,green,blue], or a metallic of 0"
         raise InputError(f"{item.mesh} is a metal without a color: {advice}")
     return mesh

@@ -127,14 +127,15 @@ def _reader(path: Path, gloss: bool) -> Callable[[MeshFile], list[Part]] | None:
 
 def files_beside(path: Path) -> list[Path]:
     """List the materials, textures and buffers that a mesh file names, and that exist."""
-    read = _reader(path, gloss=True)
-    if read is None:
+    readers = [_reader(path, gloss) for gloss in (False, True)]
+    if None in readers:
         return []
     file = MeshFile(path)
     # A reader notes each file that it opens in `beside`. `load_mesh` raises the error of a mesh
-    # that cannot be read.
-    with suppress(Exception):
-        read(file)
+    # that cannot be read. Some materials can only be read without gloss.
+    for read in readers:
+        with suppress(Exception):
+            read(file)
     return sorted(file.beside)
 
 

@@ -100,9 +100,9 @@ def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
     The chromaticity of the light stays the same, without adaptation to another
     white. Colors beyond Rec. 709 get channels of 0. The EXPOSURE and COLORCORR of
     an .hdr file are divided out. An alpha channel is dropped. A single gray
-    channel is used for red, green and blue. If an .exr file has layers, the layer
-    without a name is read. If all layers have names, the first layer with red,
-    green and blue is read. Radiance that is NaN, infinite or above 1e12 raises
+    channel is used for red, green and blue. Of the layers of an .exr file, the one
+    without a name is read, or "Combined", or the only one with red, green and
+    blue. Radiance that is NaN, infinite or above 1e12 raises
     `InputError`. (The sun has 1.6e9 cd/m².)
     """
     path = Path(path)
@@ -192,8 +192,10 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]
     # The orientation 1 of EXIF means that the top row is stored first.
     if spec.roi != spec.roi_full or image.orientation != 1:
         raise InputError("the image is stored cropped or rotated: save the whole, upright image")
-    if image.nsubimages > 1 and not {*"RGB"} <= {*spec.channelnames}:
-        raise InputError("the first of several images in the file has no R, G and B: save it alone")
+    specs = [_openimageio().ImageBuf(str(path), i, 0).spec() for i in range(image.nsubimages)]
+    colored = [index for index, each in enumerate(specs) if {*"RGB"} <= {*each.channelnames}]
+    if image.nsubimages > 1 and colored != [0]:
+        raise InputError("not only the first of its images has R, G and B: save the light alone")
     # CIE x and y of red, green, blue and white.
     chromaticities = spec.getattribute("chromaticities") or REC_709
     if image.file_format_name == "hdr":
@@ -267,12 +269,19 @@ def _color_channels(names: Sequence[str]) -> list[int]:
     """Find the indices of red, green and blue by names such as "LAYER.R". Gray is used for all."""
     # Pairs (layer, color) in lower case, such as ("layer", "r"). The layer is "" without a dot.
     keys = [name.casefold().rpartition(".")[::2] for name in names]
-    # OpenImageIO lists the layer without a name first. The loop therefore prefers it.
+    colored: dict[str, list[int]] = {}
     for layer, _ in keys:
         for color_names in _COLOR_NAMES:
             channels = [(layer, color_name) for color_name in color_names]
             if set(channels) <= set(keys):
-                return [keys.index(channel) for channel in channels]
+                colored.setdefault(layer, [keys.index(channel) for channel in channels])
+    # Blender calls the layer of all light "Combined". Layers are sorted by their names.
+    preferred = [layer for layer in colored if layer.rpartition(".")[2] in ("", "combined")]
+    layers = preferred[:1] if "" in preferred else preferred or [*colored]
+    if len(layers) > 1:
+        raise InputError(f"the layers {', '.join(layers)} have colors: save the light alone")
+    if layers:
+        return colored[layers[0]]
     # No layer has three colors. A gray channel is the only one of which no part of the name says
     # that it is no light.
     words = [name.casefold().split(".") for name in names]

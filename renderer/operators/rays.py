@@ -18,7 +18,7 @@ covered samples in P pixels, and these samples show G of the F faces.
 import math
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -473,6 +473,10 @@ class LocalLightView:
         if moved is None:
             self.fixed_paths[basis] = paths
         shown = (fragments or surface.fragments).to("cpu")
+        if surface.gloss is not None and shown.cameras is not surface.fragments.cameras:
+            # With silhouettes, highlights have gradients with respect to the camera.
+            seen = replace(surface.fragments, cameras=shown.cameras)
+            surface = replace(surface, fragments=seen)
         # Irradiance at the end of each path: one row for each path, one column for each color.
         irradiance = paths.irradiance[:, None] * light.cpu().double()[paths.function]
         radiance = path_reflectance(surface, albedo.cpu().double(), paths) / shown.samples**2

@@ -89,7 +89,7 @@ class Patches:
     patch_of_side: Int[Tensor, "2 F"]
 
     @staticmethod
-    def from_mesh(mesh: Mesh) -> "Patches":
+    def from_mesh(mesh: Mesh, encoding: str) -> "Patches":
         """Divide the surface of a mesh into patches of about the same area.
 
         The faces are first divided into small faces, called pieces. A patch is a
@@ -98,7 +98,7 @@ class Patches:
         """
         # Area of a side of the cells below, so that there are about PATCHES patches.
         patch_area = float(mesh.face_areas().sum()) / PATCHES
-        pieces = refine(mesh, patch_area)
+        pieces = refine(mesh, patch_area, encoding)
         piece_count = len(pieces.faces)
         sides = [FRONT] if pieces.closed else [FRONT, BACK]
         # One entry for each side: the fronts of all small faces (pieces), then all backs.
@@ -220,7 +220,7 @@ class Transport:
         """Divide the mesh into patches, and compute the light that they send, if light bounces."""
         # Only bounces need patches. Rays then hit the small faces (pieces) of which the patches
         # consist.
-        self._patches = Patches.from_mesh(mesh) if settings.bounces else None
+        self._patches = Patches.from_mesh(mesh, settings.encoding) if settings.bounces else None
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
         ray_count = max(rays.DIRECTIONS, rays.DIRECTIONS_PER_SAMPLE * settings.samples**2)
         # Ray directions of an exact image, and of a draft.

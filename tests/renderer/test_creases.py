@@ -138,7 +138,7 @@ def test_faces_that_only_touch_at_a_vertex_share_its_normal_in_a_file():
 def test_subdivided_and_refined_meshes_have_the_same_sharp_edges():
     finer = subdivide(CAN, 1000)
     assert is_same_partition(finer.normal_ids, normal_groups(finer.vertices, finer.faces))
-    refined = refine(CAN, 0.005)
+    refined = refine(CAN, 0.005, "linear")
     assert len(np.unique(refined.face_areas().round(9))) > 1
     for mesh in (finer, refined):
         is_lid = lids(mesh)

@@ -4,12 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import corners_of, mesh_of, patchwork
 
+from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
+from renderer.light.files import load_light
 from renderer.mesh import Mesh, concatenate, normalize, refine, subdivide
+from renderer.rendering import render
 from renderer.solids import solid
 
 EPS32 = np.finfo(np.float32).eps
@@ -137,6 +141,17 @@ def test_colors_and_texture_coordinates_are_linear_on_the_original_faces():
     assert all(a is b for a, b in zip(finer.textures, SHEET.textures, strict=True))
 
 
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+def test_a_subdivided_mesh_has_the_same_image(encoding):
+    corners = [[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]]
+    quad = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.eye(4)[:, :3])
+    camera = OrthographicCamera(polar=90, azimuth=0, width=2.0)
+    light = load_light("uniform")
+    finer = subdivide(quad, 100, encoding)
+    images = [render(mesh, camera, light, size=8, encoding=encoding) for mesh in (quad, finer)]
+    torch.testing.assert_close(images[1], images[0], rtol=0, atol=1e-5)
+
+
 # One face of area 8 in the plane z = 0, and one of area 2.
 CORNER = Mesh.plain(
     [[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 1]], [[0, 1, 2], [0, 3, 1]], np.eye(4)[:, :3]
@@ -144,11 +159,11 @@ CORNER = Mesh.plain(
 
 
 def test_a_face_is_refined_as_often_as_its_area_needs():
-    finer = refine(CORNER, 0.6)
+    finer = refine(CORNER, 0.6, "linear")
     is_flat = (corners_of(finer)[..., 2] == 0).all(axis=1)
     assert_allclose(finer.face_areas()[is_flat], [0.5] * 16)
     assert_allclose(finer.face_areas()[~is_flat], [0.5] * 4)
-    assert_array_equal(refine(CORNER, 8.0).faces, CORNER.faces)
+    assert_array_equal(refine(CORNER, 8.0, "linear").faces, CORNER.faces)
     assert_array_equal(finer.vertices[:4], CORNER.vertices)
     assert_array_equal(finer.face_normals()[is_flat], np.tile([0, 0, 1], (16, 1)))
     x, y, _ = corners_of(finer)[is_flat].reshape(-1, 3).T / 4

@@ -300,7 +300,8 @@ def load_targets(
     for mesh in read_objects(chosen.meshes, label, "transfer.meshes").values():
         # A mesh with a class that the attacked network lacks raises InputError.
         attacked.label(mesh.label)
-        objects.append(add_table(load_object(mesh, settings.scene.vertices), settings.scene.ground))
+        item = load_object(mesh, settings.scene.vertices, settings.renderer.encoding)
+        objects.append(add_table(item, settings.scene.ground))
     return {"classifiers": classifiers, "azimuths": chosen.azimuths, "objects": objects}
 
 

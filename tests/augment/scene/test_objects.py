@@ -32,6 +32,20 @@ def test_a_mesh_without_colors_takes_the_given_one_which_a_metal_needs(plain_mes
         load_object(ObjectSettings(plain_mesh, "orange", gloss=metal))
 
 
+def test_an_object_keeps_the_sharp_edges_of_its_file_if_it_is_colored(tmp_path):
+    """Each corner of the file has a normal of its own."""
+    ball = trimesh.creation.icosphere(1)
+    lines = [f"v {x} {y} {z}" for x, y, z in ball.vertices]
+    lines += [f"vn {x} {y} {z}" for x, y, z in ball.face_normals]
+    for number, face in enumerate(ball.faces, 1):
+        lines.append("f " + " ".join(f"{corner + 1}//{number}" for corner in face))
+    path = tmp_path / "facets.obj"
+    path.write_text("\n".join(lines))
+    for color in (None, [0.5, 0.5, 0.5]):
+        mesh = load_object(ObjectSettings(str(path), "ball", color=color)).mesh
+        assert len(np.unique(mesh.normal_ids)) == 3 * len(ball.faces)
+
+
 def test_props_stand_on_the_objects_ground_shifted_and_turned():
     """A quarter turn takes x to y, and y to -x."""
     prop = ObjectSettings("solid:cup:1", at=[0.9, -0.2], scale=0.5, azimuth=90)

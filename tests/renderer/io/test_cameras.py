@@ -169,9 +169,20 @@ def test_without_a_size_that_of_the_images_counts_or_that_of_both_angles(tmp_pat
 
     other.write_text(json.dumps(scene | {"camera_angle_y": angle_y}))
     np.testing.assert_allclose(project(), [each.project(POINTS) for each in expected], atol=1e-5)
+    del scene["camera_angle_x"]
+    # The image is wider than high, so its angle of y is that of its central square.
+    for angles, is_same in (
+        ({"camera_angle_x": angle_x}, 0),
+        ({"camera_angle_y": angle_y, "h": 9}, 1),
+    ):
+        other.write_text(json.dumps(scene | angles))
+        with pytest.warns(UserWarning, match="images are square"):
+            found = project()
+        assert np.allclose(found[0], expected[0].project(POINTS), atol=1e-5) == is_same
     other.write_text(json.dumps(scene))
-    with pytest.warns(UserWarning, match="images are square"):
-        assert not np.allclose(project()[0], expected[0].project(POINTS), atol=0.1)
+    with pytest.raises(InputError, match="no focal length"):
+        project()
+    other.write_text(json.dumps(scene | {"camera_angle_x": angle_x}))
     for name in NAMES:
         Image.new("L", (WIDTH, HEIGHT)).save(tmp_path / name)
     np.testing.assert_allclose(project(), [each.project(POINTS) for each in expected], atol=1e-9)

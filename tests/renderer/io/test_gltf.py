@@ -19,7 +19,7 @@ from renderer import errors
 from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io import gltf as gltf_reader
-from renderer.io.meshes import load_mesh, read_parts
+from renderer.io.meshes import files_beside, load_mesh, read_parts
 from renderer.mesh import Mesh
 
 
@@ -638,6 +638,14 @@ REFUSED = {
 def test_what_would_change_shape_or_color_is_refused(tmp_path, reason):
     with pytest.raises(InputError, match=rf"mesh\.gltf .*{reason}"):
         REFUSED[reason].load(tmp_path, gloss=True)
+
+
+def test_a_file_is_found_beside_a_mesh_whose_gloss_is_refused(tmp_path):
+    gltf = REFUSED["specular color"]
+    (tmp_path / "mesh.bin").write_bytes(gltf.buffer)
+    buffers = [{"byteLength": len(gltf.buffer), "uri": "mesh.bin"}]
+    (tmp_path / "mesh.gltf").write_text(json.dumps(gltf.tree | {"buffers": buffers}))
+    assert files_beside(tmp_path / "mesh.gltf") == [tmp_path / "mesh.bin"]
 
 
 @pytest.mark.parametrize("color", [0.8, 1.6])

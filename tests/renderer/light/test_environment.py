@@ -137,6 +137,7 @@ def numbered_texels(channels: int) -> np.ndarray:
         ("sky.R sky.G sky.B sky.A", [0, 1, 2]),
         ("spec.R spec.G spec.B R G B", [3, 4, 5]),
         ("View.Depth.Z View.Combined.R View.Combined.G View.Combined.B", [1, 2, 3]),
+        ("V.AO.R V.AO.G V.AO.B V.Combined.R V.Combined.G V.Combined.B", [3, 4, 5]),
     ],
 )
 def test_the_color_channels_of_an_exr_file_are_found_by_name(tmp_path, names, expected_channels):
@@ -246,11 +247,12 @@ PERCENT = tuple(100 * value for value in ACESCG)
         ("Z", {}, "or one gray channel"),
         ("View.Depth.V", {}, "or one gray channel"),
         ("id", {}, "or one gray channel"),
+        ("AO.R AO.G AO.B Sky.R Sky.G Sky.B", {}, "ao, sky have colors"),
         ("R G B", {"chromaticities": PERCENT}, "span no colors"),
         ("R G B", {"x": 1, "full_width": 8}, "cropped"),
         ("R G B", {"Orientation": 4}, "rotated"),
     ],
-    ids=["depth", "depth of a view", "numbers", "percent", "cropped", "turned"],
+    ids=["depth", "depth of a view", "numbers", "layers", "percent", "cropped", "turned"],
 )
 def test_an_exr_file_without_light_or_of_a_part_is_refused(tmp_path, names, attributes, message):
     channels = tuple(names.split())
@@ -259,12 +261,14 @@ def test_an_exr_file_without_light_or_of_a_part_is_refused(tmp_path, names, attr
         read_map(tmp_path / "map.exr")
 
 
-@pytest.mark.parametrize("is_first", [True, False])
-def test_of_several_images_in_an_exr_file_the_first_is_read_if_it_has_colors(tmp_path, is_first):
+@pytest.mark.parametrize("images", [("RGB", "Y"), ("Y", "RGB"), ("RGB", "BGR")])
+def test_of_several_images_in_an_exr_file_the_first_is_read_if_it_alone_has_colors(
+    tmp_path, images
+):
     openimageio = pytest.importorskip("OpenImageIO")
     path = str(tmp_path / "map.exr")
     specs = []
-    for channels in ("RGB", "Y") if is_first else ("Y", "RGB"):
+    for channels in images:
         spec = openimageio.ImageSpec(16, 8, len(channels), "float")
         spec.channelnames = tuple(channels)
         spec.attribute("oiio:subimagename", channels)
@@ -276,10 +280,10 @@ def test_of_several_images_in_an_exr_file_the_first_is_read_if_it_has_colors(tmp
             output.open(path, spec, "AppendSubimage")
         output.write_image(np.full((8, 16, spec.nchannels), 2.0, np.float32))
     output.close()
-    if is_first:
+    if images[1] == "Y":
         assert (read_map(tmp_path / "map.exr") == 2).all()
     else:
-        with pytest.raises(InputError, match="no R, G and B"):
+        with pytest.raises(InputError, match="save the light alone"):
             read_map(tmp_path / "map.exr")
 
 
