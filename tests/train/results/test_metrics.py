@@ -235,7 +235,11 @@ def test_a_prediction_is_held_against_the_threshold_of_its_own_label():
     assert [outcomes[name].hits.sum() for name in AT_THRESHOLD] == [2, 0]
 
 
-def test_a_recall_of_1_has_wilsons_interval_for_the_objects_with_students_quantile():
-    found = mean_of(np.ones(140), np.arange(140) % 7).estimate
-    quantile = student_t(6).ppf(0.975)
-    assert (found.low, found.high) == pytest.approx((7 / (7 + quantile**2), 1))
+@pytest.mark.parametrize("hits", [[1, 1, 1], [1, 1, 0], [1, 0, 0, 0, 0]])
+@pytest.mark.parametrize("count", [7, 30])
+def test_equal_objects_have_wilsons_interval_for_their_number_with_students_quantile(hits, count):
+    """The ends p of Wilson's interval of a fraction f solve (f - p)² = t² p (1 - p) / n."""
+    found = mean_of(np.tile(hits, count), np.arange(count).repeat(len(hits))).estimate
+    fraction, square = np.mean(hits), student_t(count - 1).ppf(0.975) ** 2 / count
+    ends = sorted(np.roots([1 + square, -2 * fraction - square, fraction**2]))
+    assert (found.low, found.high) == pytest.approx(ends)
