@@ -145,12 +145,15 @@ class Folder:
         return np.array([f"{label}: {mesh}" if mesh else label for label, mesh in named])
 
     def has_objects(self, label: str) -> bool:
-        """Return whether each light shows MIN_OBJECTS objects of a class, and of other classes."""
-        named: dict[tuple[str, bool], set[str]] = {}
+        """Return whether each light shows MIN_OBJECTS objects of a class, and of other classes.
+
+        All photographs must name their object.
+        """
+        named: dict[tuple[str, bool], set[str | None]] = {}
         for item, light in zip(self.photographs, self.lights, strict=True):
             side = str(light), item.label.removeprefix(OTHER_PREFIX) == label
-            named.setdefault(side, set()).update({item.mesh} - {None})
-        return min(map(len, named.values())) >= MIN_OBJECTS
+            named.setdefault(side, set()).add(item.mesh)
+        return all(None not in of and len(of) >= MIN_OBJECTS for of in named.values())
 
     @cached_property
     def names(self) -> np.ndarray:
@@ -166,10 +169,7 @@ class Folder:
 
     def units(self, label: str) -> np.ndarray:
         """Return the unit of each photograph: its object, or else the photograph with its crops."""
-        if not self.has_objects(label):
-            return self.names
-        is_named = [bool(item.mesh) for item in self.photographs]
-        return np.where(is_named, self.objects, self.names)
+        return self.objects if self.has_objects(label) else self.names
 
     def draw(self, label: str) -> np.ndarray:
         """Draw how often each photograph counts, shape (1 + DRAWS, N); first, each counts once.

@@ -253,9 +253,9 @@ def test_objects_of_two_classes_may_have_the_same_name():
 
 
 def test_objects_without_a_name_are_no_units():
-    named = [(f"{side}/{n}.png", n) for side in ("orange", "other_ball") for n in "1234"]
-    unnamed = [(f"{side}/{n}.png", None) for side in ("orange", "other_ball") for n in "5678"]
-    assert not folder_of(*named, *unnamed).has_objects("orange")
+    named = [(f"{side}/{n}.png", n) for side in ("orange", "other_ball") for n in "12345"]
+    assert folder_of(*named).has_objects("orange")
+    assert not folder_of(*named, ("orange/6.png", None)).has_objects("orange")
 
 
 def test_intervals_are_over_objects_only_if_each_light_shows_enough():

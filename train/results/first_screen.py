@@ -218,11 +218,11 @@ def _describe_images(pool: Pool, labels: Sequence[str]) -> str:
     """Tell on how many images and objects of the positive classes and of others scores are."""
     shown = pool.negatives.photograph
     # Object of each image without a positive class. A photograph has one prediction for each label.
-    others = {item.path: item.mesh or item.path for item in shown if item.label not in labels}
+    others = {item.path: item.mesh for item in shown if item.label not in labels}
     scored = pool.metrics.auc
     label = join_words([in_words(item) for item in labels], "or")
     # Without the names of the objects, the interval is over images.
-    counts = (scored.positive_objects, len({*others.values()}))
+    counts = (scored.positive_objects, len({*others.values()} - {None}) or len(others))
     objects = ["" if scored.over == IMAGES else f" ({count:,} objects)" for count in counts]
     positives = f"{scored.positives:,} images of {label}{objects[0]}"
     negatives = f"{len(others):,} of other objects{objects[1]}"

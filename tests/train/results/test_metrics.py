@@ -1,3 +1,4 @@
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from pathlib import PurePosixPath
@@ -167,18 +168,23 @@ def test_equal_networks_have_equal_recalls():
     assert (gain.low, gain.high) == pytest.approx((-wilson.high, wilson.high))
 
 
-@pytest.mark.parametrize(("object_count", "over"), [(4, THESE_OBJECTS), (5, OBJECTS)])
-def test_few_objects_have_an_interval_over_images(object_count, over):
+@pytest.mark.parametrize(
+    ("object_count", "unnamed", "over"),
+    [(4, 0, THESE_OBJECTS), (5, 0, OBJECTS), (5, 1, THESE_OBJECTS), (1, 39, THESE_OBJECTS)],
+)
+def test_few_or_unknown_objects_have_an_interval_over_images(object_count, unnamed, over):
     photographs = [
         Photograph(PurePosixPath(f"{number}.png"), name, None, (), f"{name}{number % count}.glb")
         for name, count in {"orange": object_count, "pear": 9}.items()
         for number in range(40 if name == "orange" else 50)
     ]
+    photographs[:unnamed] = [replace(item, mesh=None) for item in photographs[:unnamed]]
     logits = torch.randn(90, 2, generator=torch.Generator().manual_seed(1))
     scored = Pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
     metrics = scored.metrics
     assert (metrics.auc.over, metrics.recall.over) == (over, over)
     assert metrics.false_positive_rate.over == OBJECTS
+    assert metrics.auc.positive_objects == object_count
     if over == THESE_OBJECTS:
         recall = metrics.recall
         wilson = binomtest(recall.hits, 40).proportion_ci(method="wilson")
