@@ -346,9 +346,14 @@ def print_tables(
     gains, changes = {}, {}
     pairs: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for light, rows in groups.items():
-        # Only photographs of objects that both lights show are compared.
+        # Only photographs that both lights have are compared. If the lights share no name of an
+        # object's photographs, these are all photographs of the object.
         pair = rows, groups[first_light]
-        both = np.isin(folder.objects, np.intersect1d(*(folder.objects[side] for side in pair)))
+        is_named, is_shown = (
+            np.isin(units, np.intersect1d(*(units[side] for side in pair)))
+            for units in (folder.names, folder.objects)
+        )
+        both = is_named | is_shown & ~np.isin(folder.objects, folder.objects[is_named])
         pairs[light] = rows & both, groups[first_light] & both
     is_known = {title: np.isfinite(each[0].true_rank) for title, each in predictions.items()}
     for (title, light), values in results.items():
@@ -381,10 +386,11 @@ def print_tables(
         is_positive = rows & predictions[first_network][0].positive
         every, positives = (len({*units[side]}) for side in (rows, is_positive))
         print(f"{light}: {rows.sum()} images, {every} {what}, {positives} of them with {label}")
-        of_both = rows | groups[first_light]
-        if left_out := {*folder.objects[of_both & ~np.any(pairs[light], axis=0)]}:
-            names = ", ".join(sorted(left_out))
-            print(f"{light} minus {first_light} leaves out objects that one of them lacks: {names}")
+        left_out = folder.objects[(rows | groups[first_light]) & ~np.any(pairs[light], axis=0)]
+        if len(left_out):
+            names = ", ".join(sorted({*left_out}))
+            fault = f"{len(left_out)} images that one of them lacks, of {names}"
+            print(f"{light} minus {first_light} leaves out {fault}")
     return absolute
 
 

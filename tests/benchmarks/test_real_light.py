@@ -367,6 +367,20 @@ def test_the_interval_of_hardly_varying_draws_is_that_of_the_units_that_decide()
     assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
 
 
+@pytest.mark.parametrize(("names", "expected"), [("ss", 0), ("sx", 0), ("xx", 1 / 3)])
+def test_changes_between_lights_are_those_of_the_photographs_in_both(
+    tmp_path, monkeypatch, capsys, names, expected
+):
+    """Low light shows the recognized oranges, which have the names of plain light or others."""
+    for number, level in enumerate((40, 40, 200)):
+        save(tmp_path / f"orange/plain__s{number}.png", level)
+    for number, name in enumerate(names):
+        save(tmp_path / f"orange/low_light__{name}{number}.png", 40)
+    score(tmp_path, monkeypatch, "half")
+    change = capsys.readouterr().out.partition("minus plain")[2].partition("half")[2]
+    assert float(change.split("|")[2].split()[0]) == pytest.approx(expected, abs=1e-3)
+
+
 @pytest.mark.parametrize("low", [0.978, 0.1])
 def test_the_interval_of_a_perfect_score_holds_those_of_wilson_and_of_the_bootstrap(low):
     draws = np.ones(2001)
