@@ -128,7 +128,7 @@ class FirstScreen:
 def describe_place(folder: Path | None, name: str) -> str:
     """Write the start of a sentence that says where images are from."""
     if folder is None or not (folder / DESCRIPTION).is_file():
-        return f"In the images of “{name}”"
+        return f"In the images of “{name}”" if name else "In the scored images"
     settings = read_json(folder / DESCRIPTION)
     patterns = settings.get("patterns", [])
     if not patterns or settings.get("environments"):
@@ -146,7 +146,7 @@ def compare_networks(
 ) -> FirstScreen | None:
     """Make the first screen, which says whether hardening helped, and at what price.
 
-    Both networks were scored on the images `name` in `folder`, which is None if it is unknown.
+    Both networks were scored on the images `name` in `folder`. They are "" and None if unknown.
     Without `is_hardening`, the networks are two trained ones, which sentences call by their names.
     None if recall, false-positive rate or AUC is unknown.
     """
