@@ -145,12 +145,15 @@ class Folder:
         return np.array([f"{label}: {mesh}" if mesh else label for label, mesh in named])
 
     def has_objects(self, label: str) -> bool:
-        """Return whether each light shows MIN_OBJECTS objects of a class, and of other classes."""
-        named: dict[tuple[str, bool], set[str]] = {}
+        """Return whether each light shows MIN_OBJECTS objects of a class, and of other classes.
+
+        All photographs must name their object.
+        """
+        named: dict[tuple[str, bool], set[str | None]] = {}
         for item, light in zip(self.photographs, self.lights, strict=True):
             side = str(light), item.label.removeprefix(OTHER_PREFIX) == label
-            named.setdefault(side, set()).update({item.mesh} - {None})
-        return min(map(len, named.values())) >= MIN_OBJECTS
+            named.setdefault(side, set()).add(item.mesh)
+        return all(None not in of and len(of) >= MIN_OBJECTS for of in named.values())
 
     @cached_property
     def names(self) -> np.ndarray:
@@ -166,10 +169,7 @@ class Folder:
 
     def units(self, label: str) -> np.ndarray:
         """Return the unit of each photograph: its object, or else the photograph with its crops."""
-        if not self.has_objects(label):
-            return self.names
-        is_named = [bool(item.mesh) for item in self.photographs]
-        return np.where(is_named, self.objects, self.names)
+        return self.objects if self.has_objects(label) else self.names
 
     def draw(self, label: str) -> np.ndarray:
         """Draw how often each photograph counts, shape (1 + DRAWS, N); first, each counts once.
@@ -346,9 +346,14 @@ def print_tables(
     gains, changes = {}, {}
     pairs: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for light, rows in groups.items():
-        # Only photographs of objects that both lights show are compared.
+        # Only photographs that both lights have are compared. If the lights share no name of an
+        # object's photographs, these are all photographs of the object.
         pair = rows, groups[first_light]
-        both = np.isin(folder.objects, np.intersect1d(*(folder.objects[side] for side in pair)))
+        is_named, is_shown = (
+            np.isin(units, np.intersect1d(*(units[side] for side in pair)))
+            for units in (folder.names, folder.objects)
+        )
+        both = is_named | is_shown & ~np.isin(folder.objects, folder.objects[is_named])
         pairs[light] = rows & both, groups[first_light] & both
     is_known = {title: np.isfinite(each[0].true_rank) for title, each in predictions.items()}
     for (title, light), values in results.items():
@@ -381,10 +386,11 @@ def print_tables(
         is_positive = rows & predictions[first_network][0].positive
         every, positives = (len({*units[side]}) for side in (rows, is_positive))
         print(f"{light}: {rows.sum()} images, {every} {what}, {positives} of them with {label}")
-        of_both = rows | groups[first_light]
-        if left_out := {*folder.objects[of_both & ~np.any(pairs[light], axis=0)]}:
-            names = ", ".join(sorted(left_out))
-            print(f"{light} minus {first_light} leaves out objects that one of them lacks: {names}")
+        left_out = folder.objects[(rows | groups[first_light]) & ~np.any(pairs[light], axis=0)]
+        if len(left_out):
+            names = ", ".join(sorted({*left_out}))
+            fault = f"{len(left_out)} images that one of them lacks, of {names}"
+            print(f"{light} minus {first_light} leaves out {fault}")
     return absolute
 
 

@@ -253,9 +253,9 @@ def test_objects_of_two_classes_may_have_the_same_name():
 
 
 def test_objects_without_a_name_are_no_units():
-    named = [(f"{side}/{n}.png", n) for side in ("orange", "other_ball") for n in "1234"]
-    unnamed = [(f"{side}/{n}.png", None) for side in ("orange", "other_ball") for n in "5678"]
-    assert not folder_of(*named, *unnamed).has_objects("orange")
+    named = [(f"{side}/{n}.png", n) for side in ("orange", "other_ball") for n in "12345"]
+    assert folder_of(*named).has_objects("orange")
+    assert not folder_of(*named, ("orange/6.png", None)).has_objects("orange")
 
 
 def test_intervals_are_over_objects_only_if_each_light_shows_enough():
@@ -365,6 +365,20 @@ def test_the_interval_of_hardly_varying_draws_is_that_of_the_units_that_decide()
     found = real_light.estimate(draws, 2)
     expected = binomtest(2, 2).proportion_ci(method="wilson")
     assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+
+
+@pytest.mark.parametrize(("names", "expected"), [("ss", 0), ("sx", 0), ("xx", 1 / 3)])
+def test_changes_between_lights_are_those_of_the_photographs_in_both(
+    tmp_path, monkeypatch, capsys, names, expected
+):
+    """Low light shows the recognized oranges, which have the names of plain light or others."""
+    for number, level in enumerate((40, 40, 200)):
+        save(tmp_path / f"orange/plain__s{number}.png", level)
+    for number, name in enumerate(names):
+        save(tmp_path / f"orange/low_light__{name}{number}.png", 40)
+    score(tmp_path, monkeypatch, "half")
+    change = capsys.readouterr().out.partition("minus plain")[2].partition("half")[2]
+    assert float(change.split("|")[2].split()[0]) == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize("low", [0.978, 0.1])

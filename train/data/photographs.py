@@ -218,10 +218,11 @@ def _has_class_folders(
     names = folder_names(folder)
     known = [name for name in names if name in classes or name.startswith(OTHER_PREFIX)]
     no_classes = [name for name in names if name not in known]
+    lowered = [label.lower() for label in labels]
     for name in no_classes:
         # A name that resembles a positive class must not count as a negative by mistake.
-        is_misspelled = any(label in name.lower() for label in labels)
-        if not known or is_misspelled or get_close_matches(name.lower(), labels):
+        is_misspelled = any(label in name.lower() for label in lowered)
+        if not known or is_misspelled or get_close_matches(name.lower(), lowered):
             fault = f"{folder / name} is not a class, such as {nearest(name, classes)}"
             raise InputError(f"{fault}: rename it, hard negatives to {OTHER_PREFIX}{name}")
     if no_classes:
@@ -248,6 +249,8 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
                 if None in cells:
                     raise ValueError(f"the row of {cells['path']} has more cells than columns")
                 line = {key: cell.strip() for key, cell in cells.items()}
+                if not any(line.values()):  # Spreadsheets write empty rows as commas.
+                    continue
                 path = PurePosixPath(line["path"].replace("\\", "/"))
                 hard_negatives = split_sources(line.get("hard_negatives", ""))
                 row = (line["source_tag"] or None, hard_negatives, line.get("mesh") or None)

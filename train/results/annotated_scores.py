@@ -242,7 +242,7 @@ def evaluate_detector(
         contents=f"{missing} with {overall.n} objects",
         pictures=pictures,
         task=task,
-        labels=[*label_of_class],
+        labels=[*by_label],
         overall=overall,
         by_label=by_label,
         by_source=by_source,
@@ -253,7 +253,7 @@ def evaluate_detector(
 def _choose_labels(
     annotations: Annotations, classes: Sequence[str], labels: Sequence[str] | None
 ) -> dict[str, int]:
-    """Return the index in the network of each scored class, by its name in the annotations."""
+    """Return the index in the network of each scored class, by its names in the annotations."""
     # None for a class that the network lacks.
     known = {name: class_of_name(name, classes) for name in annotations.classes}
     # A class is named as in the annotations, as in the network, or by its index in the network.
@@ -273,7 +273,9 @@ def _choose_labels(
         raise InputError(f"{fault} network (such as {', '.join(classes[:3])}): give classes")
     if lacking:
         console.warning("not scored, because the network lacks them: %s", ", ".join(lacking))
-    return {name: classes.index(own) for name in chosen if (own := known[name]) is not None}
+    # Names may differ in their case alone. The first name of a class is that in tables.
+    wanted = {known[name] for name in chosen} - {None}
+    return {name: classes.index(known[name]) for name in (*chosen, *known) if known[name] in wanted}
 
 
 def _score(
@@ -281,7 +283,9 @@ def _score(
 ) -> dict[str, DetectionMetrics]:
     """Return the metrics of all classes, and of each class, in some photographs."""
     at_iou, at_half = map(detections.join, zip(*matches, strict=True))
-    groups = {ALL: [*labels.values()], **{name: [label] for name, label in labels.items()}}
+    # The first name of each class.
+    names = {own: next(name for name in labels if labels[name] == own) for own in labels.values()}
+    groups = {ALL: [*names], **{name: [label] for label, name in names.items()}}
     # A score of 32 bits reaches the threshold that rounds to it.
     threshold = min(task.threshold, float(np.float32(task.threshold)))
     return {

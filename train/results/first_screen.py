@@ -128,7 +128,7 @@ class FirstScreen:
 def describe_place(folder: Path | None, name: str) -> str:
     """Write the start of a sentence that says where images are from."""
     if folder is None or not (folder / DESCRIPTION).is_file():
-        return f"In the images of “{name}”"
+        return f"In the images of “{name}”" if name else "In the scored images"
     settings = read_json(folder / DESCRIPTION)
     patterns = settings.get("patterns", [])
     if not patterns or settings.get("environments"):
@@ -146,7 +146,7 @@ def compare_networks(
 ) -> FirstScreen | None:
     """Make the first screen, which says whether hardening helped, and at what price.
 
-    Both networks were scored on the images `name` in `folder`, which is None if it is unknown.
+    Both networks were scored on the images `name` in `folder`. They are "" and None if unknown.
     Without `is_hardening`, the networks are two trained ones, which sentences call by their names.
     None if recall, false-positive rate or AUC is unknown.
     """
@@ -218,11 +218,11 @@ def _describe_images(pool: Pool, labels: Sequence[str]) -> str:
     """Tell on how many images and objects of the positive classes and of others scores are."""
     shown = pool.negatives.photograph
     # Object of each image without a positive class. A photograph has one prediction for each label.
-    others = {item.path: item.mesh or item.path for item in shown if item.label not in labels}
+    others = {item.path: item.mesh for item in shown if item.label not in labels}
     scored = pool.metrics.auc
     label = join_words([in_words(item) for item in labels], "or")
     # Without the names of the objects, the interval is over images.
-    counts = (scored.positive_objects, len({*others.values()}))
+    counts = (scored.positive_objects, len({*others.values()} - {None}) or len(others))
     objects = ["" if scored.over == IMAGES else f" ({count:,} objects)" for count in counts]
     positives = f"{scored.positives:,} images of {label}{objects[0]}"
     negatives = f"{len(others):,} of other objects{objects[1]}"

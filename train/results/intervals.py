@@ -258,7 +258,8 @@ def _half_width(
 def _covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Compute the jackknife covariance of statistics from their values (..., k) without units."""
     count = one.shape[-1]
-    deviations = (x - x.mean(axis=-1, keepdims=True) for x in (one, other))
+    # Equal values may differ from their mean by rounding, which is no variance.
+    deviations = ((x - x.mean(axis=-1, keepdims=True)).round(12) for x in (one, other))
     return (count - 1) * np.mean(np.multiply(*deviations), axis=-1)
 
 

@@ -66,9 +66,10 @@ class AreaUnderCurve(Estimate):
 
     Attributes:
         positives: Number of positive images.
-        positive_objects: Number of different objects in the positive images.
+        positive_objects: Number of different objects in the positive images that have
+            a name, or of different images if no object has.
         negatives: Number of negative images.
-        negative_objects: Number of different objects in the negative images.
+        negative_objects: The same number of the negative images.
     """
 
     positives: int = 0
@@ -242,7 +243,7 @@ class Pool(ShortRepr):
         known = {name: jackknife.estimate for name, jackknife in self._rankings.items()}
         auc, *recalls = (known.get(name, Estimate()) for name in ROC_METRICS)
         # Numbers of images and objects.
-        positives, negatives = ((len(group), len({*_objects(group)})) for group in self.ranked)
+        positives, negatives = ((len(group), len(_objects(group))) for group in self.ranked)
         area = auc.value, auc.low, auc.high, auc.over
         auc_with_counts = AreaUnderCurve(*area, *positives, *negatives)
         recall_at = dict(zip(RATES, recalls, strict=True))
@@ -291,20 +292,22 @@ class Pool(ShortRepr):
 def choose_units(*groups: Predictions) -> Units:
     """Choose objects as units if each group shows enough of them, and otherwise images.
 
-    Images show the same object if they have the same label and mesh. An image with an
-    unknown mesh counts as a different object.
+    Images show the same object if they have the same label and mesh. If the mesh of an image is
+    unknown, images are the units.
     """
-    objects = [_objects(group) for group in groups]
-    images = [[item.path for item in group.photograph] for group in groups]
-    has_enough = all(len({*names}) >= MIN_OBJECTS for names in objects)
+    shown = [group.photograph for group in groups]
+    is_named = [bool(item.mesh) for items in shown for item in items]
+    has_enough = all(is_named) and all(len(_objects(group)) >= MIN_OBJECTS for group in groups)
+    objects = [[(item.label, item.mesh) for item in items] for items in shown]
+    images = [[item.path for item in items] for items in shown]
     units, over = (objects, OBJECTS) if has_enough else (images, THESE_OBJECTS)
-    return Units([_number(names) for names in units], IMAGES if objects == images else over)
+    return Units([_number(names) for names in units], over if any(is_named) else IMAGES)
 
 
-def _objects(predictions: Predictions) -> list[object]:
-    """Name the object that each photograph shows."""
+def _objects(predictions: Predictions) -> set[object]:
+    """Name the objects that photographs show. Without any name, each photograph is an object."""
     items = predictions.photograph
-    return [(item.label, item.mesh) if item.mesh else item.path for item in items]
+    return {(item.label, item.mesh) for item in items if item.mesh} or {item.path for item in items}
 
 
 def _number(names: Iterable[object]) -> np.ndarray:

@@ -117,12 +117,15 @@ def _title(found: store.Findings, methods: Methods) -> str:
     # Positive classes of all runs.
     stored = [scores for runs in methods.values() for scores in runs[0].photographs.values()]
     labels = {label for scores in stored for label in scores.labels}
-    trained = [method for method, runs in methods.items() if runs[0].mode != store.INITIAL]
+    modes = {method: runs[0].mode for method, runs in methods.items()}
     # A run that began with a network hardened it.
-    if labels and len(trained) < len(methods):
+    if labels and store.INITIAL in modes.values():
         return f"Hardened against unusual lighting: {', '.join(map(in_words, sorted(labels)))}"
     subject = " and ".join(sorted(labels)) or "Networks"
-    return f"{subject}, trained with renders: {', '.join(trained)}"
+    rendered = [method for method, mode in modes.items() if mode in MODES and mode != "none"]
+    if not rendered:
+        return f"{subject}: {', '.join(methods)}"
+    return f"{subject}, trained with renders: {', '.join(rendered)}"
 
 
 def write_page(out: Path, script: str = "", **content: Any) -> Path:
@@ -250,6 +253,8 @@ def _first_screen(groups: Mapping[str, Scored]) -> first_screen.FirstScreen | No
             run, name = group[method][0]
             compared = evaluations[base], evaluations[method], names
             images = images_folder(run, name)
+            # The folder of scores of a network without a run does not name the images.
+            name = name if run.config else ""
             screen = first_screen.compare_networks(*compared, images, name, bool(hardened))
             if screen is not None:
                 return screen

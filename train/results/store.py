@@ -189,8 +189,12 @@ def _read(folder: Path) -> RunSummary:
     name = str(Path(*path.parts[-2:]))
     settings: dict[str, Any] = {"network": str(path)}
     if (folder / SUMMARY).is_file():
+        summary = read_json(folder / SUMMARY)
+        if "task" in summary:
+            fault = f"{folder} has scores of {summary['task']}"
+            raise InputError(f"{fault}: give pnb-compare and pnb-report those of classifiers")
         # pnb-evaluate wrote it. The folder lies in its parent as scores lie in the folder of a run.
-        scores = {path.name: StoredScores.read(read_json(folder / SUMMARY))}
+        scores = {path.name: StoredScores.read(summary)}
         return RunSummary(path.parent, name, settings, scores, accuracy=None)
     if (folder / PUBLISHED).is_file():
         # This import is here because it imports torch, which other results do not need.

@@ -103,8 +103,9 @@ class Table:
 def write_csv(path: Path, rows: Iterable[Iterable[object]], line_end: str = "\n") -> None:
     """Write rows, of which the first is the header, to a CSV file."""
     text = io.StringIO()
-    csv.writer(text, lineterminator=line_end).writerows(rows)
-    atomic_write(path, text.getvalue())
+    # A cell is quoted if it has a character of the line end. No cell has the character 0.
+    csv.writer(text, lineterminator="\r\n\0").writerows(rows)
+    atomic_write(path, text.getvalue().replace("\r\n\0", line_end))
 
 
 def as_text(value: object) -> str:

@@ -93,6 +93,20 @@ def test_the_order_of_images_in_the_file_does_not_matter(photographs):
     assert precision == [1, 1]
 
 
+@pytest.mark.parametrize("label", [None, "dog", "Dog"])
+def test_names_that_differ_in_their_case_are_one_class(photographs, label):
+    file = photographs / "annotations.json"
+    expected = nb.evaluate(_find_white, photographs, "dog", classes=CLASSES, size=120).overall
+    content = json.loads(file.read_text())
+    content["categories"][1:] = [{"id": 19, "name": "Dog"}]
+    content["annotations"][0]["category_id"] = 19
+    file.write_text(json.dumps(content))
+    scores = nb.evaluate(_find_white, photographs, label, classes=CLASSES, size=120)
+    assert scores.labels == [label or "dog"]
+    assert scores.by_label == {label or "dog": expected}
+    assert scores.overall == expected
+
+
 def test_a_class_that_the_network_lacks_is_not_scored(photographs):
     scores = nb.evaluate(_find_white, photographs, classes=CLASSES, size=120)
     assert scores.labels == ["dog", "Cow"]

@@ -137,6 +137,13 @@ def test_a_folder_of_another_layout_is_refused(tmp_path, files, label, message):
         photographs.find_photographs(tmp_path / files[0], CLASSES, "orange")
 
 
+@pytest.mark.parametrize("label", ["tv", "TV"])
+def test_a_folder_that_resembles_a_positive_class_is_refused_in_any_case(tmp_path, label):
+    touch(tmp_path, "tv_set/a.jpg", "pear/b.jpg")
+    with pytest.raises(InputError, match="tv_set is not a class"):
+        photographs.find_photographs(tmp_path, ["pear", label], label)
+
+
 def test_folders_of_no_class_of_the_model_count_as_other_things_and_are_named(tmp_path, caplog):
     found = find(touch(tmp_path, "orange/a.jpg", "lion/b.jpg", "other_bee/c.jpg"))
     assert [label for _, label in found] == ["lion", "orange", "other_bee"]
@@ -151,6 +158,7 @@ def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns
         "orange,lab; web,orange/a.jpg,sun",
         "orange,,orange/b.jpg,web",
         "lemon,;,other_lemon\\c.jpg,lab", "pear,,pear/d.jpg,", "fig,,fig/gone.jpg,web", "",
+        ",,,", " , ,,",
     ]  # fmt: skip
     (tmp_path / "photos.csv").write_text("\ufeff" + "\n".join(rows), encoding="utf-8")
     with caplog.at_level(logging.WARNING):

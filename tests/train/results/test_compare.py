@@ -131,6 +131,22 @@ def test_only_scores_on_the_same_images_share_a_plot_and_a_table(scored_run, tmp
     assert methods == [["none", "random"], ["adversarial"]]
 
 
+@pytest.mark.parametrize(
+    ("modes", "is_run", "trained"),
+    [("none random", True, "random"), ("none random", False, ""), ("none none", True, "")],
+)
+def test_a_report_tells_what_was_trained_with_renders_and_on_which_images_networks_were_scored(
+    scored_run, tmp_path, modes, is_run, trained
+):
+    folders = []
+    for index, mode in enumerate(modes.split()):
+        folder = scored_run(mode, STUDIO_AND_WEB, f"train.epochs={index + 2}", name="images")
+        folders.append(folder if is_run else folder / "images")
+    text = write_report(folders, tmp_path / "out")[0].read_text()
+    assert re.findall("renders: ([^<,]*)", re.search("<title>.*", text)[0]) == trained.split()
+    assert ("“images”" in text) == is_run
+
+
 class TestAHardenedNetwork:
     @pytest.fixture
     def initial(self, scored_run) -> Path:

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from pathlib import PurePosixPath
@@ -167,18 +168,23 @@ def test_equal_networks_have_equal_recalls():
     assert (gain.low, gain.high) == pytest.approx((-wilson.high, wilson.high))
 
 
-@pytest.mark.parametrize(("object_count", "over"), [(4, THESE_OBJECTS), (5, OBJECTS)])
-def test_few_objects_have_an_interval_over_images(object_count, over):
+@pytest.mark.parametrize(
+    ("object_count", "unnamed", "over"),
+    [(4, 0, THESE_OBJECTS), (5, 0, OBJECTS), (5, 1, THESE_OBJECTS), (1, 39, THESE_OBJECTS)],
+)
+def test_few_or_unknown_objects_have_an_interval_over_images(object_count, unnamed, over):
     photographs = [
         Photograph(PurePosixPath(f"{number}.png"), name, None, (), f"{name}{number % count}.glb")
         for name, count in {"orange": object_count, "pear": 9}.items()
         for number in range(40 if name == "orange" else 50)
     ]
+    photographs[:unnamed] = [replace(item, mesh=None) for item in photographs[:unnamed]]
     logits = torch.randn(90, 2, generator=torch.Generator().manual_seed(1))
     scored = Pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
     metrics = scored.metrics
     assert (metrics.auc.over, metrics.recall.over) == (over, over)
     assert metrics.false_positive_rate.over == OBJECTS
+    assert metrics.auc.positive_objects == object_count
     if over == THESE_OBJECTS:
         recall = metrics.recall
         wilson = binomtest(recall.hits, 40).proportion_ci(method="wilson")
@@ -235,7 +241,11 @@ def test_a_prediction_is_held_against_the_threshold_of_its_own_label():
     assert [outcomes[name].hits.sum() for name in AT_THRESHOLD] == [2, 0]
 
 
-def test_a_recall_of_1_has_wilsons_interval_for_the_objects_with_students_quantile():
-    found = mean_of(np.ones(140), np.arange(140) % 7).estimate
-    quantile = student_t(6).ppf(0.975)
-    assert (found.low, found.high) == pytest.approx((7 / (7 + quantile**2), 1))
+@pytest.mark.parametrize("hits", [[1, 1, 1], [1, 1, 0], [1, 0, 0, 0, 0]])
+@pytest.mark.parametrize("count", [7, 30])
+def test_equal_objects_have_wilsons_interval_for_their_number_with_students_quantile(hits, count):
+    """The ends p of Wilson's interval of a fraction f solve (f - p)² = t² p (1 - p) / n."""
+    found = mean_of(np.tile(hits, count), np.arange(count).repeat(len(hits))).estimate
+    fraction, square = np.mean(hits), student_t(count - 1).ppf(0.975) ** 2 / count
+    ends = sorted(np.roots([1 + square, -2 * fraction - square, fraction**2]))
+    assert (found.low, found.high) == pytest.approx(ends)

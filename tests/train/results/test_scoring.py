@@ -187,14 +187,14 @@ def test_a_source_is_ranked_against_the_hard_negatives_that_it_names(fruit, tmp_
 
 
 def test_meshes_are_objects_and_ranked_against_all_images_of_the_other_kind(fruit, tmp_path):
-    """Meshes m and n are oranges, and mesh k is another thing. Images without one are objects."""
+    """Meshes m and n are oranges, and mesh k is another thing. Images without one do not count."""
     mesh_of_letter = {"a": "m", "c": "m", "b": "n", "h": "k", "i": "k"}
     *_, folder = fruit
     write_table(folder, mesh=[mesh_of_letter.get(item.letter, "") for item in FRUIT])
     scores = scored(*fruit, "orange", tmp_path / "out", by="mesh")
     summary = scores.to_summary()
-    assert summary["auc"]["positive_objects"] == 4  # m, n, d, e
-    assert summary["auc"]["negative_objects"] == 4  # f, g, k, j
+    assert summary["auc"]["positive_objects"] == 2  # m, n
+    assert summary["auc"]["negative_objects"] == 1  # k
     assert summary["auc"]["over"] == THESE_OBJECTS
     assert THESE_OBJECTS in scoring.format_scores(scores)
     for mesh, is_orange in (("k", False), ("m", True)):

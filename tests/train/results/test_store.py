@@ -1,3 +1,4 @@
+import json
 import subprocess
 import sys
 from dataclasses import asdict
@@ -18,6 +19,13 @@ def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
         (tmp_path / "metrics.jsonl").write_text(lines)
     with pytest.raises(InputError, match="holds no finished run"):
         summarize(tmp_path)
+
+
+@pytest.mark.parametrize("task", ["detection", "segmentation"])
+def test_scores_of_other_tasks_are_not_compared_as_those_of_classifiers(tmp_path, task):
+    (tmp_path / "summary.json").write_text(json.dumps({"task": task, "label": ["dog"]}))
+    with pytest.raises(InputError, match=f"{tmp_path} has scores of {task}"):
+        finished_runs([tmp_path])
 
 
 @pytest.fixture(scope="module")

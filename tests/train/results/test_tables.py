@@ -1,3 +1,4 @@
+import csv
 import os
 import shutil
 import sys
@@ -37,6 +38,14 @@ def test_a_number_in_a_table_has_three_digits_and_no_exponent(value):
     found = float(tables.as_text(value).replace(",", ""))
     assert found == pytest.approx(value, rel=0.005)
     assert "e" not in tables.as_text(value)
+
+
+@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
+def test_any_characters_of_a_name_are_read_again_from_a_csv_file(tmp_path, line_end):
+    rows = [["path", "label"], ["Icon\r.png", "a\nb"], ["c\r\nd", 'e,"f"'], ["", "é"]]
+    tables.write_csv(tmp_path / "a.csv", rows, line_end)
+    with (tmp_path / "a.csv").open(newline="", encoding="utf-8") as file:
+        assert list(csv.reader(file, strict=True)) == rows
 
 
 def split_cells(line: str) -> list[str]:
