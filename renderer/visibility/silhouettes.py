@@ -32,7 +32,7 @@ proportional to the depth, and 1 without perspective.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -323,6 +323,7 @@ def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
     return row // samples * width + column // samples
 
 
+@dataclass(eq=False, repr=False)
 class _Silhouettes:
     """Silhouette edges of a view, which may be hidden.
 
@@ -332,27 +333,24 @@ class _Silhouettes:
     normal in the image.
     """
 
-    def __init__(
-        self,
-        fragments: Fragments,
-        positions: Float[Tensor, "V 3"],
-        nearness: Float[Tensor, " V"],
-        faces: Int[np.ndarray, "F 3"],
-        sample_grid: Int[Tensor, "_ _"],
-    ):
+    fragments: Fragments
+    positions: InitVar[Float[Tensor, "V 3"]]
+    nearness: Float[Tensor, " V"]
+    faces: InitVar[Int[np.ndarray, "F 3"]]
+    sample_grid: Int[Tensor, "_ _"]
+
+    def __post_init__(self, positions: Tensor, faces: np.ndarray) -> None:
         """Find the silhouette edges, from homogeneous positions."""
-        self.fragments = fragments
-        self.nearness = nearness
-        self.sample_grid = sample_grid
+        nearness = self.nearness
         x, y, w = positions.T
         points = torch.stack([x / w, y / w, nearness], dim=1)
         # Positions are rounded to subsamples as in rasterizers.
-        rows, columns = sample_grid.shape
+        rows, columns = self.sample_grid.shape
         self.places = to_fixed_point(points, (rows, columns))[0].T.double() / SUBSAMPLES
         self.ends, all_ends = _silhouette_edges(self.places, faces)
         # Vertices that no face uses do not count.
         self.nearness_range = nearness[all_ends].max() - nearness[all_ends].min()
-        if len(fragments.sample_to_seen_face) == 0:
+        if len(self.fragments.sample_to_seen_face) == 0:
             self.ends = self.ends[:, :0]  # If no sample shows the mesh, no silhouette is visible.
         # An edge (a, b) with y down has the normal (b, a) with y up.
         normal = self.places[:, self.ends].diff(dim=1)[:, 0].flip(0)
