@@ -352,7 +352,8 @@ class AugmentationService:
         values = self._random_values(problem, number)
         # This process renders its own rows in their single view, and gets those of the others.
         own = self._own_rows(len(self.labels))
-        images = self._gather(problem.images(values, own)[:, 0], own, len(self.labels))
+        of_all = own, len(self.labels), self.world_size
+        images = distributed.all_gather_rows(problem.images(values, own)[:, 0], *of_all)
         if self._finds_objects:
             truth = self._truth(problem, values)
             return _Made(values, images, self._find(model, images, truth), truth=truth)
@@ -455,9 +456,10 @@ class AugmentationService:
         with network.frozen_eval_mode(model), self.phases("attack_classifier"):
             is_fooled = objective.fooled_in_views(result.images, result.predicted, shard)
         # Examples that are misclassified before the attack count as successes.
-        success = self._gather(is_fooled.all(1) | result.success_before, own, len(attacked))
+        of_all = own, len(attacked), self.world_size
+        success = distributed.all_gather_rows(is_fooled.all(1) | result.success_before, *of_all)
         # Replace the result of this process by the results of all processes.
-        result = result.map(lambda part: self._gather(part, own, len(attacked)))
+        result = result.map(lambda part: distributed.all_gather_rows(part, *of_all))
         values = values.index_copy(0, attacked, result.values)
         if self.settings.warm_start:
             self._last_values = values
@@ -484,10 +486,6 @@ class AugmentationService:
         With more processes than examples, several processes get the same example.
         """
         return torch.arange(self.rank % count, count, self.world_size).to(self.labels.device)
-
-    def _gather(self, part: Tensor, own: Int[Tensor, " A"], count: int) -> Tensor:
-        """Collect from all processes what each computed for its `_own_rows` of the examples."""
-        return distributed.all_gather_rows(part, own, count, self.world_size)
 
     def _attack_criterion(self) -> ClassCriterion:
         """Return the source and the target class of the attack on each example.
