@@ -22,7 +22,7 @@ from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed
 from augment.augmentation_settings import AugmentationSettings, views_of
 from augment.classifier import CheckedNetwork
 from augment.progress import Phases
-from augment.renders import Renders, select_examples_to_log
+from augment.renders import SHOWN_EXAMPLES, AttackExamples, Renders
 from augment.scene.build import MeshItem, build_scene, warn_of_exposure, with_needed_degree
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
@@ -248,7 +248,6 @@ class AugmentationService:
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
         problem = self.problem(number)
-        # Both functions return the attack values, the images and numbers about them.
         make = self._random if self.settings.mode == "random" else self._adversarial
         made = make(model, problem, number)
         if number == 0:
@@ -258,9 +257,24 @@ class AugmentationService:
             truth = made.truth or self._truth(problem, made.values)
             return Renders(made.images, self.labels, diagnostics, targets=truth.targets())
         # Classification has no boxes, but a few examples for figures.
-        chosen = (made.values, made.is_wrong, self.labels)
-        examples = select_examples_to_log(model, problem, *chosen)
+        examples = self._examples(model, problem, made)
         return Renders(made.images, self.labels, diagnostics, examples)
+
+    def _examples(self, model: nn.Module, problem: SceneProblem, made: _Made) -> AttackExamples:
+        """Render and classify some examples of a successful attack, evenly spaced, for a figure."""
+        assert made.is_wrong is not None
+        rows = torch.nonzero(made.is_wrong).squeeze(1)
+        rows = rows[network.evenly_spaced(len(rows), SHOWN_EXAMPLES).to(rows.device)]
+        before = problem.conditions(problem.start[rows], rows)
+        after = problem.conditions(made.values[rows], rows)
+        with network.frozen_eval_mode(model), torch.no_grad():
+            # Each example has one view.
+            images = [problem.scene.render(one, rows)[:, 0] for one in (before, after)]
+            logits = [model(one).float() if len(rows) else one.new_zeros(0, 0) for one in images]
+        predictions = torch.stack(logits).softmax(2)
+        lights = torch.stack([before.light, after.light])
+        labels, basis = self.labels[rows], problem.scene.basis
+        return AttackExamples(torch.stack(images), lights, predictions, labels, basis)
 
     def problem(self, number: int) -> SceneProblem:
         """Vary the scene at random, and return what an attack on it may change."""

@@ -99,7 +99,7 @@ def _torchvision(
         size = facts.size or transforms.crop_size[0]
         classes = facts.classes or tuple(published.meta["categories"])
         options: dict[str, Any] = {"num_classes": len(classes)}
-        # They were trained with other images than those of ImageNet, and convert the latter.
+        # These were trained with another normalization, and convert images to it.
         if model in ("googlenet", "inception_v3"):
             options |= {"transform_input": True, "init_weights": False}
         if model.startswith("vit_"):

@@ -172,7 +172,6 @@ def _attack(
         settings = replace(settings, optimizer=RANDOM_SEARCH)
         limit = f"at most {settings.query_limit} queries for each example (max_queries, optimizer)"
         reason = f"classifier {classifier.name} has no gradients: random search attacks it with"
-        # `stacklevel` makes Python name the user's call of `attack` in the warning.
         warnings.warn(f"{reason} {limit}", stacklevel=3)
     if settings.eot.draws and not isinstance(classifier.task, Classification):
         advice = "set eot.draws=0"

@@ -98,7 +98,6 @@ def save(
     after = result.conditions
     shown_paths = enumerate(progress(paths, "saving"))
     lines = [_write_example(result, after, example, path) for example, path in shown_paths]
-    # Versions of the attacked images, which are judged like the images themselves.
     versions = {
         "float": images,
         "8 bits": to_unit(to_bytes(images)),
@@ -238,7 +237,6 @@ def figure(result: AttackResult, example: int) -> Image.Image:
         for title, (light, basis) in {"initial light": first, "adversarial light": last}.items():
             balls = [light_sphere(light, SIDE, camera, basis) for camera in cameras]
             columns[title] = tiles_of(balls)
-    # `draw_grid` takes rows of tiles, one for each view, and the titles of the columns.
     return draw_grid(list(zip(*columns.values(), strict=True)), list(columns))
 
 

@@ -343,7 +343,7 @@ class _Reader:
             given, title = outputs, f"decode of {title}"
             with errors.explained(f"{title} fails on {errors.describe(given)}"):
                 outputs = task.decode(given)
-        elif _is_transformer(outputs) or _is_rt_detr(outputs):
+        elif _is_transformer(outputs):
             outputs = _of_transformer(outputs, images, title, self.class_count)
         if _is_ultralytics(outputs):
             outputs, is_raw = _of_ultralytics(outputs[0]), True
@@ -444,9 +444,14 @@ def log_odds_of(scores: Tensor) -> Tensor:
 
 
 def _is_transformer(outputs: Any) -> bool:
-    """Return whether outputs are those of an object detector of transformers."""
+    """Return whether outputs are those of an object detector of transformers, or like them.
+
+    RT-DETR of Ultralytics returns final boxes and five parts.
+    """
     keys = {*outputs} if isinstance(outputs, Mapping) else set()
-    return hasattr(outputs, "pred_boxes") or {"logits", "pred_boxes"} <= keys
+    if hasattr(outputs, "pred_boxes") or {"logits", "pred_boxes"} <= keys:
+        return True
+    return _is_ultralytics(outputs) and isinstance(outputs[1], tuple) and len(outputs[1]) == 5
 
 
 def _of_transformer(
@@ -490,11 +495,6 @@ def _is_ultralytics(outputs: Any) -> bool:
     """Return whether outputs are a tensor of boxes, and what Ultralytics computes it from."""
     is_pair = isinstance(outputs, tuple) and len(outputs) == 2
     return is_pair and isinstance(outputs[0], Tensor) and outputs[0].ndim == 3
-
-
-def _is_rt_detr(outputs: Any) -> bool:
-    """Return whether outputs are final boxes and five parts, as RT-DETR of Ultralytics returns."""
-    return _is_ultralytics(outputs) and isinstance(outputs[1], tuple) and len(outputs[1]) == 5
 
 
 def _of_ultralytics(outputs: Tensor) -> list[dict[str, Tensor]]:

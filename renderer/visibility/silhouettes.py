@@ -347,7 +347,17 @@ class _Silhouettes:
         # Positions are rounded to subsamples as in rasterizers.
         rows, columns = self.sample_grid.shape
         self.places = to_fixed_point(points, (rows, columns))[0].T.double() / SUBSAMPLES
-        self.ends, all_ends = _silhouette_edges(self.places, faces)
+        key = np.ascontiguousarray(faces, dtype=np.int64).tobytes()
+        all_ends, edge_of_side, direction, face_count = _edges(key, positions.device)
+        corners = torch.from_numpy(faces).to(positions.device).T
+        orientation = doubled_areas(self.places[:, corners]).sign()
+        # One number for each face and each of its three edges: 1 if the face lies on one side of
+        # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
+        side_of_face = (orientation * direction).flatten()
+        side_sums = self.places.new_zeros(len(face_count)).index_add_(0, edge_of_side, side_of_face)
+        # All n faces of an edge lie on the same side in the image if the sum is n or -n. It is
+        # n - 1 or 1 - n if one of them is seen edge-on, because this face counts 0.
+        self.ends = all_ends[:, side_sums.abs() > face_count - 2]
         # Vertices that no face uses do not count.
         self.nearness_range = nearness[all_ends].max() - nearness[all_ends].min()
         if len(self.fragments.sample_to_seen_face) == 0:
@@ -457,23 +467,6 @@ def _cut_edges(
     next_sample = position.ceil().long()
     is_inside = (next_sample > 0) & (next_sample < shape[1])
     return edge[is_inside], line[is_inside], fraction[is_inside], next_sample[is_inside]
-
-
-def _silhouette_edges(
-    places: Float[Tensor, "2 V"], faces: Int[np.ndarray, "F 3"]
-) -> tuple[Int[Tensor, "2 N"], Int[Tensor, "2 E"]]:
-    """Find the vertices of edges whose faces all lie on one side in the image, and of all edges."""
-    key = np.ascontiguousarray(faces, dtype=np.int64).tobytes()
-    ends, edge_of_side, direction, face_count = _edges(key, places.device)
-    corners = torch.from_numpy(faces).to(places.device).T
-    orientation = doubled_areas(places[:, corners]).sign()
-    # One number for each face and each of its three edges: 1 if the face lies on one side of
-    # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
-    side_of_face = (orientation * direction).flatten()
-    side_sums = places.new_zeros(len(face_count)).index_add_(0, edge_of_side, side_of_face)
-    # All n faces of an edge lie on the same side if the sum is n or -n. It is n - 1 or
-    # 1 - n if one of them is seen edge-on, because this face counts 0.
-    return ends[:, side_sums.abs() > face_count - 2], ends
 
 
 @lru_cache(maxsize=4)
