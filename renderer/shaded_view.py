@@ -123,11 +123,10 @@ class ShadedView:
             fragments, camera, self.vertices, self.mesh.faces, sample_radiance, background
         )
         uncovered_count = len(uncovered_pixels)
-        return PixelRadiance(
-            pixels=torch.cat([fragments.pixels, uncovered_pixels]),
-            coverage=F.pad(fragments.coverage.to(at_pixels), (0, uncovered_count)),
-            radiance=F.pad(at_pixels, (0, uncovered_count)) + zeros_with_gradient,
-        )
+        pixels = torch.cat([fragments.pixels, uncovered_pixels])
+        coverage = F.pad(fragments.coverage.to(at_pixels), (0, uncovered_count))
+        pixel_radiance = F.pad(at_pixels, (0, uncovered_count)) + zeros_with_gradient
+        return PixelRadiance(pixels, coverage, pixel_radiance)
 
     def radiance(self) -> Float[Tensor, "3 P"]:
         """Compute the linear radiance of the P covered pixels, times their coverage."""
