@@ -273,8 +273,8 @@ class AugmentationService:
             logits = [model(one).float() if len(rows) else one.new_zeros(0, 0) for one in images]
         predictions = torch.stack(logits).softmax(2)
         lights = torch.stack([before.light, after.light])
-        labels, basis = self.labels[rows], problem.scene.basis
-        return AttackExamples(torch.stack(images), lights, predictions, labels, basis)
+        shown = torch.stack(images)
+        return AttackExamples(shown, lights, predictions, self.labels[rows], problem.scene.basis)
 
     def problem(self, number: int) -> SceneProblem:
         """Vary the scene at random, and return what an attack on it may change."""

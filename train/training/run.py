@@ -111,10 +111,10 @@ class Run:
         if earlier is not None:
             self.trainer.resume()
             # The schedule extends over all epochs, but each epoch of a soup has the whole schedule.
-            planned, epochs = earlier.train.epochs, settings.train.epochs
-            if epochs != planned and not settings.train.soup:
+            recipe = settings.train
+            if recipe.epochs != earlier.train.epochs and not recipe.soup:
                 line = "train.epochs=%d, not %d, stretches train.schedule=%s"
-                console.warning(line, epochs, planned, settings.train.schedule)
+                console.warning(line, recipe.epochs, earlier.train.epochs, recipe.schedule)
         elif settings.train.resume:
             console.info("nothing to resume in %s; starting at epoch 1", folder)
 
