@@ -495,7 +495,12 @@ def as_network(
         # timm records the size of the published weights, which need not be those of the network.
         published = getattr(network, "pretrained_cfg", {}).get("input_size", [USUAL_SIZE])
         size = known_size or published[-1]
-    inputs = _describe_inputs(network, sizer, normalization, value_range)
+    stated_by_network = wrappers.NETWORK if wrappers.normalization_of(network) else None
+    normalizer = stated_by_network if normalization is None else wrappers.YOU
+    # A mean is in the units of the value range. The default range is an object of its own.
+    is_stated = normalization is not None or value_range is not UNIT_RANGE
+    limits = (0.0, 1.0) if normalization == IMAGENET else (value_range[0], value_range[1])
+    inputs = wrappers.Inputs(sizer, normalizer, wrappers.YOU if is_stated else None, limits)
     if says:
         wrappers.say_inputs(name, function, size, inputs)
     # Gray images of different shades, to find errors before an attack begins.
@@ -520,21 +525,6 @@ def as_network(
         made = TaskNetwork(function, size, known, name, normalize_light, task)
     made.inputs = inputs
     return made
-
-
-def _describe_inputs(
-    network: ImageFunction,
-    sizer: str | None,
-    normalization: Normalization,
-    value_range: tuple[float, float],
-) -> wrappers.Inputs:
-    """Describe what images a network gets, and who states it. `sizer` states their size."""
-    stated_by_network = wrappers.NETWORK if wrappers.normalization_of(network) else None
-    normalizer = stated_by_network if normalization is None else wrappers.YOU
-    # A mean is in the units of the value range. The default range is an object of its own.
-    is_stated = normalization is not None or value_range is not UNIT_RANGE
-    limits = (0.0, 1.0) if normalization == IMAGENET else (value_range[0], value_range[1])
-    return wrappers.Inputs(sizer, normalizer, wrappers.YOU if is_stated else None, limits)
 
 
 def require_evaluation_mode(network: object, argument: str) -> None:

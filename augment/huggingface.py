@@ -24,8 +24,6 @@ from renderer.settings import Size, height_and_width
 
 # Default prompt of a zero-shot network, in which {} stands for the name of a class.
 PROMPT = "a photo of a {}"
-# File that states how the images of a network are prepared.
-PREPROCESSOR = "preprocessor_config.json"
 # Pixels per side of two images that are prepared to find out to which size.
 PROBED = (600, 300)
 # Logits of a zero-shot network may differ by this much from those of transformers.
@@ -133,7 +131,8 @@ def _read_preprocessor(
     """
     try:
         processor: Any = library.AutoImageProcessor.from_pretrained(model)
-        source: str | None = PREPROCESSOR
+        # This file states how the images of a network are prepared.
+        source: str | None = "preprocessor_config.json"
     except (OSError, ValueError):
         # Without a file, the default processor of the kind of the model counts, if there is one.
         mapping = library.models.auto.image_processing_auto.IMAGE_PROCESSOR_MAPPING

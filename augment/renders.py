@@ -4,13 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-from jaxtyping import Bool, Float, Int, Shaped
-from torch import Tensor, nn
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor
 from torch.utils.data import Dataset
 
-from augment.attacks.problem import SceneProblem
-from augment.network import evenly_spaced, frozen_eval_mode
 from renderer.light.basis import HARMONICS, Basis
 
 # Largest number of successfully attacked renders that are kept for figures each time that the
@@ -77,29 +74,3 @@ class Renders(Dataset[tuple[Tensor, Any]]):
         """Return an image (3, H, W) in [0, 1] on the CPU, and its label or its target."""
         target = int(self.labels[index]) if self.targets is None else self.targets[index]
         return self.images[index].cpu(), target
-
-
-def select_examples_to_log(
-    model: nn.Module,
-    problem: SceneProblem,
-    values: Float[Tensor, "E D"],
-    success: Bool[Tensor, " E"],
-    labels: Int[Tensor, " E"],
-) -> AttackExamples:
-    """Select a few successfully attacked examples for a figure, and render and classify them.
-
-    At most `SHOWN_EXAMPLES` are selected, evenly spaced among the successful examples. The state of
-    the network is restored afterwards.
-    """
-    successful = torch.nonzero(success).squeeze(1)
-    rows = successful[evenly_spaced(len(successful), SHOWN_EXAMPLES).to(successful.device)]
-    before = problem.conditions(problem.start[rows], rows)
-    after = problem.conditions(values[rows], rows)
-    with frozen_eval_mode(model), torch.no_grad():
-        # Each example has one view.
-        images = [problem.scene.render(one, rows)[:, 0] for one in (before, after)]
-        logits = [model(one).float() if len(rows) else one.new_zeros(0, 0) for one in images]
-    predictions = torch.stack(logits).softmax(2)
-    lights = torch.stack([before.light, after.light])
-    basis = problem.scene.basis
-    return AttackExamples(torch.stack(images), lights, predictions, labels[rows], basis)

@@ -22,7 +22,7 @@ from augment.attacks.problem import SceneProblem, build_problem, warn_of_changed
 from augment.augmentation_settings import AugmentationSettings, views_of
 from augment.classifier import CheckedNetwork
 from augment.progress import Phases
-from augment.renders import Renders, select_examples_to_log
+from augment.renders import SHOWN_EXAMPLES, AttackExamples, Renders
 from augment.scene.build import MeshItem, build_scene, warn_of_exposure, with_needed_degree
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
@@ -248,7 +248,6 @@ class AugmentationService:
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
         problem = self.problem(number)
-        # Both functions return the attack values, the images and numbers about them.
         make = self._random if self.settings.mode == "random" else self._adversarial
         made = make(model, problem, number)
         if number == 0:
@@ -258,9 +257,24 @@ class AugmentationService:
             truth = made.truth or self._truth(problem, made.values)
             return Renders(made.images, self.labels, diagnostics, targets=truth.targets())
         # Classification has no boxes, but a few examples for figures.
-        chosen = (made.values, made.is_wrong, self.labels)
-        examples = select_examples_to_log(model, problem, *chosen)
+        examples = self._examples(model, problem, made)
         return Renders(made.images, self.labels, diagnostics, examples)
+
+    def _examples(self, model: nn.Module, problem: SceneProblem, made: _Made) -> AttackExamples:
+        """Render and classify some examples of a successful attack, evenly spaced, for a figure."""
+        assert made.is_wrong is not None
+        rows = torch.nonzero(made.is_wrong).squeeze(1)
+        rows = rows[network.evenly_spaced(len(rows), SHOWN_EXAMPLES).to(rows.device)]
+        before = problem.conditions(problem.start[rows], rows)
+        after = problem.conditions(made.values[rows], rows)
+        with network.frozen_eval_mode(model), torch.no_grad():
+            # Each example has one view.
+            images = [problem.scene.render(one, rows)[:, 0] for one in (before, after)]
+            logits = [model(one).float() if len(rows) else one.new_zeros(0, 0) for one in images]
+        predictions = torch.stack(logits).softmax(2)
+        lights = torch.stack([before.light, after.light])
+        shown = torch.stack(images)
+        return AttackExamples(shown, lights, predictions, self.labels[rows], problem.scene.basis)
 
     def problem(self, number: int) -> SceneProblem:
         """Vary the scene at random, and return what an attack on it may change."""
@@ -352,7 +366,8 @@ class AugmentationService:
         values = self._random_values(problem, number)
         # This process renders its own rows in their single view, and gets those of the others.
         own = self._own_rows(len(self.labels))
-        images = self._gather(problem.images(values, own)[:, 0], own, len(self.labels))
+        of_all = own, len(self.labels), self.world_size
+        images = distributed.all_gather_rows(problem.images(values, own)[:, 0], *of_all)
         if self._finds_objects:
             truth = self._truth(problem, values)
             return _Made(values, images, self._find(model, images, truth), truth=truth)
@@ -455,9 +470,10 @@ class AugmentationService:
         with network.frozen_eval_mode(model), self.phases("attack_classifier"):
             is_fooled = objective.fooled_in_views(result.images, result.predicted, shard)
         # Examples that are misclassified before the attack count as successes.
-        success = self._gather(is_fooled.all(1) | result.success_before, own, len(attacked))
+        of_all = own, len(attacked), self.world_size
+        success = distributed.all_gather_rows(is_fooled.all(1) | result.success_before, *of_all)
         # Replace the result of this process by the results of all processes.
-        result = result.map(lambda part: self._gather(part, own, len(attacked)))
+        result = result.map(lambda part: distributed.all_gather_rows(part, *of_all))
         values = values.index_copy(0, attacked, result.values)
         if self.settings.warm_start:
             self._last_values = values
@@ -484,10 +500,6 @@ class AugmentationService:
         With more processes than examples, several processes get the same example.
         """
         return torch.arange(self.rank % count, count, self.world_size).to(self.labels.device)
-
-    def _gather(self, part: Tensor, own: Int[Tensor, " A"], count: int) -> Tensor:
-        """Collect from all processes what each computed for its `_own_rows` of the examples."""
-        return distributed.all_gather_rows(part, own, count, self.world_size)
 
     def _attack_criterion(self) -> ClassCriterion:
         """Return the source and the target class of the attack on each example.

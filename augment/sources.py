@@ -29,17 +29,9 @@ from augment.tasks.task import Task
 from renderer.errors import InputError, as_path, require_flag, require_kind, single_line
 from renderer.settings import Size, height_and_width
 
-# Networks of torchvision that were trained with another normalization than that of ImageNet. They
-# convert their images if the argument `transform_input` is True.
-_TRANSFORMS_INPUT = ("googlenet", "inception_v3")
 # Function that makes a classifier with random weights.
 Build = Callable[[NetworkFacts], Classifier]
 SQUEEZENET_CAFFE = "squeezenet_caffe"
-# A network of timm whose name begins so is that of a repository of the Hugging Face Hub.
-HUB = "hf-hub:"
-_CAFFE_SIZE = 227
-# Mean of the channels blue, green and red that Caffe's networks subtract, from 0 to 255.
-_CAFFE_MEAN = (104, 117, 123)
 
 
 def imagenet_classes() -> tuple[str, ...]:
@@ -107,7 +99,8 @@ def _torchvision(
         size = facts.size or transforms.crop_size[0]
         classes = facts.classes or tuple(published.meta["categories"])
         options: dict[str, Any] = {"num_classes": len(classes)}
-        if model in _TRANSFORMS_INPUT:
+        # These were trained with another normalization, and convert images to it.
+        if model in ("googlenet", "inception_v3"):
             options |= {"transform_input": True, "init_weights": False}
         if model.startswith("vit_"):
             options["image_size"] = size
@@ -219,8 +212,9 @@ def _squeezenet_caffe(weights: Path | None, facts: NetworkFacts, is_random: bool
 
     network = squeezenet1_0()
     network.classifier[1].padding = (1, 1)  # Caffe's definition has this padding.
-    mean = [value / 255 for value in _CAFFE_MEAN]
-    published = _CAFFE_SIZE, imagenet_classes(), mean, [1 / 255] * 3
+    # Caffe's networks subtract this mean of the channels blue, green and red, from 0 to 255.
+    mean = [value / 255 for value in (104, 117, 123)]
+    published = 227, imagenet_classes(), mean, [1 / 255] * 3
     classifier = _classifier(network, SQUEEZENET_CAFFE, facts, *published, bgr=True)
     if is_random:
         return classifier
@@ -236,7 +230,8 @@ def _timm(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool
     """
     name = f"timm:{model}"
     timm = files.import_package("timm", name)
-    is_on_hub = model.startswith(HUB)
+    # Its name is that of a repository of the Hugging Face Hub.
+    is_on_hub = model.startswith("hf-hub:")
     if not (is_on_hub or timm.is_model(model)):
         choices = nearest(model, timm.list_models())
         raise files.name_error(name, f"is not a network of timm: choose one, such as {choices}")
@@ -339,8 +334,6 @@ SOURCES: dict[str, Callable[..., Any]] = {
     "hf:": huggingface.load,
     PYTHON: _python,
 }
-# Sources whose classes, image size and normalization (the `NetworkFacts`) the user may choose.
-_TAKE_FACTS = ("torchvision:", "timm:", "hf:")
 
 
 def load_classifier(
@@ -430,7 +423,7 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
         if path is not None:
             reason = f"cannot be combined with {name}, a file that contains weights"
             raise files.weights_error(path, f"{reason}: leave weights out")
-    elif source + colon not in _TAKE_FACTS:
+    elif source + colon not in ("torchvision:", "timm:", "hf:"):
         files.require_no_facts(name, facts)
     elif source != "hf":
         files.require_no_facts(name, NetworkFacts(prompt=facts.prompt, task=facts.task))

@@ -36,10 +36,9 @@ MIN_NEAR_RATIO = 0.01
 IN_FRONT = "give cameras that have the whole mesh in front of them"
 # Smallest and largest values of fields that are lengths, ratios or angles.
 _POSITIVE = (1 / errors.MAX_MAGNITUDE, errors.MAX_MAGNITUDE)
-_TURNS = (-MAX_TURN, MAX_TURN)
 _RANGES = {
     **dict.fromkeys(("width", "clip_range", "distance", "pixel_aspect"), _POSITIVE),
-    **dict.fromkeys(("polar", "roll"), _TURNS),
+    **dict.fromkeys(("polar", "roll"), (-MAX_TURN, MAX_TURN)),
 }
 
 

@@ -40,9 +40,6 @@ LONGEST_REASON = 300
 # Values of `dtype.kind` for arrays of real numbers: "f" is floating-point, "i" is a signed
 # integer, and "u" is an unsigned integer.
 _NUMBERS = "fiu"
-# Number of bytes of a float64 number. NumPy also has larger floating-point numbers, which torch
-# cannot read.
-_FLOAT64_BYTES = 8
 # Texts in the errors of torch, CUDA, cuDNN
 # and cuBLAS that say that memory ran out.
 OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "ALLOC", "unable to find an engine")
@@ -302,7 +299,8 @@ def _as_numbers(value: object) -> np.ndarray | None:
         return None
     if array.dtype.kind not in _NUMBERS:
         return None
-    if array.dtype.kind == "f" and array.dtype.itemsize > _FLOAT64_BYTES:
+    # NumPy also has larger numbers than those of 8 bytes, which torch cannot read.
+    if array.dtype.kind == "f" and array.dtype.itemsize > 8:
         array = array.astype(np.float64)
     native_dtype = array.dtype.newbyteorder("=")
     # `reshape` is needed because ascontiguousarray

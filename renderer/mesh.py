@@ -205,14 +205,9 @@ class Mesh:
             # Give each corner the color of its vertex, or the single color.
             corner_colors = np.broadcast_to(color, vertices.shape).take(faces, axis=0, mode="clip")
         errors.require_range("crease", crease, 0, 180)
-        mesh = Mesh(
-            vertices=vertices,
-            faces=faces,
-            corner_colors=corner_colors,
-            corner_uvs=np.zeros((len(faces), 3, 2), dtype=np.float32),
-            texture_ids=np.full(len(faces), NO_TEXTURE, dtype=np.int32),
-            normal_ids=faces,
-        )
+        corner_uvs = np.zeros((len(faces), 3, 2), dtype=np.float32)
+        texture_ids = np.full(len(faces), NO_TEXTURE, dtype=np.int32)
+        mesh = Mesh(vertices, faces, corner_colors, corner_uvs, texture_ids, normal_ids=faces)
         return replace(mesh, normal_ids=normal_groups(vertices, faces, crease=crease))
 
     def face_normals(self) -> np.ndarray:

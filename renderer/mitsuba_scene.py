@@ -54,8 +54,6 @@ SCENE = "scene.xml"
 # Number of samples per pixel in Mitsuba. With 256
 # samples, the noise under smooth lighting is below 1/255.
 SAMPLES = 256
-# Default variant of Mitsuba. It does not need the library LLVM.
-VARIANT = "scalar_rgb"
 # XML tag in a Mitsuba scene file for a value of each Python type.
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}
 # Types of objects in a Mitsuba scene file, such as an envmap, by their XML tag.
@@ -81,7 +79,7 @@ MIN_SPECULAR = 1e-4
 
 
 @contextmanager
-def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
+def mitsuba(variant: str = "scalar_rgb") -> Iterator[Any]:
     """Import Mitsuba, and set its variant for a `with` block.
 
     The previous variant is restored at the end of the block. A variant that needs LLVM raises an

@@ -179,7 +179,10 @@ def _exact_cross(a: Vectors, b: Vectors, c: Vectors) -> Vectors:
     v, v_error = _difference(c, a)
     # The components of u × v, with the rounding errors of the products added back.
     first, second = [1, 2, 0], [2, 0, 1]
-    product = _difference_of_products(u[first], v[second], u[second], v[first])
+    product, error = _product(u[first], v[second])
+    subtracted, subtracted_error = _product(u[second], v[first])
+    rounded, rounding_error = _difference(product, subtracted)
+    product = rounded + (rounding_error + (error - subtracted_error))
     # (u + u_error) × (v + v_error) = u × v + u × v_error + u_error × v, because
     # u_error × v_error is negligible.
     return product + (_cross(u, v_error) + _cross(u_error, v))
@@ -216,14 +219,6 @@ def _halves(numbers: Tensor) -> tuple[Tensor, Tensor]:
     # Both subtractions round away the lower half of the digits.
     high = scaled - (scaled - numbers)
     return high, numbers - high
-
-
-def _difference_of_products(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """Compute a · b - c · d for tensors of one shape, almost without rounding errors."""
-    product_ab, error_ab = _product(a, b)
-    product_cd, error_cd = _product(c, d)
-    rounded, error = _difference(product_ab, product_cd)
-    return rounded + (error + (error_ab - error_cd))
 
 
 # Faces that meet at an edge at a larger angle in degrees have separate normals there.

@@ -24,9 +24,6 @@ from renderer.camera import PerspectiveCamera, Points
 from renderer.errors import InputError
 from renderer.io.images import SUFFIXES, open_image
 
-# Conventions for the axes of a camera in its view matrix. OpenCV has y down and z forward. OpenGL
-# has y up and z backward.
-CONVENTIONS = ("opencv", "opengl")
 # Smallest depth that a pinhole camera can show, divided by the depth of the farthest point of the
 # mesh. A mesh with a smaller depth raises an error.
 MIN_DEPTH_RATIO = 1e-3
@@ -151,7 +148,7 @@ class PinholeCamera(PerspectiveCamera):
             >>> nb.render(nb.solid("orange"), camera, nb.load_light("grace"), size=64).shape[-1]
             64
         """
-        errors.require_choice("convention", convention, CONVENTIONS)
+        errors.require_choice("convention", convention, ("opencv", "opengl"))
         # The rows of the rotation matrix are the axes of the camera in world axes.
         rotation, translation = _split_view(view)
         if convention == "opencv":

@@ -99,13 +99,34 @@ class ShadedView:
         may move then follow the covered ones. The background is encoded, shape (3, height · width)
         or (1, height · width).
         """
-        if self.settings.silhouettes and self.is_moved:
-            # Silhouettes move between the mesh and the background, whose linear values are needed.
-            linear_background = decode(background, self.settings.encoding).expand(3, -1)
-            return self._radiance_with_silhouettes(camera, linear_background)
-        pixel_radiance = self.radiance()
-        coverage = self.fragments.coverage.to(pixel_radiance)
-        return PixelRadiance(self.fragments.pixels, coverage, pixel_radiance)
+        fragments = self.fragments
+        if not (self.settings.silhouettes and self.is_moved):
+            pixel_radiance = self.radiance()
+            coverage = fragments.coverage.to(pixel_radiance)
+            return PixelRadiance(fragments.pixels, coverage, pixel_radiance)
+        # Silhouettes move between the mesh and the background, whose linear values are needed.
+        background = decode(background, self.settings.encoding).expand(3, -1)
+        # Each sample becomes a pixel of a finer image, so that it is shaded alone.
+        finer_fragments = replace(fragments.by_sample(), cameras=(camera,))
+        at_samples = self._sum(finer_fragments, has_indirect=False)
+        zeros = at_samples.new_zeros(3, len(fragments.pixels))
+        at_pixels = zeros.index_add(1, fragments.sample_to_pixel, at_samples)
+        at_pixels = at_pixels / fragments.samples**2
+        # Radiance of each sample as a constant, through which no gradients flow.
+        sample_radiance = at_samples.detach()
+        indirect = self._indirect_radiance()
+        if indirect is not None:
+            at_pixels = at_pixels + indirect
+            sample_radiance = sample_radiance + self._divide_among_samples(indirect.detach())
+        # Adding these zeros to the radiance adds the gradients of moving silhouettes.
+        uncovered_pixels, zeros_with_gradient = moving_outlines(
+            fragments, camera, self.vertices, self.mesh.faces, sample_radiance, background
+        )
+        uncovered_count = len(uncovered_pixels)
+        pixels = torch.cat([fragments.pixels, uncovered_pixels])
+        coverage = F.pad(fragments.coverage.to(at_pixels), (0, uncovered_count))
+        pixel_radiance = F.pad(at_pixels, (0, uncovered_count)) + zeros_with_gradient
+        return PixelRadiance(pixels, coverage, pixel_radiance)
 
     def radiance(self) -> Float[Tensor, "3 P"]:
         """Compute the linear radiance of the P covered pixels, times their coverage."""
@@ -140,38 +161,6 @@ class ShadedView:
         if not summands:
             return torch.zeros(3, len(fragments.pixels)).to(self.albedo)
         return reduce(torch.add, summands)
-
-    def _radiance_with_silhouettes(
-        self, camera: Camera, background: Float[Tensor, "3 pixels"]
-    ) -> PixelRadiance:
-        """Compute radiance whose gradients include the movement of silhouettes and surfaces.
-
-        The background is linear. Uncovered pixels into which silhouettes may move follow the
-        covered ones.
-        """
-        fragments = self.fragments
-        # Each sample becomes a pixel of a finer image, so that it is shaded alone.
-        finer_fragments = replace(fragments.by_sample(), cameras=(camera,))
-        at_samples = self._sum(finer_fragments, has_indirect=False)
-        zeros = at_samples.new_zeros(3, len(fragments.pixels))
-        at_pixels = zeros.index_add(1, fragments.sample_to_pixel, at_samples)
-        at_pixels = at_pixels / fragments.samples**2
-        # Radiance of each sample as a constant, through which no gradients flow.
-        sample_radiance = at_samples.detach()
-        indirect = self._indirect_radiance()
-        if indirect is not None:
-            at_pixels = at_pixels + indirect
-            sample_radiance = sample_radiance + self._divide_among_samples(indirect.detach())
-        # Adding these zeros to the radiance adds the gradients of moving silhouettes.
-        uncovered_pixels, zeros_with_gradient = moving_outlines(
-            fragments, camera, self.vertices, self.mesh.faces, sample_radiance, background
-        )
-        uncovered_count = len(uncovered_pixels)
-        return PixelRadiance(
-            pixels=torch.cat([fragments.pixels, uncovered_pixels]),
-            coverage=F.pad(fragments.coverage.to(at_pixels), (0, uncovered_count)),
-            radiance=F.pad(at_pixels, (0, uncovered_count)) + zeros_with_gradient,
-        )
 
     def _divide_among_samples(self, pixel_radiance: Float[Tensor, "3 P"]) -> Float[Tensor, "3 S"]:
         """Divide the radiance of each pixel among its samples, in proportion to their albedo.

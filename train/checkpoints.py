@@ -49,8 +49,6 @@ FACTS = ("version", "encoding", "validation", "assumed")
 ASSUMED = "assumed"
 # Entry in the description of a network that normalizes the light of images, with its settings.
 NORMALIZE_LIGHT = "normalize_light"
-# If a network normalizes the light of images, the names of its weights begin with this text.
-LIGHT_PREFIX = "network."
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
@@ -190,22 +188,17 @@ def load_chosen(settings: TaskSettings) -> Any:
     """Load the network that the settings of a command choose, with its task."""
     names = ("weights", "classes", "size", "normalization", "normalize_light", "prompt")
     given = {name: getattr(settings, name) for name in names}
-    task = _task_that_decodes(settings)
+    task = None
+    if settings.decode is not None:
+        advice = "give package.module:function, and start the command in the folder of the module"
+        # The user's code may raise any exception, and even end the program.
+        kinds = (Exception, SystemExit)
+        with explained(f"decode={settings.decode} cannot be imported", advice, "decode", *kinds):
+            task = Detection(decode=import_function(settings.decode))
     # Error messages about the arguments `name` and `task` begin with these settings instead.
     with keyed(name="network", task="decode"):
         network = load_network(str(settings.network), trust_code=settings.trust, task=task, **given)
     return with_task(network, settings)
-
-
-def _task_that_decodes(settings: TaskSettings) -> Detection | None:
-    """Return the task whose function `decode` the settings name. None if they name none."""
-    if settings.decode is None:
-        return None
-    advice = "give package.module:function, and start the command in the folder of the module"
-    # The user's code may raise any exception, and even end the program.
-    kinds = (Exception, SystemExit)
-    with explained(f"decode={settings.decode} cannot be imported", advice, "decode", *kinds):
-        return Detection(decode=import_function(settings.decode))
 
 
 def with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
@@ -278,7 +271,6 @@ def load_run(
         built = build_network(classes, size, trust_code=trust_code, **shape)
         network = with_normalized_light(built, light)
         network.load_state_dict(state["model"])
-        # Arguments of `Classifier` and `TaskNetwork`: network, size, classes and name.
         facts = network, size, classes, f"{RUN}{run}"
         loaded: Any
         if name == DETECTOR:
@@ -346,7 +338,8 @@ def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
     weights: dict[str, Tensor] = state["model"]
     if NORMALIZE_LIGHT not in state["architecture"]:
         return weights
-    return {name.removeprefix(LIGHT_PREFIX): value for name, value in weights.items()}
+    # The wrapper keeps the network as its attribute `network`.
+    return {name.removeprefix("network."): value for name, value in weights.items()}
 
 
 def write_published(path: Path, state: Mapping[str, Any]) -> None:

@@ -146,7 +146,6 @@ class AttackExperimentSettings(TaskSettings):
         # The name of a class can be a number, which YAML reads as one.
         if isinstance(self.target, int | float):
             self.target = str(self.target)
-        # Names of the attacked parameters, such as "lighting" and "pose".
         attacked = self.attack.parameters
         # Relighting attacks photographs, so it needs a folder of them.
         if (self.attack.relighting is None) != (self.unlabeled is None):

@@ -39,9 +39,6 @@ STD = (0.25, 0.25, 0.25)
 # Key in the description of a network. It is True if `augment.build_classifier` built
 # the network.
 CLASSIFIER = "classifier"
-# Architectures of torchvision with auxiliary classifiers, with which a network would return
-# several outputs.
-WITH_AUXILIARY = ("googlenet", "inception_v3")
 
 
 class WideResNet(nn.Module):
@@ -215,7 +212,8 @@ def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Mo
 
     require_architecture(architecture)
     options: dict[str, Any] = {}
-    if architecture in WITH_AUXILIARY:
+    # With auxiliary classifiers, a network would return several outputs.
+    if architecture in ("googlenet", "inception_v3"):
         options = {"aux_logits": False, "init_weights": True}
     if architecture.startswith("vit_"):
         options = {"image_size": size}

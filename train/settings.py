@@ -36,8 +36,6 @@ RESERVED = ("renders", "test", "before", KEPT_ASIDE, PHOTOGRAPHS_FIRST)
 UNLABELED = "unlabeled"
 # Choices of data.name.
 DATA_SETS = ("cifar100", "npz", "folder", UNLABELED, "shapes")
-# Values of data.name that need data.path.
-DATA_SETS_WITH_PATH = ("npz", "folder")
 # Properties of photographs. Those with the same value can be scored as one group.
 GROUPS = ("source", "mesh", "class")
 # Smallest images in pixels per side. Random crops pad images by reflection, which
@@ -95,8 +93,6 @@ LIGHTS = {
     RELIGHT_AND_LOW_LIGHT: "in the light of a projector or in low light",
     STRIPES: "in the light of a scanner",
 }
-# Choices of train.augmentation.
-AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", *LIGHTS)
 # Choices of train.optimizer.
 OPTIMIZERS = ("sgd", "adamw")
 # Choices of train.flips.
@@ -133,7 +129,7 @@ class DataSettings(Settings):
     def __post_init__(self) -> None:
         """Check all values, and that data sets of the user have a path."""
         super().__post_init__()
-        if self.name in DATA_SETS_WITH_PATH and not self.path:
+        if self.name in ("npz", "folder") and not self.path:
             raise InputError(f"path is not set: give the path of the data set {self.name}", "path")
 
 
@@ -270,7 +266,7 @@ class TrainSettings(Settings):
         "none",
         "relight: light of a projector. low_light: few photons. relight+low_light: both in turn. "
         "stripes: light of a scanner.",
-        choices=AUGMENTATIONS,
+        choices=("none", *TRANSFORMS, "pgd", *LIGHTS),
     )
     relight_gain: float = setting(
         3.0, "Largest factor of a channel for relight, and 1 / the smallest.", within=(1, 100)

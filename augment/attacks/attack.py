@@ -32,9 +32,6 @@ from augment.tasks.task import Criterion, Task
 from renderer.errors import InputError, as_list, is_whole, require_flag, require_kind, require_whole
 from renderer.light import basis, files
 
-# `attack(..., target="least_likely")` makes the target the class with the lowest confidence
-# before the attack.
-LEAST_LIKELY = "least_likely"
 # `_candidates` draws the polar angle of a camera from the range `POLAR`, in degrees, and
 # the width of the visible region from the range `WIDTH`, in world units.
 POLAR = (20.0, 100.0)
@@ -175,7 +172,6 @@ def _attack(
         settings = replace(settings, optimizer=RANDOM_SEARCH)
         limit = f"at most {settings.query_limit} queries for each example (max_queries, optimizer)"
         reason = f"classifier {classifier.name} has no gradients: random search attacks it with"
-        # `stacklevel` makes Python name the user's call of `attack` in the warning.
         warnings.warn(f"{reason} {limit}", stacklevel=3)
     if settings.eot.draws and not isinstance(classifier.task, Classification):
         advice = "set eot.draws=0"
@@ -268,7 +264,7 @@ def target_labels(
     if target is None:
         return None
     classifier.task.require_target(target)
-    if isinstance(target, str) and target == LEAST_LIKELY:
+    if isinstance(target, str) and target == "least_likely":
         # The last axis of the evidence has the classes.
         return evidence.argmin(2)
     view_count = evidence.shape[1]

@@ -229,7 +229,6 @@ def transfer(
     images = result.images_in_views
     given = attacked.size, attacked.classes, normalization, value_range, images.device
     examples = torch.nonzero(result.clean_correct & result.success)[:, 0]
-    # `classify` takes a classifier, and a function that changes an adversary before it is rendered.
     classify = partial(_classify, result, examples, _adversaries(result, examples))
     rows = []
     for index, network in enumerate(networks):

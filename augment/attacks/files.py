@@ -26,8 +26,6 @@ from renderer.visibility import Rasterizer
 
 # `save` also classifies the attacked images after JPEG compression with this quality.
 JPEG_QUALITY = 90
-# Renderers that `save` may use to render the saved files again.
-RENDERERS = ("reload", MITSUBA)
 
 # Entries of attack.jsonl that are attributes of `AttackResult`.
 NUMBERS = (
@@ -100,7 +98,6 @@ def save(
     after = result.conditions
     shown_paths = enumerate(progress(paths, "saving"))
     lines = [_write_example(result, after, example, path) for example, path in shown_paths]
-    # Versions of the attacked images, which are judged like the images themselves.
     versions = {
         "float": images,
         "8 bits": to_unit(to_bytes(images)),
@@ -125,7 +122,7 @@ def save(
 def require_renderers(names: Sequence[str]) -> None:
     """Check that the renderers of the argument `verify` are known and installed."""
     for name in names:
-        require_choice("verify", name, RENDERERS)
+        require_choice("verify", name, ("reload", MITSUBA))
     if MITSUBA in names:
         # The context imports Mitsuba, or raises InputError if it is not installed.
         with mitsuba():
@@ -232,15 +229,14 @@ def figure(result: AttackResult, example: int) -> Image.Image:
         # A difference of 0 becomes the gray value 1/2.
         "difference": tiles_of((1 + scale * differences) / 2, captions, SIDE),
     }
-    light_before, basis_before = result.light(result.problem.start, example)
-    light_after, basis_after = result.light(result.minimum.values, example)
-    if not torch.equal(light_before, light_after) or basis_before != basis_after:
+    first, last = (
+        result.light(values, example) for values in (result.problem.start, result.minimum.values)
+    )
+    if not torch.equal(first[0], last[0]) or first[1] != last[1]:
         cameras = result.problem.scene.cameras[example]
-        balls = [light_sphere(light_before, SIDE, camera, basis_before) for camera in cameras]
-        columns["initial light"] = tiles_of(balls)
-        balls = [light_sphere(light_after, SIDE, camera, basis_after) for camera in cameras]
-        columns["adversarial light"] = tiles_of(balls)
-    # `draw_grid` takes rows of tiles, one for each view, and the titles of the columns.
+        for title, (light, basis) in {"initial light": first, "adversarial light": last}.items():
+            balls = [light_sphere(light, SIDE, camera, basis) for camera in cameras]
+            columns[title] = tiles_of(balls)
     return draw_grid(list(zip(*columns.values(), strict=True)), list(columns))
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -78,6 +78,7 @@ class Score(Rows):
         return Score(cost.sum(1), gap.amin(1), predicted, is_success.all(1), is_extreme.any(1))
 
 
+@dataclass(eq=False, repr=False)
 class Objective:
     """Cost and success of E examples of V views, against one network.
 
@@ -89,24 +90,21 @@ class Objective:
         phases: Timer of the passes through the network.
     """
 
-    def __init__(
-        self,
-        network: nn.Module,
-        criterion: Criterion,
-        settings: AttackSettings,
-        seed: int = 0,
-        phases: Phases | None = None,
-    ):
-        self.model = preprocessed_model(settings, network)
-        self.criterion = criterion
-        self.settings = settings
-        self.seed = seed
-        self.phases = phases or Phases()
-        self._rows = torch.arange(len(criterion.source), device=criterion.source.device)
+    network: InitVar[nn.Module]
+    criterion: Criterion
+    settings: AttackSettings
+    seed: int = 0
+    phases: Phases = field(default_factory=Phases)
+
+    def __post_init__(self, network: nn.Module) -> None:
+        """Prepare the network, the random transformations and the size of the batches."""
+        self.model = preprocessed_model(self.settings, network)
+        source = self.criterion.source
+        self._rows = torch.arange(len(source), device=source.device)
         # Each example has its own random transformations, whichever others are attacked with it.
-        rows = self._rows.tolist() if settings.eot.draws else []
-        self._transformations = [generator(seed, "expectation", row) for row in rows]
-        self._batch_size = BatchSize(settings.batch_size)
+        rows = self._rows.tolist() if self.settings.eot.draws else []
+        self._transformations = [generator(self.seed, "expectation", row) for row in rows]
+        self._batch_size = BatchSize(self.settings.batch_size)
 
     def select(self, examples: Tensor | slice) -> Objective:
         """Return the objective of some of the examples, with the same random numbers."""
@@ -167,9 +165,7 @@ class Objective:
         outputs = self._outputs(batch)
         # Costs and gaps are those of the mean over random transformations, if there are any.
         # The success is that of the image as it is.
-        expected = outputs
-        if self.settings.eot.draws:
-            expected = average_transformed(self.model, batch, outputs, self.settings.eot, draws)
+        expected = self._expected(outputs, batch, draws)
         cost = criterion.cost(expected)
         if gradients is not None:
             # The network may return its gradient in another memory layout. The copy has the
@@ -185,6 +181,20 @@ class Objective:
                 is_success=criterion.reached_in_views(predicted),
                 is_overconfident=criterion.is_overconfident(expected_evidence),
             )
+
+    def _expected(self, outputs: Any, images: SingleImages, draws: Sequence[Generator]) -> Any:
+        """Average predictions over random transformations of images (EOT, Athalye et al. 2018).
+
+        The log-probabilities of each image and of its transformed copies are averaged. Gradients
+        ignore the JPEG compression (straight-through estimator). Without draws, the outputs stay.
+        """
+        settings = self.settings.eot
+        if not settings.draws:
+            return outputs
+        transformed = (
+            self._outputs(_transformed(images, settings, draws)) for _ in range(settings.draws)
+        )
+        return torch.stack([one.log_softmax(1) for one in (outputs, *transformed)]).mean(0)
 
     def _outputs(self, batch: SingleImages) -> Any:
         """Compute the outputs of single images. The network may compute in half precision."""
@@ -333,23 +343,6 @@ def add_sensor_noise(
         noise = [torch.randn(images.shape[1:], generator=draws) for draws in generators]
         noisy = images + deviation / 255 * torch.stack(noise).to(images)
         yield to_unit(to_bytes(clamp(noisy))).to(images)
-
-
-def average_transformed(
-    model: nn.Module,
-    images: SingleImages,
-    logits: Float[Tensor, "N C"],
-    settings: EOTSettings,
-    draws: Sequence[Generator],
-) -> Float[Tensor, "N C"]:
-    """Average predictions over random transformations of images (EOT, Athalye et al. 2018).
-
-    The log-probabilities of each image and of its transformed copies are averaged. Gradients ignore
-    the JPEG compression (straight-through estimator).
-    """
-    transformed = (model(_transformed(images, settings, draws)) for _ in range(settings.draws))
-    versions = [logits, *(version.to(logits.dtype) for version in transformed)]
-    return torch.stack([version.log_softmax(1) for version in versions]).mean(0)
 
 
 def _transformed(

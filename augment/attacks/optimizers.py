@@ -29,7 +29,6 @@ from renderer.vectors import Ball, nearest_in_box
 # and by SHRINKAGE after a rejected one. Four rejections undo one acceptance (the 1/5 success rule
 # of evolution strategies), so that about one candidate in five is accepted.
 GROWTH = 1.5
-SHRINKAGE = GROWTH**-0.25
 # CMA-ES with more values than this uses a diagonal covariance (Ros and Hansen
 # 2008), because the size of a full covariance is the square of their number.
 MAX_FULL_COVARIANCE = 1000
@@ -331,7 +330,7 @@ class RandomSearch(Optimizer):
     an accepted candidate and shorter after another.
     """
 
-    length_factors = (GROWTH, SHRINKAGE)
+    length_factors = (GROWTH, GROWTH**-0.25)
 
     def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N 1 D"]:
         """Return a random change of the accepted values."""

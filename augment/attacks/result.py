@@ -33,11 +33,6 @@ if TYPE_CHECKING:
 BALL_SIZE = 96
 # Largest number of classes in its bar chart. The most probable classes are drawn.
 SHOWN_CLASSES = 5
-# Colors of the bars of the probabilities before and after the attack.
-BEFORE_COLOR = "#4c78a8"
-AFTER_COLOR = "#e45756"
-# File formats that `AttackResult.save_animation` can write.
-ANIMATION_SUFFIXES = (".gif", ".webp")
 # Largest number of frames that it writes.
 MAX_FRAME_COUNT = 1000
 # Pixels per side of the white ball in a frame. Smaller images are enlarged by a whole factor to at
@@ -274,8 +269,8 @@ class AttackResult(ShortRepr):
         # matplotlib draws bars from the bottom to the top, so the most probable class comes last.
         ranked = shown.flip(0)
         heights = np.arange(len(ranked))
-        chart.barh(heights + 0.2, before[ranked].numpy(), 0.4, color=BEFORE_COLOR, label="before")
-        chart.barh(heights - 0.2, after[ranked].numpy(), 0.4, color=AFTER_COLOR, label="after")
+        chart.barh(heights + 0.2, before[ranked].numpy(), 0.4, color="#4c78a8", label="before")
+        chart.barh(heights - 0.2, after[ranked].numpy(), 0.4, color="#e45756", label="after")
         chart.set_yticks(heights, [classes[index] for index in ranked.tolist()], fontsize=8)
         chart.set_xlim(0, 1)
         chart.set_xlabel(self.classifier.task.confidence, fontsize=8)
@@ -335,7 +330,7 @@ class AttackResult(ShortRepr):
             True
         """
         path = as_path("path", path)
-        require_choice("path: its suffix", path.suffix.lower(), ANIMATION_SUFFIXES)
+        require_choice("path: its suffix", path.suffix.lower(), (".gif", ".webp"))
         example, view = self._shown_view(example, view)
         require_whole("frame_count", frame_count, 2, MAX_FRAME_COUNT)
         start = self.problem.start

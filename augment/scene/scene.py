@@ -35,17 +35,6 @@ AT_ONCE = 2**24
 # A progress bar is shown if more views than this are rendered one by one. For fewer views, the bar
 # would make a step of an attack 4 % slower.
 MAX_VIEWS_WITHOUT_PROGRESS = 8
-# An attack on the light keeps about so many numbers in memory for each coefficient of the light of
-# each example.
-NUMBERS_PER_LIGHT_VALUE = 12
-# An attack on the light keeps about so many numbers in memory for each pixel of all images.
-NUMBERS_PER_PIXEL = 8
-# An attack on the light also keeps about so many numbers for each pixel of the images that are
-# rendered at the same time.
-NUMBERS_PER_RENDERED_PIXEL = 16
-# If effects of a camera, such as blur and noise, are rendered, an attack on the light keeps about
-# so many numbers for each pixel of the images that are rendered at the same time.
-NUMBERS_WITH_CAMERA = 48
 
 
 class Scene:
@@ -170,13 +159,15 @@ class Scene:
 
     def _count_attack_bytes(self) -> int:
         """Estimate the memory of an attack on all examples."""
-        per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL
-        if self.camera_effects:
-            per_rendered_pixel = NUMBERS_WITH_CAMERA
+        # An attack on the light keeps about so many numbers for each pixel of the images that are
+        # rendered at the same time. Effects of a camera, such as blur and noise, need more.
+        per_rendered_pixel = 48 if self.camera_effects else 16
         pixels_per_example = self.views * self.settings.pixel_count
-        numbers = NUMBERS_PER_PIXEL * len(self) * pixels_per_example
+        # It also keeps so many for each pixel of all images.
+        numbers = 8 * len(self) * pixels_per_example
         numbers += per_rendered_pixel * min(len(self), self.group_size) * pixels_per_example
-        numbers += NUMBERS_PER_LIGHT_VALUE * self.lights.numel()
+        # And it keeps so many for each coefficient of the light of each example.
+        numbers += 12 * self.lights.numel()
         return self.lights.element_size() * numbers
 
     def _require_fit(self, examples: list[Example], lights: Tensor, backgrounds: Tensor) -> None:

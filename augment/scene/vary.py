@@ -356,7 +356,6 @@ def _with_directional(environment: Float[Tensor, "E K 3"], directions: Tensor) -
     is_directional = directions.any(1)
     if not is_directional.any():
         return environment
-    # Coefficients of a white directional light of each example, shape (E, K, 3).
     added = directional(directions, torch.ones(3), degree_of(environment[0]))
     mask = is_directional[:, None, None].to(environment.device)
     return torch.where(mask, added.to(environment) + environment, environment)
@@ -392,7 +391,6 @@ def draw_camera_effects(
     [-1, 1] of the point of the pattern that each pixel shows. None lets the pattern fill the image.
     """
     size = image.size
-    # Relative light of the projector at each pixel, shape (count, 3, height, width).
     light = patterns.draw_patterns(count, size, draws, points)
     if settings.slides is not None:
         is_photograph = torch.rand(count, generator=draws) < PHOTOGRAPH_PROBABILITY

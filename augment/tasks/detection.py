@@ -33,8 +33,6 @@ NEAR = 0.5
 SMALLEST_SCORE = 1e-6
 # Boxes that `decode` returns are removed if a better box of their class has a larger IoU.
 MAX_OVERLAP = 0.5
-# Largest number of classes if their number is not known.
-NO_LIMIT = 1e9
 # Keys of the candidates in an output: boxes (K, 4), and scores of all classes (K, C) or, with
 # labels (K,), of one class (K,).
 CANDIDATE_BOXES, CANDIDATE_SCORES = "candidate_boxes", "candidate_scores"
@@ -44,8 +42,6 @@ CANDIDATES_OF = CANDIDATE_BOXES, CANDIDATE_SCORES, CANDIDATE_LABELS
 FINAL = "boxes", "scores", "labels"
 # Candidates of a detector of torchvision are so many boxes with the highest scores above this one.
 MAX_CANDIDATES, CANDIDATE_SCORE = 5000, 1e-4
-# Number of classes of the detectors of torchvision for COCO, with background and gaps.
-COCO_COUNT = 91
 # Boxes of one image: "boxes" (n, 4) in pixels, "labels" (n,) and "scores" (n,), and candidates.
 Detections = dict[str, Tensor]
 
@@ -121,7 +117,8 @@ class Detection(Task):
     def class_names(self, network: Any, count: int | None) -> Sequence[str] | None:
         """Return the names of COCO for torchvision, or those that transformers stores."""
         names = stored_names(unwrapped(network))
-        if not names and _torchvision_count(network) == COCO_COUNT:
+        # Detectors of torchvision for COCO have this many classes, with background and gaps.
+        if not names and _torchvision_count(network) == 91:
             from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights as Weights
 
             # The names of COCO by the numbers that torchvision's detectors return.
@@ -346,7 +343,7 @@ class _Reader:
             given, title = outputs, f"decode of {title}"
             with errors.explained(f"{title} fails on {errors.describe(given)}"):
                 outputs = task.decode(given)
-        elif _is_transformer(outputs) or _is_rt_detr(outputs):
+        elif _is_transformer(outputs):
             outputs = _of_transformer(outputs, images, title, self.class_count)
         if _is_ultralytics(outputs):
             outputs, is_raw = _of_ultralytics(outputs[0]), True
@@ -408,7 +405,7 @@ class _Reader:
             return found
         if not torch.equal(labels, labels.round()):
             raise InputError(f"{title} returned labels with fractions: give indices of classes")
-        last = (class_count or int(NO_LIMIT)) - 1
+        last = (class_count or int(1e9)) - 1
         if len(labels) and not (labels.min() >= 0 and labels.max() <= last):
             span = f"from {int(labels.min())} to {int(labels.max())}"
             advice = "give indices of classes, from 0" + f" to {last}" * bool(class_count)
@@ -447,9 +444,14 @@ def log_odds_of(scores: Tensor) -> Tensor:
 
 
 def _is_transformer(outputs: Any) -> bool:
-    """Return whether outputs are those of an object detector of transformers."""
+    """Return whether outputs are those of an object detector of transformers, or like them.
+
+    RT-DETR of Ultralytics returns final boxes and five parts.
+    """
     keys = {*outputs} if isinstance(outputs, Mapping) else set()
-    return hasattr(outputs, "pred_boxes") or {"logits", "pred_boxes"} <= keys
+    if hasattr(outputs, "pred_boxes") or {"logits", "pred_boxes"} <= keys:
+        return True
+    return _is_ultralytics(outputs) and isinstance(outputs[1], tuple) and len(outputs[1]) == 5
 
 
 def _of_transformer(
@@ -493,11 +495,6 @@ def _is_ultralytics(outputs: Any) -> bool:
     """Return whether outputs are a tensor of boxes, and what Ultralytics computes it from."""
     is_pair = isinstance(outputs, tuple) and len(outputs) == 2
     return is_pair and isinstance(outputs[0], Tensor) and outputs[0].ndim == 3
-
-
-def _is_rt_detr(outputs: Any) -> bool:
-    """Return whether outputs are final boxes and five parts, as RT-DETR of Ultralytics returns."""
-    return _is_ultralytics(outputs) and isinstance(outputs[1], tuple) and len(outputs[1]) == 5
 
 
 def _of_ultralytics(outputs: Tensor) -> list[dict[str, Tensor]]:

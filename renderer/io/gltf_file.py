@@ -509,9 +509,7 @@ def _image(file: GltfFile, info: dict[str, Any]) -> tuple[Image.Image, Placement
     rows = np.column_stack([linear, transform.get("offset", (0, 0))])
     sampler_index = file.entry("textures", info["index"]).get("sampler")
     sampler = {} if sampler_index is None else file.entry("samplers", sampler_index)
-    placement = Placement(
-        uv_set=transform.get("texCoord", info.get("texCoord", 0)),
-        transform=tuple(map(tuple, rows.tolist())),
-        wraps=(sampler.get("wrapS", REPEAT), sampler.get("wrapT", REPEAT)),
-    )
+    uv_set = transform.get("texCoord", info.get("texCoord", 0))
+    wraps = (sampler.get("wrapS", REPEAT), sampler.get("wrapT", REPEAT))
+    placement = Placement(uv_set, tuple(map(tuple, rows.tolist())), wraps)
     return file.image(info["index"]), placement

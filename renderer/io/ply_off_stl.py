@@ -19,9 +19,8 @@ _LENGTH = "length of "
 # Byte orders of NumPy. The numbers of an ASCII file become float64 before they are read.
 _ASCII = "ascii"
 _BYTE_ORDERS = {_ASCII: "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-# Names of red, green and blue, and of the texture coordinates of vertices.
+# Names of red, green and blue.
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"))
-_UVS = (("s", "t"), ("u", "v"))
 # Beginnings of the names of elements and properties that would change the shape or the color.
 # Colors that are read are removed before, so these are incomplete.
 _REFUSED = ("tristrips", "material", "multi_texture", "red", "green", "blue", "rgb", "color")
@@ -114,7 +113,7 @@ def _rgb(values: _Values, file: MeshFile) -> np.ndarray | None:
 def _corner_uvs(vertex: _Values, face: _Values, faces: _Lists) -> np.ndarray:
     """Remove the texture coordinates, and return those of all corners, or NaN, shape (C, 2)."""
     uvs = np.full((len(faces.numbers), 2), np.nan)
-    for names in _UVS:
+    for names in (("s", "t"), ("u", "v")):
         vertex_uvs = _columns(vertex, names)
         if vertex_uvs is not None:
             uvs = vertex_uvs.take(faces.numbers, axis=0, mode="clip")
@@ -280,7 +279,6 @@ def read_off(file: MeshFile) -> list[Part]:
 # Face of a binary .stl file. Some programs store a color in `attribute`, and say so by `_FLAG`,
 # or by a color for all other faces in the header, whose last four bytes are the number of faces.
 _STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_FLAG = 0x8000
 _HEADER_SIZE = 84
 
 
@@ -302,7 +300,7 @@ def read_stl(file: MeshFile) -> list[Part]:
         raise ValueError(_TRUNCATED)
     else:
         faces = np.frombuffer(content, _STL_FACE, face_count, _HEADER_SIZE)
-        has_colors = b"COLOR=" in header or bool((faces["attribute"] & _FLAG).any())
+        has_colors = b"COLOR=" in header or bool((faces["attribute"] & 0x8000).any())
         coordinates = faces["corners"].astype(np.float64)
     if has_colors:
         raise ValueError("colors in .stl files are not supported: export the mesh as .ply")

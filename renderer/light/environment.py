@@ -54,8 +54,6 @@ _CHANNEL_NAMES_BY_COUNT = {1: "Y", 3: "RGB", 4: "RGBA"}
 # Possible names of a channel that is no light, or of its layer, in lower case: alpha, depth
 # (OpenEXR reserves Z and ZBack for it) and numbers of objects.
 _OTHER_NAMES = {"a", "alpha", "z", "zback", "depth", "mist", "id", "indexob", "indexma"}
-# Possible names of the three color channels, in lower case.
-_COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
 
 
 def to_map(coefficients: Tensor, height: int) -> Float[Tensor, "height _ _"]:
@@ -271,7 +269,7 @@ def _color_channels(names: Sequence[str]) -> list[int]:
     keys = [name.casefold().rpartition(".")[::2] for name in names]
     colored: dict[str, list[int]] = {}
     for layer, _ in keys:
-        for color_names in _COLOR_NAMES:
+        for color_names in (("r", "g", "b"), ("red", "green", "blue")):
             channels = [(layer, color_name) for color_name in color_names]
             if set(channels) <= set(keys):
                 colored.setdefault(layer, [keys.index(channel) for channel in channels])

@@ -139,8 +139,6 @@ _PUBLISHED_PROBES = json.loads(Path(__file__).with_name("probes.json").read_text
 PROBES = tuple(_PUBLISHED_PROBES)
 # Name with which `load_light` creates light with the same radiance from all directions.
 UNIFORM = "uniform"
-# `load_light` scales environment maps to the mean luminance of this probe.
-_REFERENCE_PROBE = "grace"
 
 
 def load_light(
@@ -288,5 +286,5 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
     luminance = mean_luminance(coefficients)
     if luminance <= 0:
         raise InputError(f"environment map {path} is black: give a map with positive radiance")
-    scale = mean_luminance(probe(_REFERENCE_PROBE)) / luminance
+    scale = mean_luminance(probe("grace")) / luminance
     return (coefficients * scale).float()

@@ -52,8 +52,6 @@ from renderer.surface.lobes import ViewFrame
 from renderer.vectors import unit
 from renderer.visibility.fragments import Fragments
 
-# Attributes of `Gloss`, in the order of the columns of the array `Mesh.gloss`.
-_NAMES = ("roughness", "metallic", "specular_factor")
 # `smallest_roughness` ignores this percentage of the texels of a texture, namely those
 # with the smallest roughness.
 _IGNORED_PERCENT = 1
@@ -123,7 +121,7 @@ class Gloss:
         """
         require_flag("textured", self.textured)
         checked = []
-        for name in _NAMES:
+        for name in ("roughness", "metallic", "specular_factor"):
             given = getattr(self, name)
             values = as_tensor(f"gloss: {name}", given)
             if isinstance(given, int | float):

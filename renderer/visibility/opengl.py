@@ -52,10 +52,6 @@ void main() {
 """
 
 
-# Number of bytes of a float32 coordinate.
-FLOAT_BYTES = 4
-
-
 def rasterize(points: Views, faces: Faces, shape: tuple[int, int], closed: bool) -> FaceIds:
     """Find the nearest face at each sample of each view.
 
@@ -129,7 +125,8 @@ def _draw(
     size = (columns, rows)
     program = context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
     # Buffer for x, y and z of the three corners of all faces of one view.
-    corners = context.buffer(reserve=faces.size * 3 * FLOAT_BYTES, dynamic=True)
+    # Each face has three coordinates, which take 4 bytes.
+    corners = context.buffer(reserve=faces.size * 3 * 4, dynamic=True)
     triangles = context.vertex_array(program, [(corners, "3f", "position")])
     texture = context.texture(size, 1, dtype="i4")
     framebuffer = context.framebuffer([texture], context.depth_renderbuffer(size))

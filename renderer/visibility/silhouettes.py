@@ -32,7 +32,7 @@ proportional to the depth, and 1 without perspective.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -323,6 +323,7 @@ def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
     return row // samples * width + column // samples
 
 
+@dataclass(eq=False, repr=False)
 class _Silhouettes:
     """Silhouette edges of a view, which may be hidden.
 
@@ -332,27 +333,34 @@ class _Silhouettes:
     normal in the image.
     """
 
-    def __init__(
-        self,
-        fragments: Fragments,
-        positions: Float[Tensor, "V 3"],
-        nearness: Float[Tensor, " V"],
-        faces: Int[np.ndarray, "F 3"],
-        sample_grid: Int[Tensor, "_ _"],
-    ):
+    fragments: Fragments
+    positions: InitVar[Float[Tensor, "V 3"]]
+    nearness: Float[Tensor, " V"]
+    faces: InitVar[Int[np.ndarray, "F 3"]]
+    sample_grid: Int[Tensor, "_ _"]
+
+    def __post_init__(self, positions: Tensor, faces: np.ndarray) -> None:
         """Find the silhouette edges, from homogeneous positions."""
-        self.fragments = fragments
-        self.nearness = nearness
-        self.sample_grid = sample_grid
+        nearness = self.nearness
         x, y, w = positions.T
         points = torch.stack([x / w, y / w, nearness], dim=1)
         # Positions are rounded to subsamples as in rasterizers.
-        rows, columns = sample_grid.shape
+        rows, columns = self.sample_grid.shape
         self.places = to_fixed_point(points, (rows, columns))[0].T.double() / SUBSAMPLES
-        self.ends, all_ends = _silhouette_edges(self.places, faces)
+        key = np.ascontiguousarray(faces, dtype=np.int64).tobytes()
+        all_ends, edge_of_side, direction, face_count = _edges(key, positions.device)
+        corners = torch.from_numpy(faces).to(positions.device).T
+        orientation = doubled_areas(self.places[:, corners]).sign()
+        # One number for each face and each of its three edges: 1 if the face lies on one side of
+        # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
+        side_of_face = (orientation * direction).flatten()
+        side_sums = self.places.new_zeros(len(face_count)).index_add_(0, edge_of_side, side_of_face)
+        # All n faces of an edge lie on the same side in the image if the sum is n or -n. It is
+        # n - 1 or 1 - n if one of them is seen edge-on, because this face counts 0.
+        self.ends = all_ends[:, side_sums.abs() > face_count - 2]
         # Vertices that no face uses do not count.
         self.nearness_range = nearness[all_ends].max() - nearness[all_ends].min()
-        if len(fragments.sample_to_seen_face) == 0:
+        if len(self.fragments.sample_to_seen_face) == 0:
             self.ends = self.ends[:, :0]  # If no sample shows the mesh, no silhouette is visible.
         # An edge (a, b) with y down has the normal (b, a) with y up.
         normal = self.places[:, self.ends].diff(dim=1)[:, 0].flip(0)
@@ -459,23 +467,6 @@ def _cut_edges(
     next_sample = position.ceil().long()
     is_inside = (next_sample > 0) & (next_sample < shape[1])
     return edge[is_inside], line[is_inside], fraction[is_inside], next_sample[is_inside]
-
-
-def _silhouette_edges(
-    places: Float[Tensor, "2 V"], faces: Int[np.ndarray, "F 3"]
-) -> tuple[Int[Tensor, "2 N"], Int[Tensor, "2 E"]]:
-    """Find the vertices of edges whose faces all lie on one side in the image, and of all edges."""
-    key = np.ascontiguousarray(faces, dtype=np.int64).tobytes()
-    ends, edge_of_side, direction, face_count = _edges(key, places.device)
-    corners = torch.from_numpy(faces).to(places.device).T
-    orientation = doubled_areas(places[:, corners]).sign()
-    # One number for each face and each of its three edges: 1 if the face lies on one side of
-    # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
-    side_of_face = (orientation * direction).flatten()
-    side_sums = places.new_zeros(len(face_count)).index_add_(0, edge_of_side, side_of_face)
-    # All n faces of an edge lie on the same side if the sum is n or -n. It is n - 1 or
-    # 1 - n if one of them is seen edge-on, because this face counts 0.
-    return ends[:, side_sums.abs() > face_count - 2], ends
 
 
 @lru_cache(maxsize=4)

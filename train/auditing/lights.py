@@ -103,8 +103,6 @@ STEPS_PER_RADIUS = 4
 # The background of the views is medium gray, in sRGB.
 BACKGROUND = 0.5
 
-# Names of the plain lights that are tried: an environment map, and uniform light.
-PLAIN_LIGHTS = (LIGHT, UNIFORM)
 # The objects are scaled by each of these factors.
 SIZES = (1.0, 0.75, 1.2)
 # The search ends as soon as this fraction of the views is recognized.
@@ -190,7 +188,6 @@ class Views:
         settings = ImageSettings(size, samples=2, encoding="srgb", normals="smooth")
         shown = objects, CAMERA, background, lights.to(self.device), settings, choose("auto")
         scene = Scene.grid(*shown, shared=False, basis=basis)
-        # Azimuth of the camera, rotation and size of the object are random in each view.
         variation = replace(VARIATION, scale=[self.size * scale for scale in VARIATION.scale])
         return vary(scene, variation, generator(self.seed, "views"))
 
@@ -304,7 +301,6 @@ def success_by_light(
         counts |= classifier.task.found(both_evidence, predicted, classifier.classes)
         counts["slider"] = frames_of(result, example)
     yield counts
-    # Success of the attack and of random draws at each radius, for views that were correct before.
     by_radius = success_by_radius(result, [radius / radii[-1] for radius in radii])
     for suffix, success in successes.items():
         adversarial, random = f"adversarial{suffix}", f"random{suffix}"
@@ -419,7 +415,7 @@ def find_plain_views(classifier: TaskNetwork, views: Views) -> PlainViews:
     for size in progress(SIZES, "search for plain light"):
         scene = replace(views, size=size).scene(classifier.size)
         criterion = criterion_of(classifier, scene, classifier.label(scene.labels[0]))
-        for exposure, name in product(EXPOSURES, PLAIN_LIGHTS):
+        for exposure, name in product(EXPOSURES, (LIGHT, UNIFORM)):
             images = render_in(scene, load_light(name).to(scene.lights) * exposure)
             recognized = int(is_found(classifier, criterion, images).sum())
             # The first combination is the light as it is given, before any search.

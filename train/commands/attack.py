@@ -109,7 +109,6 @@ def run(settings: AttackExperimentSettings) -> None:
             filterwarnings("ignore", ZERO_GRADIENT)
         attacked = []
         sweeps: dict[str, Sweep] = {}
-        # Attacks on one mesh after the other, each with its scene and its result.
         found = attacks(settings, classifier, device, adversary)
         for index, (name, scene, result) in enumerate(found):
             # The name of a solid has colons, which Windows does not allow in file names.
@@ -372,7 +371,6 @@ def format_attack(
 def _success(result: AttackResult) -> str:
     """Write on how many examples an attack succeeds, of those classified correctly before."""
     clean = result.clean_correct
-    # Only examples that were classified correctly before the attack count.
     rate = _success_rate(result.success[clean])
     if rate.n == 0:
         return f"none of {len(clean)} examples was correct before: there is nothing to count"

@@ -203,7 +203,11 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
     """
     is_named = networks is None
     device = choose_device(settings.device)
-    loaded = networks or _load_networks(settings)
+    loaded = networks or {CLASSIFIER: load_chosen(settings)}
+    if is_named and settings.hardened:
+        with keyed(name="hardened"):
+            hardened = load_network(settings.hardened, trust_code=settings.trust)
+        loaded = {**loaded, HARDENED: hardened}
     networks = {key: network.to(device) for key, network in loaded.items()}
     # Without meshes, only photographs are attacked, and there is no plan.
     plan, given = None, settings
@@ -261,15 +265,6 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
         if settings.unlabeled:
             _attack_photographs(settings, networks, photographs, out)
         return write_page(plan.image_folders if plan else {}, out, caveats)
-
-
-def _load_networks(settings: AuditSettings) -> dict[str, Classifier]:
-    """Load the network that the settings name, and the hardened one, if they name one."""
-    networks = {CLASSIFIER: load_chosen(settings)}
-    if settings.hardened:
-        with keyed(name="hardened"):
-            networks[HARDENED] = load_network(settings.hardened, trust_code=settings.trust)
-    return networks
 
 
 def _attack_photographs(

@@ -214,7 +214,6 @@ def sweep(
     parent = writable_folder(str(first_config.sweep), "sweep")
     # An earlier report about the same sweep may be replaced.
     require_replaceable(parent, "sweep", overwrite, own=[PAGE])
-    # Settings on the command line that have the same value in all runs.
     shared = set.intersection(*map(set, runs))
     shared_keys = [override.partition("=")[0] for override in shared]
     folders = [parent / run_name(overrides, shared_keys, str(parent)) for overrides in runs]

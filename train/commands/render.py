@@ -21,8 +21,6 @@ from train.settings import label_names, read_objects
 
 # Processes that share a data set differ in these settings only.
 CIRCUMSTANCES = ("out", "shard", "shards", "device", "trust")
-# Folder of files of Hydra and submitit for --multirun, as conf/render.yaml says.
-LAUNCHER = ".launcher"
 DEFAULT_SIZE = 224
 
 
@@ -98,7 +96,8 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
         if changed:
             raise InputError(f"out={folder} has another {changed[0]}: choose another folder", "out")
         require_same_inputs(folder, settings, found, "out=")
-    elif any(path.name != LAUNCHER for path in folder.iterdir()):
+    # With --multirun, Hydra and submitit keep files in .launcher, as conf/render.yaml says.
+    elif any(path.name != ".launcher" for path in folder.iterdir()):
         raise InputError(f"out={folder} is not empty: choose a new folder", "out")
     else:
         write_json(path, facts | {"inputs": fingerprints(settings)}, indent=1)

@@ -37,14 +37,10 @@ DATA_SET = "data_set.json"
 YAML = (".yaml", ".yml")
 # Text files that list the names of classes, one on each line.
 CLASS_FILES = ("classes.txt", "obj.names")
-# Folders of photographs and of their masks, the latter as in VOC.
-MASK_FOLDERS = (("images", "masks"), ("JPEGImages", "SegmentationClass"))
 # Coordinates may leave the image by this fraction of a side.
 ROUNDING = 1e-3
 # Number of photographs that a network sees at a time.
 BATCH = 16
-# Images are read at full size.
-FULL_SIZE = 2**16
 # From the coordinates (x, y) in a stored image, as fractions of its sides, to those in the upright
 # one, by the EXIF orientation. Only these exchange width and height.
 TURNED = {
@@ -131,7 +127,7 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
     file.
     """
     # The first pair of folders that exist has the photographs and the masks.
-    for names in MASK_FOLDERS:
+    for names in (("images", "masks"), ("JPEGImages", "SegmentationClass")):
         images, masks = (folder / name for name in names)
         if images.is_dir() and masks.is_dir():
             break
@@ -435,7 +431,8 @@ def _yolo_rows(file: Path, class_count: int, has_keypoints: bool) -> Iterator[Se
 
 def fit(photograph: Annotated, size: tuple[int, int], how: str) -> Fitted:
     """Read a photograph, and bring it to a height and width as `FITS` says."""
-    image = read_rgb(photograph.path, FULL_SIZE)
+    # Images are read at full size.
+    image = read_rgb(photograph.path, 2**16)
     upright = np.array(image.size, float)
     # Boxes are cut off at the borders of the photograph. Empty ones are left out.
     boxes = _upright_boxes(photograph, upright).clip(0, np.tile(upright, 2))

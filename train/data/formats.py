@@ -30,8 +30,6 @@ DETAILS = "details"
 NO_CLASS = "no_class"
 # Renders in a tar file of WebDataset.
 PER_TAR = 1000
-# Largest value of an image of 16 bits.
-MAX_DEPTH = 2**16 - 1
 
 
 @dataclass(frozen=True)
@@ -251,7 +249,7 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
 
 def _depth_scale(depth: Tensor) -> float:
     """Return the depth, in world units, of one step of a depth image."""
-    return float(depth.max()) / MAX_DEPTH
+    return float(depth.max()) / (2**16 - 1)
 
 
 def _map(render: LabeledRender, name: str) -> np.ndarray:

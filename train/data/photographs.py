@@ -23,8 +23,6 @@ from renderer.settings import Size, height_and_width
 from train.data.photo import DESCRIPTION, TABLE, Photograph, split_sources
 from train.settings import OTHER_PREFIX, label_names
 
-# macOS adds a folder of this name to zip archives. It has no photographs.
-MACOS_FOLDER = "__MACOSX"
 # Suffixes of photographs that are not read.
 UNREAD = {".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw"} - {*SUFFIXES}
 # Largest number of classes that are positive because they have a sub-folder. The scores of each
@@ -181,7 +179,7 @@ def _is_image(folder: Path, path: PurePosixPath) -> bool:
 
 def is_hidden(name: str) -> bool:
     """Return whether a file or folder is hidden, or was added by macOS."""
-    return name.startswith(".") or name == MACOS_FOLDER
+    return name.startswith(".") or name == "__MACOSX"
 
 
 def visible_files(folder: Path) -> Iterator[PurePosixPath]:

@@ -76,9 +76,6 @@ NEGATIVE_COUNT = 2
 NEGATIVES = ("lemon", "peach", "ball", "apple", "pear", "sweet_pepper", "orange")
 # Horizontal field of view of the camera in degrees.
 FOV = 25.0
-# A setup in an environment map is drawn with projectors of this pattern first. The
-# environment map then replaces the projectors.
-PLAIN_PATTERN = "solid"
 # Range of the random draw of half of the width that the camera sees at the object, in
 # world units.
 HALF_WIDTHS = (1.2, 1.9)
@@ -204,7 +201,7 @@ def draw_shots(
         # the shots in a lighting. A shot draws its brightness from its interval.
         position = (index + rng.uniform()) / shots_per_lighting
         brightness = dimmest * (brightest / dimmest) ** position
-        pattern = PLAIN_PATTERN if lighting in environments else lighting
+        pattern = "solid" if lighting in environments else lighting
         first_pattern, *other_patterns = pattern.split("+")
         # The first pattern and its generator, and further projectors with another generator, so
         # that they do not change the other draws of the shot.

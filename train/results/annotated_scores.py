@@ -33,8 +33,6 @@ from train.results.tables import Estimate, Table
 SHOWN, COLUMNS = 24, 4
 # Name of the metrics of all classes.
 ALL = "all"
-# File of all detections, in the form of COCO's results.
-DETECTIONS = "detections.json"
 
 
 class Showing(NamedTuple):
@@ -338,7 +336,7 @@ def write(scores: AnnotatedScores, out: Path) -> None:
     begin_scores(out)
     if isinstance(scores, DetectionScores):
         lines = ",\n".join(json.dumps(entry, ensure_ascii=False) for entry in scores.detections)
-        atomic_write(out / DETECTIONS, f"[\n{lines}\n]\n")
+        atomic_write(out / "detections.json", f"[\n{lines}\n]\n")
     tiles = tiles_of(scores.pictures.values(), [(name,) for name in scores.pictures])
     rows = [tiles[start : start + COLUMNS] for start in range(0, len(tiles), COLUMNS)]
     write_image(out / CONTACT_SHEET, draw_grid(rows, heading=scores.about.replace("×", "x")))

@@ -345,8 +345,8 @@ def format_short_comparison(runs: Sequence[RunSummary], by: str = "source") -> s
     rows = []
     for method, runs_of_method in methods.items():
         shown = [_mean(Estimate(run.accuracy) for run in runs_of_method)]
-        for name in SHORT_METRICS:
-            shown.append(_mean(item.scores.overall.find(name) for item in group.get(method, ())))
+        of_method = [item.scores.overall for item in group.get(method, ())]
+        shown += [_mean(metrics.find(name) for metrics in of_method) for name in SHORT_METRICS]
         gain = None
         if first is not None and method in evaluations and method != first:
             gain = difference(evaluations[method], evaluations[first], ALL, "auc")

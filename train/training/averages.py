@@ -86,7 +86,6 @@ class Averages:
         self._keeps_latest = soup or keeps_latest
         self._best_accuracy = -1.0
         average = self._soup or self._ema
-        # The average is selected if there is one, and otherwise the trained network.
         self.selected = cast(MixedPrecision, average.module) if average else model
 
     def begin_epoch(self, initial: nn.Module | None, optimizer: torch.optim.Optimizer) -> None:

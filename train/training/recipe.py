@@ -24,10 +24,6 @@ from renderer.image import to_unit
 from train.device import PRECISIONS, MixedPrecision
 from train.settings import ALL_BUT_LAST, TrainSettings
 
-# The schedule "step" multiplies the learning rate by STEP_FACTOR after each of these
-# fractions of the training, like Zagoruyko and Komodakis (2016).
-MILESTONES = (0.3, 0.6, 0.8)
-STEP_FACTOR = 0.2
 # The schedule "one_cycle" begins with this fraction of the highest learning rate, and
 # reaches the highest learning rate after the fraction WARMUP of the training.
 START_FACTOR = 0.1
@@ -47,7 +43,8 @@ def learning_rate(settings: TrainSettings, done: float) -> float:
     rises linearly to the highest rate, and then falls to 0.
     """
     if settings.schedule == "step":
-        factor = STEP_FACTOR ** sum(done >= milestone for milestone in MILESTONES)
+        # The fractions are those of Zagoruyko and Komodakis (2016).
+        factor = 0.2 ** sum(done >= milestone for milestone in (0.3, 0.6, 0.8))
     elif settings.schedule == "cosine":
         factor = (1 + math.cos(math.pi * done)) / 2
     # The schedule "one_cycle": a linear rise, and then a linear fall to 0.

@@ -110,7 +110,11 @@ class Run:
         self._threads = torch.get_num_threads()
         if earlier is not None:
             self.trainer.resume()
-            self._warn_of_stretched_schedule(earlier.train.epochs)
+            # The schedule extends over all epochs, but each epoch of a soup has the whole schedule.
+            recipe = settings.train
+            if recipe.epochs != earlier.train.epochs and not recipe.soup:
+                line = "train.epochs=%d, not %d, stretches train.schedule=%s"
+                console.warning(line, recipe.epochs, earlier.train.epochs, recipe.schedule)
         elif settings.train.resume:
             console.info("nothing to resume in %s; starting at epoch 1", folder)
 
@@ -240,17 +244,6 @@ class Run:
         if light is not None:
             given = json.dumps(asdict(light))
             console.info("it needs images with normalized light: normalize_light=%s", given)
-
-    def _warn_of_stretched_schedule(self, planned: int) -> None:
-        """Warn if a resumed run has another number of epochs, and so another learning rate.
-
-        The schedule of the learning rate extends over all epochs, but each epoch of a model soup
-        has the whole schedule.
-        """
-        recipe = self.settings.train
-        if recipe.epochs != planned and not recipe.soup:
-            line = "train.epochs=%d, not %d, stretches train.schedule=%s"
-            console.warning(line, recipe.epochs, planned, recipe.schedule)
 
     def _score_initial(self, model: MixedPrecision) -> dict[str, float]:
         """Score the initial network, whose predictions become labels if the data have none."""

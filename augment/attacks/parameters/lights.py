@@ -160,7 +160,6 @@ class Skylight(Parameter):
         # Convert the angles to degrees in float64, so that rounding is negligible.
         zenith, azimuth = (values[:, :2].double() * self._sun).unbind(1)
         turbidity = values[:, 2] * TURBIDITY_UNIT
-        # RGB of the 49 harmonic coefficients of the sky model, shape (E, 49, 3).
         sky = sky_coefficients(zenith, azimuth, turbidity)
         sky = sky * self._scale[examples, None, None]
         if self._window is not None:

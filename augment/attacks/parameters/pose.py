@@ -67,7 +67,12 @@ class Pose(Parameter):
         # Height z of the ground of each object. None for an object without props or table, which
         # may float.
         self._grounds = [None if item.own is None else item.lowest for item in scene.objects]
-        self._unit = _pose_units(settings).to(scene.lights)
+        # Units of the rotation vector in degrees (3), the shift in world units (2), the logarithm
+        # of the scale (1), polar angle and azimuth of the cameras in degrees (2), and the
+        # logarithm of their distance (1).
+        units = [settings.rotation] * 3 + [settings.shift] * 2 + [math.log1p(settings.scale)]
+        units += [settings.view] * 2 + [math.log1p(settings.distance)]
+        self._unit = torch.tensor(units, dtype=torch.float64).to(scene.lights)
         limit = self._largest_values(scene, settings)
         self.box = -limit, limit
         # A value with the unit 0 has no effect.
@@ -131,15 +136,3 @@ class Pose(Parameter):
             lift = ground_height - moved[object_mask, 2].amin()
             moved = moved + lift * moved.new_tensor([0, 0, 1])
         return torch.where(object_mask[:, None], moved, vertices)
-
-
-def _pose_units(settings: PoseSettings) -> Float[Tensor, " 9"]:
-    """Return the units of the attack values of a pose.
-
-    They are those of the rotation vector in degrees (3), the shift in world units (2), the
-    logarithm of the scale (1), polar angle and azimuth of the cameras in degrees (2), and the
-    logarithm of their distance (1).
-    """
-    units = [settings.rotation] * 3 + [settings.shift] * 2 + [math.log1p(settings.scale)]
-    units += [settings.view] * 2 + [math.log1p(settings.distance)]
-    return torch.tensor(units, dtype=torch.float64)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 import augment
 from augment.attack_settings import EOTSettings
 from augment.attacks import objective
-from augment.attacks.objective import _moved, as_jpeg, average_transformed
+from augment.attacks.objective import _moved, as_jpeg
 from augment.network import Network, Quantization
 from augment.random_streams import generator
 from augment.tasks.classification import (
@@ -160,8 +160,10 @@ def transformed(images: Tensor, seed: int = 0, **settings) -> tuple[Tensor, list
     chosen = EOTSettings(**nothing | settings)
     means = Means()
     draws = [generator(seed, index) for index in range(len(images))]
-    mean = average_transformed(means, images, means(images), chosen, draws)
-    return mean, means.seen
+    criterion = ClassCriterion(torch.zeros(len(images), 1, dtype=torch.int64))
+    settings = augment.AttackSettings(eot=chosen, quantized=False)
+    averaged = objective.Objective(means, criterion, settings)
+    return averaged._expected(means(images), images, draws), means.seen
 
 
 def test_a_model_is_given_bytes_and_its_derivative_ignores_the_rounding():
