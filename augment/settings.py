@@ -21,8 +21,12 @@ PYTHON = "python:"
 
 
 def split_function(name: str) -> tuple[str, str]:
-    """Split "package.module:function" or "package.module.function" into module and function."""
-    module, _, function = name.rpartition(":" if ":" in name else ".")
+    """Split "package.module:function" or "package.module.function" into module and function.
+
+    The name may begin with PYTHON.
+    """
+    path = name.removeprefix(PYTHON)
+    module, _, function = path.rpartition(":" if ":" in path else ".")
     return module, function
 
 

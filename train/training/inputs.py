@@ -17,7 +17,7 @@ from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
-from augment.settings import PYTHON
+from augment.settings import PYTHON, split_function
 from augment.sources import load_source
 from augment.switch import SWITCHES
 from augment.tasks.classification import Classification, class_index, complementary_label
@@ -137,7 +137,8 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     # A run of a network that a Python function built names this function. To call it means to run
     # code, which the user must allow.
     built_by = str(state["architecture"].get("name"))
-    if built_by.startswith(PYTHON) and settings.model.name != built_by and not settings.trust:
+    is_named = split_function(settings.model.name) == split_function(built_by)
+    if built_by.startswith(PYTHON) and not is_named and not settings.trust:
         advice = f"give model.name={built_by} to run that code"
         raise InputError(f"the network in {path} is built by {built_by}: {advice}", "network")
     architecture = state["architecture"]
