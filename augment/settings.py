@@ -5,10 +5,10 @@ in `augment.attack_settings`, those of random variation and training renders in
 `augment.augmentation_settings`.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from renderer import settings as base
 from renderer.errors import MAX_SCALE, InputError, is_number, require_choice, require_range
@@ -21,8 +21,12 @@ PYTHON = "python:"
 
 
 def split_function(name: str) -> tuple[str, str]:
-    """Split "package.module:function" or "package.module.function" into module and function."""
-    module, _, function = name.rpartition(":" if ":" in name else ".")
+    """Split "package.module:function" or "package.module.function" into module and function.
+
+    The name may begin with PYTHON.
+    """
+    path = name.removeprefix(PYTHON)
+    module, _, function = path.rpartition(":" if ":" in path else ".")
     return module, function
 
 
@@ -134,6 +138,9 @@ LOCAL_LIGHT_SETTINGS: dict[str, type[Settings]] = {
     "projector": ProjectorSettings,
     "lamps": LampsSettings,
 }
+# Power with which each default lamp starts (`LampsSettings.start`) if an attack moves the
+# lamps, but does not change their power.
+LAMP_POWER = 2.0
 
 
 # Value of `SceneSettings.exposure` that means: chosen for each mesh.
@@ -204,6 +211,17 @@ class SceneSettings(Settings):
     def given_exposure(self) -> float:
         """The exposure, or 1 if it is chosen for each mesh."""
         return 1.0 if self.adapts_exposure else float(self.exposure)
+
+    def with_lights(self, attacked: Collection[str]) -> Self:
+        """Return these settings with default lights if attacked parameters need lights.
+
+        A light that the scene has stays.
+        """
+        lights: Any = {key: kind() for key, kind in LOCAL_LIGHT_SETTINGS.items() if key in attacked}
+        # An attack on the positions of lamps needs lamps that shine.
+        if "positions" in attacked:
+            lights.setdefault("lamps", LampsSettings(start=LAMP_POWER))
+        return replace(self, **{name: getattr(self, name) or lights[name] for name in lights})
 
 
 @dataclass

@@ -25,7 +25,7 @@ from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.exposure import DIM, with_normalized_light
 from augment.files import as_facts, is_network_file, require_no_facts
 from augment.network import FROM_FILE, Inputs, say_inputs, say_once
-from augment.settings import PYTHON, NormalizeLight
+from augment.settings import PYTHON, NormalizeLight, split_function
 from augment.sources import SOURCES, import_function, load_classifier
 from augment.switch import LIT_NAME, SWITCHES, Recognizer
 from augment.tasks.detection import Detection
@@ -259,10 +259,11 @@ def load_run(
     # Arguments of `build_network`, and entries for the wrapper around the network.
     shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
-    if name.startswith(PYTHON) and name != model and not trust_code:
+    is_named = model is not None and split_function(model) == split_function(name)
+    if name.startswith(PYTHON) and not is_named and not trust_code:
         advice = "set trust=true (trust_code=True in Python) to run that code"
         raise InputError(f"{path} is built by {name}: {advice}")
-    if model not in (None, name):
+    if model is not None and not is_named:
         raise InputError(f"{path} is built by {name}, not by {model}: leave {model} out")
     with checks_architecture(path):
         size = int(shape.pop("size"))

@@ -12,7 +12,7 @@ from typing import Any
 from augment import augmentation_settings as augmentation
 from augment import settings as scenes
 from augment.attack_settings import PARAMETER_NAMES, AttackSettings, RelightingSettings
-from augment.settings import LampsSettings, RendererSettings, SceneSettings
+from augment.settings import RendererSettings, SceneSettings
 from renderer import errors
 from renderer import settings as base
 from renderer.errors import MAX_SCALE, MAX_SEED, InputError, is_number
@@ -23,9 +23,6 @@ from train.settings import LABEL, MESHES, NETWORKS, PROBABILITY, TIME_FOLDER, Ta
 SCALES = (1 / MAX_SCALE, MAX_SCALE)
 # Default environment maps of an audit.
 ENVIRONMENTS = ("grace", "eucalyptus", "st_peters")
-# Power with which each default lamp starts (`LampsSettings.start`) if an attack moves the
-# lamps, but does not change their power.
-LAMP_POWER = 2.0
 # Patterns of projectors in training images.
 TRAINED_PATTERNS = ("solid", "gradient", "stripes", "checkers", "half", "spots")
 # Patterns of projectors in test images. Training uses none of these patterns.
@@ -155,13 +152,7 @@ class AttackExperimentSettings(TaskSettings):
         if self.unlabeled is not None:
             counting = (*OF_RELIGHTING, *OF_NETWORK)
             require_counting(self, AttackExperimentSettings(), counting, "for attack=relighting")
-        # An attacked light that the scene lacks, such as a projector, is added with default
-        # settings. An attack on the positions of lamps needs lamps that shine.
-        for light, settings_class in scenes.LOCAL_LIGHT_SETTINGS.items():
-            if light in attacked and getattr(self.scene, light, None) is None:
-                setattr(self.scene, light, settings_class())
-        if "positions" in attacked and self.scene.lamps is None:
-            self.scene.lamps = LampsSettings(start=LAMP_POWER)
+        self.scene = self.scene.with_lights(attacked)
         if "pose" in attacked:
             self.renderer.silhouettes = True
 
@@ -434,6 +425,7 @@ class RenderSettings(TaskSettings):
         parts = [*self.splits.values()] if isinstance(self.splits, dict) else []
         if not all(is_number(part) and part >= 0 for part in parts) or not sum(parts):
             raise self.wrong("splits", "must be parts and their fractions, such as {train: 1}")
+        self.scene = self.scene.with_lights(self.augment.attack.parameters)
         if "pose" in self.augment.attack.parameters:
             self.renderer.silhouettes = True
         # The default depends on the network. `require_counting` refuses other modes.

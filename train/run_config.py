@@ -251,7 +251,7 @@ def _path_of(text: str) -> Path:
     if text.startswith(PYTHON):
         # `find_spec` imports the packages above the module, which can raise errors of any type.
         with suppress(Exception):
-            spec = find_spec(split_function(text.removeprefix(PYTHON))[0])
+            spec = find_spec(split_function(text)[0])
             if spec and spec.origin:
                 return Path(spec.origin)
     return published_folder(Path(text.removeprefix("run:").removeprefix("hf:")))

@@ -357,6 +357,8 @@ class ExperimentSettings(NetworkSettings):
                 raise InputError(f"{key}={value} needs an initial network: set network", key)
         self._check_photographs()
         renders_meshes = self.augment.renders and self.augment.mode != "folder"
+        if renders_meshes:
+            self.scene = self.scene.with_lights(self.augment.attack.parameters)
         # The gradient of an attack on the pose needs the silhouettes of objects.
         if renders_meshes and "pose" in self.augment.attack.parameters:
             self.renderer = replace(self.renderer, silhouettes=True)

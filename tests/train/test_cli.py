@@ -16,7 +16,7 @@ import yaml
 
 from renderer.errors import InputError
 from scripts.compare import main as compare
-from train import console
+from train import checkpoints, console
 from train.cli import USER_ERROR
 from train.commands.experiment import logged_to
 from train.data.sets import content_hash
@@ -170,10 +170,11 @@ def test_a_stopped_run_is_resumed_by_folder(call, capsys, no_report, tmp_path, t
     [
         ("inputs.load_data", False, KeyboardInterrupt(), 128 + signal.SIGINT),
         ("run.evaluate_photographs", True, KeyboardInterrupt(), 128 + signal.SIGINT),
+        ("run.evaluate_photographs", True, SystemExit(143), 128 + signal.SIGTERM),
         ("run.evaluate_photographs", True, OSError(errno.ENOSPC, "full"), USER_ERROR),
     ],
 )
-def test_ctrl_c_and_a_full_disk_tell_how_to_resume_if_there_is_a_checkpoint(
+def test_a_signal_and_a_full_disk_tell_how_to_resume_if_there_is_a_checkpoint(
     call, capsys, monkeypatch, tmp_path, tiny_npz, photos, function, has_trained, error, code
 ):
     monkeypatch.setattr(f"train.training.{function}", Mock(side_effect=error))
@@ -182,6 +183,24 @@ def test_ctrl_c_and_a_full_disk_tell_how_to_resume_if_there_is_a_checkpoint(
     last_line = capsys.readouterr().out.splitlines()[-1]
     assert (tmp_path / "here" / LAST).is_file() == has_trained
     assert ("train.resume=true" in last_line) == has_trained
+
+
+def test_a_disk_full_before_the_first_checkpoint_tells_a_command_that_trains(
+    call, capsys, no_report, tmp_path, tiny_npz
+):
+    def save_best_alone(path: Path, *state) -> None:
+        if path.name == LAST:
+            raise OSError(errno.ENOSPC, "full")
+        save(path, *state)
+
+    save = checkpoints.save
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoints, "save", save_best_alone)
+        data = "data=npz", f"data.path={tiny_npz}", "photos=null"
+        assert call("train", "out=here", *data, *SMALL) == USER_ERROR
+    words = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert call("train", *words[words.index("train") + 1 :]) == 0
+    assert (tmp_path / "here" / LAST).is_file()
 
 
 def test_ctrl_c_is_one_line_even_if_a_library_turns_it_into_an_error(capsys):

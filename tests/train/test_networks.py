@@ -13,7 +13,8 @@ from renderer.errors import InputError
 from train.checkpoints import load_network, load_run, load_selected, save, write_published
 from train.networks import Dropout, WideResNet, build_network, describe
 from train.run_folder import BEST, PUBLISHED
-from train.training.inputs import Initial
+from train.settings import ExperimentSettings, ModelSettings
+from train.training.inputs import Initial, load_initial
 
 CLASSES = ("apple", "orange", "pear")
 MEAN = (0.4, 0.5, 0.6)
@@ -214,12 +215,20 @@ def test_the_folder_of_a_run_is_its_network(network, tmp_path):
     assert load_network(str(tmp_path)).name == f"run:{tmp_path}"
 
 
-@pytest.mark.parametrize("name", ["torchvision:shufflenet_v2_x0_5", "python:own_models:build"])
-def test_other_networks_are_loaded_by_their_name_and_copied_without_their_code(tmp_path, name):
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("torchvision:shufflenet_v2_x0_5", "torchvision:shufflenet_v2_x0_5"),
+        *product(["python:own_models:build", "python:own_models.build"], repeat=2),
+    ],
+)
+def test_other_networks_are_loaded_by_their_name_and_copied_without_their_code(
+    tmp_path, name, given
+):
     network = build_network(CLASSES, 16, name, MEAN, STD).eval()
     write(tmp_path, network, describe(network, CLASSES, size=16, encoding="linear", name=name))
     images = torch.rand(2, 3, 16, 16)
-    assert torch.equal(load_run(tmp_path / BEST, model=name)(images), network(images))
+    assert torch.equal(load_run(tmp_path / BEST, model=given)(images), network(images))
     if name.startswith("python:"):
         with pytest.raises(InputError, match=f"{name}: set trust=true"):
             load_network(f"run:{tmp_path}")
@@ -227,7 +236,9 @@ def test_other_networks_are_loaded_by_their_name_and_copied_without_their_code(t
         assert torch.equal(trusted(images), network(images))
     fresh = build_network(CLASSES, 16, name)
     (tmp_path / "own_models.py").write_text("raise SystemExit('code ran')")
-    initial_of(tmp_path / BEST).copy_to(fresh, {"classes": [*CLASSES], "size": 16, "name": name})
+    settings = ExperimentSettings(network=str(tmp_path), model=ModelSettings(name=given))
+    initial = load_initial(settings)
+    initial.copy_to(fresh, {"classes": [*CLASSES], "size": 16, "name": name})
     assert torch.equal(fresh.eval()(images), network(images))
 
 

@@ -9,6 +9,7 @@ from augment.augmentation_settings import AugmentationSettings
 from renderer.errors import InputError
 from scripts.attack import main as attack_command
 from scripts.evaluate import main as evaluate_command
+from scripts.render import main as render_command
 from tests.runs import loaded_run
 from train.__main__ import main as train_command
 from train.cli import as_override, quoted
@@ -87,6 +88,17 @@ def test_a_wrong_setting_is_one_sentence_that_starts_with_its_key(overrides, sta
     sentence = str(refusal.value)
     assert sentence.startswith(start)
     assert "\n" not in sentence
+
+
+@pytest.mark.parametrize("name", ["projector", "lamps", "positions"])
+def test_training_and_renders_add_the_lights_that_an_attack_changes_as_the_attack_does(name):
+    expected = attack_command.read([f"attack=[{name}]"]).scene
+    for command in (train_command, render_command):
+        radius = f"augment.attack.{name}.radius=1"
+        scene = command.read(["out=a", f"attack@augment.attack=[{name}]", radius]).scene
+        assert (scene.projector, scene.lamps) == (expected.projector, expected.lamps)
+        plain = command.read(["out=a"]).scene
+        assert plain.projector is plain.lamps is None
 
 
 def test_an_attack_on_the_pose_has_gradients_at_silhouettes():

@@ -148,13 +148,15 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, resume: 
                 console.debug("\n%s\n", format_comparison(summaries))
                 console.info("%s\n", format_short_comparison(summaries))
                 console.info("%s", report_of([folder], folder))
-        except (Interrupted, KeyboardInterrupt, OSError) as stop:
+        except (SystemExit, KeyboardInterrupt, OSError) as stop:
             if isinstance(stop, OSError) and stop.errno not in NO_ROOM:
                 raise
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
             advice = "no checkpoint yet: start again"
             # The first training on photographs may have ended before the main one.
-            if any(map(checkpoints.exists, [*settings_of_runs, folder / PHOTOGRAPHS_FIRST])):
+            folders = [*settings_of_runs, folder / PHOTOGRAPHS_FIRST]
+            # Of best.pt without a checkpoint, a new run would be refused, but not one that resumes.
+            if any(checkpoints.exists(path) or checkpoints.selected_file(path) for path in folders):
                 advice = f"to go on: {shlex.join(resume)}"
             console.info("%s%s", cause, advice)
             raise

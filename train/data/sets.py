@@ -453,6 +453,12 @@ def _read(root: Path, classes: Sequence[str], size: int, skip: bool, workers: in
     label is 0.
     """
     if classes:
+        # Images alone would be of one class, and folders that are no classes would be negatives.
+        names = photographs.folder_names(root)
+        wrong = {*names}.difference(classes) if names else {"no class folder"}
+        if wrong:
+            advice = f"give folders named by the classes only, such as {classes[0]}"
+            raise InputError(f"path: {root} holds {min(wrong)}: {advice}", "path")
         # The positive class does not matter here, so the first class stands for it.
         found = photographs.find_photographs(root, classes, classes[0])
     else:

@@ -1,6 +1,6 @@
 """The inputs of a run: its initial network, its data set, and the service that renders images."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,13 @@ from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
-from augment.settings import PYTHON
+from augment.settings import PYTHON, split_function
 from augment.sources import load_source
 from augment.switch import SWITCHES
 from augment.tasks.classification import Classification, class_index, complementary_label
 from augment.tasks.detection import Detection
 from augment.tasks.task import Task
-from renderer.errors import InputError, as_path, is_whole, keyed, keys_of, require_range
+from renderer.errors import InputError, as_path, composed, is_whole, keyed, keys_of, require_range
 from renderer.settings import MAX_SIZE
 from train import checkpoints, console
 from train.class_names import class_of_name, name_of_mesh, require_others, with_class_names
@@ -137,7 +137,8 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     # A run of a network that a Python function built names this function. To call it means to run
     # code, which the user must allow.
     built_by = str(state["architecture"].get("name"))
-    if built_by.startswith(PYTHON) and settings.model.name != built_by and not settings.trust:
+    is_named = split_function(settings.model.name) == split_function(built_by)
+    if built_by.startswith(PYTHON) and not is_named and not settings.trust:
         advice = f"give model.name={built_by} to run that code"
         raise InputError(f"the network in {path} is built by {built_by}: {advice}", "network")
     architecture = state["architecture"]
@@ -347,7 +348,7 @@ def build_service(
     if is_ranked or settings.augment.renders:
         positive_classes = [class_index(data.classes, name, "label") for name in names]
     if settings.augment.renders and settings.augment.mode == "folder":
-        images, labels = load_renders(settings, data)
+        images, labels = load_renders(settings, data, positive_classes)
         images = images.to(device)
         is_ranked = len(labels.unique()) > 1
     elif settings.augment.renders:
@@ -390,22 +391,25 @@ def _build_scene(
         return scene.with_count(settings.render_count)
 
 
-def load_renders(settings: ExperimentSettings, data: sets.DataSet) -> tuple[Tensor, Tensor]:
+def load_renders(
+    settings: ExperimentSettings, data: sets.DataSet, positive_classes: Sequence[int]
+) -> tuple[Tensor, Tensor]:
     """Load images that are used as renders from the folder in the setting `augment.folder`.
 
     A label is the index of a class, or the complementary label in a subfolder that is no class.
     """
     folder = published_folder(Path(str(settings.augment.folder)))
-    positive_classes = label_names(settings.label)
-    label_of_class = {name: index for index, name in enumerate(data.classes)}
-    label_of_negative = complementary_label(label_of_class[positive_classes[0]])
+    classes = [*map(composed, data.classes)]
+    positive_names = [classes[index] for index in positive_classes]
+    label_of_class = {name: index for index, name in enumerate(classes)}
+    label_of_negative = complementary_label(positive_classes[0])
     skip = settings.evaluate.skip_unreadable
     with keyed("augment.folder"):
         # Photographs with the names of their subfolders as labels.
-        found = find_photographs(folder, data.classes, positive_classes)
+        found = find_photographs(folder, classes, positive_names)
         found, images, _ = load_photographs(folder, found, data.size, skip)
         # Training needs renders of each positive class.
-        for name in sorted(set(positive_classes) - {item.label for item in found}):
+        for name in sorted(set(positive_names) - {item.label for item in found}):
             raise InputError(f"{folder} has no image of label={name}: add a sub-folder {name}")
     labels = [label_of_class.get(item.label, label_of_negative) for item in found]
     return images, torch.tensor(labels)

@@ -105,6 +105,8 @@ def test_train_and_test_folders_are_the_splits(tmp_path):
         (["fig/a.png"], "has 1 class folders: give two or more"),
         (["fig/a.png", "lime/.a.png"], "data/lime holds no image"),
         (["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"], "the folders test, train, val: "),
+        (["train/fig/a.png", "train/lime/a.png", "test/a.png"], "data/test holds no class f"),
+        (["train/fig/a.png", "train/lime/a.png", "test/1/a.png"], "^path: .*data/test holds 1: "),
         (["fig/a.png", "lime/a.png"], "^test_fraction=0.1 cannot split the one image of class 0"),
     ],
 )

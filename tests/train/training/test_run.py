@@ -343,7 +343,10 @@ def test_the_network_best_on_validation_is_scored_once_after_the_last_epoch(tiny
     assert scores["test/accuracy"] == pytest.approx(is_correct.double().mean().item())
 
 
-def test_a_folder_of_renders_is_shown_in_turn_with_its_labels(tiny, tmp_path, renders_of_rounds):
+@pytest.mark.parametrize("positive", ["orange", ORANGE])
+def test_a_folder_of_renders_is_shown_in_turn_with_its_labels(
+    tiny, tmp_path, renders_of_rounds, positive
+):
     """Two epochs of two rounds each show 4 of 9 images."""
     rng = np.random.default_rng(0)
     label_of_image = {}
@@ -354,7 +357,8 @@ def test_a_folder_of_renders_is_shown_in_turn_with_its_labels(tiny, tmp_path, re
         label_of_image[np.asarray(Image.open(path)).tobytes()] = label
     folder = ("augment=folder", f"augment.folder={tmp_path / 'lab'}", "augment.examples=4")
     rounds = ("augment.warm_start=false", "augment.regenerate_every=27", "train.epochs=2")
-    completed_run(tiny(*folder, *rounds, "train.ranking_weight=1"), tmp_path / "run")
+    ranked = (f"label={positive}", "train.ranking_weight=1")
+    completed_run(tiny(*folder, *rounds, *ranked), tmp_path / "run")
     assert len(renders_of_rounds) == 4
     shown = []
     for renders in renders_of_rounds:
