@@ -127,8 +127,8 @@ def _reader(path: Path, gloss: bool) -> Callable[[MeshFile], list[Part]] | None:
 
 def files_beside(path: Path) -> list[Path]:
     """List the materials, textures and buffers that a mesh file names, and that exist."""
-    readers = [_reader(path, gloss) for gloss in (False, True)]
-    if None in readers:
+    readers = [read for gloss in (False, True) if (read := _reader(path, gloss))]
+    if not readers:
         return []
     file = MeshFile(path)
     # A reader notes each file that it opens in `beside`. `load_mesh` raises the error of a mesh

@@ -15,6 +15,7 @@ In shapes, `size` is the number of functions of a basis.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -259,7 +260,11 @@ class LocalBasis(Basis):
 
     @abstractmethod
     def connect(
-        self, points: Tensor, normals: Tensor, positions: Tensor | None = None
+        self,
+        points: Tensor,
+        normals: Tensor,
+        positions: Tensor | None = None,
+        width: float = math.inf,
     ) -> LightPaths:
         """Find the straight paths from light sources to S surface points, without shadows.
 
@@ -269,6 +274,8 @@ class LocalBasis(Basis):
             positions: Positions to which the L light sources have moved,
                 shape (L, 3). None for their own `positions`. Only a basis with
                 `is_movable` accepts positions.
+            width: Smallest width α of the specular lobes at the points
+                (`renderer.microfacets`). Infinite if they are matte.
 
         Returns:
             Paths, also those that an object blocks. Their irradiance is

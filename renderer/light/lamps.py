@@ -104,7 +104,11 @@ class Projector(Settings, LocalBasis):
         return coefficients.view(self.pixels, self.pixels, 3) / self.power
 
     def connect(
-        self, points: Tensor, normals: Tensor, positions: Tensor | None = None
+        self,
+        points: Tensor,
+        normals: Tensor,
+        positions: Tensor | None = None,
+        width: float = math.inf,
     ) -> LightPaths:
         """Find the straight path from the projector to each surface point that it lights.
 
@@ -112,6 +116,7 @@ class Projector(Settings, LocalBasis):
             points: N surface points in world axes, shape (N, 3).
             normals: Unit normals at the points, shape (N, 3).
             positions: Not used, because a projector cannot be moved.
+            width: Not used, because a projector is a point.
 
         Returns:
             One path for each point that lies within the pattern and faces the
@@ -159,8 +164,10 @@ class Projector(Settings, LocalBasis):
         return [projector(pose_of(camera), self.fov, pattern, scale)]
 
 
-# A surface point casts a ray to each point of a set of points on a disc lamp.
+# A matte surface point casts a ray to each point of a set of points on a disc lamp. A glossy one
+# casts more, up to this number of rays from all points, so that they do not show in highlights.
 POINTS_PER_SET = 8
+MAX_PATHS = 2**23
 # Number of different sets of points on a disc lamp. Neighboring surface points use
 # different sets, which makes the edges of soft shadows smoother.
 POINT_SETS = 4
@@ -257,7 +264,11 @@ class Lamps(LocalBasis):
         return replace(self, positions=tuple(map(tuple, positions.tolist())))
 
     def connect(
-        self, points: Tensor, normals: Tensor, positions: Tensor | None = None
+        self,
+        points: Tensor,
+        normals: Tensor,
+        positions: Tensor | None = None,
+        width: float = math.inf,
     ) -> LightPaths:
         """Find the straight paths from lamps to surface points, without shadows.
 
@@ -266,16 +277,20 @@ class Lamps(LocalBasis):
             normals: Unit normals at the points, shape (S, 3).
             positions: Positions to which the L lamps have moved, shape (L, 3).
                 None uses the positions of the basis.
+            width: Smallest width α of the specular lobes at the points. Discs have
+                more points for narrower lobes. Infinite if the points are matte.
 
         Returns:
             Paths that arrive at the front of the surface, also those that an
             object blocks. There is one path for each pair of a surface point and
-            a lamp, or `POINTS_PER_SET` paths if the lamps are discs.
+            a lamp, or at least `POINTS_PER_SET` paths if the lamps are discs.
         """
         positions = points.new_tensor(self.positions) if positions is None else positions
         # Points on the lamps. Neighboring surface points use different sets of points. Axes:
         # set, lamp, point, coordinate. A point lamp has one set of one point.
-        sources = self._disc_points(positions) if self.radius else positions[None, :, None]
+        sources = positions[None, :, None]
+        if self.radius:
+            sources = self._disc_points(positions, self._point_count(points, positions, width))
         set_of_point = torch.arange(len(points), device=points.device) % len(sources)
         # First find the paths with light, without recording operations for gradients.
         with torch.no_grad():
@@ -321,7 +336,18 @@ class Lamps(LocalBasis):
             emitters.append({"type": "disk", "to_world": pose, "emitter": area_light})
         return emitters
 
-    def _disc_points(self, positions: Float[Tensor, "L 3"]) -> Float[Tensor, "_ L _ 3"]:
+    def _point_count(self, points: Tensor, positions: Tensor, width: float) -> int:
+        """Choose how many points on each disc are apart by less than a highlight of this width."""
+        if math.isinf(width):
+            return POINTS_PER_SET
+        distances = torch.cdist(points.detach(), positions.detach()).cpu().numpy()
+        # Length of the narrowest highlight on the nearest disc.
+        length = max(width * distances.min(initial=math.inf), 1e-9)
+        wanted = 2 * (self.radius / length) ** 2
+        limit = MAX_PATHS / max(1, len(points) * len(positions))
+        return int(max(POINTS_PER_SET, min(wanted, limit)))
+
+    def _disc_points(self, positions: Float[Tensor, "L 3"], count: int) -> Float[Tensor, "_ L _ 3"]:
         """Choose points on disc lamps, to which shadow rays are cast.
 
         Each of several sets lies on Vogel's spiral (1979), rotated by another angle, with one point
@@ -329,8 +355,8 @@ class Lamps(LocalBasis):
         coordinate.
         """
         # Tensors have one row for each set and one column for each point.
-        set_index, point_index = torch.arange(POINT_SETS)[:, None], torch.arange(POINTS_PER_SET)
-        area_fraction = (point_index + (set_index + 0.5) / POINT_SETS) / POINTS_PER_SET
+        set_index, point_index = torch.arange(POINT_SETS)[:, None], torch.arange(count)
+        area_fraction = (point_index + (set_index + 0.5) / POINT_SETS) / count
         distance = self.radius * area_fraction.sqrt()
         # Successive points of the spiral are apart by the golden angle π (3 - √5).
         angle = point_index * math.pi * (3 - math.sqrt(5)) + set_index * 2 * math.pi / POINT_SETS

@@ -152,6 +152,13 @@ class Surface:
         """Specular material (gloss) at the samples, or None for a matte surface."""
         return sample_gloss(self.mesh, self.fragments, self.given_gloss)
 
+    @property
+    def lobe_width(self) -> float:
+        """Smallest width α = roughness² of the specular lobes. Infinite for a matte surface."""
+        if self.gloss is None:
+            return math.inf
+        return float(self.gloss.roughness.detach().numpy().min(initial=1.0)) ** 2
+
     @cached_property
     def toward(self) -> Tensor:
         """Unit vectors from the S samples to the camera, shape (S, 3).
@@ -360,7 +367,8 @@ def local_transfer(
     as those of the mesh.
     """
     fragments = surface.fragments
-    paths = unoccluded(rays, basis, surface.points, surface.normals, surface.planes)
+    samples = surface.points, surface.normals, surface.planes
+    paths = unoccluded(rays, basis, *samples, width=surface.lobe_width)
     # One row for each path, one column for each channel: radiance of the sample at the end
     # of the path, per unit of the coefficient of its light.
     weights = path_reflectance(surface, albedo, paths) * paths.irradiance[:, None]
@@ -408,13 +416,15 @@ def unoccluded(
     normals: Float[Tensor, "S 3"],
     planes: Float[Tensor, "S 3"],
     positions: Float[Tensor, "L 3"] | None = None,
+    width: float = math.inf,
 ) -> LightPaths:
     """Find the paths from local lights to surface points that no face of the mesh blocks.
 
     A path must also arrive above the plane of the face on which the point lies. `positions`
-    are the places to which lamps have moved. None leaves them where the basis has them.
+    are the places to which lamps have moved. None leaves them where the basis has them. `width` is
+    that of the narrowest highlights (`LocalBasis.connect`).
     """
-    paths = basis.connect(points, normals, positions)
+    paths = basis.connect(points, normals, positions, width)
     # Whether a path is blocked has no gradient, so no operations are recorded.
     with torch.no_grad():
         plane_of_path = planes[paths.point]
@@ -469,7 +479,7 @@ class LocalLightView:
         paths = self.fixed_paths.get(basis) if moved is None else None
         if paths is None:
             samples = surface.points, surface.normals, surface.planes
-            paths = unoccluded(self.rays, basis, *samples, moved)
+            paths = unoccluded(self.rays, basis, *samples, moved, surface.lobe_width)
         if moved is None:
             self.fixed_paths[basis] = paths
         shown = (fragments or surface.fragments).to("cpu")

@@ -21,8 +21,10 @@ from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_sc
 from renderer.operators.apply import TransferOperator
 from renderer.operators.build import build_operators
 from renderer.operators.rays import LocalLightView, Rays, Surface
+from renderer.rendering import render
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo
+from renderer.surface.gloss import Gloss
 from renderer.visibility import choose
 from renderer.visibility.fragments import build_fragments
 
@@ -194,6 +196,29 @@ def test_a_small_disc_is_a_point_times_the_cosine_to_its_axis_and_dark_behind():
     expected = irradiance_of_lamp(POSITION, 0.0, points, normals) * cosine
     found = irradiance_of_lamp(POSITION, 1e-7, points, normals)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.4])
+def test_the_highlight_of_a_disc_is_that_of_many_small_discs(roughness):
+    """600 small discs on a spiral have equal areas, and axes of almost the same direction."""
+    center = np.array([1.3, 0.9, 1.1])
+    across = np.linalg.svd(center[None])[2][1:]
+    steps = np.arange(600) + 0.5
+    turns = steps * math.pi * (3 - math.sqrt(5))
+    offsets = 0.5 * np.sqrt(steps / 600) * np.stack([np.cos(turns), np.sin(turns)])
+    places = center + offsets.T @ across
+    gloss = Gloss(roughness, 1.0)
+    images = []
+    for lamps in (
+        Lamps((tuple(center),), radius=0.5),
+        Lamps(tuple(map(tuple, places)), radius=1e-6),
+    ):
+        power = torch.full((lamps.size, 3), 0.2 / lamps.size, dtype=torch.float64)
+        lights = [(lamps, power)]
+        options = {"lights": lights, "gloss": gloss, "samples": 2}
+        images.append(render(ball(3), CAMERA, None, 16, 0.0, **options))
+    error = (images[0] - images[1]).square().mean().sqrt()
+    assert error < 0.05 * images[1].square().mean().sqrt()
 
 
 def test_a_surface_behind_a_lamp_casts_no_shadow():

@@ -87,12 +87,13 @@ def moved_vertices(mesh: renderer.Mesh, camera: Camera, size: int, normals: str)
     return image
 
 
-def moved_camera(mesh, camera, names, size, gloss=None) -> ChangedImage:
+def moved_camera(mesh, camera, names, size, gloss=None, **options) -> ChangedImage:
     def image(change: Tensor, samples: int) -> Tensor:
         values = {
             name: getattr(camera, name) + amount for name, amount in zip(names, change, strict=True)
         }
-        return rendered(mesh, replace(camera, **values), size, samples, gloss=gloss)
+        options["silhouettes"] = change.requires_grad
+        return rendered(mesh, replace(camera, **values), size, samples, gloss=gloss, **options)
 
     return image
 
@@ -160,6 +161,18 @@ def test_gradients_by_the_camera_include_the_movement_of_highlights():
     # A smaller turn moves outlines across too few samples.
     expected = differences(image, directions, samples=14, step=0.5)
     assert relative_error(found, expected) < 0.1
+
+
+def test_the_highlight_of_a_lamp_on_a_large_mirror_moves_with_the_camera():
+    lights = [(Lamps(((0.4, 0.3, 1.5),)), torch.full((1, 3), 2.0))]
+    names = ["polar", "azimuth"]
+    metal = renderer.Gloss(0.5, 1.0)
+    camera = replace(NEAR, polar=20.0)
+    image = moved_camera(square(2.5, 0.0), camera, names, 16, metal, light=None, lights=lights)
+    directions = torch.eye(2, dtype=torch.float64)
+    found = derivatives(image, directions, samples=4)
+    expected = differences(image, directions, samples=4, step=0.1)
+    assert relative_error(found, expected) < 0.03
 
 
 def square(half: float, height: float) -> renderer.Mesh:
