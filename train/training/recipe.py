@@ -102,9 +102,8 @@ def called_layers(network: nn.Module, size: int, count: int = 1) -> tuple[Output
     images = torch.full((count, 3, size, size), 0.5, device=device_of(network))
     with ExitStack() as hooks, eval_mode(network), torch.no_grad():
         for name, module in network.named_modules():
-            own = list(module.parameters(recurse=False))
             # A layer has parameters itself, and contains no module with others.
-            is_layer = own and len(own) == len(list(module.parameters()))
+            is_layer = {_module_of(parameter) for parameter, _ in module.named_parameters()} == {""}
             if is_layer and not isinstance(module, torch.jit.ScriptModule):
                 hooks.enter_context(module.register_forward_hook(partial(note, name)))
         outputs = plain_outputs(network(images))
@@ -112,8 +111,11 @@ def called_layers(network: nn.Module, size: int, count: int = 1) -> tuple[Output
 
 
 def _module_of(parameter: str) -> str:
-    """Return the name of the module of a parameter: "head.fc" for "head.fc.weight"."""
-    return parameter.rpartition(".")[0]
+    """Return the name of the module of a parameter: "head.fc" for "head.fc.weight".
+
+    That of a parametrized weight, "head.fc.parametrizations.weight.original", is also of "head.fc".
+    """
+    return parameter.partition("parametrizations.")[0].rpartition(".")[0]
 
 
 def freeze(network: nn.Module, stage: str, size: int) -> None:
@@ -126,8 +128,9 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
         called, logits = called_layers(network, size)
         class_count = logits.shape[1]
         last = called[-1][0] if called else last_layer(network)
-        named = network.named_parameters()
-        weights = [weight for name, weight in named if _module_of(name) == last]
+        # A weight that several modules share has several names.
+        named = network.named_parameters(remove_duplicate=False)
+        weights = {weight for name, weight in named if _module_of(name) == last}
         # The last layer of a classifier has a row for each class, that of a zero-shot network none.
         is_zero_shot = not any(class_count in weight.shape for weight in weights)
         texts = text_vectors(network, class_count)[-1:] if is_zero_shot else []
@@ -135,7 +138,7 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
         if texts:
             keep_text_vectors(network, class_count, nn.Parameter)
         for name, parameter in network.named_parameters():
-            parameter.requires_grad_(name in texts if texts else _module_of(name) == last)
+            parameter.requires_grad_(name in texts if texts else parameter in weights)
         return
     names = [name for name, _ in network.named_parameters()]
     chosen = [name for name in names if name.startswith(f"{stage}.")]
@@ -207,6 +210,10 @@ def feature_norm(network: nn.Module, images: Float[Tensor, "N 3 H W"]) -> float:
                 raise InputError(f"{fault}: name the last module that stays as it is", "freeze")
             gradients = torch.autograd.grad(logit, weights)
             squares.append(sum(float(gradient.square().sum()) for gradient in gradients))
+        # Weights that each pass computes (`torch.nn.utils.weight_norm`) get no graph in this pass.
+        # A network with such a graph could not be copied.
+        with torch.no_grad():
+            network(images[:1])
     return math.sqrt(fmean(squares))
 
 
@@ -335,7 +342,6 @@ class SharedTeacher(nn.Module):
         self.hook = layer.register_forward_pre_hook(self._store_features)
 
     def _store_features(self, _: nn.Module, inputs: tuple[Any, ...]) -> None:
-        # A parametrization of the layer is called without inputs.
         self.features = inputs[0].detach() if inputs else None
 
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B classes"]:
@@ -355,7 +361,9 @@ def share_layers(
     is_frozen = settings.freeze == ALL_BUT_LAST and settings.eval_mode
     # `SharedTeacher` registers a hook, which modules of TorchScript do not support.
     has_script = any(isinstance(module, torch.jit.ScriptModule) for module in pupil.modules())
-    if not is_frozen or has_script:
+    # The features change if an earlier layer shares a weight with the last one.
+    is_tied = len([*pupil.parameters()]) < len([*pupil.named_parameters(remove_duplicate=False)])
+    if not is_frozen or has_script or is_tied:
         return teacher
     shared = SharedTeacher(pupil, teacher)
     # Two test images with a color gradient.

@@ -233,6 +233,36 @@ def test_the_matrix_that_is_called_last_learns_wherever_it_stands():
     assert learning_layers(script) == {"2"}
 
 
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        nn.utils.parametrizations.weight_norm,
+        nn.utils.parametrizations.spectral_norm,
+        nn.utils.weight_norm,
+    ],
+)
+def test_a_parametrized_last_layer_learns_as_a_whole_and_can_be_copied(wrap):
+    network = nn.Sequential(nn.Flatten(), nn.Linear(12, 4), wrap(nn.Linear(4, 2))).eval()
+    recipe.freeze(network, "all_but_last", size=2)
+    learns = {name: parameter.requires_grad for name, parameter in network.named_parameters()}
+    assert learns == {name: name.startswith("2.") for name in learns}
+    images = torch.rand(2, 3, 2, 2)
+    assert recipe.feature_norm(network, images) > 0
+    assert torch.equal(deepcopy(network)(images), network(images))
+
+
+def test_a_weight_that_the_last_layer_shares_learns_and_changes_the_features():
+    network = nn.Sequential(nn.Flatten(), nn.Linear(12, 12), nn.Linear(12, 12))
+    network[2].weight = network[1].weight
+    recipe.freeze(network, "all_but_last", size=2)
+    learning = [name for name, value in network.named_parameters() if value.requires_grad]
+    assert learning == ["1.weight", "2.bias"]
+    pupil = MixedPrecision(network, "float32")
+    teacher = deepcopy(pupil).eval()
+    assert recipe.share_layers(TrainSettings(**LAST_LAYER_ONLY), pupil, teacher, 2) is teacher
+
+
 def test_a_network_that_cannot_learn_in_its_last_layer_is_refused():
     vectors = nn.Sequential(nn.Flatten(), nn.LayerNorm(12))
     recipe.freeze(vectors, "all_but_last", size=2)
@@ -304,8 +334,12 @@ def pair(*layers_after: nn.Module) -> tuple[MixedPrecision, MixedPrecision]:
     return pupil, deepcopy(pupil).eval()
 
 
-def test_the_logits_are_those_of_the_teacher_after_the_last_layer_has_learned():
+@pytest.mark.parametrize("wrap", [lambda layer: layer, nn.utils.parametrizations.weight_norm])
+def test_the_logits_are_those_of_the_teacher_after_the_last_layer_has_learned(wrap):
     pupil, teacher = pair()
+    for network in (pupil, teacher):
+        wrap(network.network[3])
+    pupil.network[:3].requires_grad_(False)
     shared = recipe.share_layers(TrainSettings(**LAST_LAYER_ONLY), pupil, teacher, TINY)
     assert isinstance(shared, recipe.SharedTeacher)
     pupil.eval()
@@ -313,7 +347,7 @@ def test_the_logits_are_those_of_the_teacher_after_the_last_layer_has_learned():
     expected = teacher(images)
     calls = teacher.network[0].calls
     with torch.no_grad():
-        pupil.network[3].weight += 1
+        pupil.network[3].bias += torch.arange(5)
     assert not torch.equal(pupil(images), expected)
     assert torch.equal(shared(images), expected)
     assert teacher.network[0].calls == calls
@@ -332,18 +366,6 @@ def test_a_teacher_with_other_features_or_more_layers_computes_its_own(changes, 
     pupil, teacher = pair(*layers_after)
     settings = TrainSettings(**LAST_LAYER_ONLY | changes)
     assert recipe.share_layers(settings, pupil, teacher, TINY) is teacher
-
-
-def test_a_last_layer_with_a_parametrization_has_a_teacher_of_its_own():
-    pupil, teacher = (weight_norm_at_last(network) for network in pair())
-    assert recipe.share_layers(TrainSettings(**LAST_LAYER_ONLY), pupil, teacher, TINY) is teacher
-
-
-def weight_norm_at_last(network: MixedPrecision) -> MixedPrecision:
-    nn.utils.parametrizations.weight_norm(network.network[3])
-    for parameter in network.network[:3].parameters():
-        parameter.requires_grad_(False)
-    return network
 
 
 class ByText(nn.Module):
