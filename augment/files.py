@@ -339,9 +339,11 @@ class InBatches(Network):
 
     def forward(self, images: Tensor) -> Any:
         """Compute the outputs of images (N, 3, H, W). A list of outputs becomes a tuple."""
+        # Without images, the network gets black ones.
+        shown = images if len(images) else nn.functional.pad(images, (0,) * 7 + (1,))
         # Number of copies that fill up the last batch.
-        missing_count = -len(images) % self.batch_size
-        filled = torch.cat([images, images[:1].expand(missing_count, -1, -1, -1)])
+        missing_count = -len(shown) % self.batch_size
+        filled = torch.cat([shown, shown[:1].expand(missing_count, -1, -1, -1)])
         parts = [self.network(part) for part in filled.split(self.batch_size)]
         joined = tree_map(lambda *of: torch.cat(of)[: len(images)], *parts)
         return tuple(joined) if isinstance(joined, list) else joined

@@ -49,11 +49,12 @@ def save_exported(network: nn.Module, folder: Path) -> Path:
 
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 @pytest.mark.parametrize("save", [save_torchscript, save_exported])
-def test_a_file_gives_the_logits_and_the_gradient_of_its_network(tmp_path, save):
+@pytest.mark.parametrize("count", [0, 5])
+def test_a_file_gives_the_logits_and_the_gradient_of_its_network(tmp_path, save, count):
     network = small_network()
     path = save(network, tmp_path)
     classifier = load_classifier(str(path), classes=["a", "b", "c"], size=SIZE, trust_code=True)
-    images = torch.rand(5, 3, SIZE, SIZE, requires_grad=True)
+    images = torch.rand(count, 3, SIZE, SIZE, requires_grad=True)
     expected = network(images)
     found = classifier(images)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
