@@ -235,7 +235,9 @@ def _as_found(boxes: Any, labels: Any) -> dict[str, Tensor]:
     """Return the boxes and labels of an image as a detector that is sure of them does."""
     if isinstance(boxes, tv_tensors.BoundingBoxes):
         corners = tv_tensors.BoundingBoxFormat.XYXY
-        boxes = v2.functional.convert_bounding_box_format(boxes, new_format=corners)
+        fault = f"targets has boxes of the format {boxes.format.name}"
+        with errors.explained(fault, "give boxes of the format XYXY", "", ValueError):
+            boxes = v2.functional.convert_bounding_box_format(boxes, new_format=corners)
     boxes = torch.as_tensor(boxes, dtype=torch.float32).as_subclass(Tensor)
     labels = errors.as_integers("labels", labels)
     return {"boxes": boxes.reshape(-1, 4), "labels": labels, "scores": torch.ones(len(labels))}

@@ -168,6 +168,17 @@ def test_boxes_may_be_whole_numbers_lists_or_those_of_a_sample(images):
     assert all(torch.equal(found[0], other) for other in found[1:])
 
 
+# Older versions of torchvision have no rotated boxes.
+@pytest.mark.parametrize(
+    "name", sorted({*tv_tensors.BoundingBoxFormat.__members__} - {"XYXY", "XYWH", "CXCYWH"})
+)
+def test_rotated_boxes_are_refused(images, name):
+    sides = torch.ones(1, 8 if name == "XYXYXYXY" else 5)
+    boxes = tv_tensors.BoundingBoxes(sides, format=name, canvas_size=images.shape[-2:])
+    with pytest.raises(InputError, match=name):
+        hiding()(images, [{"boxes": boxes, "labels": [1]}] * 8)
+
+
 class Pixels(nn.Module):
     """Segmenter whose logits of two classes are the mean of a pixel and .3."""
 
