@@ -484,6 +484,8 @@ def as_network(
         name = network.__name__
         raise InputError(f"{argument} is the class {name}: give a network, such as {name}(...)")
     require_evaluation_mode(network, argument)
+    if isinstance(network, nn.Module) and any(weight.is_meta for weight in network.parameters()):
+        raise InputError(f"{argument} is on the device meta: load its weights first")
     device = wrappers.device_of(network) if device is None else errors.as_device(device)
     function = _preprocessed(network, normalization, value_range).to(device)
     name = name or type(network).__name__

@@ -173,6 +173,7 @@ def with_pixel_mean(network: nn.Module) -> nn.Module:
     ("change", "options", "message"),
     [
         (without_eval, {}, "training mode"),
+        (lambda network: network.to("meta"), {"device": "cpu"}, "load its weights"),
         (lambda _: lambda images: {"scores": images.mean((2, 3))}, {}, "dict"),
         (with_normalize, {"normalization": "imagenet"}, "Normalize"),
         (with_pixel_mean, {"normalization": "imagenet"}, "pixel_mean"),
