@@ -24,7 +24,7 @@ def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
 @pytest.mark.parametrize("task", ["detection", "segmentation"])
 def test_scores_of_other_tasks_are_not_compared_as_those_of_classifiers(tmp_path, task):
     (tmp_path / "summary.json").write_text(json.dumps({"task": task, "label": ["dog"]}))
-    with pytest.raises(InputError, match=f"{tmp_path} has scores of {task}"):
+    with pytest.raises(InputError, match=f"^runs: {tmp_path} has scores of {task}"):
         finished_runs([tmp_path])
 
 
