@@ -220,7 +220,8 @@ class TaskNetwork(CheckedNetwork):
             dim: Network for dim images, with the same task, size and classes.
             below: An image is dim if the 98th percentile of its linear values
                 is below this value, above 0 and at most 1. Of 2,439 photographs
-                in ordinary light, 14 are below the default, 0.25.
+                in ordinary light, 14 are below the default, 0.25, which
+                `normalize_light` with `average` always uses.
 
         Raises:
             InputError: If the networks differ in task, size or classes.

@@ -257,13 +257,13 @@ class AuditedNetwork:
     @cached_property
     def verdict(self) -> tuple[str, str]:
         """Whether the network is safe, in words such as "No", and a sentence that says why."""
-        if not any(any(views) for views in self.recognized.values()):
+        view_count = max(counts["correct"] for counts in self.counts.values())
+        if not view_count and not any(map(any, self.recognized.values())):
             return "Unknown", f"Unknown: it does not recognize {self.label} in plain light, either."
         of_images = self._judge_images()
         findings = [*_findings(self.rates), *of_images]
         faults = [item.text for item in findings if item.right < PASS_THRESHOLD]
         faults += self._attack_faults()
-        view_count = max(counts["correct"] for counts in self.counts.values())
         rests_on_images = any(item.right < PASS_THRESHOLD for item in of_images)
         # Faults in renders of few views may be chance.
         if faults and not rests_on_images and view_count < MIN_VIEWS:

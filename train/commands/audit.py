@@ -263,7 +263,13 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
             if is_named:
                 console.warning(f"first results: {path}")
         if settings.unlabeled:
-            _attack_photographs(settings, networks, photographs, out)
+            try:
+                _attack_photographs(settings, networks, photographs, out)
+            except InputError as error:
+                # The results of the meshes are shown.
+                if plan is None:
+                    raise
+                caveats.append(f"The light of the photographs was not attacked: {error}.")
         return write_page(plan.image_folders if plan else {}, out, caveats)
 
 

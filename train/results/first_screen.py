@@ -4,12 +4,14 @@ It says whether hardening helped, and shows metrics and pictures before and afte
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from renderer.errors import InputError
 from train.data.photo import DESCRIPTION
 from train.results import compare
 from train.results.compare import Difference
@@ -330,8 +332,10 @@ def _draw_images(before: Predictions, after: Predictions, images: Path) -> list[
         subject = ", ".join(map(in_words, filter(None, (photograph.label, photograph.source))))
         original, hardened = (describe_prediction(item, row) for item in (before, after))
         alt = f"{subject}; original network: {original.text}; hardened network: {hardened.text}"
-        picture = read_square(images / photograph.path, SIDE, alt)
-        drawn.append(ComparedImage([picture], subject, original, hardened))
+        # A photograph may be gone since it was scored.
+        with suppress(InputError):
+            picture = read_square(images / photograph.path, SIDE, alt)
+            drawn.append(ComparedImage([picture], subject, original, hardened))
     return drawn
 
 

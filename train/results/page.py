@@ -273,7 +273,7 @@ def images_folder(run: RunSummary, name: str) -> Path | None:
     if folder:
         # A relative path is relative to the folder in which the run was started.
         working_folder = Path(run.config.get("working_folder") or "")
-        candidates = [published_folder(Path(folder)), working_folder / folder]
+        candidates = [working_folder / folder, published_folder(Path(folder))]
     return next(filter(Path.is_dir, candidates), None)
 
 

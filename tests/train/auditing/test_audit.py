@@ -330,12 +330,26 @@ def test_test_images_of_another_size_than_a_later_network_needs_are_refused(give
     assert not (out / "classifier").exists()
 
 
-def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None:
+def test_an_audit_of_meshes_ends_with_its_page_if_photographs_show_nothing(given, monkeypatch):
+    def fail(*_: Any) -> None:
+        raise InputError("dark has no detections in 1 photographs: give others")
+
+    found = []
+    monkeypatch.setattr(audit, "_attack_photographs", fail)
+    monkeypatch.setattr(audit._Plan, "measure", lambda *_: [])
+    monkeypatch.setattr(audit.page, "write_audit_page", lambda *given: found.append(given[-1]))
+    run_audit(AuditSettings(**given, unlabeled=given["out"]))
+    assert "no detections" in found[0][-1]
+
+
+def write_parts(folder: Path, hits: int, n: int, adversarial: list[int], correct: int = 4) -> None:
     is_recognized = [True] * hits + [False] * (n - hits)
     recognized = {"uniform": is_recognized, "random 1": is_recognized}
     (folder / RECOGNIZED).write_text(json.dumps(recognized))
     for kind in lights.KINDS:
-        (folder / f"{kind}.json").write_text(json.dumps({"correct": 4, "adversarial": adversarial}))
+        (folder / f"{kind}.json").write_text(
+            json.dumps({"correct": correct, "adversarial": adversarial})
+        )
     rates = {"recall": fraction(hits, n), "false_positive_rate": fraction(0, n)}
     scores = {"label": "orange"} | {name: asdict(rate) for name, rate in rates.items()}
     (folder / LABORATORY).mkdir()
@@ -352,12 +366,14 @@ def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None
         # Four attacked views, of which all are lost, do not decide alone.
         (9, 9, [0, 0, 4, 4], "Perhaps not: an attack"),
         (200, 400, [0, 0, 4, 4], "No: it recognizes"),
+        # Four views are recognized, but in plain light alone.
+        (0, 400, [0, 0, 0, 0], "No: it recognizes 0%"),
         # Without a view that is recognized in plain light, nothing is known.
-        (0, 400, [0, 0, 0, 0], "Unknown: "),
+        (0, 400, None, "Unknown: "),
     ],
 )
 def test_the_answer_of_an_audit(tmp_path, hits, n, adversarial, answer):
-    write_parts(tmp_path, hits, n, adversarial)
+    write_parts(tmp_path, hits, n, adversarial or [0, 0, 0, 0], correct=4 if adversarial else 0)
     network = AuditedNetwork("orange", "dark", tmp_path)
     assert network.answer.startswith(f"Is dark safe under unusual lighting? {answer}")
     # No interval has zero width, even if all views are recognized or none.

@@ -42,6 +42,9 @@ def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predict
     assert {item.subject for item in gained} == {"banana, source 0", "cup, source 3"}
     assert {item.subject for item in lost} == {"mug, source 1", "cup, source 4"}
     assert [re.findall(r"\d+", title) for title in rows] == [["2", "6"], ["2", "6"]]
+    (tmp_path / "0.png").unlink()
+    gained, lost = choose_disagreements(before, after, tmp_path).values()
+    assert [[item.subject for item in gained], len(lost)] == [["cup, source 3"], 2]
 
 
 def screen_of(labels: tuple[str, ...]) -> FirstScreen:

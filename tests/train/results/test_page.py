@@ -4,9 +4,11 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 from PIL import Image
 
-from train.results.page import report_of, write_report
+from train.results.page import images_folder, report_of, write_report
+from train.results.store import RunSummary
 from train.run_config import write_config
 from train.run_folder import locked
 
@@ -111,6 +113,15 @@ def test_runs_in_every_state_are_shown_or_named(page):
     for name in ("damaged", "old", "other"):
         assert states[name][0].startswith(f"cannot be read: {page.parents[1]}/{name}")
     assert any(cells[:3] == ["none", "2 seeds", "0.765 ± 0.000"] for cells in parsed.rows)
+
+
+def test_images_of_a_relative_folder_are_those_of_the_folder_of_the_run(tmp_path, monkeypatch):
+    for folder in ("there", "here"):
+        (tmp_path / folder / "photographs").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    config = OmegaConf.create({"photos": "photographs", "working_folder": f"{tmp_path}/there"})
+    run = RunSummary(tmp_path / "run", "", {}, {}, None, config=config)
+    assert images_folder(run, "photographs") == tmp_path / "there" / "photographs"
 
 
 def test_an_attack_is_shown_with_its_rates_and_the_outcome_of_each_example(page):
