@@ -195,13 +195,13 @@ def load_object(item: ObjectSettings, vertices: int = 0, encoding: str = "linear
     ends = np.array([-loaded.radius, loaded.radius, *(end for span in spans for end in span)])
     left, right = ends.min(), ends.max()
     # Put the others without a position at the ends of the row, with a gap.
-    for index, given in enumerate(item.others):
-        if given.at is None:
-            low, high = _span_of_y(others[index])
-            shift = left - GAP - high if index % 2 else right + GAP - low
-            left, right = min(left, low + shift), max(right, high + shift)
-            moved = others[index].vertices + np.array([0, shift, 0])
-            others[index] = replace(others[index], vertices=moved)
+    free = [index for index, given in enumerate(item.others) if given.at is None]
+    for turn, index in enumerate(free):
+        low, high = _span_of_y(others[index])
+        shift = left - GAP - high if turn % 2 else right + GAP - low
+        left, right = min(left, low + shift), max(right, high + shift)
+        moved = others[index].vertices + np.array([0, shift, 0])
+        others[index] = replace(others[index], vertices=moved)
     labels = [other.label for other in item.others]
     return with_others(loaded, [*zip(labels, others, strict=True)])
 

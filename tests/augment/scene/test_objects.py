@@ -62,6 +62,17 @@ def test_props_stand_on_the_objects_ground_shifted_and_turned():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
 
 
+def test_objects_without_a_position_stand_right_and_left_by_turns():
+    places = [[0.0, 2.5], None, [2.0, 0.0], None]
+    others = [ObjectSettings(f"solid:ball:{seed}", at=at) for seed, at in enumerate(places)]
+    item = load_object(ObjectSettings("solid:apple", "apple", others=others))
+    parts = np.split(item.mesh.faces, item.ends[:-1])
+    centers = [item.mesh.vertices[faces][..., 1].mean() for faces in parts]
+    # The second of these others is at the right end, and the fourth at the left one.
+    assert centers[2] > 2.5
+    assert centers[4] < -1
+
+
 @pytest.mark.parametrize("at", [[0.1, 0.0], [-3.0, 0.4], [0.7, 2.0]])
 def test_a_table_reaches_under_everything_that_stands_on_it(at):
     prop = ObjectSettings("solid:cup", at=at, scale=0.5)

@@ -143,7 +143,8 @@ def test_light_from_above_meets_a_ball_and_its_table_at_their_own_x_and_y(camera
     down = torch.tensor([0.0, 0.0, 1.0]).double()
     placed = tabletop.project_along_light(around, ball, camera, ImageSettings(SIZE), down).numpy()
     y = placed[0] * camera.width / 2
-    x = -placed[1] * camera.width / 2
+    # Seen along the light with y to the right, x points down, as in `pixel_centers`.
+    x = placed[1] * camera.width / 2
 
     even = ambient(torch.ones(3))
     shown = renderer.render(ball, camera, even, SIZE, 0.0, samples=1)[0].numpy()
