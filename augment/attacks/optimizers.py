@@ -88,7 +88,8 @@ def sample(
         # A uniform point of the unit ball in n dimensions has a distance below r with probability
         # r^n. Its distance is distributed like the n-th root of a uniform number in [0, 1].
         distance = torch.rand(len(center), 1, generator=draws) ** (1 / dimension_count)
-        offset = direction / direction.norm(dim=1, keepdim=True) * distance
+        # Rows without a used value stay at the center.
+        offset = torch.nn.functional.normalize(direction) * distance
     if is_used is not None:
         offset = offset * is_used
     return center + settings.radius * offset.to(center)
@@ -189,7 +190,7 @@ class NormBalls:
             if self.used_mask is not None:
                 direction = direction * self.used_mask
             distance = (reached - self.start).norm(dim=1, keepdim=True)
-            offset = direction * distance / direction.norm(dim=1, keepdim=True)
+            offset = direction * distance / direction.norm(dim=1, keepdim=True).clamp(min=1e-12)
             return self.project_feasible(self.start + offset)
         drawn = sample(self.settings, self.start, draws, self.used_mask)
         return self.project(drawn, slice(None))
