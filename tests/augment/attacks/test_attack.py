@@ -197,6 +197,14 @@ def test_misclassified_examples_are_refused_unless_the_attack_is_forced(by_color
     assert augment.attack(by_color, scene, force=True).minimum.success_before.all()
 
 
+def test_the_least_likely_class_is_never_the_true_one(by_color):
+    settings = augment.AttackSettings(lighting=augment.StepSettings(), max_steps=0)
+    scene = orange_labeled("night")
+    result = augment.attack(by_color, scene, "least_likely", settings, force=True)
+    assert result.logits_before.argmin() == 3
+    assert result.criterion.target.item() == result.logits_before[0, :3].argmin()
+
+
 LIT = {"degree": 6, "width": 3.0, "light": "uniform"}
 WIDE = {
     "projector": ({"projector": {"pixels": 8, "pattern": 0.3}}, augment.StepSettings),
