@@ -121,8 +121,10 @@ class NormBalls:
         """Return None: objects in images that are not rendered stay where they are."""
         return None
 
-    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
-        """Find the nearest feasible values. By default, those in the box are feasible.
+    def project_feasible(
+        self, values: Values, within: Ball | None = None, examples: Examples | slice = slice(None)
+    ) -> Values:
+        """Find the nearest feasible values of examples. By default, those in the box are feasible.
 
         The nearest values are meant in the Euclidean sense, and the centers of `within` are
         feasible.
@@ -175,7 +177,7 @@ class NormBalls:
         """Find the nearest values that are feasible and lie in the norm-balls around the start."""
         radius = self.settings.radius
         ball = None if radius is None else Ball(self.start[examples], radius, self.settings.norm)
-        return self.project_feasible(values, ball)
+        return self.project_feasible(values, ball, examples)
 
     def sample(self, draws: Generator, reached: Values | None = None) -> Values:
         """Draw random feasible values for all E examples.
