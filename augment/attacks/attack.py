@@ -87,8 +87,8 @@ def attack(
             indices of classes.
         target: Class as which the images shall be classified. A list has one
             class for each view, and requires views that share the attacked
-            values. "least_likely" is the class with the lowest confidence. None
-            accepts any misclassification.
+            values. "least_likely" is the other class with the lowest confidence.
+            None accepts any misclassification.
         settings: Attacked parameters with their norm-balls, and the steps. By
             default, the light is changed without a limit.
         task: What the outputs of a plain network mean, such as
@@ -265,8 +265,8 @@ def target_labels(
         return None
     classifier.task.require_target(target)
     if isinstance(target, str) and target == "least_likely":
-        # The last axis of the evidence has the classes.
-        return evidence.argmin(2)
+        # The last axis of the evidence has the classes. The true class is never the target.
+        return evidence.scatter(2, source[..., None], torch.inf).argmin(2)
     view_count = evidence.shape[1]
     names: list[Any] = [target] * view_count
     if not isinstance(target, str) and not is_whole(target):

@@ -140,12 +140,14 @@ class Objective:
         criterion = self.criterion.map(of_single_images)
         gradients = torch.empty_like(all_images) if needs_gradient else None
         shown = self._rows.tolist() if self._transformations else []
-        # The views of an example follow each other.
-        draws = [self._transformations[row] for row in shown for _ in range(images.shape[1])]
+        # The views of an example follow each other. An example draws a seed for each of its images,
+        # so that the random numbers of an image do not depend on the batches.
+        streams = [self._transformations[row] for row in shown for _ in range(images.shape[1])]
+        seeds = [int(torch.randint(2**62, (), generator=stream)) for stream in streams]
 
         def score_batch(rows: slice) -> Score:
             part = None if gradients is None else gradients[rows]
-            return self._score_batch(all_images[rows], criterion.select(rows), draws[rows], part)
+            return self._score_batch(all_images[rows], criterion.select(rows), seeds[rows], part)
 
         with self.phases("attack_classifier"), torch.set_grad_enabled(needs_gradient):
             batches = list(self._batch_size.map(score_batch, len(all_images)))
@@ -154,18 +156,14 @@ class Objective:
         return Score.join(batches).of_examples(images.shape[1]), gradients
 
     def _score_batch(
-        self,
-        batch: Tensor,
-        criterion: Criterion,
-        draws: Sequence[Generator],
-        gradients: Tensor | None,
+        self, batch: Tensor, criterion: Criterion, seeds: Sequence[int], gradients: Tensor | None
     ) -> Score:
         """Score single images, and write the gradients of their costs if a tensor is given."""
         batch = batch.detach().requires_grad_(gradients is not None)
         outputs = self._outputs(batch)
         # Costs and gaps are those of the mean over random transformations, if there are any.
         # The success is that of the image as it is.
-        expected = self._expected(outputs, batch, draws)
+        expected = self._expected(outputs, batch, [*map(generator, seeds)])
         cost = criterion.cost(expected)
         if gradients is not None:
             # The network may return its gradient in another memory layout. The copy has the

@@ -88,7 +88,8 @@ def sample(
         # A uniform point of the unit ball in n dimensions has a distance below r with probability
         # r^n. Its distance is distributed like the n-th root of a uniform number in [0, 1].
         distance = torch.rand(len(center), 1, generator=draws) ** (1 / dimension_count)
-        offset = direction / direction.norm(dim=1, keepdim=True) * distance
+        # Rows without a used value stay at the center.
+        offset = torch.nn.functional.normalize(direction) * distance
     if is_used is not None:
         offset = offset * is_used
     return center + settings.radius * offset.to(center)
@@ -120,8 +121,10 @@ class NormBalls:
         """Return None: objects in images that are not rendered stay where they are."""
         return None
 
-    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
-        """Find the nearest feasible values. By default, those in the box are feasible.
+    def project_feasible(
+        self, values: Values, within: Ball | None = None, examples: Examples | slice = slice(None)
+    ) -> Values:
+        """Find the nearest feasible values of examples. By default, those in the box are feasible.
 
         The nearest values are meant in the Euclidean sense, and the centers of `within` are
         feasible.
@@ -174,7 +177,7 @@ class NormBalls:
         """Find the nearest values that are feasible and lie in the norm-balls around the start."""
         radius = self.settings.radius
         ball = None if radius is None else Ball(self.start[examples], radius, self.settings.norm)
-        return self.project_feasible(values, ball)
+        return self.project_feasible(values, ball, examples)
 
     def sample(self, draws: Generator, reached: Values | None = None) -> Values:
         """Draw random feasible values for all E examples.
@@ -189,7 +192,7 @@ class NormBalls:
             if self.used_mask is not None:
                 direction = direction * self.used_mask
             distance = (reached - self.start).norm(dim=1, keepdim=True)
-            offset = direction * distance / direction.norm(dim=1, keepdim=True)
+            offset = direction * distance / direction.norm(dim=1, keepdim=True).clamp(min=1e-12)
             return self.project_feasible(self.start + offset)
         drawn = sample(self.settings, self.start, draws, self.used_mask)
         return self.project(drawn, slice(None))

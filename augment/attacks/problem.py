@@ -13,7 +13,7 @@ from augment.attacks.objective import Examples, Images, Values
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.lights import Lighting, Skylight, environment_light
 from augment.attacks.parameters.material import Material
-from augment.attacks.parameters.offsets import Albedo, Geometry
+from augment.attacks.parameters.offsets import Albedo, Geometry, Pixels
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.pose import Pose
 from augment.classifier import TaskNetwork
@@ -142,6 +142,7 @@ def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
         scene = scene.changed(one_light=False)
     of_light = {"nonnegative": not settings.allow_negative}
     options = {Lighting.name: of_light, Skylight.name: of_light}
+    options[Pixels.name] = {"is_alone": len(settings.parameters) == 1}
     parameters = [
         make_parameter(name, scene, steps, **options.get(name, {}))
         for name, steps in settings.parameters.items()

@@ -46,7 +46,9 @@ class LightParameter(Parameter):
         """Return a copy of the conditions with other coefficients of this light."""
         return replace_light(conditions, self._rows, values.unflatten(1, (-1, 3)))
 
-    def project_feasible(self, values: Values, within: Ball | None = None) -> Values:
+    def project_feasible(
+        self, values: Values, within: Ball | None = None, examples: Examples | slice = slice(None)
+    ) -> Values:
         """Find the nearest coefficients whose radiance is not negative."""
         if not self._nonnegative:
             return super().project_feasible(values, within)

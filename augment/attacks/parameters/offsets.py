@@ -3,18 +3,22 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import relu
 from torch.nn.utils.rnn import pad_sequence
 
 from augment.attack_settings import StepSettings
 from augment.attacks.objective import Examples, Values
+from augment.attacks.parameters.material import ROUNDING
 from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
+from renderer.vectors import Ball, nearest_in_box
 
 
 class MeshParameter(Parameter):
@@ -86,7 +90,8 @@ class Geometry(MeshParameter):
 class Albedo(MeshParameter):
     """Attack on the colors: a linear RGB offset that is added to the albedo of each face.
 
-    The renderer clamps the sum to [0, 1].
+    The renderer clamps the sum to [0, 1]. An offset that a restart puts beyond
+    this range has a gradient of zero, and stays.
 
     Args:
         scene: Scene to attack. Props and table stay as they are.
@@ -115,19 +120,37 @@ class Pixels(Parameter):
     2014). With several smaller steps, it is the basic iterative method (Kurakin
     et al. 2016). With random restarts in addition, it is PGD (Madry et al. 2017).
 
+    An attack on the pixels alone keeps the offsets in the range in which nothing
+    is clamped. Together with other parameters, an offset that a restart puts
+    beyond this range has a gradient of zero, and stays.
+
     Args:
         scene: Scene to attack.
         settings: Norm-ball and steps of the attack.
+        is_alone: Whether no other parameter changes the images.
     """
 
     name = "pixels"
     fits_other_meshes = False
     fits_other_views = False
 
-    def __init__(self, scene: Scene, settings: StepSettings):
+    def __init__(self, scene: Scene, settings: StepSettings, is_alone: bool = False):
         self._images_shape = (scene.views, 3, *scene.settings.shape)
+        self._scene = scene
+        self._is_alone = is_alone
         start = scene.lights.new_zeros(len(scene), math.prod(self._images_shape))
         super().__init__(settings, start)
+
+    def project_feasible(
+        self, values: Values, within: Ball | None = None, examples: Examples | slice = slice(None)
+    ) -> Values:
+        """Keep the sums of images and offsets in [0, 1], if nothing else changes the images."""
+        if not self._is_alone:
+            return super().project_feasible(values, within)
+        images = self._images[examples]
+        # A sum beyond the limits by rounding would have a gradient of zero.
+        low, high = -relu(images - ROUNDING), relu(1 - ROUNDING - images)
+        return nearest_in_box(values, low, high, within)
 
     def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with an offset for each pixel value.
@@ -135,3 +158,12 @@ class Pixels(Parameter):
         The values are in the order (V, 3, height, width) of the images.
         """
         return replace(conditions, pixels=values.unflatten(1, self._images_shape))
+
+    @cached_property
+    def _images(self) -> Values:
+        """Images of all examples before the attack, one row for each."""
+        scene = self._scene
+        groups = torch.arange(len(scene), device=self.start.device).split(scene.group_size)
+        with torch.no_grad():
+            images = [scene.render(scene.conditions(group), group) for group in groups]
+        return torch.cat(images).flatten(1)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 import augment
-from augment.attack_settings import PARAMETER_NAMES
+from augment.attack_settings import NORMS, OPTIMIZERS, PARAMETER_NAMES
 from augment.attacks.problem import build_problem
 from augment.tasks.classification import ClassCriterion
 from renderer.errors import InputError
@@ -41,6 +41,24 @@ def test_logits_costs_and_success_are_those_of_the_images(result, by_color):
         # Sums of 64 pixels in another order differ by rounding.
         torch.testing.assert_close(cost, expected, rtol=0, atol=1e-4)
     assert torch.equal(result.success, result.logits.argmax(1) != 0)
+
+
+@pytest.mark.parametrize("norm", NORMS)
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_the_sums_of_images_and_attacked_offsets_are_images(attacked, optimizer, norm):
+    """Nothing reaches the target, so that a restart is drawn."""
+    if optimizer == "cma_es":
+        pytest.importorskip("cma")
+    steps = {"pixels": augment.StepSettings(norm, 0.3, step_size=0.2)}
+    scene = SHARED | {"backgrounds": [0.0, 1.0]}
+    options = {"max_queries": 120, "max_steps": 4, "margin": 1e4, "restarts": 1, "force": True}
+    result = attacked(steps, scene, target="sky", optimizer=optimizer, **options)
+    before = result.images_in_views_before.flatten(1)
+    starts = result.problem.sample(torch.Generator().manual_seed(0))
+    for offsets in (result.minimum.values, starts):
+        assert offsets.any(1).all()
+        low, high = (before + offsets).aminmax()
+        assert 0 <= low <= high <= 1
 
 
 def test_inference_mode_changes_no_attack(attacked):
@@ -195,6 +213,14 @@ def test_misclassified_examples_are_refused_unless_the_attack_is_forced(by_color
     with pytest.raises(InputError, match=r"1 of 1 images .*solid:orange"):
         augment.attack(by_color, scene)
     assert augment.attack(by_color, scene, force=True).minimum.success_before.all()
+
+
+def test_the_least_likely_class_is_never_the_true_one(by_color):
+    settings = augment.AttackSettings(lighting=augment.StepSettings(), max_steps=0)
+    scene = orange_labeled("night")
+    result = augment.attack(by_color, scene, "least_likely", settings, force=True)
+    assert result.logits_before.argmin() == 3
+    assert result.criterion.target.item() == result.logits_before[0, :3].argmin()
 
 
 LIT = {"degree": 6, "width": 3.0, "light": "uniform"}

@@ -362,11 +362,22 @@ def attack_nine(
     return minimize(problem, objective, examples=examples)
 
 
-@pytest.mark.parametrize(("batch_size", "views"), [(1, 2), (4, 1), (100, 2)])
-def test_the_batch_size_does_not_matter(batch_size, views):
+@pytest.mark.parametrize(
+    ("batch_size", "views", "options"),
+    [
+        (1, 2, {}),
+        (4, 1, {}),
+        (100, 2, {}),
+        (1, 2, {"eot": EOTSettings(draws=2)}),
+        (7, 2, {"eot": EOTSettings(draws=2), "optimizer": "cma_es", "max_queries": 150}),
+    ],
+)
+def test_the_batch_size_does_not_matter(batch_size, views, options):
     """A batch may end between two views of an example."""
-    whole = attack_nine(views, batch_size=9 * views)
-    batched = attack_nine(views, batch_size=batch_size)
+    if "optimizer" in options:
+        pytest.importorskip("cma")
+    whole = attack_nine(views, batch_size=9 * views, **options)
+    batched = attack_nine(views, batch_size=batch_size, **options)
     assert len(whole.steps.unique()) > 2
     for name in FIELDS:
         # Sums in another order differ by rounding.

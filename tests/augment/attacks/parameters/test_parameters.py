@@ -194,6 +194,33 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
     assert is_changed.double().mean() > 0.4
 
 
+@pytest.mark.parametrize("gray", [0.0, 1.0])
+def test_steps_from_a_random_start_are_pgd(make_scene, make_linear, gray):
+    """PGD clips the images of the start and of each step to the ball and to [0, 1]."""
+    pixels = StepSettings("linf", 0.1, "sign", 0.03)
+    options = {"max_steps": 8, "margin": 1e4, "quantized": False, "allow_negative": True}
+    settings = AttackSettings(pixels=pixels, **options)
+    problem = build_problem(settings, make_scene(backgrounds=torch.full((3, 3, 6, 6), gray)))
+    model = make_linear(4)
+    before = problem.images(problem.start)
+    labels = model(before.flatten(0, 1)).argmax(1)
+    draws = 2 * torch.rand(problem.start.shape, generator=torch.Generator().manual_seed(0)) - 1
+    start = (before + 0.1 * draws.view_as(before)).clamp(0, 1)
+    expected = start.clone()
+    for _ in range(8):
+        leaf = expected.requires_grad_()
+        loss = torch.nn.functional.cross_entropy(model(leaf.flatten(0, 1)), labels)
+        (gradient,) = torch.autograd.grad(loss, leaf)
+        stepped = leaf.detach() + 0.03 * gradient.sign()
+        expected = stepped.clamp(before - 0.1, before + 0.1).clamp(0, 1)
+
+    sampled = problem.sample(torch.Generator().manual_seed(0))
+    torch.testing.assert_close(before + sampled.view_as(before), start, rtol=0, atol=2e-6)
+    objective = Objective(model, ClassCriterion(labels.view(3, 2)), settings)
+    images = minimize(problem, objective, start=sampled).images
+    torch.testing.assert_close(images, expected, rtol=0, atol=2e-6)
+
+
 def norms(offsets: Tensor, norm: str) -> Tensor:
     return offsets.norm(dim=1) if norm == "l2" else offsets.abs().amax(1)
 
