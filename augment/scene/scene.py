@@ -237,7 +237,9 @@ class Scene:
             copy._operator_renderer = self._operator_renderer
         # Views that are rendered directly have no number, so the same ones may be in any order.
         has_same_views = {*map(_view_of, copy.examples)} <= {*map(_view_of, self.examples)}
-        if arguments.keys() <= {"lights", "examples"} and kinds[0] == kinds[1] and has_same_views:
+        is_same = arguments.keys() <= {"lights", "examples"} and kinds[0] == kinds[1]
+        # With `one_light`, the renderer keeps the shadows of the light of each example.
+        if is_same and has_same_views and not self.one_light:
             copy._direct_renderer = self._direct_renderer
         return copy
 
