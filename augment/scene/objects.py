@@ -394,7 +394,7 @@ class Conditions(ShortRepr):
             an example.
         gloss: Roughness, metallic and specular factor of each face, shape (A, F, 3), or of all
             faces, shape (A, 1, 3). Textures of gloss are multiplied by them.
-        hue: Angle in degrees by which the hue of the albedo of each face is turned, after the
+        hue: Angle in degrees by which the hue of the albedo of each face is turned, before the
             addition of `albedo`, shape (A, F).
     """
 
@@ -411,6 +411,9 @@ class Conditions(ShortRepr):
         for name, values in vars(self).items():
             if values is not None and not isinstance(values, Tensor):
                 object.__setattr__(self, name, as_tensor(name, values))
+        if self.hue is not None and self.albedo is None:
+            # The renderer rotates hues only where it adds a color to the albedo, so add 0.
+            object.__setattr__(self, "albedo", self.hue.new_zeros(*self.hue.shape, 3))
 
     def row(self, index: int, mesh: Mesh) -> Conditions:
         """Return the conditions of one example, without the dimension of the examples.
