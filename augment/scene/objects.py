@@ -185,6 +185,7 @@ def load_object(item: ObjectSettings, vertices: int = 0, encoding: str = "linear
     The first object spans [-1, 1]. It is subdivided until it has more than `vertices` vertices.
     Objects without a position stand to the right and to the left of all before them, by turns.
     """
+    item.require_first_place()
     mesh = subdivide(_load(item), vertices, encoding)
     loaded = SceneObject.from_mesh(item.label, mesh, item.albedo_scale, item.mesh)
     if item.azimuth:
