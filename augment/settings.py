@@ -91,16 +91,22 @@ class ObjectSettings(MeshSettings):
     def __post_init__(self) -> None:
         """Convert the other objects to settings, and check what only one kind of object has."""
         super().__post_init__()
+        self.others = [*self.others]
         for index, other in enumerate(self.others):
             key = f"others[{index}]"
             self.others[index] = item = base.settings_from(ObjectSettings, other, key)
             if item.others or item.albedo_scale != 1:
                 reason = f"{key} has others or albedo_scale={item.albedo_scale}"
                 raise InputError(f"{reason}: give both to the first object", key)
-        if self.others and (self.scale != 1 or any(self.at or ())):
+        if self.others:
+            self.require_first_place()
+
+    def require_first_place(self) -> None:
+        """Refuse another place or scale than the first object of an entry has."""
+        if self.scale != 1 or any(self.at or ()):
             given = f"at={self.at} and scale={self.scale}"
             reason = f"{given} of the first object do not fit: it has the scale 1 at [0, 0]"
-            raise InputError(f"{reason}, and the other objects are placed beside it", "at")
+            raise InputError(f"{reason}, and other objects are placed beside it", "at")
 
 
 @dataclass

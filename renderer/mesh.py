@@ -119,9 +119,12 @@ class Mesh:
             if getattr(self, name) is None and name in ("gloss", "normal_ids"):
                 continue
             array = errors.as_array(name, getattr(self, name), kinds)
-            if array.dtype.kind in "iu":
-                # Small and unsigned integers would overflow.
-                array = array.astype(np.int64 if kinds == "iu" else np.float64, copy=False)
+            # Small and unsigned integers would overflow, and torch refuses negative strides and
+            # some types, such as those of another byte order.
+            native = array.dtype.newbyteorder("=")
+            is_short = native in (np.float16, np.float32) and name != "vertices"
+            dtype = np.int64 if kinds == "iu" else native if is_short else np.float64
+            array = np.asarray(array, dtype, order="C")
             # A frozen dataclass forbids assignments, so fields are set by object.__setattr__.
             object.__setattr__(self, name, array)
             # Arrays per face have as many rows as `faces`. Other arrays may have any number of
@@ -133,7 +136,8 @@ class Mesh:
         for name, channels in (("textures", 3), ("gloss_textures", 2)):
             expected = f"a list of arrays (height, width, {channels}) of uint8"
             given = errors.as_list(name, getattr(self, name), object, expected)
-            textures = tuple(errors.as_array(name, texture) for texture in given)
+            arrays = (errors.as_array(name, texture) for texture in given)
+            textures = tuple(np.asarray(texture, order="C") for texture in arrays)
             for texture in textures:
                 if texture.shape[2:] != (channels,) or texture.dtype != np.uint8:
                     raise InputError(f"{name} has {errors.describe(texture)}: give {expected}")

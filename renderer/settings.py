@@ -166,6 +166,10 @@ class Settings:
         """Check the type, the range and the choices of each field."""
         for name, hint, facts in _checked_fields(type(self)):  # type: ignore[arg-type]  # types are hashable
             value = getattr(self, name)
+            if facts.checks_type and hasattr(value, "tolist"):
+                # Arrays and tensors have no single truth value.
+                value = value.tolist()
+                object.__setattr__(self, name, value)
             if facts.checks_type and not _fits(value, hint):
                 # `formatannotation` puts the module before the name of a class.
                 expected = re.sub(r"\b[\w.]+\.", "", formatannotation(hint))

@@ -387,7 +387,9 @@ def _classify(
     rasterizer = result.problem.scene.rasterizer
 
     def truth_of(some: Sequence[Adversary]) -> Truth:
-        return Truth.join([item.scene(rasterizer).truth(unlabeled) for item in some])
+        truths = [item.scene(rasterizer).truth(unlabeled) for item in some]
+        # The attack is about the first object. Examples may have different numbers of others.
+        return Truth.join([truth.map(lambda rows: rows[:, :, :1]) for truth in truths])
 
     # Without examples, these tensors are empty and have the right number of dimensions.
     criterion = result.criterion.select(examples)

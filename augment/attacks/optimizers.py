@@ -252,7 +252,6 @@ class Optimizer(ABC):
     def __init__(self, problem: Problem, settings: AttackSettings, seed: int):
         self.problem = problem
         self.settings = settings
-        self.seed = seed
         # Generator of the random numbers of each example, so that its numbers do not depend on the
         # other examples. Further starts continue with the same generators.
         self._generator = cache(lambda example: generator(seed, example, "directions"))
@@ -359,6 +358,11 @@ class CMAES(Optimizer):
     of the first standard deviations (as Hansen et al. 2009 scale it).
     """
 
+    def __init__(self, problem: Problem, settings: AttackSettings, seed: int):
+        super().__init__(problem, settings, seed)
+        # The same as `_generator`, for the arrays of `cma`.
+        self._draws = cache(lambda of: np.random.default_rng(stream_seed(seed, of, "cma")))
+
     def begin(self, examples: Examples, start: Values) -> None:
         """Begin new evolution strategies. A point p of one stands for the values start + scale · p.
 
@@ -381,8 +385,7 @@ class CMAES(Optimizer):
         candidates = []
         for row in rows.tolist():
             if row not in self._strategies:
-                seed = stream_seed(self.seed, int(self.examples[row]), "cma")
-                self._strategies[row] = self._strategy(seed)
+                self._strategies[row] = self._strategy(self._draws(int(self.examples[row])))
             self._drawn[row] = np.stack(self._strategies[row].ask())
             values = self._unprojected(row)
             # `project` needs the example of each of the P candidates, which is the same for all.
@@ -410,10 +413,9 @@ class CMAES(Optimizer):
             self._strategies[row].tell(list(self._drawn[row]), (costs + penalties).tolist())
         return super().tell(rows, evaluation)
 
-    def _strategy(self, seed: int) -> Any:
+    def _strategy(self, draws: np.random.Generator) -> Any:
         """Start an evolution strategy at 0 with standard deviation 1."""
         cma = import_package("cma", '"parametric-norm-balls[search]"')
-        draws = np.random.default_rng(seed)
         value_count = self.values.shape[1]
         options = {
             # Print nothing, and adapt the variances alone if there are many values.

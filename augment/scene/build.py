@@ -24,7 +24,7 @@ from augment.augmentation_settings import SpecularLayerSettings, VariationSettin
 from augment.network import say_once
 from augment.progress import progress
 from augment.scene import objects as placed
-from augment.scene.objects import Conditions, SceneObject
+from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import unlabeled
 from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
@@ -522,7 +522,9 @@ def _linear_values(probe: Scene, factor: float) -> Float[Tensor, "N 3"]:
     lights = probe.lights.clone()
     if probe.basis.environment is not None:
         lights[:, probe.basis.environment.rows] *= factor
-    for layer in probe.layers(Conditions(lights), every.to(lights.device)):
+    # With `one_light`, a scene keeps the shadows of its first light, so make a copy.
+    lit = probe.changed(lights=lights)
+    for layer in lit.layers(lit.conditions(every), every.to(lights.device)):
         shown = layer.composite.detach().float().cpu()
         canvas[layer.rows] = canvas[layer.rows].index_copy(2, layer.pixels.cpu(), shown)
     masks = probe.truth(unlabeled).masks[:, :, 0].flatten(0, 1).flatten(1).cpu()

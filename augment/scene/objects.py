@@ -185,6 +185,7 @@ def load_object(item: ObjectSettings, vertices: int = 0, encoding: str = "linear
     The first object spans [-1, 1]. It is subdivided until it has more than `vertices` vertices.
     Objects without a position stand to the right and to the left of all before them, by turns.
     """
+    item.require_first_place()
     mesh = subdivide(_load(item), vertices, encoding)
     loaded = SceneObject.from_mesh(item.label, mesh, item.albedo_scale, item.mesh)
     if item.azimuth:
@@ -393,8 +394,9 @@ class Conditions(ShortRepr):
             change of the logarithm of the distance, shape (A, 3). They apply to all V cameras of
             an example.
         gloss: Roughness, metallic and specular factor of each face, shape (A, F, 3), or of all
-            faces, shape (A, 1, 3). Textures of gloss are multiplied by them.
-        hue: Angle in degrees by which the hue of the albedo of each face is turned, after the
+            faces, shape (A, 1, 3). Textures of gloss are multiplied by them. What shadows and
+            bounces of environment light change is still shaded with the gloss of the mesh.
+        hue: Angle in degrees by which the hue of the albedo of each face is turned, before the
             addition of `albedo`, shape (A, F).
     """
 
@@ -411,6 +413,9 @@ class Conditions(ShortRepr):
         for name, values in vars(self).items():
             if values is not None and not isinstance(values, Tensor):
                 object.__setattr__(self, name, as_tensor(name, values))
+        if self.hue is not None and self.albedo is None:
+            # The renderer rotates hues only where it adds a color to the albedo, so add 0.
+            object.__setattr__(self, "albedo", self.hue.new_zeros(*self.hue.shape, 3))
 
     def row(self, index: int, mesh: Mesh) -> Conditions:
         """Return the conditions of one example, without the dimension of the examples.

@@ -336,8 +336,9 @@ class DirectRenderer:
         # Ray tracers, and shadows and bounces, of unmoved objects by their indices.
         self._rays = [Rays(item.mesh) for item in self.objects]
         self._transport_of_object: dict[int, FrozenTransport] = {}
-        # Shadows and bounces of moved shapes, by the indices of their examples.
-        self._transport_of_example: dict[int, FrozenTransport] = {}
+        # Shadows and bounces of moved shapes, by the indices of their examples and objects. Scenes
+        # with other examples of the same objects may share this renderer.
+        self._transport_of_example: dict[tuple[int, int], FrozenTransport] = {}
 
     @cached_property
     def vertices(self) -> list[Tensor]:
@@ -546,10 +547,11 @@ class DirectRenderer:
         frozen = self._transport_of_object.get(object_index) or trace(item.mesh)
         self._transport_of_object[object_index] = frozen
         if not frozen.is_near(positions):
-            frozen = self._transport_of_example.get(example, frozen)
+            key = (example, object_index)
+            frozen = self._transport_of_example.get(key, frozen)
             if not frozen.is_near(positions):
                 frozen = trace(replace(item.mesh, vertices=positions))
-            self._transport_of_example[example] = frozen
+            self._transport_of_example[key] = frozen
         return frozen
 
     def _rasterize(

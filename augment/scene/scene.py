@@ -237,7 +237,9 @@ class Scene:
             copy._operator_renderer = self._operator_renderer
         # Views that are rendered directly have no number, so the same ones may be in any order.
         has_same_views = {*map(_view_of, copy.examples)} <= {*map(_view_of, self.examples)}
-        if arguments.keys() <= {"lights", "examples"} and kinds[0] == kinds[1] and has_same_views:
+        is_same = arguments.keys() <= {"lights", "examples"} and kinds[0] == kinds[1]
+        # With `one_light`, the renderer keeps the shadows of the light of each example.
+        if is_same and has_same_views and not self.one_light:
             copy._direct_renderer = self._direct_renderer
         return copy
 
@@ -458,8 +460,8 @@ class Scene:
     ) -> Iterator[Layer]:
         """Render the pixels that objects cover, by the fastest method that is exact.
 
-        - If shape, albedo or gloss have changed, or if `one_light` is set, each view is rendered
-          directly.
+        - If shape, albedo, gloss or cameras have changed, or if `one_light` is set, each view is
+          rendered directly.
         - If lamps have moved, transfer operators (matrices from light to image) render all other
           light. The light of the lamps is computed for each view and added.
         - If only the light has changed, transfer operators render all of it.
@@ -468,7 +470,7 @@ class Scene:
         """
         errors.require_bounded(light=conditions.light)
         light = self.exposed(conditions.light, examples)
-        changes = (conditions.vertices, conditions.albedo, conditions.gloss)
+        changes = (conditions.vertices, conditions.albedo, conditions.gloss, conditions.cameras)
         if self.one_light or any(values is not None for values in changes):
             return self._render_directly(replace(conditions, light=light), examples, is_draft)
         if conditions.positions is not None:

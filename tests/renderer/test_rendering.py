@@ -171,14 +171,27 @@ def test_vertices_that_no_face_uses_change_neither_images_nor_gradients(camera, 
     assert np.array_equal(renderer.normalize(more).vertices[:-1], renderer.normalize(cup).vertices)
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.int16])
-def test_vertices_and_faces_can_be_small_integers(dtype):
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32, np.longdouble, ">f8"])
+def test_vertices_can_be_numbers_of_any_type(dtype):
     cup, light = renderer.solid("cup"), load_light("grace")
     vertices = np.rint(60 * (cup.vertices + 1))
     plain = renderer.Mesh.plain(vertices, cup.faces)
     small = replace(plain, vertices=vertices.astype(dtype), normal_ids=None)
     camera = renderer.OrthographicCamera(60.0, 20.0, 150.0, clip_range=300.0)
-    images = [renderer.render(mesh, camera, light, **SMALL) for mesh in (small, plain)]
+    options = SMALL | {"bounces": int(dtype == np.float32)}
+    operators = [renderer.precompute_transfer(mesh, camera, **options) for mesh in (small, plain)]
+    images = [operator.image(light) for operator in operators]
+    assert torch.equal(*images)
+
+
+def test_arrays_of_a_mesh_can_be_views_in_reverse_order(stone):
+    texture = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    mesh = textured(stone, draw_uniform(FACE_COUNT, 3, 2), texture)
+    arrays = {name: value for name, value in vars(mesh).items() if isinstance(value, np.ndarray)}
+    turned = {name: value[::-1].copy()[::-1] for name, value in arrays.items()}
+    turned["textures"] = [texture[::-1].copy()[::-1]]
+    both = mesh, replace(mesh, **turned)
+    images = [renderer.render(each, CAMERAS[0], load_light("grace"), **SMALL) for each in both]
     assert torch.equal(*images)
 
 

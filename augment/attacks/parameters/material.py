@@ -118,9 +118,5 @@ class Material(Parameter):
         if self._changes_hue:
             # Rotation in degrees.
             hue = (material[:, HUE] * object_mask).expand(-1, self._face_count)
-            albedo_offset = conditions.albedo
-            if albedo_offset is None:
-                # The renderer rotates hues only where it adds a color to the albedo, so add 0.
-                albedo_offset = hue.new_zeros(*hue.shape, 3)
-            conditions = replace(conditions, hue=hue, albedo=albedo_offset)
+            conditions = replace(conditions, hue=hue)
         return conditions

@@ -295,6 +295,18 @@ def test_points_of_cma_es_outside_of_the_ball_are_told_with_a_penalty(monkeypatc
     np.testing.assert_allclose(costs, expected + penalties, atol=1e-6)
 
 
+@pytest.mark.parametrize("optimizer", ["random_search", "cma_es"])
+def test_each_start_of_a_search_draws_changes_of_its_own(optimizer):
+    pytest.importorskip("cma")
+    problem = LinearScene(torch.zeros(1, VALUE_COUNT).double(), StepSettings("linf", 0.5))
+    drawn, project = [], problem.project
+    problem.project = lambda values, examples: drawn.append(values) or project(values, examples)
+    zeros = torch.zeros(1, 1, dtype=torch.int64)
+    settings = settings_of(optimizer=optimizer, max_queries=30)
+    descend(Linear(bias=50.0), problem, ClassCriterion(zeros), settings, [problem.start] * 2)
+    assert len({tuple(values[0].tolist()) for values in drawn}) == len(drawn) > 2
+
+
 def test_of_several_candidates_the_success_of_the_lowest_cost_is_taken():
     """The first costs least and is none, and the last is one that costs more than the second."""
     costs = torch.tensor([-3.0, -1.0, 1.0])

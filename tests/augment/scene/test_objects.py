@@ -73,6 +73,16 @@ def test_objects_without_a_position_stand_right_and_left_by_turns():
     assert centers[4] < -1
 
 
+@pytest.mark.parametrize("kind", [list, tuple])
+def test_settings_of_objects_take_arrays_and_leave_the_callers_objects_alone(kind):
+    prop = {"mesh": "solid:cup", "at": np.array([1.0, 0.5])}
+    given = kind([prop])
+    item = ObjectSettings("solid:apple", "apple", gloss=np.array([0.5, 0.0, 1.0]), others=given)
+    cup = ObjectSettings("solid:cup", at=[1.0, 0.5])
+    assert item == ObjectSettings("solid:apple", "apple", gloss=[0.5, 0.0, 1.0], others=[cup])
+    assert given[0] is prop and len(load_object(item).others) == 1
+
+
 @pytest.mark.parametrize("at", [[0.1, 0.0], [-3.0, 0.4], [0.7, 2.0]])
 def test_a_table_reaches_under_everything_that_stands_on_it(at):
     prop = ObjectSettings("solid:cup", at=at, scale=0.5)

@@ -1,10 +1,12 @@
 """Images of changed light, shape, albedo and pixels are those of a scene built so."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import augment
@@ -62,16 +64,26 @@ def test_moved_vertices_look_like_a_mesh_built_with_them(make_scene, stone):
     assert is_changed.double().mean() > 0.3
 
 
+@pytest.mark.parametrize("parts", [["albedo"], ["hue"], ["albedo", "hue"]])
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_a_changed_albedo_looks_like_a_mesh_of_that_color(make_scene, stone, encoding):
-    """The linear albedo changes, whatever the encoding, and stays in [0, 1]."""
+def test_a_changed_albedo_looks_like_a_mesh_of_that_color(make_scene, stone, encoding, parts):
+    """The linear albedo changes, whatever the encoding, and stays in [0, 1].
+
+    Its hue is turned about gray before a color is added.
+    """
     scene = make_scene(encoding=encoding)
     lights = own_lights(scene)
     offsets = torch.rand(3, 20, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
-    images = scene.render(Conditions(lights, albedo=offsets), EVERY)
-    linear = decode(torch.from_numpy(stone.corner_colors).double(), encoding)
-    changed = linear + offsets[:, :, None]  # (3, 20, 3 corners, 3)
-    assert (changed < 0).any()
+    changes = {"albedo": offsets, "hue": torch.full((3, 20), 100.0).double()}
+    chosen = {part: changes[part] for part in parts}
+    images = scene.render(Conditions(lights, **chosen), EVERY)
+    linear = decode(torch.from_numpy(stone.corner_colors).double(), encoding).expand(3, -1, -1, -1)
+    if "hue" in parts:
+        turn = Rotation.from_rotvec(np.full(3, 100 / math.sqrt(3)), degrees=True)
+        linear = linear @ torch.from_numpy(turn.as_matrix().T)
+    # Shape (3, 20, 3 corners, 3).
+    changed = linear + offsets[:, :, None] if "albedo" in parts else linear
+    assert parts == ["hue"] or (changed < 0).any()
     for row in range(3):
         colors = encode(changed[row].clamp(0, 1), encoding).float().numpy()
         other = make_scene(mesh=replace(stone, corner_colors=colors), encoding=encoding)

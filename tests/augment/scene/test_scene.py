@@ -24,7 +24,7 @@ from augment.scene.objects import Conditions, Example, load_object
 from augment.scene.render import NEAR
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
-from augment.settings import ObjectSettings, ProjectorSettings
+from augment.settings import LampsSettings, ObjectSettings, ProjectorSettings
 from renderer.camera import orbit_cameras
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import ambient, probe
@@ -65,11 +65,17 @@ def test_renders_are_shared_as_equally_as_possible(examples, meshes, backgrounds
     assert len({(e.object, e.cameras, e.background) for e in scene.examples}) == examples
 
 
-@pytest.mark.parametrize(("light", "encoding"), [("grace", "linear"), ("st_peters", "srgb")])
-def test_the_automatic_exposure_makes_the_mean_of_an_object_two_fifths(light, encoding):
+LAMP_IN_SHADOWS = {"shadows": True, "lamps": LampsSettings([[3.0, 0.0, 3.0]], start=0.01)}
+
+
+@pytest.mark.parametrize(
+    ("light", "encoding", "more"),
+    [("grace", "linear", {}), ("st_peters", "srgb", {}), ("grace", "linear", LAMP_IN_SHADOWS)],
+)
+def test_the_automatic_exposure_makes_the_mean_of_an_object_two_fifths(light, encoding, more):
     meshes = [("solid:orange", "orange"), ("solid:cup", "cup")]
     options = {"light": light, "encoding": encoding, "backgrounds": [0.0], "exposure": "auto"}
-    scene = build_scene(meshes, 24, 3, **options)
+    scene = build_scene(meshes, 24, 3, **options, **more)
     images = scene.render(scene.conditions(torch.arange(6)), torch.arange(6))[:, 0]
     masks = scene.truth(lambda label: 0).masks[:, 0, 0]
     for rows in (slice(0, 3), slice(3, 6)):
@@ -225,6 +231,19 @@ def test_the_same_views_in_another_order_are_not_rasterized_again(rasterized):
     torch.testing.assert_close(found, expected)
 
 
+def test_fewer_examples_of_moved_meshes_have_the_shadows_of_each_mesh():
+    scene, fresh = (built("cup", "ball", shadows=True) for _ in range(2))
+
+    def moved(scene: Scene) -> torch.Tensor:
+        every = torch.arange(len(scene))
+        vertices = 0.9 * scene.vertices[scene.object_of]
+        return scene.render(replace(scene.conditions(every), vertices=vertices), every)
+
+    expected = moved(fresh.with_count(2))
+    moved(scene)
+    torch.testing.assert_close(moved(scene.with_count(2)), expected)
+
+
 STACKS = {"one stack": (render.PIXELS_PER_STACK, "linear"), "a stack per view": (1, "srgb")}
 
 
@@ -339,7 +358,9 @@ def test_shadows_of_unmoved_vertices_and_colors_are_those_of_the_operators(names
     face_count = max(len(item.mesh.faces) for item in scene.objects)
     unmoved = {"vertices": scene.vertices[scene.object_of]}
     unpainted = {"albedo": torch.zeros(len(scene), face_count, 3)}
-    in_one_light = scene.changed(lights=lights, one_light=True)
+    in_old_light = scene.changed(one_light=True)
+    in_old_light.render(in_old_light.conditions(rows), rows)
+    in_one_light = in_old_light.changed(lights=lights)
     for shown, change in ((scene, {}), (scene, unmoved), (scene, unpainted), (in_one_light, {})):
         images = shown.render(Conditions(lights, **change), rows)[:, 0]
         torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=1000 * EPS32)

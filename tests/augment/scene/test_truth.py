@@ -116,6 +116,7 @@ def test_a_list_of_objects_in_settings_and_arguments_is_one_entry():
     [
         ([("solid:pear", "pear"), "solid:cup"], r"^meshes\[0\]\[1\] is 'solid:cup': give a pair"),
         ([nb.ObjectSettings("solid:pear", at=[1.0, 0.0]), ("solid:cup", 1)], r"^at=\[1\.0, 0\.0\]"),
+        (nb.ObjectSettings("solid:pear", "pear", scale=2.0), r"^at=None and scale=2\.0"),
         ([("solid:pear", "pear"), ("solid:cup", 1.5)], r"^meshes\[0\]\[1\]: its label"),
         ([], r"^meshes\[0\] is "),
     ],

@@ -76,6 +76,16 @@ def test_an_attack_darkens_an_object_until_its_segment_is_lost(wrap):
     assert nb.transfer(nothing, [result.classifier])[0]["success"] == []
 
 
+def test_an_attack_on_different_numbers_of_objects_transfers_to_its_own_network():
+    alone, beside = (nb.ObjectSettings("solid:ball", "ball", at=at) for at in (None, [0.0, 2.1]))
+    scene = nb.build_scene([[alone, beside], alone], SIZE, backgrounds=[0.0], width=3.0)
+    light = nb.StepSettings(step_size=0.3)
+    options = {"settings": nb.AttackSettings(lighting=light, max_steps=60, margin=0.1)}
+    result = nb.attack(bright, scene, **options, classes=["dark", "ball"])
+    [row] = nb.transfer(result, [result.classifier])
+    assert row["success"] == result.success.tolist() == [True, True]
+
+
 @pytest.mark.parametrize("shape", [(1, 2, SIZE, SIZE), (2, 3, SIZE, SIZE), (1, 3, 6, 12), (1, 3)])
 def test_logits_of_another_size_are_refused(shape):
     reader = nb.Segmentation().reader("network", 3)

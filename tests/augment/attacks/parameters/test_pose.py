@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -62,6 +63,10 @@ def test_the_camera_moves_to_the_place_of_another_scenes_camera(fov):
     expected = other.render(conditions, FIRST)
     rendered = problem_of(scene, distance=0.15).render(values, FIRST)
     torch.testing.assert_close(rendered, expected, rtol=0, atol=1e-9)
+    # Conditions of the camera alone show the same, although the object is unchanged.
+    cameras = torch.tensor([[5.0, -15.0, 2 * math.log(1.15)]], dtype=torch.float64)
+    alone = scene.render(replace(scene.conditions(FIRST), cameras=cameras), FIRST)
+    torch.testing.assert_close(alone, expected, rtol=0, atol=1e-9)
 
 
 def test_an_object_that_grows_and_a_camera_that_comes_closer_do_not_meet():
