@@ -213,9 +213,11 @@ class Run:
             self._render_kept_aside()
         has_labels = not trainer.is_detector
         scores = self._score_initial(trainer.initial) if trainer.initial and has_labels else {}
-        split = self.data.train.to(trainer.device)  # `_score_initial` may have replaced its labels.
+        # `_score_initial` may have replaced labels. An unreadable file is replaced in its own part.
+        rows = ~self.held_out, self.held_out
+        train, validation = (self.data.train[of].to(trainer.device) for of in rows)
         with keyed(**keys_of("train", self.settings.train)):
-            trainer.fit(split, self.held_out, log)
+            trainer.fit(train, validation, log)
             scores |= self._score() if has_labels else {}
             if self.settings.train.recognize and checkpoints.RECOGNIZER not in trainer.best:
                 self._recognize()
