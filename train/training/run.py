@@ -18,6 +18,7 @@ from augment.switch import LIT_NAME
 from augment.tasks.classification import Classification
 from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
+from renderer.io.files import remove
 from train import checkpoints, console
 from train.data import photographs
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
@@ -26,6 +27,7 @@ from train.laboratory.laboratory import is_laboratory, kept_aside_settings, writ
 from train.networks import CLASSIFIER, build_network, describe
 from train.results.metrics import METRICS
 from train.results.overwrite import remove_run
+from train.results.predictions import SUMMARY
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, BEST, WEIGHTS
@@ -180,7 +182,7 @@ class Run:
             return build_network(classes, size, trust_code=self.settings.trust, **shape)
 
     def begin(self) -> None:
-        """Remove what an earlier run left in the folder, unless it is resumed; write config.yaml.
+        """Remove results of an earlier run, or only the scores of one to resume; write config.yaml.
 
         All runs of a command begin before the first one is trained. Whatever stops the command,
         no result in their folders belongs to another run then.
@@ -190,7 +192,10 @@ class Run:
         # Without `overwrite`, only a run that stopped before its first checkpoint can have left
         # config.yaml here: `__init__` resumes or refuses a run with a checkpoint.
         may_be_left = self.settings.overwrite or (self.folder / CONFIG).is_file()
-        if may_be_left and not self._is_resumed:
+        if self._is_resumed:
+            # Folders that are no longer scored would keep the scores of an older network.
+            remove(*self.folder.glob(f"*/{SUMMARY}"))
+        elif may_be_left:
             remove_run(self.folder, with_others=not self.settings.train.resume)
         device, model = str(self.trainer.device), self.trainer.model
         hardware = {"device": device, "precision": model.precision, "threads": self._threads}

@@ -483,6 +483,16 @@ def test_a_resumed_run_is_stopped_without_its_best_network_before_it_writes(tiny
     assert modification_times(run) == before
 
 
+def test_a_resumed_run_has_no_scores_of_its_earlier_network(tiny, finished, photos, tmp_path):
+    started = f"network={finished}", "augment=none"
+    completed_run(tiny(*started, "train.epochs=1", f"photos={{a: {photos}}}"), tmp_path)
+    resumed = "train.epochs=2", "train.resume=true", f"photos={{c: {photos}}}"
+    completed_run(tiny(*started, *resumed), tmp_path)
+    run = summarize(tmp_path)
+    assert {*run.photographs} == {"c"}
+    assert {*run.before.photographs} >= {"a"}  # The initial network is the same as before.
+
+
 def test_a_logger_gets_the_metrics_of_each_epoch_in_place_of_tensorboard(tmp_path):
     lines = []
     recorder = SimpleNamespace(log=lambda values, step: lines.append((step, dict(values))))
