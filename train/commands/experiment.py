@@ -212,6 +212,8 @@ def sweep(
         raise InputError("launcher=slurm needs the command sbatch: start on the cluster")
     if first_config.photographs_first:
         raise InputError("photographs_first=true makes no sweep: start the runs one by one")
+    if first_config.compare:
+        raise InputError(f"compare={first_config.compare} makes no sweep: give augment=none,random")
     overwrite = bool(first_config.overwrite)
     parent = writable_folder(str(first_config.sweep), "sweep")
     # An earlier report about the same sweep may be replaced.
