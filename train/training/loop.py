@@ -120,6 +120,8 @@ class TrainingStep:
         if isinstance(service.task, Detection):
             if settings.relight_steps:
                 raise InputError("relight_steps attacks classifiers: set it to 0", "relight_steps")
+            if settings.interpolate:
+                raise InputError("interpolate mixes classifiers: set it to False", "interpolate")
             is_compiled = False
             self._loss = DetectionLoss(replica, settings, teacher, service.task).compute
         else:
@@ -189,7 +191,8 @@ class Trainer:
         averages: Moving average and model soup of the network.
         selected: Network that is validated after each epoch: an average, or the network in
             training.
-        is_detector: Whether the network finds boxes. It has no accuracy on test images then.
+        is_detector: Whether the network finds boxes. Its accuracy is the fraction of the boxes of
+            `initial` that it finds then.
         epoch: Number of finished epochs.
         history: Metrics of each finished epoch by name.
         best: Content of best.pt, the network that the training selected. It is empty before the
@@ -344,11 +347,7 @@ class Trainer:
         loss_sum, hits = all_reduce_sum(state.sums).tolist()
         self.averages.end_epoch()
         with self.phases("evaluation"):
-            if self.is_detector and self.initial is not None:
-                networks = self.selected, self.initial
-                validated = validate(*networks, cast(Detection, self.service.task), split)
-            else:
-                validated = evaluate(self.selected, split)
+            validated = self.evaluate(split)
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
         accuracy = validated["accuracy"]
@@ -372,6 +371,13 @@ class Trainer:
         if self._log:
             self._log.scalars(metrics, self.epoch)
         console.debug("%s", format_epoch(self.epoch, self.settings.epochs, metrics))
+
+    def evaluate(self, split: Split) -> dict[str, float]:
+        """Measure the loss and the accuracy of the selected network."""
+        if self.is_detector and self.initial is not None:
+            task = cast(Detection, self.service.task)
+            return validate(self.selected, self.initial, task, split)
+        return evaluate(self.selected, split)
 
     def _require_finite(self, loss: float, epoch: int) -> None:
         """Raise InputError if the loss or a weight of the network is NaN or infinite."""

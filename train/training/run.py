@@ -216,14 +216,15 @@ class Run:
         log = RunLog(self.folder, trainer.history, logger) if is_first else None
         if is_first:
             self._render_kept_aside()
-        has_labels = not trainer.is_detector
-        scores = self._score_initial(trainer.initial) if trainer.initial and has_labels else {}
+        scores: dict[str, float] = {}
+        if trainer.initial and not trainer.is_detector:
+            scores = self._score_initial(trainer.initial)
         # `_score_initial` may have replaced labels. An unreadable file is replaced in its own part.
         rows = ~self.held_out, self.held_out
         train, validation = (self.data.train[of].to(trainer.device) for of in rows)
         with keyed(**keys_of("train", self.settings.train)):
             trainer.fit(train, validation, log)
-            scores |= self._score() if has_labels else {}
+            scores |= self._score()
             if self.settings.train.recognize and checkpoints.RECOGNIZER not in trainer.best:
                 self._recognize()
         if log:  # Only the first process has a log.
@@ -298,7 +299,7 @@ class Run:
         trainer = self.trainer
         test = self.data.test.to(trainer.device)
         # `trainer.selected` has the weights of the last epoch until they are replaced below.
-        last = selected = evaluate(trainer.selected, test)["accuracy"]
+        last = selected = trainer.evaluate(test)["accuracy"]
         if self.settings.train.interpolate:
             self._interpolate()
         best = trainer.best
@@ -306,7 +307,7 @@ class Run:
         # The selected network differs from the last one.
         if epoch != trainer.epoch or INTERPOLATION in best:
             trainer.selected.network.load_state_dict(best["model"])
-            selected = evaluate(trainer.selected, test)["accuracy"]
+            selected = trainer.evaluate(test)["accuracy"]
         scores = {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": epoch}
         if INTERPOLATION in best:
             scores["test/interpolation"] = best[INTERPOLATION]
