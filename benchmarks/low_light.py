@@ -125,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             cells += [format_interval(of_light[label].recall) for label in CLASSES]
             cells.append(format_interval(of_light["all"].false_per_image))
         with torch.no_grad():
-            agreement = validate(network, original, TASK, kept, torch.arange(len(images)))
+            agreement = validate(network, original, TASK, kept)
         lines.append(f"|{name}|{'|'.join(cells)}|{agreement['accuracy']:.3f}|")
         print(lines[-1], flush=True)
     (options.out / "table.md").write_text("\n".join(lines) + f"\n\n{machine()}\n")

@@ -36,6 +36,8 @@ def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
     The same holds for the objects beside it. A mapping without a label, or with one that no network
     has, such as "other_lemon", keeps it. Only a mapping can have a label.
     """
+    if isinstance(item, list):
+        return [with_class_name(one, classes, key) for one in item]
     if not isinstance(item, dict):
         return item
     named = dict(item)
@@ -137,13 +139,14 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
     """
     if settings.label is None:
         found = classes_of_meshes(settings.meshes, classes, "meshes")
-        mappings = [item if isinstance(item, dict) else {"mesh": item} for item in settings.meshes]
+        mappings = map(common.as_mapping, settings.meshes)
         meshes = [item | {"label": name} for item, name in zip(mappings, found, strict=True)]
         # A dictionary has each name once, in the order of the meshes.
         names = [*dict.fromkeys(found)]
     else:
         names = [class_name(classes, name, "label") for name in label_names(settings.label)]
-        meshes = [with_class_name(item, classes, "meshes") for item in settings.meshes]
+        meshes = settings.meshes
+    meshes = [with_class_name(item, classes, "meshes") for item in meshes]
     key = "hard_negatives"
     negatives = [with_class_name(item, classes, key) for item in settings.hard_negatives]
     # A single positive class is given by its name, several are given as a list.

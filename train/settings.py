@@ -474,18 +474,17 @@ def read_object(item: Any, label: str, key: str) -> ObjectSettings:
     `item` is a file, "solid:NAME", a mapping with fields of `ObjectSettings`, which can have its
     own class, or a list of them on the same ground. Only the first of a list gets `label`.
     """
+    return settings_from(ObjectSettings, {"label": label, **as_mapping(item)}, key)
+
+
+def as_mapping(item: Any) -> dict[str, Any]:
+    """Convert a mesh, a mapping or a list to a mapping. In YAML, a name can be a number."""
     first, *others = item or [None] if isinstance(item, list) else [item]
-    values = {"label": label, **_as_mapping(first)}
-    if others:
-        values["others"] = [*values.get("others", ()), *map(_as_mapping, others)]
-    return settings_from(ObjectSettings, values, key)
-
-
-def _as_mapping(item: Any) -> dict[str, Any]:
-    """Convert a mesh or a mapping to a mapping. The name of a class can be a number in YAML."""
-    values = dict(item) if isinstance(item, dict) else {"mesh": item}
+    values = dict(first) if isinstance(first, dict) else {"mesh": first}
     if is_whole(values.get("label")):
         values["label"] = str(values["label"])
+    if others:
+        values["others"] = [*values.get("others", ()), *map(as_mapping, others)]
     return values
 
 

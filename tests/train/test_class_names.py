@@ -32,6 +32,16 @@ def test_label_lists_the_classes_of_labels_files_and_solids_once():
     assert named.meshes[0]["albedo_scale"] == 2.0
 
 
+@pytest.mark.parametrize("label", [None, "orange"])
+def test_objects_beside_a_mesh_stay_and_get_the_names_of_their_classes(label):
+    group = ["solid:orange", {"mesh": "solid:lemon", "label": 2, "at": [2.0, 0.0]}]
+    named = class_names.with_class_names(replace(settings([group]), label=label), CLASSES)
+    (item,) = named.objects.values()
+    (other,) = item.others
+    assert (item.mesh, item.label) == ("solid:orange", "orange")
+    assert (other.mesh, other.label) == ("solid:lemon", "lemon")
+
+
 def test_generated_hard_negatives_of_these_classes_are_left_out():
     negatives = ["solid:fruit", "solid:lemon", {"mesh": "solid:orange", "label": 3}]
     named = class_names.with_class_names(settings(["lemon.glb"], negatives), CLASSES)

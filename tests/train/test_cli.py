@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -21,6 +22,7 @@ from train.cli import USER_ERROR
 from train.commands.experiment import logged_to
 from train.data.sets import content_hash
 from train.run_folder import LAST, locked, writable_folder
+from train.settings import PHOTOGRAPHS_FIRST
 from train.system import take_flag
 
 ROOT = Path(__file__).parents[2]
@@ -198,6 +200,27 @@ def test_a_disk_full_before_the_first_checkpoint_tells_a_command_that_trains(
         patch.setattr(checkpoints, "save", save_best_alone)
         data = "data=npz", f"data.path={tiny_npz}", "photos=null"
         assert call("train", "out=here", *data, *SMALL) == USER_ERROR
+    words = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert call("train", *words[words.index("train") + 1 :]) == 0
+    assert (tmp_path / "here" / LAST).is_file()
+
+
+def test_a_signal_between_the_two_trainings_of_a_command_tells_one_that_goes_on(
+    call, capsys, monkeypatch, no_report, tmp_path, tiny_npz
+):
+    def train_first(settings, folder, *_):
+        (folder / PHOTOGRAPHS_FIRST).mkdir(exist_ok=True, parents=True)
+        (folder / PHOTOGRAPHS_FIRST / LAST).touch()
+        return replace(settings, photographs_first=False)
+
+    data = "data.name=npz", f"data.path={tiny_npz}", "photos=null", "network=null"
+    alone = [f"train.{name}_weight=0" for name in ("distillation", "ranking")]
+    alone += ["train.eval_mode=null", "augment.mode=none"]
+    monkeypatch.setattr("train.commands.experiment._train_on_photographs", train_first)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("train.training.inputs.load_data", Mock(side_effect=KeyboardInterrupt))
+        words = "out=here", "photographs_first=true", *data, *alone, *SMALL[1:]
+        assert call("train", *words) == 128 + signal.SIGINT
     words = shlex.split(capsys.readouterr().out.splitlines()[-1])
     assert call("train", *words[words.index("train") + 1 :]) == 0
     assert (tmp_path / "here" / LAST).is_file()

@@ -71,15 +71,15 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         folder = Path(broadcast(str(config.out))).absolute()
         config.out = str(folder)
         # A resumed run keeps its recorded settings, except for single values that the
-        # overrides change. An override that chooses a whole file prevents this.
+        # overrides change. A choice of a whole file, or of photographs_first, prevents this.
         keys = [override.partition("=")[0] for override in overrides]
-        if config.train.resume and not any(key in CHOICES or "@" in key for key in keys):
+        is_whole = config.photographs_first or any(key in CHOICES or "@" in key for key in keys)
+        if config.train.resume and not is_whole:
             config, command = resume_config(config, overrides)
         settings = with_label(read_settings(ExperimentSettings, config))
         if settings.photographs_first:
             settings = _train_on_photographs(settings, folder, command)
-        again = (f"out={folder}", "train.resume=true")
-        _train_in(folder, settings, command, [*program("train", as_called=True), *again])
+        _train_in(folder, settings, command, folder)
 
 
 def _train_on_photographs(
@@ -102,20 +102,18 @@ def _train_on_photographs(
     else:
         if settings.overwrite and not settings.train.resume and distributed.rank() == 0:
             remove_run(folder)
-        # The folder of the main training has no recorded settings yet. To resume, the
-        # user therefore has to give the whole command again.
-        again = (f"out={folder}", "train.resume=true")
-        _train_in(first, on_photographs, command, [*shlex.split(command), *again])
+        _train_in(first, on_photographs, command, folder)
     # The file of the first network has its weights, classes and normalization, and names the code
     # that the user has named for it.
-    cleared: dict[str, Any] = dict.fromkeys(("weights", "classes", "normalization"))
+    cleared: dict[str, Any] = dict.fromkeys(("weights", "classes", "normalization", "prompt"))
     return replace(settings, photographs_first=False, trust=True, network=str(first), **cleared)
 
 
-def _train_in(folder: Path, settings: ExperimentSettings, command: str, resume: list[str]) -> None:
+def _train_in(folder: Path, settings: ExperimentSettings, command: str, out: Path) -> None:
     """Check that the folders can be written to, and train a network and its baselines.
 
-    If the training is interrupted, the command that resumes it is printed: `resume`.
+    If the training is interrupted, the command that resumes it is printed. `out` is the folder that
+    the user has given.
     """
     # The baselines come first. Each has a sub-folder with the name of its kind of renders.
     settings_of_runs = {}
@@ -157,7 +155,10 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, resume: 
             folders = [*settings_of_runs, folder / PHOTOGRAPHS_FIRST]
             # Of best.pt without a checkpoint, a new run would be refused, but not one that resumes.
             if any(checkpoints.exists(path) or checkpoints.selected_file(path) for path in folders):
-                advice = f"to go on: {shlex.join(resume)}"
+                # Until the main training begins, its settings are in the whole command alone.
+                is_recorded = (out / CONFIG).is_file()
+                words = program("train", as_called=True) if is_recorded else shlex.split(command)
+                advice = f"to go on: {shlex.join([*words, f'out={out}', 'train.resume=true'])}"
             console.info("%s%s", cause, advice)
             raise
 
@@ -212,6 +213,8 @@ def sweep(
         raise InputError("launcher=slurm needs the command sbatch: start on the cluster")
     if first_config.photographs_first:
         raise InputError("photographs_first=true makes no sweep: start the runs one by one")
+    if first_config.compare:
+        raise InputError(f"compare={first_config.compare} makes no sweep: give augment=none,random")
     overwrite = bool(first_config.overwrite)
     parent = writable_folder(str(first_config.sweep), "sweep")
     # An earlier report about the same sweep may be replaced.

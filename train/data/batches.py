@@ -34,15 +34,11 @@ class TrainingImages(NamedTuple):
     numbers 0 to N - 1, and the renders have the numbers from N on.
 
     Attributes:
-        split: Images of the data set. It may also have images that are held
-            out for validation.
-        rows: Indices into `split` of the N images that are trained on, shape
-            (N,).
+        split: Images of the data set that are trained on.
         renders: Renders with their labels.
     """
 
     split: Split
-    rows: Int[Tensor, " N"]
     renders: Split
 
 
@@ -106,23 +102,23 @@ def training_batches(
     round. All random draws are made on the CPU, so they are the same for every
     device and every number of processes. Yield images, labels, and whether each image is a render.
     """
-    split, rows, renders = images
+    split, renders = images
     own_size = batch_size // distributed.world_size()
     begin = distributed.rank() * own_size
     # The batches from `first` on, and in each the places of this process.
     own = (..., slice(first, None), slice(begin, begin + own_size))
     drawn = _draw(images, batch_size, seed, this_round, flips)
     order, shifts, is_flipped, seeds = (draws[own] for draws in drawn)
-    is_render = order >= len(rows)
+    is_render = order >= len(split)
     # `clamp` gives each render some valid row of the data set. It is replaced by the render below.
-    row_of_image = rows[order.clamp(max=len(rows) - 1)]
+    row_of_image = order.clamp(max=len(split) - 1)
     crops: Iterator[Tensor] = iter(())
     if isinstance(split.images, ImageFiles):
         draws_of_batches = zip(row_of_image, seeds, ~is_render, strict=True)
         crops = split.images.crops((row[mask], seed[mask]) for row, seed, mask in draws_of_batches)
     # All draws are copied before the first batch, since a GPU finishes earlier work before a copy.
     device = split.labels.device
-    draws = (row_of_image, order - len(rows), shifts.transpose(0, 1), is_flipped, is_render)
+    draws = (row_of_image, order - len(split), shifts.transpose(0, 1), is_flipped, is_render)
     on_device = [one.to(device) for one in draws]
     # Places of the renders in each batch. On a GPU, `nonzero` would wait for earlier work, too.
     all_places = [mask.nonzero().squeeze(1).to(device) for mask in is_render]
@@ -175,7 +171,7 @@ def _draw(
         is_flipped = torch.randint(0, 2, order.shape, generator=draws, dtype=torch.bool)
     else:
         # A random half of the images is flipped in even epochs, and the others in odd epochs.
-        count = len(images.rows) + len(images.renders)
+        count = len(images.split) + len(images.renders)
         draws = generator(seed, "flips")
         is_flipped_if_even = torch.randint(0, 2, (count,), generator=draws, dtype=torch.bool)
         is_flipped = (is_flipped_if_even ^ bool(this_round.epoch % 2))[order]

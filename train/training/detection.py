@@ -206,14 +206,15 @@ def detected(network: nn.Module, images: Images, task: Detection) -> list[Target
 
 
 def validate(
-    network: nn.Module, teacher: nn.Module, task: Detection, split: Split, rows: Int[Tensor, " N"]
+    network: nn.Module, teacher: nn.Module, task: Detection, split: Split
 ) -> dict[str, float]:
     """Measure which fraction of the boxes of the teacher in photographs a network finds, too.
 
     Return it as "accuracy", and its complement as "loss".
     """
     device = split.labels.device
-    own_rows = rows.to(device)[distributed.rank() :: distributed.world_size()]
+    own = slice(distributed.rank(), None, distributed.world_size())
+    own_rows = torch.arange(len(split), device=device)[own]
     # Boxes of the teacher that the network finds, too, and all boxes of the teacher.
     counts = torch.zeros(2, device=device)
     # With few photographs, a process has none, and not every network takes an empty batch.

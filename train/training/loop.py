@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment import distributed
@@ -120,6 +120,8 @@ class TrainingStep:
         if isinstance(service.task, Detection):
             if settings.relight_steps:
                 raise InputError("relight_steps attacks classifiers: set it to 0", "relight_steps")
+            if settings.interpolate:
+                raise InputError("interpolate mixes classifiers: set it to False", "interpolate")
             is_compiled = False
             self._loss = DetectionLoss(replica, settings, teacher, service.task).compute
         else:
@@ -189,7 +191,8 @@ class Trainer:
         averages: Moving average and model soup of the network.
         selected: Network that is validated after each epoch: an average, or the network in
             training.
-        is_detector: Whether the network finds boxes. It has no accuracy on test images then.
+        is_detector: Whether the network finds boxes. Its accuracy is the fraction of the boxes of
+            `initial` that it finds then.
         epoch: Number of finished epochs.
         history: Metrics of each finished epoch by name.
         best: Content of best.pt, the network that the training selected. It is empty before the
@@ -243,26 +246,23 @@ class Trainer:
         options = service, self.architecture["size"], self.labeled
         self.step = TrainingStep(settings, model, teacher, *options)
 
-    def fit(self, split: Split, held_out: Bool[Tensor, " N"], log: RunLog | None) -> None:
+    def fit(self, train: Split, validation: Split, log: RunLog | None) -> None:
         """Train to the last epoch, and write checkpoints.
 
         Afterwards, best.pt contains the network of the epoch with the highest
         validation accuracy. For a model soup, and for data without labels, it
-        contains the network after the last epoch. `held_out` marks the validation images, and `log`
-        is None in all processes but the first one.
+        contains the network after the last epoch. `log` is None in all processes but the first one.
         """
         self._log = log
-        train = torch.nonzero(~held_out).squeeze(1)
-        validation = torch.nonzero(held_out).squeeze(1)
         # The batch size is limited to the images of a round and to the memory.
         in_round = round_size(len(train), *self._limits) + len(self.service)
-        batch_size = fitting_batch_size(self.settings, self.model, in_round, split.images.shape[-1])
+        batch_size = fitting_batch_size(self.settings, self.model, in_round, train.images.shape[-1])
         self.settings = replace(self.settings, batch_size=batch_size)
         with SignalHandler() as signals:
             # `_train_epoch` returns False if a signal stopped it, and the epoch is then not ended.
             while self.epoch < self.settings.epochs:
-                if self._train_epoch(split, train, signals):
-                    self._end_epoch(split, validation)
+                if self._train_epoch(train, signals):
+                    self._end_epoch(validation)
                 is_stopping = signals.requested()
                 is_last = self.epoch == self.settings.epochs
                 is_due = self.epoch % self.settings.checkpoint_every == 0
@@ -271,14 +271,14 @@ class Trainer:
                 if is_stopping:
                     signals.stop()
 
-    def _train_epoch(self, split: Split, rows: Int[Tensor, " N"], signals: SignalHandler) -> bool:
+    def _train_epoch(self, split: Split, signals: SignalHandler) -> bool:
         """Take the training steps of an epoch that remain.
 
         If the run was resumed within the epoch, some steps were taken before. Return False if a
         signal stopped the epoch before its last step.
         """
         settings = self.settings
-        counts = (len(rows), len(self.service))
+        counts = (len(split), len(self.service))
         rounds = rounds_of_epoch(*counts, self.seed, self.epoch, *self._limits)
         # Number of training steps in each round.
         steps = [math.ceil(len(one.rows) / settings.batch_size) for one in rounds]
@@ -307,7 +307,7 @@ class Trainer:
                 has_losses = self.is_detector and getattr(self.service.task, "decode", None) is None
                 recipe.set_training_mode(self.model, settings, has_losses)
                 options = settings.batch_size, self.seed, now, settings.flips, first
-                batches = training_batches(TrainingImages(split, rows, shown), *options)
+                batches = training_batches(TrainingImages(split, shown), *options)
                 for batch in progress(batches, title, steps[index], first):
                     # Fraction of the training that is done, on which the learning rate depends.
                     done = state.step / sum(steps)
@@ -340,18 +340,14 @@ class Trainer:
                 self._log.attack_examples(renders.attack_examples, classes, self.epoch + 1)
         return renders
 
-    def _end_epoch(self, split: Split, rows: Int[Tensor, " N"]) -> None:
+    def _end_epoch(self, split: Split) -> None:
         """Finish an epoch: validate the network, keep it if it is the best, and log the metrics."""
         state = cast(EpochState, self._epoch_state)
         self._epoch_state = None
         loss_sum, hits = all_reduce_sum(state.sums).tolist()
         self.averages.end_epoch()
         with self.phases("evaluation"):
-            if self.is_detector and self.initial is not None:
-                networks = self.selected, self.initial
-                validated = validate(*networks, cast(Detection, self.service.task), split, rows)
-            else:
-                validated = evaluate(self.selected, split, rows)
+            validated = self.evaluate(split)
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
         accuracy = validated["accuracy"]
@@ -375,6 +371,13 @@ class Trainer:
         if self._log:
             self._log.scalars(metrics, self.epoch)
         console.debug("%s", format_epoch(self.epoch, self.settings.epochs, metrics))
+
+    def evaluate(self, split: Split) -> dict[str, float]:
+        """Measure the loss and the accuracy of the selected network."""
+        if self.is_detector and self.initial is not None:
+            task = cast(Detection, self.service.task)
+            return validate(self.selected, self.initial, task, split)
+        return evaluate(self.selected, split)
 
     def _require_finite(self, loss: float, epoch: int) -> None:
         """Raise InputError if the loss or a weight of the network is NaN or infinite."""
@@ -485,7 +488,7 @@ class Trainer:
 
 
 @torch.no_grad()
-def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict[str, float]:
+def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
     """Measure the loss and the accuracy of a network in evaluation mode.
 
     If a run has several processes, each of them scores a part of the images, and
@@ -493,20 +496,20 @@ def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict
     fraction of correct predictions as "accuracy".
     """
     device = split.labels.device
-    rows = torch.arange(len(split)) if rows is None else rows
     # Each of n processes scores every n-th image.
-    own_rows = rows.to(device)[distributed.rank() :: distributed.world_size()]
+    own = slice(distributed.rank(), None, distributed.world_size())
+    own_rows = torch.arange(len(split), device=device)[own]
     batches = own_rows.split(EVALUATION_BATCH)
     sums = torch.zeros(2, device=device)
     # With few images, a process has none, and not every network takes an empty batch.
     if len(own_rows):
-        shown = progress(split.squares(batches), f"{len(rows)} images", len(batches))
+        shown = progress(split.squares(batches), f"{len(split)} images", len(batches))
         logits = compute_outputs(model, shown, EVALUATION_BATCH, device)
         labels = split.labels[own_rows]
         loss_sum = F.cross_entropy(logits, labels, reduction="sum")
         sums = torch.stack([loss_sum, (logits.argmax(1) == labels).sum()])
     loss_sum, hits = all_reduce_sum(sums).tolist()
-    return {"loss": loss_sum / len(rows), "accuracy": hits / len(rows)}
+    return {"loss": loss_sum / len(split), "accuracy": hits / len(split)}
 
 
 def fitting_batch_size(settings: TrainSettings, model: nn.Module, in_round: int, size: int) -> int:

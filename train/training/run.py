@@ -18,6 +18,7 @@ from augment.switch import LIT_NAME
 from augment.tasks.classification import Classification
 from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
+from renderer.io.files import remove
 from train import checkpoints, console
 from train.data import photographs
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
@@ -26,6 +27,7 @@ from train.laboratory.laboratory import is_laboratory, kept_aside_settings, writ
 from train.networks import CLASSIFIER, build_network, describe
 from train.results.metrics import METRICS
 from train.results.overwrite import remove_run
+from train.results.predictions import SUMMARY
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, write_config
 from train.run_folder import BEFORE, BEST, WEIGHTS
@@ -180,7 +182,7 @@ class Run:
             return build_network(classes, size, trust_code=self.settings.trust, **shape)
 
     def begin(self) -> None:
-        """Remove what an earlier run left in the folder, unless it is resumed; write config.yaml.
+        """Remove results of an earlier run, or only the scores of one to resume; write config.yaml.
 
         All runs of a command begin before the first one is trained. Whatever stops the command,
         no result in their folders belongs to another run then.
@@ -190,7 +192,10 @@ class Run:
         # Without `overwrite`, only a run that stopped before its first checkpoint can have left
         # config.yaml here: `__init__` resumes or refuses a run with a checkpoint.
         may_be_left = self.settings.overwrite or (self.folder / CONFIG).is_file()
-        if may_be_left and not self._is_resumed:
+        if self._is_resumed:
+            # Folders that are no longer scored would keep the scores of an older network.
+            remove(*self.folder.glob(f"*/{SUMMARY}"))
+        elif may_be_left:
             remove_run(self.folder, with_others=not self.settings.train.resume)
         device, model = str(self.trainer.device), self.trainer.model
         hardware = {"device": device, "precision": model.precision, "threads": self._threads}
@@ -211,12 +216,15 @@ class Run:
         log = RunLog(self.folder, trainer.history, logger) if is_first else None
         if is_first:
             self._render_kept_aside()
-        has_labels = not trainer.is_detector
-        scores = self._score_initial(trainer.initial) if trainer.initial and has_labels else {}
-        split = self.data.train.to(trainer.device)  # `_score_initial` may have replaced its labels.
+        scores: dict[str, float] = {}
+        if trainer.initial and not trainer.is_detector:
+            scores = self._score_initial(trainer.initial)
+        # `_score_initial` may have replaced labels. An unreadable file is replaced in its own part.
+        rows = ~self.held_out, self.held_out
+        train, validation = (self.data.train[of].to(trainer.device) for of in rows)
         with keyed(**keys_of("train", self.settings.train)):
-            trainer.fit(split, self.held_out, log)
-            scores |= self._score() if has_labels else {}
+            trainer.fit(train, validation, log)
+            scores |= self._score()
             if self.settings.train.recognize and checkpoints.RECOGNIZER not in trainer.best:
                 self._recognize()
         if log:  # Only the first process has a log.
@@ -291,7 +299,7 @@ class Run:
         trainer = self.trainer
         test = self.data.test.to(trainer.device)
         # `trainer.selected` has the weights of the last epoch until they are replaced below.
-        last = selected = evaluate(trainer.selected, test)["accuracy"]
+        last = selected = trainer.evaluate(test)["accuracy"]
         if self.settings.train.interpolate:
             self._interpolate()
         best = trainer.best
@@ -299,7 +307,7 @@ class Run:
         # The selected network differs from the last one.
         if epoch != trainer.epoch or INTERPOLATION in best:
             trainer.selected.network.load_state_dict(best["model"])
-            selected = evaluate(trainer.selected, test)["accuracy"]
+            selected = trainer.evaluate(test)["accuracy"]
         scores = {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": epoch}
         if INTERPOLATION in best:
             scores["test/interpolation"] = best[INTERPOLATION]

@@ -22,6 +22,8 @@ from augment.tasks.detection import Detection
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
 from tests.detectors import BrightBox, OneBox, RawCells, small_detector
+from train.data.sets import load_unlabeled
+from train.results.store import summarize
 from train.settings import ExperimentSettings, TrainSettings
 from train.training.augmentations import Augmentation
 from train.training.detection import candidate_loss, detected, losses_of
@@ -137,6 +139,24 @@ def test_a_detector_of_torchvision_is_trained_without_meshes(photographs):
     assert hardened.state_dict().keys() == network.state_dict().keys()
     weights = zip(hardened.parameters(), network.parameters(), strict=True)
     assert not all(torch.equal(*pair) for pair in weights)
+
+
+def test_the_run_of_a_detector_is_scored_by_the_boxes_that_it_keeps(
+    detector, photographs, tmp_path
+):
+    train = {"epochs": 1, "batch_size": 8, "learning_rate": 0.03}
+    data = {"test_fraction": 0.5, "workers": 0}
+    hardened = harden(detector, photographs, train=train, data=data, out=tmp_path)
+    images = load_unlabeled(str(photographs), SIZE, 0.5, False, 0).test.images
+    expected = kept(detector, hardened, images)
+    assert 0 < expected < 1
+    assert summarize(tmp_path).accuracy == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("name", ["interpolate", "relight_steps"])
+def test_settings_of_classifiers_alone_are_refused(detector, photographs, name):
+    with pytest.raises(InputError, match=f"train.{name}"):
+        harden(detector, photographs, train=SHORT["train"] | {name: 1})
 
 
 LOW_LIGHT = TrainSettings(augmentation="low_light")

@@ -209,6 +209,7 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
     ("override", "start"),
     [
         ("train.learning_rate=0.05,-1", "train.learning_rate=-1.0"),
+        ("compare=[none]", "compare=['none'] makes no sweep"),
         ("photos=null,missing", "photos: missing is not a folder"),
     ],
 )

@@ -24,7 +24,7 @@ def epoch_round(image_count: int, epoch: int) -> batches.Round:
 def numbered(images: torch.Tensor) -> batches.TrainingImages:
     """Make training images without renders, each labeled with its row."""
     split = Split(images, torch.arange(len(images)))
-    return batches.TrainingImages(split, split.labels, split[:0])
+    return batches.TrainingImages(split, split[:0])
 
 
 def gray_images(count: int) -> torch.Tensor:
@@ -86,7 +86,7 @@ def mirrored_rows(images: torch.Tensor | ImageFiles, now: batches.Round) -> torc
     split = Split(images, torch.arange(40))
     no_renders = Split(images[:0], split.labels[:0])
     shown = batches.training_batches(
-        batches.TrainingImages(split, split.labels, no_renders), 40, 0, now, "alternating"
+        batches.TrainingImages(split, no_renders), 40, 0, now, "alternating"
     )
     ((images, labels, _),) = shown
     is_flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
@@ -119,7 +119,7 @@ def test_an_epoch_continues_from_any_batch_as_if_one_split_held_its_rows_and_ren
     split = Split(noise(90, 3, 8, 8), torch.arange(90))
     rows = torch.arange(0, 90, 2)
     renders = Split(255 - noise(5, 3, 8, 8), torch.arange(-5, 0))
-    separate = batches.TrainingImages(split, rows, renders)
+    separate = batches.TrainingImages(split[rows], renders)
     mixed = numbered(torch.cat([split.images[rows], renders.images]))
     mixed_labels = torch.cat([rows, renders.labels])
     whole = list(batches.training_batches(mixed, 8, 0, epoch_round(50, 1), flips))
@@ -170,9 +170,7 @@ def test_objects_in_renders_move_with_the_pixels_that_show_them():
     renders = (masks * light).sum(1, dtype=torch.uint8)[:, None].repeat(1, 3, 1, 1)
     renders[:, 1] = torch.arange(3, dtype=torch.uint8)[:, None, None]  # Green is the index.
     photographs = Split(noise(4, 3, 12, 16), torch.zeros(4, dtype=torch.int64))
-    images = batches.TrainingImages(
-        photographs, torch.arange(4), Split(renders, object_maps(targets))
-    )
+    images = batches.TrainingImages(photographs, Split(renders, object_maps(targets)))
     counts = []
     for number in range(20):
         now = batches.Round(number, number, torch.arange(7))
@@ -195,7 +193,7 @@ def test_a_batch_of_renders_alone_needs_no_file(tmp_path):
     files = ImageFiles(tmp_path, (PurePosixPath("photograph.png"),), 12, workers=0, skip=False)
     photographs = Split(files, torch.zeros(1, dtype=torch.int64))
     renders = Split(noise(3, 3, 12, 12), torch.ones(3, dtype=torch.int64))
-    images = batches.TrainingImages(photographs, torch.arange(1), renders)
+    images = batches.TrainingImages(photographs, renders)
     made = [*batches.training_batches(images, 2, 0, epoch_round(4, 0))]
     assert sorted(int(is_render.sum()) for _, _, is_render in made) == [1, 2]
     for shown, labels, is_render in made:

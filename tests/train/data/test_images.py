@@ -93,7 +93,7 @@ def test_batches_from_disk_have_labeled_images_and_renders_and_go_on_where_they_
     assert isinstance(data.train.images, ImageFiles)
     assert data.size == SIZE
     renders = Split(torch.full((3, 3, SIZE, SIZE), 200, dtype=torch.uint8), torch.full((3,), -2))
-    images = TrainingImages(data.train, torch.arange(1, 9), renders)
+    images = TrainingImages(data.train[1:9], renders)
     every = Round(number=3, epoch=3, rows=torch.arange(11))
     batches = list(training_batches(images, 4, 0, every))
     assert len(batches) == 3

@@ -67,10 +67,7 @@ def make_trainer(
 
 
 def fit(trainer: Trainer, trained: Split, validated: Split) -> list[dict]:
-    images = torch.cat([trained.images, validated.images])
-    both = Split(images, torch.cat([trained.labels, validated.labels]))
-    held_out = torch.arange(len(both)) >= len(trained)
-    trainer.fit(both, held_out, RunLog(trainer.folder))
+    trainer.fit(trained, validated, RunLog(trainer.folder))
     return read_metrics(trainer.folder)
 
 

@@ -12,7 +12,7 @@ from tests.helpers import save_noise
 from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.checkpoints import load
-from train.commands.experiment import train
+from train.commands import experiment
 from train.data.sets import Split
 from train.device import MixedPrecision
 from train.results.page import PAGE
@@ -88,7 +88,7 @@ def chain(small):
         scene = ["scene.backgrounds=[0.5]", "scene.views=1", "evaluate.laboratory_setups=0"]
         words = ["experiment=classifier", "photographs_first=true", "train.epochs=1"]
         words += [*small, *meshes, *scene, f"out={folder}", *overrides]
-        train(train_command.compose(words), words)
+        experiment.train(train_command.compose(words), words)
 
     return start
 
@@ -132,6 +132,16 @@ def test_a_command_stopped_in_its_first_training_ends_the_same(chain, tmp_path, 
     trained_at = (stopped / PHOTOGRAPHS_FIRST / LAST).stat().st_mtime_ns
     chain(stopped, "train.resume=true")
     assert (stopped / PHOTOGRAPHS_FIRST / LAST).stat().st_mtime_ns == trained_at
+
+
+def test_the_second_training_states_no_fact_that_the_first_network_defines(chain, monkeypatch):
+    trained = []
+    monkeypatch.setattr(experiment, "_train_in", lambda _, settings, *__: trained.append(settings))
+    given = "classes=[a,b]", "normalization=imagenet", "prompt='a photo of a {}'", "size=32"
+    chain("run", *given, "label=a")
+    facts = [(one.weights, one.classes, one.normalization, one.prompt) for one in trained]
+    assert None not in facts[0]
+    assert facts[1] == (None, None, None, None)
 
 
 def test_weights_are_interpolated_by_predictions_in_the_light_of_the_training():

@@ -80,7 +80,7 @@ def renders_of_rounds(monkeypatch) -> list[Split]:
     training_images = loop.TrainingImages
 
     def record(*fields):
-        renders.append(fields[2])
+        renders.append(fields[1])
         return training_images(*fields)
 
     monkeypatch.setattr(loop, "TrainingImages", record)
@@ -319,6 +319,41 @@ def test_a_run_warns_if_it_would_score_images_that_it_trains_on(
     assert ("which is trained on" in caplog.text) == is_warned
 
 
+def test_a_damaged_file_is_replaced_by_a_trained_or_a_held_out_one_as_it_is_itself(
+    tiny, finished, tmp_path, monkeypatch
+):
+    """The level of gray of an image tells its file."""
+    monkeypatch.setattr("train.data.sets.MAX_SIZE_IN_MEMORY", 0)
+    (tmp_path / "images").mkdir()
+    for level in range(40):
+        Image.new("L", (16, 16), level).save(tmp_path / "images" / f"{level:02}.png")
+    source = "data=unlabeled", f"unlabeled={tmp_path / 'images'}", f"network={finished}"
+    options = "evaluate.skip_unreadable=true", "data.workers=0", "train.distillation_weight=1"
+    run = loaded_run(tiny(*source, *options, *WITHOUT_RENDERS), tmp_path / "run")
+    levels = torch.tensor([int(path.stem) for path in run.data.train.images.paths])
+    is_last = run.held_out[:-1] != run.held_out[1:]  # The next file is of the other part.
+    for level in levels[:-1][is_last].tolist():
+        (tmp_path / "images" / f"{level:02}.png").write_bytes(b"damaged")
+    shown = {True: [], False: []}  # Levels by whether they validate.
+
+    def recorded_batches(images, *options):
+        for batch in batches.training_batches(images, *options):
+            shown[False] += batch[0][:, 0, 0, 0].tolist()
+            yield batch
+
+    def recorded_evaluate(model, split):
+        shown[True] += split.sample(len(split))[:, 0, 0, 0].tolist()
+        return evaluate(model, split)
+
+    evaluate = loop.evaluate
+    monkeypatch.setattr(loop, "training_batches", recorded_batches)
+    monkeypatch.setattr(loop, "evaluate", recorded_evaluate)
+    run.train()
+    for validates, found in shown.items():
+        assert found
+        assert not {*found} & {*levels[run.held_out != validates].tolist()}
+
+
 def test_the_network_best_on_validation_is_scored_once_after_the_last_epoch(tiny, tmp_path):
     data = load_data(tiny())
     epochs_of_looks = []
@@ -446,6 +481,16 @@ def test_a_resumed_run_is_stopped_without_its_best_network_before_it_writes(tiny
     with pytest.raises(InputError, match=r"best\.pt"):
         loaded_run(settings, run)
     assert modification_times(run) == before
+
+
+def test_a_resumed_run_has_no_scores_of_its_earlier_network(tiny, finished, photos, tmp_path):
+    started = f"network={finished}", "augment=none"
+    completed_run(tiny(*started, "train.epochs=1", f"photos={{a: {photos}}}"), tmp_path)
+    resumed = "train.epochs=2", "train.resume=true", f"photos={{c: {photos}}}"
+    completed_run(tiny(*started, *resumed), tmp_path)
+    run = summarize(tmp_path)
+    assert {*run.photographs} == {"c"}
+    assert {*run.before.photographs} >= {"a"}  # The initial network is the same as before.
 
 
 def test_a_logger_gets_the_metrics_of_each_epoch_in_place_of_tensorboard(tmp_path):
