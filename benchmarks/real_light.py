@@ -351,7 +351,7 @@ def print_tables(
         pair = rows, groups[first_light]
         is_named, is_shown = (
             np.isin(units, np.intersect1d(*(units[side] for side in pair)))
-            for units in (folder.names, folder.objects)
+            for units in (np.char.add(folder.names, folder.objects), folder.objects)
         )
         both = is_named | is_shown & ~np.isin(folder.objects, folder.objects[is_named])
         pairs[light] = rows & both, groups[first_light] & both
@@ -389,8 +389,8 @@ def print_tables(
         left_out = folder.objects[(rows | groups[first_light]) & ~np.any(pairs[light], axis=0)]
         if len(left_out):
             names = ", ".join(sorted({*left_out}))
-            fault = f"{len(left_out)} images that one of them lacks, of {names}"
-            print(f"{light} minus {first_light} leaves out {fault}")
+            left = f"{len(left_out)} images that one of them lacks, of {names}"
+            print(f"{light} minus {first_light} leaves out {left}")
     return absolute
 
 

@@ -478,7 +478,7 @@ def read_object(item: Any, label: str, key: str) -> ObjectSettings:
 
 
 def as_mapping(item: Any) -> dict[str, Any]:
-    """Convert a mesh, a mapping or a list to a mapping. In YAML, a name can be a number."""
+    """Convert a mesh, a mapping or a list to a mapping. A label that is a number becomes a text."""
     first, *others = item or [None] if isinstance(item, list) else [item]
     values = dict(first) if isinstance(first, dict) else {"mesh": first}
     if is_whole(values.get("label")):

@@ -381,6 +381,18 @@ def test_changes_between_lights_are_those_of_the_photographs_in_both(
     assert float(change.split("|")[2].split()[0]) == pytest.approx(expected, abs=1e-3)
 
 
+def test_a_photograph_whose_crop_shows_an_object_in_one_light_alone_is_no_pair(
+    tmp_path, monkeypatch, capsys
+):
+    for name, level in {"plain__p_1": 200, "low_light__q_1": 40}.items():
+        save(tmp_path / f"orange/{name}.png", level)
+    for name in ("plain__p_2", "low_light__p_2"):
+        save(tmp_path / f"other_apple/{name}.png", 200)
+    score(tmp_path, monkeypatch, "half", "--crops")
+    change = capsys.readouterr().out.partition("minus plain")[2].partition("half")[2]
+    assert float(change.split("|")[3].split()[0]) == 1
+
+
 @pytest.mark.parametrize("low", [0.978, 0.1])
 def test_the_interval_of_a_perfect_score_holds_those_of_wilson_and_of_the_bootstrap(low):
     draws = np.ones(2001)

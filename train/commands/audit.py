@@ -216,7 +216,7 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
         plan = _Plan(settings, networks, device)
     # A path below pretrained/ is found from any working folder.
     photographs = published_folder(Path(str(settings.unlabeled)))
-    if plan is None:
+    if settings.unlabeled:
         find_unlabeled(photographs)
     caveats = _caveats(given, networks, plan)
     out = writable_folder(settings.out, "out")
@@ -270,6 +270,7 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
                 if plan is None:
                     raise
                 caveats.append(f"The light of the photographs was not attacked: {error}.")
+                console.warning(caveats[-1])
         return write_page(plan.image_folders if plan else {}, out, caveats)
 
 

@@ -153,10 +153,10 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, out: Pat
             advice = "no checkpoint yet: start again"
             # The first training on photographs may have ended before the main one.
             folders = [*settings_of_runs, folder / PHOTOGRAPHS_FIRST]
-            # Of best.pt without a checkpoint, a new run would be refused, but not one that resumes.
+            # A folder with best.pt and no checkpoint is refused, unless the run is resumed.
             if any(checkpoints.exists(path) or checkpoints.selected_file(path) for path in folders):
                 # Until the main training begins, its settings are in the whole command alone.
-                is_recorded = (out / CONFIG).is_file()
+                is_recorded = folder == out and (out / CONFIG).is_file()
                 words = program("train", as_called=True) if is_recorded else shlex.split(command)
                 advice = f"to go on: {shlex.join([*words, f'out={out}', 'train.resume=true'])}"
             console.info("%s%s", cause, advice)

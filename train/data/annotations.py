@@ -123,8 +123,8 @@ class Fitted(NamedTuple):
 def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str]]:
     """Find the photographs of a folder, the mask of each by its name, and those without a mask.
 
-    A mask has the path of its photograph with another folder, as in `MASK_FOLDERS`, and is a PNG
-    file.
+    A mask is a PNG file with the path of its photograph, but in the folder `masks` or
+    `SegmentationClass`.
     """
     # The first pair of folders that exist has the photographs and the masks.
     for names in (("images", "masks"), ("JPEGImages", "SegmentationClass")):

@@ -129,7 +129,7 @@ def training_batches(
             shown = shown.to(device)
             shown = torch.where(flip[:, None, None, None], shown.flip(3), shown)
         else:
-            shown = crop_and_flip(split.images, row, shift, flip)
+            shown = crop_and_flip(split.images, split.places(row), shift, flip)
         labels = split.labels[row]
         places = all_places[index]
         if len(places):

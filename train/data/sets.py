@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Shaped, UInt8
+from jaxtyping import Bool, Int, Shaped, UInt8
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -173,6 +173,7 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
         """Read an image, or another image of its subfolder if it cannot be read.
 
         The next one in the list of paths comes first, and the image is black if none can be read.
+        The list has only images for training, or only those for validation.
         The dictionary has the error of each unreadable file.
         """
         index, seed = key
@@ -220,10 +221,12 @@ class Split:
             their files.
         labels: Index of the class of each image, int64, shape (N,). For renders with
             objects, maps of them, shape (N, 1, H, W).
+        rows: Places of the N images in `images`, if it has others, too. None for all.
     """
 
     images: Tensor | ImageFiles
     labels: Shaped[Tensor, "N ..."]
+    rows: Int[Tensor, " N"] | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -253,7 +256,18 @@ class Split:
         images = self.images
         if isinstance(images, ImageFiles):
             return images.squares(rows)
-        return (images[batch] for batch in rows)
+        return (images[self.places(batch)] for batch in rows)
+
+    def places(self, rows: Tensor) -> Tensor:
+        """Return the places in `images` of images of the split."""
+        return rows if self.rows is None else self.rows[rows]
+
+    def part(self, is_chosen: Bool[Tensor, " N"]) -> "Split":
+        """Return some of the images. Those in memory are not copied."""
+        if isinstance(self.images, ImageFiles):
+            return self[is_chosen]
+        rows = is_chosen.nonzero()[:, 0].to(self.labels.device)
+        return Split(self.images, self.labels[rows], rows)
 
     def sample(self, count: int) -> UInt8[Tensor, "_ 3 H W"]:
         """Return images whose indices are evenly spread from the first to the last image.

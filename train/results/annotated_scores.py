@@ -271,7 +271,7 @@ def _choose_labels(
         raise InputError(f"{fault} network (such as {', '.join(classes[:3])}): give classes")
     if lacking:
         console.warning("not scored, because the network lacks them: %s", ", ".join(lacking))
-    # Names may differ in their case alone. The first name of a class is that in tables.
+    # Names may differ in their case alone. Tables show the first name of a class.
     wanted = {known[name] for name in chosen} - {None}
     return {name: classes.index(known[name]) for name in (*chosen, *known) if known[name] in wanted}
 
@@ -281,8 +281,9 @@ def _score(
 ) -> dict[str, DetectionMetrics]:
     """Return the metrics of all classes, and of each class, in some photographs."""
     at_iou, at_half = map(detections.join, zip(*matches, strict=True))
-    # The first name of each class.
-    names = {own: next(name for name in labels if labels[name] == own) for own in labels.values()}
+    names: dict[int, str] = {}
+    for name, own in labels.items():
+        names.setdefault(own, name)
     groups = {ALL: [*names], **{name: [label] for label, name in names.items()}}
     # A score of 32 bits reaches the threshold that rounds to it.
     threshold = min(task.threshold, float(np.float32(task.threshold)))

@@ -69,7 +69,7 @@ class AreaUnderCurve(Estimate):
         positive_objects: Number of different objects in the positive images that have
             a name, or of different images if no object has.
         negatives: Number of negative images.
-        negative_objects: The same number of the negative images.
+        negative_objects: Number of objects in the negative images, as in `positive_objects`.
     """
 
     positives: int = 0

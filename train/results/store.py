@@ -450,9 +450,9 @@ def finished_runs(folders: Sequence[Path]) -> list[RunSummary]:
     for folder in folders:
         found = find([folder])
         if not found.runs:
-            for run in found.unfinished[:1]:
-                if run.state.startswith("cannot be read: "):
-                    raise InputError(f"runs: {run.state.partition(': ')[2]}")
+            state = found.unfinished[0].state if found.unfinished else ""
+            if state.startswith("cannot be read: "):
+                raise InputError(f"runs: {state.partition(': ')[2]}")
             reasons = [f" ({run.folder}: {run.state})" for run in found.unfinished]
             fault = f"runs: {folder} holds no finished run{''.join(reasons[:1])}"
             raise InputError(f"{fault}: finish or resume it, or give another folder")

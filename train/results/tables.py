@@ -103,7 +103,7 @@ class Table:
 def write_csv(path: Path, rows: Iterable[Iterable[object]], line_end: str = "\n") -> None:
     """Write rows, of which the first is the header, to a CSV file."""
     text = io.StringIO()
-    # A cell is quoted if it has a character of the line end. No cell has the character 0.
+    # A cell is quoted if it has a character of the line end. No cell has the null character.
     csv.writer(text, lineterminator="\r\n\0").writerows(rows)
     atomic_write(path, text.getvalue().replace("\r\n\0", line_end))
 

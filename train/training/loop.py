@@ -191,8 +191,8 @@ class Trainer:
         averages: Moving average and model soup of the network.
         selected: Network that is validated after each epoch: an average, or the network in
             training.
-        is_detector: Whether the network finds boxes. Its accuracy is the fraction of the boxes of
-            `initial` that it finds then.
+        is_detector: Whether the network finds boxes. The accuracy of a detector is the fraction of
+            the boxes of `initial` that it finds.
         epoch: Number of finished epochs.
         history: Metrics of each finished epoch by name.
         best: Content of best.pt, the network that the training selected. It is empty before the

@@ -113,7 +113,7 @@ def called_layers(network: nn.Module, size: int, count: int = 1) -> tuple[Output
 def _module_of(parameter: str) -> str:
     """Return the name of the module of a parameter: "head.fc" for "head.fc.weight".
 
-    That of a parametrized weight, "head.fc.parametrizations.weight.original", is also of "head.fc".
+    The module of the parametrized weight "head.fc.parametrizations.weight.original" is "head.fc".
     """
     return parameter.partition("parametrizations.")[0].rpartition(".")[0]
 
@@ -210,8 +210,8 @@ def feature_norm(network: nn.Module, images: Float[Tensor, "N 3 H W"]) -> float:
                 raise InputError(f"{fault}: name the last module that stays as it is", "freeze")
             gradients = torch.autograd.grad(logit, weights)
             squares.append(sum(float(gradient.square().sum()) for gradient in gradients))
-        # Weights that each pass computes (`torch.nn.utils.weight_norm`) get no graph in this pass.
-        # A network with such a graph could not be copied.
+        # Some weights are computed in each pass (`torch.nn.utils.weight_norm`). After this pass
+        # without gradients, they have no graph, with which the network could not be copied.
         with torch.no_grad():
             network(images[:1])
     return math.sqrt(fmean(squares))

@@ -182,7 +182,7 @@ class Run:
             return build_network(classes, size, trust_code=self.settings.trust, **shape)
 
     def begin(self) -> None:
-        """Remove results of an earlier run, or only the scores of one to resume; write config.yaml.
+        """Remove results of an earlier run, and write config.yaml. A resumed run loses its scores.
 
         All runs of a command begin before the first one is trained. Whatever stops the command,
         no result in their folders belongs to another run then.
@@ -220,8 +220,8 @@ class Run:
         if trainer.initial and not trainer.is_detector:
             scores = self._score_initial(trainer.initial)
         # `_score_initial` may have replaced labels. An unreadable file is replaced in its own part.
-        rows = ~self.held_out, self.held_out
-        train, validation = (self.data.train[of].to(trainer.device) for of in rows)
+        split = self.data.train.to(trainer.device)
+        train, validation = (split.part(rows) for rows in (~self.held_out, self.held_out))
         with keyed(**keys_of("train", self.settings.train)):
             trainer.fit(train, validation, log)
             scores |= self._score()

@@ -330,15 +330,20 @@ def test_test_images_of_another_size_than_a_later_network_needs_are_refused(give
     assert not (out / "classifier").exists()
 
 
-def test_an_audit_of_meshes_ends_with_its_page_if_photographs_show_nothing(given, monkeypatch):
+def test_an_audit_of_meshes_ends_with_its_page_if_photographs_show_nothing(
+    given, monkeypatch, tmp_path
+):
     def fail(*_: Any) -> None:
         raise InputError("dark has no detections in 1 photographs: give others")
 
     found = []
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    write_image(photographs / "gray.png", np.full((8, 8, 3), 128, np.uint8))
     monkeypatch.setattr(audit, "_attack_photographs", fail)
     monkeypatch.setattr(audit._Plan, "measure", lambda *_: [])
     monkeypatch.setattr(audit.page, "write_audit_page", lambda *given: found.append(given[-1]))
-    run_audit(AuditSettings(**given, unlabeled=given["out"]))
+    run_audit(AuditSettings(**given, unlabeled=str(photographs)))
     assert "no detections" in found[0][-1]
 
 
