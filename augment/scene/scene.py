@@ -239,7 +239,8 @@ class Scene:
         has_same_views = {*map(_view_of, copy.examples)} <= {*map(_view_of, self.examples)}
         is_same = arguments.keys() <= {"lights", "examples"} and kinds[0] == kinds[1]
         # With `one_light`, the renderer keeps the shadows of the light of each example.
-        if is_same and has_same_views and not self.one_light:
+        keeps_light = self.one_light and self.settings.global_illumination
+        if is_same and has_same_views and not keeps_light:
             copy._direct_renderer = self._direct_renderer
         return copy
 

@@ -264,7 +264,7 @@ class LocalBasis(Basis):
         points: Tensor,
         normals: Tensor,
         positions: Tensor | None = None,
-        width: float = math.inf,
+        lobe_width: float = math.inf,
     ) -> LightPaths:
         """Find the straight paths from light sources to S surface points, without shadows.
 
@@ -274,7 +274,7 @@ class LocalBasis(Basis):
             positions: Positions to which the L light sources have moved,
                 shape (L, 3). None for their own `positions`. Only a basis with
                 `is_movable` accepts positions.
-            width: Smallest width α of the specular lobes at the points
+            lobe_width: Smallest width α of the specular lobes at the points
                 (`renderer.microfacets`). Infinite if they are matte.
 
         Returns:

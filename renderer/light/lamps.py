@@ -108,7 +108,7 @@ class Projector(Settings, LocalBasis):
         points: Tensor,
         normals: Tensor,
         positions: Tensor | None = None,
-        width: float = math.inf,
+        lobe_width: float = math.inf,
     ) -> LightPaths:
         """Find the straight path from the projector to each surface point that it lights.
 
@@ -116,7 +116,7 @@ class Projector(Settings, LocalBasis):
             points: N surface points in world axes, shape (N, 3).
             normals: Unit normals at the points, shape (N, 3).
             positions: Not used, because a projector cannot be moved.
-            width: Not used, because a projector is a point.
+            lobe_width: Not used, because a projector is a point.
 
         Returns:
             One path for each point that lies within the pattern and faces the
@@ -165,9 +165,10 @@ class Projector(Settings, LocalBasis):
 
 
 # A matte surface point casts a ray to each point of a set of points on a disc lamp. A glossy one
-# casts more, up to this number of rays from all points, so that they do not show in highlights.
+# casts more, so that single points do not show in highlights, but a view casts at most about
+# `MAX_PATHS` rays in total.
 POINTS_PER_SET = 8
-MAX_PATHS = 2**23
+MAX_PATHS = 2**20
 # Number of different sets of points on a disc lamp. Neighboring surface points use
 # different sets, which makes the edges of soft shadows smoother.
 POINT_SETS = 4
@@ -268,7 +269,7 @@ class Lamps(LocalBasis):
         points: Tensor,
         normals: Tensor,
         positions: Tensor | None = None,
-        width: float = math.inf,
+        lobe_width: float = math.inf,
     ) -> LightPaths:
         """Find the straight paths from lamps to surface points, without shadows.
 
@@ -277,7 +278,7 @@ class Lamps(LocalBasis):
             normals: Unit normals at the points, shape (S, 3).
             positions: Positions to which the L lamps have moved, shape (L, 3).
                 None uses the positions of the basis.
-            width: Smallest width α of the specular lobes at the points. Discs have
+            lobe_width: Smallest width α of the specular lobes at the points. Discs have
                 more points for narrower lobes. Infinite if the points are matte.
 
         Returns:
@@ -290,7 +291,7 @@ class Lamps(LocalBasis):
         # set, lamp, point, coordinate. A point lamp has one set of one point.
         sources = positions[None, :, None]
         if self.radius:
-            sources = self._disc_points(positions, self._point_count(points, positions, width))
+            sources = self._disc_points(positions, self._point_count(points, positions, lobe_width))
         set_of_point = torch.arange(len(points), device=points.device) % len(sources)
         # First find the paths with light, without recording operations for gradients.
         with torch.no_grad():
@@ -336,16 +337,16 @@ class Lamps(LocalBasis):
             emitters.append({"type": "disk", "to_world": pose, "emitter": area_light})
         return emitters
 
-    def _point_count(self, points: Tensor, positions: Tensor, width: float) -> int:
-        """Choose how many points on each disc are apart by less than a highlight of this width."""
-        if math.isinf(width):
+    def _point_count(self, points: Tensor, positions: Tensor, lobe_width: float) -> int:
+        """Choose how many points each disc has, apart by less than the narrowest highlight."""
+        if math.isinf(lobe_width):
             return POINTS_PER_SET
         distances = torch.cdist(points.detach(), positions.detach()).cpu().numpy()
         # Length of the narrowest highlight on the nearest disc.
-        length = max(width * distances.min(initial=math.inf), 1e-9)
+        length = max(lobe_width * distances.min(initial=math.inf), 1e-9)
         wanted = 2 * (self.radius / length) ** 2
         limit = MAX_PATHS / max(1, len(points) * len(positions))
-        return int(max(POINTS_PER_SET, min(wanted, limit)))
+        return math.ceil(max(POINTS_PER_SET, min(wanted, limit)))
 
     def _disc_points(self, positions: Float[Tensor, "L 3"], count: int) -> Float[Tensor, "_ L _ 3"]:
         """Choose points on disc lamps, to which shadow rays are cast.

@@ -35,7 +35,14 @@ from renderer.mesh import Mesh
 from renderer.normals import face_normals
 from renderer.operators.apply import SparseTransfer
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import Gloss, SampleGloss, at_samples, sample_gloss, toward_camera
+from renderer.surface.gloss import (
+    IGNORED_PERCENT,
+    Gloss,
+    SampleGloss,
+    at_samples,
+    sample_gloss,
+    toward_camera,
+)
 from renderer.surface.shading import normals_in_sight, smooth_normals
 from renderer.vectors import unit, unit_vectors
 from renderer.visibility.fragments import Fragments
@@ -154,10 +161,16 @@ class Surface:
 
     @property
     def lobe_width(self) -> float:
-        """Smallest width α = roughness² of the specular lobes. Infinite for a matte surface."""
+        """Smallest width α = roughness² of the specular lobes. Infinite for a matte surface.
+
+        As in `smallest_roughness`, the 1% of the samples with the smallest roughness do not count.
+        """
         if self.gloss is None:
             return math.inf
-        return float(self.gloss.roughness.detach().numpy().min(initial=1.0)) ** 2
+        roughness, *factors = torch.broadcast_tensors(*(values.detach() for values in self.gloss))
+        roughness = roughness[(factors[0] > 0) | (factors[1] > 0)]
+        rank = 1 + len(roughness) * IGNORED_PERCENT // 100
+        return float(roughness.kthvalue(rank).values) ** 2 if len(roughness) else math.inf
 
     @cached_property
     def toward(self) -> Tensor:
@@ -368,7 +381,7 @@ def local_transfer(
     """
     fragments = surface.fragments
     samples = surface.points, surface.normals, surface.planes
-    paths = unoccluded(rays, basis, *samples, width=surface.lobe_width)
+    paths = unoccluded(rays, basis, *samples, lobe_width=surface.lobe_width)
     # One row for each path, one column for each channel: radiance of the sample at the end
     # of the path, per unit of the coefficient of its light.
     weights = path_reflectance(surface, albedo, paths) * paths.irradiance[:, None]
@@ -416,15 +429,15 @@ def unoccluded(
     normals: Float[Tensor, "S 3"],
     planes: Float[Tensor, "S 3"],
     positions: Float[Tensor, "L 3"] | None = None,
-    width: float = math.inf,
+    lobe_width: float = math.inf,
 ) -> LightPaths:
     """Find the paths from local lights to surface points that no face of the mesh blocks.
 
     A path must also arrive above the plane of the face on which the point lies. `positions`
-    are the places to which lamps have moved. None leaves them where the basis has them. `width` is
-    that of the narrowest highlights (`LocalBasis.connect`).
+    are the places to which lamps have moved. None leaves them where the basis has them. The
+    `lobe_width` is that of the narrowest highlights (`LocalBasis.connect`).
     """
-    paths = basis.connect(points, normals, positions, width)
+    paths = basis.connect(points, normals, positions, lobe_width)
     # Whether a path is blocked has no gradient, so no operations are recorded.
     with torch.no_grad():
         plane_of_path = planes[paths.point]

@@ -54,7 +54,7 @@ from renderer.visibility.fragments import Fragments
 
 # `smallest_roughness` ignores this percentage of the texels of a texture, namely those
 # with the smallest roughness.
-_IGNORED_PERCENT = 1
+IGNORED_PERCENT = 1
 # The only SH coefficient of uniform light with irradiance 1. Its radiance is 1 / π, and
 # the coefficient is √(4π) times the radiance.
 _UNIFORM_COEFFICIENT = math.sqrt(4 * math.pi) / math.pi
@@ -274,7 +274,7 @@ def smallest_roughness(mesh: Mesh) -> float:
     if mesh.gloss is None:
         return 1.0
     # The first channel of a gloss texture is a factor for the roughness.
-    smallest = [np.percentile(t[..., 0], _IGNORED_PERCENT) / 255 for t in mesh.gloss_textures]
+    smallest = [np.percentile(t[..., 0], IGNORED_PERCENT) / 255 for t in mesh.gloss_textures]
     # Faces without a texture have the texture index -1, which selects the last factor.
     factor_of_face = np.take([*smallest, 1.0], mesh.texture_ids if smallest else -1)
     roughness_of_face = mesh.gloss[:, 0] * factor_of_face

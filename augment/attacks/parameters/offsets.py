@@ -147,7 +147,7 @@ class Pixels(Parameter):
         """Keep the sums of images and offsets in [0, 1], if nothing else changes the images."""
         if not self._is_alone:
             return super().project_feasible(values, within)
-        images = self._images[examples]
+        images = self._images_of(examples)
         # A sum beyond the limits by rounding would have a gradient of zero.
         low, high = -relu(images - ROUNDING), relu(1 - ROUNDING - images)
         return nearest_in_box(values, low, high, within)
@@ -159,11 +159,17 @@ class Pixels(Parameter):
         """
         return replace(conditions, pixels=values.unflatten(1, self._images_shape))
 
+    def _images_of(self, examples: Examples | slice) -> Values:
+        """Return the images of examples before the attack, one row for each."""
+        rows = torch.arange(len(self._scene), device=self.start.device)[examples]
+        missing = rows[self._images[rows, 0].isnan()]
+        with torch.no_grad():
+            for group in missing.split(self._scene.group_size) if len(missing) else ():
+                images = self._scene.render(self._scene.conditions(group), group)
+                self._images[group] = images.flatten(1)
+        return self._images[rows]
+
     @cached_property
     def _images(self) -> Values:
-        """Images of all examples before the attack, one row for each."""
-        scene = self._scene
-        groups = torch.arange(len(scene), device=self.start.device).split(scene.group_size)
-        with torch.no_grad():
-            images = [scene.render(scene.conditions(group), group) for group in groups]
-        return torch.cat(images).flatten(1)
+        """Images of all examples before the attack, or NaN until they are needed."""
+        return torch.full_like(self.start, math.nan)

@@ -297,4 +297,4 @@ def test_adversaries_of_eot_survive_transformations_that_others_do_not():
         settings = augment.AttackSettings(lighting=SMALL_STEPS, eot=eot, **options)
         result = augment.attack(classifier, scene, settings=settings)
         rates[draws] = survival(result.images)
-    assert rates[8] > rates[0] + 0.02
+    assert rates[8] > rates[0] + 0.05

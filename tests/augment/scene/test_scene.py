@@ -214,8 +214,10 @@ def test_a_copy_in_other_light_is_not_rasterized_again_and_shows_that_light(rast
     torch.testing.assert_close(found, fresh.render(copy.conditions(every), every))
 
 
-def test_the_same_views_in_another_order_are_not_rasterized_again(rasterized):
-    scene, fresh = (built("cup", "ball", shadows=True) for _ in range(2))
+@pytest.mark.parametrize("one_light", [False, True])
+def test_the_same_views_in_another_order_are_not_rasterized_again(rasterized, one_light):
+    scenes = (built("cup", "ball", shadows=not one_light) for _ in range(2))
+    scene, fresh = (each.changed(one_light=one_light) for each in scenes)
 
     def unpainted(scene: Scene) -> torch.Tensor:
         """Render with unchanged colors that could change, for which no operator is used."""

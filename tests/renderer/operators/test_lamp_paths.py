@@ -200,12 +200,12 @@ def test_a_small_disc_is_a_point_times_the_cosine_to_its_axis_and_dark_behind():
 
 @pytest.mark.parametrize("roughness", [0.2, 0.4])
 def test_the_highlight_of_a_disc_is_that_of_many_small_discs(roughness):
-    """600 small discs on a spiral have equal areas, and axes of almost the same direction."""
+    """200 small discs on a spiral have equal areas, and axes of almost the same direction."""
     center = np.array([1.3, 0.9, 1.1])
     across = np.linalg.svd(center[None])[2][1:]
-    steps = np.arange(600) + 0.5
+    steps = np.arange(200) + 0.5
     turns = steps * math.pi * (3 - math.sqrt(5))
-    offsets = 0.5 * np.sqrt(steps / 600) * np.stack([np.cos(turns), np.sin(turns)])
+    offsets = 0.5 * np.sqrt(steps / 200) * np.stack([np.cos(turns), np.sin(turns)])
     places = center + offsets.T @ across
     gloss = Gloss(roughness, 1.0)
     images = []
@@ -219,6 +219,24 @@ def test_the_highlight_of_a_disc_is_that_of_many_small_discs(roughness):
         images.append(render(ball(3), CAMERA, None, 16, 0.0, **options))
     error = (images[0] - images[1]).square().mean().sqrt()
     assert error < 0.05 * images[1].square().mean().sqrt()
+
+
+def path_count(rows: list) -> int:
+    """Return the number of paths from a disc to a ball whose nearest face has the last gloss."""
+    mesh = ball(3)
+    gloss = np.resize(np.float32(rows[:1]), (len(mesh.faces), 3))
+    gloss[np.argmax(mesh.vertices[mesh.faces].mean(1) @ CAMERA.axes()[2])] = rows[-1]
+    view = LitView(replace(mesh, gloss=gloss), DISCS, SIZE, 2)
+    lit = LocalLightView(Rays(view.mesh), Surface(view.mesh, view.view, view.settings))
+    lit.radiance(DISCS, view.albedo, draw_uniform(3, 3))
+    return len(lit.fixed_paths[DISCS].point)
+
+
+def test_rays_to_discs_are_more_only_if_many_samples_have_narrow_highlights():
+    matte = path_count([[1, 0, 0]])
+    assert path_count([[0.2, 0, 0]]) == matte
+    assert path_count([[1, 0, 1], [0.2, 0, 1]]) == matte
+    assert path_count([[0.2, 0, 1]]) > 2 * matte
 
 
 def test_a_surface_behind_a_lamp_casts_no_shadow():

@@ -194,6 +194,25 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
     assert is_changed.double().mean() > 0.4
 
 
+def test_an_attack_on_the_pixels_renders_only_the_examples_that_it_attacks(
+    make_scene, make_linear, monkeypatch
+):
+    rendered = set()
+    original = Scene.render
+
+    def render_noted(scene: Scene, conditions: Any, examples: Tensor, *options: Any) -> Tensor:
+        rendered.update(examples.tolist())
+        return original(scene, conditions, examples, *options)
+
+    monkeypatch.setattr(Scene, "render", render_noted)
+    settings = AttackSettings(pixels=StepSettings("linf", 0.1, "sign", 0.03), max_steps=2)
+    problem = build_problem(settings, make_scene())
+    criterion = ClassCriterion(torch.zeros(2, 2, dtype=torch.int64))
+    objective = Objective(make_linear(3, bias=50.0), criterion, settings)
+    minimize(problem, objective, examples=torch.tensor([2, 0]))
+    assert rendered == {0, 2}
+
+
 @pytest.mark.parametrize("gray", [0.0, 1.0])
 def test_steps_from_a_random_start_are_pgd(make_scene, make_linear, gray):
     """PGD clips the images of the start and of each step to the ball and to [0, 1]."""
