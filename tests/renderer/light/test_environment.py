@@ -261,7 +261,7 @@ def test_an_exr_file_without_light_or_of_a_part_is_refused(tmp_path, names, attr
         read_map(tmp_path / "map.exr")
 
 
-@pytest.mark.parametrize("images", [("RGB", "Y"), ("Y", "RGB"), ("Y", "Y"), ("RGB", "BGR")])
+@pytest.mark.parametrize("images", [("RGB", "Y"), ("Y", "RGB"), ("RGB", "BGR")])
 def test_of_several_images_in_an_exr_file_the_first_is_read_if_it_alone_has_colors(
     tmp_path, images
 ):
@@ -280,7 +280,7 @@ def test_of_several_images_in_an_exr_file_the_first_is_read_if_it_alone_has_colo
             output.open(path, spec, "AppendSubimage")
         output.write_image(np.full((8, 16, spec.nchannels), 2.0, np.float32))
     output.close()
-    if images == ("RGB", "Y"):
+    if images[1] == "Y":
         assert (read_map(tmp_path / "map.exr") == 2).all()
     else:
         with pytest.raises(InputError, match="several images"):
