@@ -21,7 +21,7 @@ from renderer import errors
 from renderer.errors import InputError
 from renderer.image import decode, encode
 from renderer.normals import CREASE, doubled_area_vectors, normal_groups, vertex_normals
-from renderer.settings import MAX_VERTICES, NORMALS
+from renderer.settings import ENCODINGS, MAX_VERTICES, NORMALS
 
 # Affine matrix, shape (4, 4), that rotates the y-axis to the z-axis. It converts meshes from files
 # in which y points up to our axes, in which z points up.
@@ -432,8 +432,8 @@ def subdivide(mesh: Mesh, vertices: float, encoding: str = "linear") -> Mesh:
 
     The surface stays the same. New vertices are the midpoints of edges. Faces
     that share an edge share the new vertex, so a closed mesh stays closed. Colors
-    and texture coordinates are interpolated as shading does it. The old vertices
-    keep their indices. Each division replaces face f by the faces 4 f to 4 f + 3.
+    and texture coordinates are interpolated, too. The old vertices keep their
+    indices. Each division replaces face f by the faces 4 f to 4 f + 3.
 
     Args:
         mesh: Mesh to divide.
@@ -460,6 +460,7 @@ def subdivide(mesh: Mesh, vertices: float, encoding: str = "linear") -> Mesh:
     if isinstance(vertices, float) and vertices.is_integer():
         vertices = int(vertices)
     errors.require_whole("vertices", vertices, 0, MAX_VERTICES)
+    errors.require_choice("encoding", encoding, ENCODINGS)
     while len(mesh.vertices) <= vertices:
         mesh = _quartered(mesh, encoding)
     return mesh

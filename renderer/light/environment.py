@@ -193,7 +193,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]
     specs = [_openimageio().ImageBuf(str(path), i, 0).spec() for i in range(image.nsubimages)]
     colored = [index for index, each in enumerate(specs) if {*"RGB"} <= {*each.channelnames}]
     if image.nsubimages > 1 and colored != [0]:
-        raise InputError("not only the first of its images has R, G and B: save the light alone")
+        raise InputError("the file has several images: save one with R, G and B alone")
     # CIE x and y of red, green, blue and white.
     chromaticities = spec.getattribute("chromaticities") or REC_709
     if image.file_format_name == "hdr":
@@ -275,7 +275,7 @@ def _color_channels(names: Sequence[str]) -> list[int]:
                 colored.setdefault(layer, [keys.index(channel) for channel in channels])
     # Blender calls the layer of all light "Combined". Layers are sorted by their names.
     preferred = [layer for layer in colored if layer.rpartition(".")[2] in ("", "combined")]
-    layers = preferred[:1] if "" in preferred else preferred or [*colored]
+    layers = [""] if "" in preferred else preferred or [*colored]
     if len(layers) > 1:
         raise InputError(f"the layers {', '.join(layers)} have colors: save the light alone")
     if layers:

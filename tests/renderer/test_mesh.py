@@ -152,6 +152,11 @@ def test_a_subdivided_mesh_has_the_same_image(encoding):
     torch.testing.assert_close(images[1], images[0], rtol=0, atol=1e-5)
 
 
+def test_a_mesh_that_needs_no_division_is_refused_in_an_unknown_encoding():
+    with pytest.raises(InputError, match="encoding=gamma"):
+        subdivide(SHEET, 0, "gamma")
+
+
 # One face of area 8 in the plane z = 0, and one of area 2.
 CORNER = Mesh.plain(
     [[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 1]], [[0, 1, 2], [0, 3, 1]], np.eye(4)[:, :3]

@@ -283,7 +283,7 @@ def test_of_several_images_in_an_exr_file_the_first_is_read_if_it_alone_has_colo
     if images[1] == "Y":
         assert (read_map(tmp_path / "map.exr") == 2).all()
     else:
-        with pytest.raises(InputError, match="save the light alone"):
+        with pytest.raises(InputError, match="several images"):
             read_map(tmp_path / "map.exr")
 
 
