@@ -26,8 +26,8 @@ from renderer.errors import import_package
 from renderer.vectors import Ball, nearest_in_box
 
 # Random search multiplies the length of its random changes by GROWTH after an accepted candidate
-# and by SHRINKAGE after a rejected one. Four rejections undo one acceptance (the 1/5 success rule
-# of evolution strategies), so that about one candidate in five is accepted.
+# and by GROWTH^(-1/4) after a rejected one. Four rejections undo one acceptance (the 1/5 success
+# rule of evolution strategies), so that about one candidate in five is accepted.
 GROWTH = 1.5
 # CMA-ES with more values than this uses a diagonal covariance (Ros and Hansen
 # 2008), because the size of a full covariance is the square of their number.

@@ -269,9 +269,8 @@ def project_along_light(
     height = ((first - starts[mesh_pixels]) * face_normals).sum(1)
     length = height / (forward[mesh_pixels] * face_normals).sum(1)
     points[mesh_pixels] = starts[mesh_pixels] + length[:, None] * forward[mesh_pixels]
-    # Axes of the pattern, to the right and down, both perpendicular to the projector's rays.
-    # Horizontal direction perpendicular to the rays of the projector. If these are vertical, the
-    # small number keeps the vector from being zero.
+    # Axes of the pattern, to the right and down, perpendicular to the rays of the projector. If the
+    # rays are vertical, the small number keeps the vector from being zero.
     right = torch.stack([-towards[1], towards[0] + 1e-9, towards.new_zeros(())])
     right = F.normalize(right, dim=0)
     axes = torch.stack([right, torch.linalg.cross(right, towards)])

@@ -109,7 +109,7 @@ class Detection(Task):
 
     def recognizes(self, outputs: Any) -> bool:
         """Return whether outputs are dictionaries of boxes, or those of a library of detectors."""
-        if _is_transformer(outputs) or _is_ultralytics(outputs):
+        if _has_final_boxes(outputs) or _is_ultralytics(outputs):
             return True
         is_list = isinstance(outputs, list | tuple) and len(outputs) > 0
         return is_list and all(isinstance(item, Mapping) and "boxes" in item for item in outputs)
@@ -343,7 +343,7 @@ class _Reader:
             given, title = outputs, f"decode of {title}"
             with errors.explained(f"{title} fails on {errors.describe(given)}"):
                 outputs = task.decode(given)
-        elif _is_transformer(outputs):
+        elif _has_final_boxes(outputs):
             outputs = _of_transformer(outputs, images, title, self.class_count)
         if _is_ultralytics(outputs):
             outputs, is_raw = _of_ultralytics(outputs[0]), True
@@ -443,10 +443,10 @@ def log_odds_of(scores: Tensor) -> Tensor:
     return torch.logit(scores + (limited - scores).detach())
 
 
-def _is_transformer(outputs: Any) -> bool:
-    """Return whether outputs are those of an object detector of transformers, or like them.
+def _has_final_boxes(outputs: Any) -> bool:
+    """Return whether outputs are boxes that need no suppression, as those of transformers.
 
-    RT-DETR of Ultralytics returns final boxes and five parts.
+    RT-DETR of Ultralytics returns such boxes and five parts.
     """
     keys = {*outputs} if isinstance(outputs, Mapping) else set()
     if hasattr(outputs, "pred_boxes") or {"logits", "pred_boxes"} <= keys:

@@ -276,7 +276,7 @@ def read_off(file: MeshFile) -> list[Part]:
     return _parts(file, {"vertex": vertex, "face": face}, [])
 
 
-# Face of a binary .stl file. Some programs store a color in `attribute`, and say so by `_FLAG`,
+# Face of a binary .stl file. Some programs store a color in `attribute`, and say so by its bit 15,
 # or by a color for all other faces in the header, whose last four bytes are the number of faces.
 _STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER_SIZE = 84

@@ -124,8 +124,8 @@ def _draw(
     rows, columns = shape
     size = (columns, rows)
     program = context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
-    # Buffer for x, y and z of the three corners of all faces of one view.
-    # Each face has three coordinates, which take 4 bytes.
+    # Buffer for the three corners of all faces of one view. Each of the three coordinates of a
+    # corner takes 4 bytes.
     corners = context.buffer(reserve=faces.size * 3 * 4, dynamic=True)
     triangles = context.vertex_array(program, [(corners, "3f", "position")])
     texture = context.texture(size, 1, dtype="i4")

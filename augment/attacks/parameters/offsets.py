@@ -90,8 +90,8 @@ class Geometry(MeshParameter):
 class Albedo(MeshParameter):
     """Attack on the colors: a linear RGB offset that is added to the albedo of each face.
 
-    The renderer clamps the sum to [0, 1]. An offset that a restart puts beyond
-    this range has a gradient of zero, and stays.
+    The renderer clamps the sum to [0, 1]. The gradient of an offset that a
+    restart puts beyond this range is zero, so the offset does not change.
 
     Args:
         scene: Scene to attack. Props and table stay as they are.
@@ -121,8 +121,8 @@ class Pixels(Parameter):
     et al. 2016). With random restarts in addition, it is PGD (Madry et al. 2017).
 
     An attack on the pixels alone keeps the offsets in the range in which nothing
-    is clamped. Together with other parameters, an offset that a restart puts
-    beyond this range has a gradient of zero, and stays.
+    is clamped. Together with other parameters, the gradient of an offset that a
+    restart puts beyond this range is zero, so the offset does not change.
 
     Args:
         scene: Scene to attack.

@@ -122,7 +122,7 @@ class Pose(Parameter):
     ) -> Float[Tensor, "N 3"]:
         """Scale, rotate and shift an object of the scene.
 
-        The change is in degrees, world units and logarithms, in the order of `_pose_units`. Props
+        The change is in degrees, world units and logarithms, in the order of `_unit`. Props
         and table do not move, and the lowest vertex of an object on a ground stays on it.
         """
         object_mask, ground_height = self._object_masks[index], self._grounds[index]

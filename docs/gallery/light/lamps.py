@@ -21,6 +21,6 @@ for radius in radii:
     images.append(scene.render(scene.conditions(first), first)[0, 0])
 
 plt.imshow(torch.cat(images, 2).permute(1, 2, 0))
-plt.xticks(80 + 160 * torch.arange(3), ["a point", "a disk of radius 0.5", "radius 1.5"])
+plt.xticks(80 + 160 * torch.arange(3), ["a point", "a disc of radius 0.5", "radius 1.5"])
 plt.yticks([])
 plt.show()
