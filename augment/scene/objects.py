@@ -394,8 +394,8 @@ class Conditions(ShortRepr):
             change of the logarithm of the distance, shape (A, 3). They apply to all V cameras of
             an example.
         gloss: Roughness, metallic and specular factor of each face, shape (A, F, 3), or of all
-            faces, shape (A, 1, 3). Textures of gloss are multiplied by them. What shadows and
-            bounces of environment light change is still shaded with the gloss of the mesh.
+            faces, shape (A, 1, 3). Textures of gloss are multiplied by them. Shadows
+            and bounces of environment light still have the gloss of the mesh.
         hue: Angle in degrees by which the hue of the albedo of each face is turned, before the
             addition of `albedo`, shape (A, F).
     """

@@ -127,13 +127,15 @@ def _reader(path: Path, gloss: bool) -> Callable[[MeshFile], list[Part]] | None:
 
 def files_beside(path: Path) -> list[Path]:
     """List the materials, textures and buffers that a mesh file names, and that exist."""
+    readers = [read for gloss in (True, False) if (read := _reader(path, gloss))]
+    if not readers:
+        return []
     file = MeshFile(path)
     # A reader notes each file that it opens in `beside`. `load_mesh` raises the error of a mesh
     # that cannot be read. Some materials can only be read without gloss.
-    for gloss in (True, False):
+    for read in readers:
         with suppress(Exception):
-            if read := _reader(path, gloss):
-                read(file)
+            read(file)
             break
     return sorted(file.beside)
 

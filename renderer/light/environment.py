@@ -190,10 +190,11 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]
     # The orientation 1 of EXIF means that the top row is stored first.
     if spec.roi != spec.roi_full or image.orientation != 1:
         raise InputError("the image is stored cropped or rotated: save the whole, upright image")
-    specs = [_openimageio().ImageBuf(str(path), i, 0).spec() for i in range(image.nsubimages)]
-    colored = [index for index, each in enumerate(specs) if {*"RGB"} <= {*each.channelnames}]
-    if image.nsubimages > 1 and colored != [0]:
-        raise InputError("the file has several images: save one with R, G and B alone")
+    if image.nsubimages > 1:
+        specs = [_openimageio().ImageBuf(str(path), i, 0).spec() for i in range(image.nsubimages)]
+        colored = [index for index, each in enumerate(specs) if {*"RGB"} <= {*each.channelnames}]
+        if colored != [0]:
+            raise InputError("the file has several images: save one with R, G and B alone")
     # CIE x and y of red, green, blue and white.
     chromaticities = spec.getattribute("chromaticities") or REC_709
     if image.file_format_name == "hdr":

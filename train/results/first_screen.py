@@ -149,8 +149,8 @@ def compare_networks(
     """Make the first screen, which says whether hardening helped, and at what price.
 
     Both networks were scored on the images `name` in `folder`. If unknown, `name` is "" and
-    `folder` is None.
-    Without `is_hardening`, the networks are two trained ones, which sentences call by their names.
+    `folder` is None. Without `is_hardening`, the networks are two trained ones, which sentences
+    call by their names.
     None if recall, false-positive rate or AUC is unknown.
     """
     subjects, change = NETWORKS, "hardening"
