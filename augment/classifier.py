@@ -104,11 +104,13 @@ class CheckedNetwork(wrappers.Network):
             given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
             kind = f"{type(error).__name__}: {errors.single_line(error)}"
             remedy = "give the size of its images, or use a network that takes such images"
-            # Images of another precision than the weights are the most frequent cause.
-            dtypes = {weight.dtype for weight in self.parameters() if weight.is_floating_point()}
-            if dtypes and images.dtype not in dtypes:
-                names = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
-                remedy = f"its weights are {names}, convert it with network.to({images.dtype})"
+            # Images of another precision or device than the weights are the most frequent causes.
+            weights = [weight for weight in self.parameters() if weight.is_floating_point()]
+            for wanted in (images.dtype, images.device):
+                found = {getattr(weight, type(wanted).__name__) for weight in weights}
+                if found and wanted not in found:
+                    names = ", ".join(sorted(str(each).removeprefix("torch.") for each in found))
+                    remedy = f"its weights are {names}, convert it with network.to({wanted!r})"
             raise InputError(f"{self.title} fails on {given} ({kind}): {remedy}") from error
         # Both networks of a switch have read their own outputs.
         if self._read is None or isinstance(self.network, Switch):

@@ -305,6 +305,8 @@ class TrainSettings(Settings):
         super().__post_init__()
         if self.relight_steps and not self.consistency_weight:
             raise self.wrong("relight_steps", "needs a consistency loss: set its weight")
+        if self.relight_steps and RELIGHT not in self.augmentation:
+            raise self.wrong("relight_steps", "needs the light of a projector: set relight")
         if self.recognize and self.augmentation not in LIGHTS:
             raise self.wrong("recognize", f"needs a light: set augmentation={' or '.join(LIGHTS)}")
 

@@ -428,7 +428,8 @@ class DirectRenderer:
         normals = normalize(normals, dim=1) * fragments.facing[seen_face]
         # Depth and the three components of the normal, shape (4, P).
         at_pixels = torch.cat([depth[None], normals.T])
-        maps = torch.zeros(4, len(cameras) * self.settings.pixel_count)
+        samples = len(cameras) * self.settings.pixel_count
+        maps = torch.zeros(4, samples, dtype=torch.float32)
         is_covered = fragments.coverage >= COVERED
         maps[:, fragments.pixels[is_covered]] = at_pixels[:, is_covered].float()
         return maps.view(4, -1, *self.settings.shape).transpose(0, 1)

@@ -429,7 +429,8 @@ class Scene:
         self, conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Float[Tensor, "A V 4 height width"]:
         """Return the depth and the three components of normals in the views of examples."""
-        maps = torch.zeros(len(examples), self.views, 4, *self.settings.shape)
+        shape = (len(examples), self.views, 4, *self.settings.shape)
+        maps = torch.zeros(shape, dtype=torch.float32)
         for group in self._groups(conditions, examples.tolist()):
             of_views = self._direct_renderer.surface_maps(group)
             maps[list(group.rows), list(group.views)] = of_views

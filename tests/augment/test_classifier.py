@@ -1,4 +1,5 @@
 import re
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ from torchvision.transforms import Normalize
 import augment
 import norm_balls as nb
 import renderer
-from augment.classifier import Classifier, as_network, remembering
+from augment.classifier import CheckedNetwork, Classifier, as_network, remembering
 from augment.network import ChannelNormalization, Network, say_once
 from renderer import InputError
 
@@ -186,6 +187,13 @@ def with_pixel_mean(network: nn.Module) -> nn.Module:
 def test_a_mistake_is_refused(network, change, options, message):
     with pytest.raises(InputError, match=message):
         as_network(change(network), SIZE, **options)
+
+
+@pytest.mark.parametrize("change", [{"dtype": torch.float16}, {"device": "meta"}])
+def test_weights_unlike_the_images_are_named_if_a_network_fails(network, change):
+    checked = CheckedNetwork(deepcopy(network).float().to(**change), "mine")
+    with pytest.raises(InputError, match=str(*change.values()).removeprefix("torch.")):
+        checked(torch.rand(1, 3, SIZE, SIZE))
 
 
 def test_a_network_with_a_single_output_is_refused():

@@ -17,7 +17,7 @@ from train.settings import OTHER, ExperimentSettings, TrainingSceneSettings
 
 OTHER_DATA = ["data=npz", "data.path=a.npz", "out=here"]
 EXPERIMENTS = ["best", "classifier", "cpu", "demo", "dim", "fast", "harden", "low_light", "paper"]
-EXPERIMENTS += ["photographs"]
+EXPERIMENTS += ["photographs", "stripes"]
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
@@ -31,6 +31,14 @@ def test_every_experiment_takes_other_data(experiment):
 def test_an_experiment_that_fine_tunes_asks_for_the_initial_network():
     with pytest.raises(InputError, match=r"^network is empty: give a run or "):
         train_command.read(["experiment=harden", *OTHER_DATA])
+
+
+@pytest.mark.parametrize("experiment", ["stripes", "low_light"])
+def test_gradient_steps_on_light_that_has_no_factors_are_refused(experiment):
+    words = [f"experiment={experiment}", "network=b", "unlabeled=c", "train.consistency_weight=1"]
+    assert train_command.read(words)
+    with pytest.raises(InputError, match=r"^train\.relight_steps"):
+        train_command.read([*words, "train.relight_steps=1"])
 
 
 def test_a_classifier_of_another_library_needs_no_class_but_the_label():

@@ -153,6 +153,16 @@ def test_masks_are_found_for_all_renders_of_a_block_together(meshes, monkeypatch
     assert counts == [4, 4, 3]
 
 
+def test_maps_of_renders_do_not_need_the_default_type_of_torch(meshes):
+    try:
+        torch.set_default_dtype(torch.float64)
+        [render] = render_dataset([(meshes[1]["mesh"], "ball")], 12, 1)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    lengths = render.normals.norm(dim=0)[render.masks[0]]
+    torch.testing.assert_close(lengths, torch.ones_like(lengths, dtype=torch.float32))
+
+
 def test_a_tar_file_has_the_same_pictures_as_a_folder(meshes, written, tmp_path):
     expected = pictures(written)
     folder = write(meshes, tmp_path / "tar", format="webdataset", maps=MAPS)
