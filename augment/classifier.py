@@ -185,13 +185,15 @@ class TaskNetwork(CheckedNetwork):
     @property
     def normalized_light(self) -> NormalizedLightSettings | None:
         """Settings with which the light of images is normalized. None if it is not normalized."""
-        return light_settings(self.network)
+        inner = self.network
+        return inner.other.normalized_light if isinstance(inner, Switch) else light_settings(inner)
 
     def normalizing_light(self, normalize_light: NormalizeLight = True) -> Self:
         """Return a classifier that first normalizes the light of images.
 
         It shares the network. It has no operating points, because its logits
-        differ.
+        differ. With a second network (`with_dim`, `with_lit`), the images of that one alone
+        are normalized.
 
         Args:
             normalize_light: True for the defaults, or a mapping with fields of
@@ -213,7 +215,12 @@ class TaskNetwork(CheckedNetwork):
         """
         if read_normalized_light(normalize_light) is None:
             return self
-        return self.with_network(self.network, normalize_light)
+        inner = self.network
+        if isinstance(inner, Switch):
+            # The switch looks at images as they are, and those of the first network stay so.
+            other = inner.other.normalizing_light(normalize_light)
+            return self.with_network(Switch(inner.network, other, inner.chooses))
+        return self.with_network(inner, normalize_light)
 
     def with_dim(self, dim: Self, below: float = DIM) -> Self:
         """Return a network that shows dim images alone to another network.

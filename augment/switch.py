@@ -19,6 +19,8 @@ Chooser = Callable[[Tensor], Bool[Tensor, " N"]]
 class Switch(nn.Module):
     """Network that shows the images which a function chooses to another network."""
 
+    other: Any
+
     def __init__(self, network: nn.Module, other: nn.Module, chooses: Chooser):
         super().__init__()
         self.network, self.other, self.chooses = network, other, chooses

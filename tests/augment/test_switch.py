@@ -77,6 +77,21 @@ def test_a_name_of_two_networks_is_the_first_with_the_second_for_dim_images():
     torch.testing.assert_close(*gradients)
 
 
+def test_only_the_second_network_of_a_switch_gets_images_in_normalized_light():
+    from train.checkpoints import load_network
+
+    name = "dim:run:pretrained/none+run:pretrained/best"
+    plain, dim = nb.load("none"), nb.load("best").normalizing_light()
+    images = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    expected = torch.cat([plain(images), dim(images * 0.1)])
+    settings = nb.NormalizedLightSettings()
+    for network in (load_network(name).normalizing_light(), load_network(name, normalize_light={})):
+        assert network.normalized_light == settings
+        torch.testing.assert_close(network(torch.cat([images, images * 0.1])), expected)
+        with pytest.raises(nb.InputError, match="already"):
+            network.normalizing_light()
+
+
 def test_the_candidates_of_a_detector_are_those_of_the_network_that_an_image_gets():
     plain = nb.load("detector")
     dim = plain.normalizing_light()

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from augment import distributed
 from augment.classifier import TaskNetwork
-from augment.exposure import without_normalized_light
+from augment.exposure import light_settings, without_normalized_light
 from augment.files import as_facts, is_network_file, name_from_anywhere, require_no_facts
 from augment.network import FROM_FILE, YOU, Inputs
 from augment.progress import Phases
@@ -199,8 +199,9 @@ def initial_of(classifier: TaskNetwork, size: int | None) -> Initial:
     # The wrapper that normalizes light is described by its settings, and built again by the run.
     network = without_normalized_light(classifier.network)
     shape: dict[str, Any] = {"name": name_from_anywhere(classifier.name), CLASSIFIER: True}
-    if classifier.normalized_light is not None:
-        shape[checkpoints.NORMALIZE_LIGHT] = asdict(classifier.normalized_light)
+    light = light_settings(classifier.network)
+    if light is not None:
+        shape[checkpoints.NORMALIZE_LIGHT] = asdict(light)
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
     # A size that the caller gives is said to be stated by the user.
     inputs = classifier.inputs if size is None else replace(classifier.inputs, size=YOU)
