@@ -11,6 +11,7 @@ import io
 import json
 import math
 import pickle
+import sys
 import textwrap
 import warnings
 import zipfile
@@ -187,7 +188,7 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
 
     if batch_size is not None:
         # The file takes batches of one size only. `InBatches` splits other numbers of images.
-        network = InBatches(network, batch_size)
+        network = InBatches(network, batch_size, batch_size)
     if isinstance(network, nn.Module):
         # Set the mode without a call of `eval`, which networks of torch.export refuse.
         for module in network.modules():
@@ -270,8 +271,16 @@ def _read_exported(path: Path) -> Content:
     [node] = [node for node in program.graph.nodes if node.name == name]
     # `node.meta["val"]` is an example of the images. In its shape, the dimensions of fixed size are
     # whole numbers, and the others are symbols.
-    sizes = [size if isinstance(size, int) else None for size in node.meta["val"].shape]
-    return Exported(program.module()), sizes
+    shape = node.meta["val"].shape
+    sizes = [size if isinstance(size, int) else None for size in shape]
+    network: nn.Module = Exported(program.module())
+    if sizes[0] is None:
+        bounds = program.range_constraints[shape[0].node.expr]
+        # A missing upper bound is an infinity of sympy.
+        least, most = int(bounds.lower), int(min(bounds.upper, sys.maxsize))
+        if least > 1 or most < sys.maxsize:
+            network = InBatches(network, least, most)
+    return network, sizes
 
 
 def _require_plain_members(path: Path) -> None:
@@ -324,27 +333,30 @@ class Exported(Network):
 
 
 class InBatches(Network):
-    """Give a network batches of the one size that it takes, whatever the number of images is.
+    """Give a network batches of a size that it takes, whatever the number of images is.
 
     The last batch is filled up with copies of the first image.
 
     Args:
-        network: Module or function from images (batch_size, 3, H, W) to logits.
-        batch_size: Number of images that the network takes.
+        network: Module or function from images (B, 3, H, W) to logits.
+        least: Smallest number of images that the network takes.
+        most: Largest number of images that it takes.
     """
 
-    def __init__(self, network: Callable[[Tensor], Tensor], batch_size: int):
+    def __init__(self, network: Callable[[Tensor], Tensor], least: int, most: int):
         super().__init__(network)
-        self.batch_size = batch_size
+        self.least = least
+        self.most = most
 
     def forward(self, images: Tensor) -> Any:
         """Compute the outputs of images (N, 3, H, W). A list of outputs becomes a tuple."""
         # Without images, the network gets black ones.
         shown = images if len(images) else nn.functional.pad(images, (0,) * 7 + (1,))
         # Number of copies that fill up the last batch.
-        missing_count = -len(shown) % self.batch_size
+        last_count = (len(shown) - 1) % self.most + 1
+        missing_count = max(0, self.least - last_count)
         filled = torch.cat([shown, shown[:1].expand(missing_count, -1, -1, -1)])
-        parts = [self.network(part) for part in filled.split(self.batch_size)]
+        parts = [self.network(part) for part in filled.split(self.most)]
         joined = tree_map(lambda *of: torch.cat(of)[: len(images)], *parts)
         return tuple(joined) if isinstance(joined, list) else joined
 

@@ -44,7 +44,7 @@ from augment.exposure import IsDim
 from augment.network import say_once
 from augment.switch import SWITCHES
 from augment.tasks.classification import nearest
-from renderer.errors import InputError, require_whole
+from renderer.errors import InputError, composed, require_whole
 from renderer.image import to_unit
 from renderer.io.images import write_image
 from renderer.settings import MAX_SIZE
@@ -96,7 +96,7 @@ def load(name: str) -> Classifier:
 
 def light_of(photograph: Photograph) -> str:
     """Return the light of a photograph, which its name states, or photos.csv."""
-    light, separator, _ = photograph.path.name.partition("__")
+    light, separator, _ = composed(photograph.path.name).partition("__")
     return light if separator else photograph.source or PLAIN
 
 

@@ -455,6 +455,7 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
         return _explain_choice(group, choice)
     if isinstance(wrong, OverrideParseException):
         advice = "put texts with umlauts, spaces or brackets in quotes, as in meshes=['a b.glb']"
+        advice = advice if "=" in str(wrong.override) else "give KEY=VALUE, as --help shows"
         return f"{wrong.override} cannot be read: {advice}"
     if isinstance(wrong, OmegaConfBaseException | HydraException):
         text = re.split(r"\n *(?:full_key|Config search path|See https)", str(wrong))[0]

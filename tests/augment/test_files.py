@@ -47,9 +47,17 @@ def save_exported(network: nn.Module, folder: Path) -> Path:
     return path
 
 
+def save_bounded(network: nn.Module, folder: Path) -> Path:
+    path = folder / "network.pt2"
+    shapes = ({0: torch.export.Dim("batch", min=2, max=4)},)
+    images = torch.rand(3, 3, SIZE, SIZE)
+    torch.export.save(torch.export.export(network, (images,), dynamic_shapes=shapes), path)
+    return path
+
+
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
-@pytest.mark.parametrize("save", [save_torchscript, save_exported])
-@pytest.mark.parametrize("count", [0, 5])
+@pytest.mark.parametrize("save", [save_torchscript, save_exported, save_bounded])
+@pytest.mark.parametrize("count", [0, 1, 5])
 def test_a_file_gives_the_logits_and_the_gradient_of_its_network(tmp_path, save, count):
     network = small_network()
     path = save(network, tmp_path)

@@ -246,7 +246,7 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
             for cells in csv.DictReader(map(composed, file), restval="", strict=True):
                 if None in cells:
                     raise ValueError(f"the row of {cells['path']} has more cells than columns")
-                line = {key: cell.strip() for key, cell in cells.items()}
+                line = {key.strip().lower(): cell.strip() for key, cell in cells.items()}
                 if not any(line.values()):  # Spreadsheets write empty rows as commas.
                     continue
                 path = PurePosixPath(line["path"].replace("\\", "/"))

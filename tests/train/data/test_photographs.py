@@ -154,7 +154,7 @@ def test_folders_of_no_class_of_the_model_count_as_other_things_and_are_named(tm
 def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns(tmp_path, caplog):
     touch(tmp_path, "orange/a.jpg", "orange/b.jpg", "other_lemon/c.jpg", "pear/d.jpg")
     rows = [
-        "class,hard_negatives,path,source_tag",
+        "class, Hard_Negatives,path, source_tag",
         "orange,lab; web,orange/a.jpg,sun",
         "orange,,orange/b.jpg,web",
         "lemon,;,other_lemon\\c.jpg,lab", "pear,,pear/d.jpg,", "fig,,fig/gone.jpg,web", "",
