@@ -430,10 +430,12 @@ def test_only_the_first_buffer_of_a_glb_is_its_binary_chunk(tmp_path):
 
 
 def test_a_text_file_reads_its_buffer_and_its_images_below_its_folder(tmp_path):
+    """A file of the same name beside it does not count."""
     gltf = masked(hole(8, -1), "OPAQUE")
     folder = tmp_path / "mesh"
     (folder / "parts of it").mkdir(parents=True)
     (folder / "parts of it" / "data.bin").write_bytes(gltf.buffer)
+    (folder / "data.bin").write_bytes(bytes(len(gltf.buffer)))
     Image.fromarray(color_texels(2, 2)).save(folder / "peel.webp", lossless=True)
     gltf.tree["buffers"] = [{"byteLength": len(gltf.buffer), "uri": "parts%20of%20it/data.bin"}]
     gltf.tree["images"][0] = {"uri": "peel.webp"}
