@@ -64,6 +64,12 @@ IN_TRAINING_MODE = (
 COMPILED = "/aotinductor/"
 # Keys under which training scripts store the weights of a network in a checkpoint.
 _WRAPPERS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net")
+# What else training scripts store in a checkpoint: their arguments, as in those of torchvision, and
+# numbers of NumPy, under its present and its former module.
+_SCALAR = np.float64(0).__reduce__()[0]
+_PERMITTED: list[Any] = [argparse.Namespace, np.dtype]
+_PERMITTED += {type(np.dtype(code)) for code in "?bhilqBHILQefd"}
+_PERMITTED += [(_SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
 # Prefixes that `DataParallel`, `torch.compile` and other wrappers of a network add to the names of
 # its weights.
 _PREFIXES = ("module.", "_orig_mod.", "model.", "network.", "net.")
@@ -433,10 +439,9 @@ def read_weights(path: Path) -> State:
     """
     require_file(path, "give the path of a file of weights")
     try:
-        if path.suffix == ".safetensors":
+        if path.suffix.lower() == ".safetensors":
             return _without_prefixes(safetensors.torch.load_file(path))
-        # Permit this class, because the training scripts of torchvision store their arguments.
-        with torch.serialization.safe_globals([argparse.Namespace]):
+        with torch.serialization.safe_globals(_PERMITTED):
             content = torch.load(path, map_location="cpu", weights_only=True)
         return _without_prefixes(_state_dict(content))
     # torch and safetensors raise many kinds of errors for damaged files.
@@ -456,10 +461,14 @@ def _state_dict(content: Any) -> State:
     while isinstance(content, Mapping) and not all(
         isinstance(value, Tensor) for value in content.values()
     ):
-        inner = [content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)]
-        if not inner:
+        # Names of mappings. Those of moving averages contain "ema", as in timm and torchvision.
+        names = [key for key, value in content.items() if isinstance(value, Mapping)]
+        used = next((key for key in _WRAPPERS if key in names), None)
+        if used is None:
             raise TypeError(f"it contains no weights, but {', '.join(map(str, content))}")
-        content = inner[0]
+        for average in (key for key in names if "ema" in str(key)):
+            say_once(f"{used} of the checkpoint is used: save {average} alone to use that")
+        content = content[used]
     if not isinstance(content, Mapping):
         raise TypeError(f"it contains a value of type {type(content).__name__}")
     return content

@@ -32,6 +32,8 @@ from renderer.settings import Size, height_and_width
 # Function that makes a classifier with random weights.
 Build = Callable[[NetworkFacts], Classifier]
 SQUEEZENET_CAFFE = "squeezenet_caffe"
+# Networks of torchvision that convert images from ImageNet's normalization to (x - 0.5) / 0.5.
+CONVERTING = ("googlenet", "inception_v3")
 
 
 def imagenet_classes() -> tuple[str, ...]:
@@ -99,9 +101,8 @@ def _torchvision(
         size = facts.size or transforms.crop_size[0]
         classes = facts.classes or tuple(published.meta["categories"])
         options: dict[str, Any] = {"num_classes": len(classes)}
-        # These were trained with another normalization, and convert images to it.
-        if model in ("googlenet", "inception_v3"):
-            options |= {"transform_input": True, "init_weights": False}
+        if model in CONVERTING:
+            options |= {"transform_input": True, "init_weights": False, "aux_logits": False}
         if model.startswith("vit_"):
             options["image_size"] = size
         # A transformer takes squares that its patches fill.
@@ -121,7 +122,14 @@ def _torchvision(
         # Published files have names of weights such as "norm.1". The network has "norm1" instead.
         own_name = partial(re.sub, r"\.(norm|conv)\.([12])\.", r".\1\2.")
         state = {own_name(key): value for key, value in state.items()}
+    # Classifiers that only help to train a network may be absent, or have other classes.
+    auxiliary = ("aux1.", "aux2.", "AuxLogits.")
+    state = {key: value for key, value in state.items() if not key.startswith(auxiliary)}
     is_published = weights is None or bool(of_file)
+    if model in CONVERTING and not is_published:
+        reason = "converts images from ImageNet's normalization, as torchvision's weights need"
+        advice = "load a network that was built with weights=None by python:module:function"
+        wrappers.say_once(f"{name} {reason}: {advice}")
     return _with_weights(build, facts, state, weights or published.url, is_published)
 
 

@@ -323,6 +323,10 @@ def _read_transforms(path: Path, whole: bool) -> dict[str, PinholeCamera]:
             if not isinstance(frame["file_path"], str):
                 raise TypeError(f"file_path is {frame['file_path']}")
             entries = {**scene, **frame}
+            if {"camera_angle_x", "camera_angle_y"} & frame.keys():
+                # An angle of the frame also overrides the focal lengths of the scene.
+                shared = {"fl_x", "fl_y"} - frame.keys()
+                entries = {key: entries[key] for key in entries.keys() - shared}
             if not {"w", "h", "fl_x", "fl_y", "cx", "cy"} & entries.keys():
                 entries |= _size_of_image(path.parent / frame["file_path"])
             intrinsics, size = _transforms_intrinsics(entries)

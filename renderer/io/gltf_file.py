@@ -299,27 +299,31 @@ class Material:
         textures = {name: texels for name, texels in planes.items() if texels is not None}
         # Axis 0 is u, which runs along columns, and axis 1 is v, which runs along rows.
         for axis, wrap in enumerate(self.placement.wraps):
-            shape = textures["texture"].shape[:2]
-            size = shape[1 - axis]
+            sizes = [texels.shape[1 - axis] for texels in textures.values()]
+            # All textures grow by the same fraction, so they are divided into as many blocks.
+            count = math.gcd(*sizes)
             coordinates = uvs[:, axis]
             mode: Any = "edge"
             if wrap == MIRROR:
-                # Texels are added before the first and after the last one.
-                before, after, mode = 0, size, "symmetric"
+                # Blocks are added before the first and after the last one.
+                before, after, mode = 0, count, "symmetric"
             elif wrap == CLAMP:
                 # Interpolation needs one texel more than the surface covers.
-                before = 1 + max(0, math.ceil(-coordinates.min() * size))
-                after = 1 + max(0, math.ceil((coordinates.max() - 1) * size))
+                border = count / min(sizes)
+                before = math.ceil(border + max(0, -coordinates.min() * count))
+                after = math.ceil(border + max(0, (coordinates.max() - 1) * count))
             else:
                 continue
-            new_size = before + size + after
-            require_memory("textures", TEXEL_BYTES * new_size * shape[axis], CPU)
+            new_count = before + count + after
             for name, texels in textures.items():
+                length = texels.shape[1 - axis] // count
+                new_size = length * new_count * texels.shape[axis]
+                require_memory("textures", TEXEL_BYTES * new_size, CPU)
                 padding = [(0, 0)] * texels.ndim
-                padding[1 - axis] = (before, after)
+                padding[1 - axis] = (length * before, length * after)
                 textures[name] = np.pad(texels, padding, mode)
             # The same texel has another coordinate in the larger texture.
-            uvs[:, axis] = (coordinates * size + before) / new_size
+            uvs[:, axis] = (coordinates * count + before) / new_count
         # v points down in glTF, and up in `Mesh`.
         uvs[:, 1] = 1 - uvs[:, 1]
         return replace(self, **textures), uvs
@@ -336,19 +340,10 @@ class Material:
     def with_gloss_texture(self, texels: np.ndarray, placement: Placement) -> "Material":
         """Return a copy with factors of roughness and metallic (H, W, 2)."""
         # A material without a texture gets a white one, because each `gloss_texture` of `Mesh`
-        # belongs to a texture. Textures that will be extended need the same size.
+        # belongs to a texture. Textures of one size are extended by the fewest texels.
         is_extended = placement.wraps != (REPEAT, REPEAT)
-        shape = texels.shape[:2] if is_extended else (1, 1)
-        material = self.with_placement(placement, shape)
-        texture = material.texture
-        assert texture is not None
-        if is_extended:
-            size = max(texture.shape[1], shape[1]), max(texture.shape[0], shape[0])
-            texture, texels = _resized(texture, size), _resized(texels, size)
-            if material.alpha is not None:
-                alpha = _resized(material.alpha[..., None], size)[..., 0]
-                material = replace(material, alpha=alpha)
-        return replace(material, texture=texture, gloss_texture=texels)
+        material = self.with_placement(placement, texels.shape[:2] if is_extended else (1, 1))
+        return replace(material, gloss_texture=texels)
 
 
 def _resized(texture: np.ndarray, size: tuple[int, int]) -> np.ndarray:

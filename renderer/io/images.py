@@ -158,7 +158,10 @@ def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None
     if image.has_transparency_data:
         rgba = image.convert("RGBA")
         color = rgba.getchannel("R") if is_gray else rgba.convert("RGB")
-        return color, rgba.getchannel("A")
+        alpha = rgba.getchannel("A")
+        # Some programs leave the opacity of an opaque .bmp file at 0.
+        is_unset = image.format == "BMP" and alpha.getextrema() == (0, 0)
+        return color, None if is_unset else alpha
     if image.mode in ("L", "CMYK"):
         return image, None
     return image.convert("L" if is_gray else "RGB"), None

@@ -91,15 +91,16 @@ class MeshFile:
         written = name.strip('" \t').replace("\\", "/")
         errors = []
         # A name in a text file may be followed by a comment.
-        for path in (written, unquote(written), re.split(r"\s+#", written)[0]):
-            for candidate in (f"{folder}{path}", path, path.rpartition("/")[2]):
-                try:
-                    found = file_below(self.path.parent, candidate)
-                except ValueError as error:
-                    errors.append(error)
-                    continue
-                self.beside.add(found)
-                return found.read_bytes()
+        paths = (written, unquote(written), re.split(r"\s+#", written)[0])
+        names = [path.rpartition("/")[2] for path in paths]
+        for candidate in (*(f"{folder}{path}" for path in paths), *paths, *names):
+            try:
+                found = file_below(self.path.parent, candidate)
+            except ValueError as error:
+                errors.append(error)
+                continue
+            self.beside.add(found)
+            return found.read_bytes()
         raise errors[0]
 
     def texture(self, name: str, folder: str = "") -> np.ndarray:

@@ -1,6 +1,7 @@
 """Read .obj files and their material libraries, which are .mtl files."""
 
 import re
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -238,7 +239,11 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
     for keyword, text in properties:
         match keyword.lower():
             case "kd":
-                values = [float(word) for word in mesh_file.without_comments(text.encode()).split()]
+                values: list[float] = []
+                # Words such as "spectral" are no numbers.
+                with suppress(ValueError):
+                    words = mesh_file.without_comments(text.encode()).split()
+                    values = [float(word) for word in words]
                 is_color = all(0 <= value <= 1 + mesh_file.TOLERANCE for value in values)
                 if len(values) not in (1, 3) or not is_color:
                     raise ValueError(f'"Kd {text}" is no color: give red, green, blue from 0 to 1')

@@ -296,9 +296,11 @@ def read_stl(file: MeshFile) -> list[Part]:
         coordinates = mesh_file.parse_numbers(b"\n".join(lines), np.float64)
         if len(coordinates) != 9 * face_count or len(lines) != 3 * face_count:
             raise ValueError("a facet does not have three vertices with three coordinates")
-    elif len(content) < _HEADER_SIZE + face_count * _STL_FACE.itemsize:
+    elif (excess := len(content) - _HEADER_SIZE - face_count * _STL_FACE.itemsize) < 0:
         raise ValueError(_TRUNCATED)
     else:
+        if excess >= _STL_FACE.itemsize:
+            file.assume(f"the last {excess} bytes are taken as no faces, as the header says")
         faces = np.frombuffer(content, _STL_FACE, face_count, _HEADER_SIZE)
         has_colors = b"COLOR=" in header or bool((faces["attribute"] & 0x8000).any())
         coordinates = faces["corners"].astype(np.float64)

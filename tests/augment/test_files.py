@@ -5,11 +5,13 @@ import zipfile
 from copy import deepcopy
 from pathlib import Path
 
+import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from torch import nn
 
-from augment.files import as_facts
+from augment.files import as_facts, read_weights
 from augment.sources import load_classifier
 from renderer.errors import InputError
 
@@ -200,3 +202,32 @@ def test_a_file_of_class_names_of_windows_gives_the_names(tmp_path):
     path.write_bytes("orange\ncup\n".encode("utf-16"))
     with pytest.raises(InputError, match="UTF-8"):
         as_facts(path)
+
+
+@pytest.mark.parametrize("module", [b"numpy._core.", b"numpy.core."])
+@pytest.mark.parametrize("number", [np.float64(70), np.float32(0.5), np.int64(3), np.bool_(True)])
+def test_a_checkpoint_may_have_numbers_of_new_and_old_versions_of_numpy(tmp_path, number, module):
+    content = io.BytesIO()
+    checkpoint = {"state_dict": {"weight": torch.ones(2)}, "best": number}
+    torch.save(checkpoint, content, _use_new_zipfile_serialization=False)
+    path = tmp_path / "a.pth"
+    path.write_bytes(content.getvalue().replace(b"numpy._core.", module))
+    assert read_weights(path)["weight"].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("names", [("state_dict", "state_dict_ema"), ("model", "ema")])
+@pytest.mark.parametrize("has_average", [False, True])
+def test_the_weights_of_a_checkpoint_count_and_an_average_is_named(
+    tmp_path, caplog, names, has_average
+):
+    states = [{"weight": torch.full((2,), float(value))} for value in (1, 2)]
+    checkpoint = dict(zip(names[: 1 + has_average], states, strict=False))
+    torch.save({"epoch": 3, "optimizer": {}, **checkpoint}, tmp_path / "a.pth")
+    assert read_weights(tmp_path / "a.pth")["weight"].tolist() == [1, 1]
+    assert [names[1] in record.getMessage() for record in caplog.records] == [True] * has_average
+
+
+def test_the_suffix_of_safetensors_may_be_in_upper_case(tmp_path):
+    path = tmp_path / "a.SAFETENSORS"
+    safetensors.torch.save_file({"weight": torch.ones(2)}, path)
+    assert read_weights(path)["weight"].tolist() == [1, 1]

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import nn
 from torchvision.models import get_model, get_model_weights, squeezenet1_0, squeezenet1_1
+from torchvision.transforms.functional import normalize
 
 from augment.classifier import Classifier
 from augment.sources import imagenet_classes, load_classifier
@@ -149,6 +150,24 @@ def test_torchvision_models_give_its_logits_from_file_or_download(hub, model, ar
         torch.testing.assert_close(logits, expected, rtol=0, atol=rounding)
         assert classifier.name == name
         assert classifier.classes == CLASSES
+
+
+@pytest.mark.parametrize("model", ["googlenet", "inception_v3"])
+@pytest.mark.parametrize("has_auxiliary", [False, True])
+def test_auxiliary_classifiers_of_training_are_left_out(tmp_path, model, has_auxiliary):
+    """Fine-tuning replaces the last layer alone, so that the others keep 1,000 classes."""
+    torch.manual_seed(0)
+    options = {"transform_input": True, "init_weights": False, "aux_logits": has_auxiliary}
+    own = get_model(model, **options).eval()
+    own.fc = nn.Linear(own.fc.in_features, 7)
+    torch.save(own.state_dict(), tmp_path / "mine.pth")
+    classifier = load_classifier(f"torchvision:{model}", tmp_path / "mine.pth", size=96)
+    images = random_images(96, 1)
+    with torch.no_grad():
+        logits = classifier(images)
+        expected = own(normalize(images, (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
+    rounding = 100 * EPS32 * float(expected.abs().max())
+    torch.testing.assert_close(logits, expected, rtol=0, atol=rounding)
 
 
 class Harmful:

@@ -235,7 +235,8 @@ def _read_coco(file: Path) -> Annotations:
             label = classes.index(names[item["category_id"]])
             # COCO gives left, top, width and height. The result is left, top, right and bottom.
             corners = (*box[:2], *(box[:2] + box[2:]))
-            rows[item["image_id"]].append((label, *corners, bool(item.get("iscrowd"))))
+            is_crowd = bool(int(item.get("iscrowd") or 0))
+            rows[item["image_id"]].append((label, *corners, is_crowd))
         paths = _find_images(file, names_of_images)
         missing = [name for name in names_of_images if name not in paths]
         photographs = []

@@ -141,6 +141,16 @@ def test_points_are_where_cameras_of_nerfstudio_see_them(tmp_path):
     require_expected(tmp_path / "a.json", focal_y=FOCAL_X)
 
 
+def test_an_angle_of_a_frame_overrides_the_focal_lengths_of_the_scene(tmp_path):
+    path = tmp_path / "a.json"
+    write_transforms(path, fl_x=3 * FOCAL_X, fl_y=9 * FOCAL_Y, cx=CENTER_X, cy=CENTER_Y)
+    scene = json.loads(path.read_text())
+    for frame in scene["frames"]:
+        frame["camera_angle_x"] = 2 * math.atan(WIDTH / 2 / FOCAL_X)
+    path.write_text(json.dumps(scene))
+    require_expected(path, focal_y=FOCAL_X)
+
+
 def test_an_image_of_cameras_must_have_a_name(tmp_path):
     path = tmp_path / "transforms.json"
     write_transforms(path, fl_x=FOCAL_X, fl_y=FOCAL_Y, cx=CENTER_X, cy=CENTER_Y)

@@ -130,14 +130,20 @@ def wrapped(index: np.ndarray, count: int, mode: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("wrap_u", "wrap_v"), [(10497, 33071), (33071, 33648), (33648, 10497)])
-def test_textures_are_wrapped_as_opengl_wraps_them(tmp_path, wrap_u, wrap_v):
+@pytest.mark.parametrize("gloss_side", [None, 1, 2, 5])
+def test_textures_are_wrapped_as_opengl_wraps_them(tmp_path, wrap_u, wrap_v, gloss_side):
     """The texture coordinates of the square are from -0.7 to 2.3."""
     texels = color_texels(3, 4)
     gltf = Gltf()
-    texture = gltf.texture(texels, wrapS=wrap_u, wrapT=wrap_v)
-    gltf.square(pbrMetallicRoughness={"baseColorTexture": texture})
+    samplers = {"wrapS": wrap_u, "wrapT": wrap_v}
+    model = {"baseColorTexture": gltf.texture(texels, **samplers)}
+    if gloss_side:
+        # A gloss texture of another size changes no color.
+        factors = color_texels(gloss_side, gloss_side)
+        model["metallicRoughnessTexture"] = gltf.texture(factors, **samplers)
+    gltf.square(pbrMetallicRoughness=model)
     gltf.tree["accessors"][1]["bufferView"] = gltf.view((3 * SQUARE_UVS - 0.7).tobytes())
-    mesh = gltf.load(tmp_path)
+    mesh = gltf.load(tmp_path, gloss=gloss_side is not None)
     weights = np.random.default_rng(1).dirichlet([1, 1, 1], (2, 50))
     points = np.einsum("fnc,fci->fni", weights, corners_of(mesh)).reshape(-1, 3)
     uvs = np.einsum("fnc,fci->fni", weights, mesh.corner_uvs).reshape(-1, 2)
@@ -430,10 +436,12 @@ def test_only_the_first_buffer_of_a_glb_is_its_binary_chunk(tmp_path):
 
 
 def test_a_text_file_reads_its_buffer_and_its_images_below_its_folder(tmp_path):
+    """A file of the same name beside it does not count."""
     gltf = masked(hole(8, -1), "OPAQUE")
     folder = tmp_path / "mesh"
     (folder / "parts of it").mkdir(parents=True)
     (folder / "parts of it" / "data.bin").write_bytes(gltf.buffer)
+    (folder / "data.bin").write_bytes(bytes(len(gltf.buffer)))
     Image.fromarray(color_texels(2, 2)).save(folder / "peel.webp", lossless=True)
     gltf.tree["buffers"] = [{"byteLength": len(gltf.buffer), "uri": "parts%20of%20it/data.bin"}]
     gltf.tree["images"][0] = {"uri": "peel.webp"}

@@ -316,6 +316,17 @@ def test_the_transparent_color_of_16_bits_is_transparent(tmp_path):
     assert read(tmp_path / "a.png")[0].tolist() == [[255] * 3, [0x11, 0x20, 0x30]]
 
 
+@pytest.mark.parametrize(("opacities", "expected"), [((0, 0), (50, 50)), ((0, 255), (255, 50))])
+def test_a_bmp_file_whose_opacity_is_0_everywhere_is_opaque(tmp_path, opacities, expected):
+    """Header of version 4, two pixels, and masks of red, green, blue and opacity."""
+    header = struct.pack("<IiiHHII16x", 108, 2, 1, 1, 32, 3, 8)
+    header += struct.pack("<4I52x", 0xFF0000, 0xFF00, 0xFF, 0xFF000000)
+    pixels = b"".join(bytes([50, 50, 50, opacity]) for opacity in opacities)
+    start = struct.pack("<2sIII", b"BM", 130, 0, 122)
+    (tmp_path / "a.bmp").write_bytes(start + header + pixels)
+    assert read(tmp_path / "a.bmp")[0, :, 0].tolist() == [*expected]
+
+
 def test_16_bit_tiff_files_are_turned_and_scaled(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 8

@@ -241,6 +241,7 @@ ROWS = [
     ("binary that begins with solid", stl(0, b"solid thing"), WHITE),
     ("text with a NUL block", {"mesh.stl": STL_TEXT + "\0" * 99}, REFUSED),
     ("binary with more bytes", {"mesh.stl": b"".join([*stl(0, b"solid").values(), b"12"])}, WHITE),
+    ("binary with a face too many", {"mesh.stl": stl(0)["mesh.stl"] + bytes(50)}, ASSUMED),
     ("empty", {"mesh.stl": ""}, REFUSED),
     ("binary that is truncated", stl(0, face_count=2), REFUSED),
     ("VisCAM", stl(0x8000 | 31 << 10), REFUSED),

@@ -137,6 +137,13 @@ def test_the_materials_in_use_are_found_by_name(tmp_path, name, library):
     assert face_colors(mesh) == [RED, RED, GREEN, GREEN]
 
 
+@pytest.mark.parametrize("color", ["spectral red.rfl", "xyz 0.4 0.2 0.1", "red"])
+def test_a_color_that_is_not_red_green_and_blue_is_named(tmp_path, color):
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nmtllib m.mtl\nusemtl a\nf 1 2 3\n"
+    with pytest.raises(InputError, match=f'"Kd {color}" is no color'):
+        load(tmp_path, text, m=f"newmtl a\nKd {color}\n")
+
+
 def test_faces_without_a_material_are_white_with_a_warning_if_no_library_is_named(tmp_path):
     text = PLAIN.replace("usemtl red\n", "")
     assert face_colors(load(tmp_path, text)) == [WHITE, WHITE, GREEN, GREEN]

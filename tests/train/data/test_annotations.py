@@ -67,6 +67,16 @@ def test_classes_of_coco_are_in_the_order_of_their_ids(tmp_path):
     assert (read.classes, read.photographs[0].labels.tolist()) == (("cat", "dog"), [1])
 
 
+@pytest.mark.parametrize(
+    ("value", "expected"), [(0, False), ("0", False), (None, False), (1, True), ("1", True)]
+)
+def test_iscrowd_of_coco_may_be_text_or_absent(tmp_path, value, expected):
+    _draw(tmp_path / "a.png")
+    annotation = {"image_id": 7, "category_id": 3, "bbox": [0, 0, 1, 1], "iscrowd": value}
+    _write_coco(tmp_path / "a.json", annotations=[annotation])
+    assert read_annotations(tmp_path).photographs[0].is_crowd.tolist() == [expected]
+
+
 def test_missing_images_of_coco_are_named_and_ambiguous_ones_refused(tmp_path):
     _draw(tmp_path / "a.png")
     _write_coco(tmp_path / "a.json", ["a.png", "b.png"])
