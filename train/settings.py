@@ -303,8 +303,9 @@ class TrainSettings(Settings):
     def __post_init__(self) -> None:
         """Check all values, and that attacked images have a loss."""
         super().__post_init__()
-        if self.relight_steps and not self.consistency_weight:
-            raise self.wrong("relight_steps", "needs a consistency loss: set its weight")
+        for name in ("relight_steps", "interpolate"):
+            if getattr(self, name) and not self.consistency_weight:
+                raise self.wrong(name, "needs a consistency loss: set its weight")
         if self.relight_steps and RELIGHT not in self.augmentation:
             raise self.wrong("relight_steps", "needs the light of a projector: set relight")
         if self.recognize and self.augmentation not in LIGHTS:

@@ -41,6 +41,13 @@ def test_gradient_steps_on_light_that_has_no_factors_are_refused(experiment):
         train_command.read([*words, "train.relight_steps=1"])
 
 
+@pytest.mark.parametrize("name", ["interpolate", "relight_steps"])
+def test_what_a_consistency_loss_is_for_is_refused_without_one(name):
+    words = ["experiment=classifier", "network=b", "unlabeled=c", f"train.{name}=1"]
+    with pytest.raises(InputError, match=rf"^train\.{name}"):
+        train_command.read(words)
+
+
 def test_a_classifier_of_another_library_needs_no_class_but_the_label():
     files = ["network=b", "out=a", "unlabeled=c"]
     settings = train_command.read(["experiment=classifier", "label=mug", *files])

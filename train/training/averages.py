@@ -158,7 +158,7 @@ def interpolate(
     weights on the CPU, and the factor, which is the smallest of equally good ones.
     """
     # Weights of the losses of unchanged and of relit images.
-    weights = (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0)
+    weights = (recipe.distillation_weight or 1.0, recipe.consistency_weight)
     device = next(initial.parameters()).device
     initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
     targets = predict(initial, validation, device)
