@@ -136,9 +136,10 @@ def epoch_metrics(
     """Join the metrics of an epoch under the names that metrics.jsonl and TensorBoard have.
 
     "augment/" has means of the diagnostics over all rounds, and "round_1/" those of one of several
-    rounds.
+    rounds. A round without a visible object lacks some of them.
     """
-    means = {name: fmean(one[name] for one in diagnostics) for name in diagnostics[0]}
+    names = dict.fromkeys(name for one in diagnostics for name in one)
+    means = {name: fmean(one[name] for one in diagnostics if name in one) for name in names}
     groups = {"train": trained, "validation": validated, "augment": means, "seconds": seconds}
     for number, one in enumerate(diagnostics if len(diagnostics) > 1 else (), 1):
         groups[f"round_{number}"] = {name: one[name] for name in SHOWN if name in one}

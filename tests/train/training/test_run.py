@@ -33,7 +33,7 @@ from train.run_folder import read_metrics
 from train.system import user_message
 from train.training import loop
 from train.training.inputs import choose_validation, load_data, load_initial
-from train.training.run_log import RunLog
+from train.training.run_log import RunLog, epoch_metrics
 
 WITHOUT_RENDERS = ("augment=none", "train.epochs=1")
 
@@ -504,3 +504,10 @@ def test_a_logger_gets_the_metrics_of_each_epoch_in_place_of_tensorboard(tmp_pat
     assert lines == [(1, {"loss": 2.0}), (2, {"loss": 1.0}), (3, {"accuracy": 0.5})]
     assert len(read_metrics(tmp_path)) == 3
     assert not list(tmp_path.glob("events.out*"))
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_means_over_rounds_leave_out_rounds_without_a_visible_object(order):
+    rounds = [{"light_change": 1.0}, {"light_change": 3.0, "loss": 0.5}][::order]
+    found = epoch_metrics({}, {}, rounds, {})
+    assert (found["augment/light_change"], found["augment/loss"]) == (2.0, 0.5)
