@@ -96,8 +96,8 @@ def load(name: str) -> Classifier:
 
 def light_of(photograph: Photograph) -> str:
     """Return the light of a photograph, which its name states, or photos.csv."""
-    light, separator, _ = composed(photograph.path.name).partition("__")
-    return light if separator else photograph.source or PLAIN
+    light, separator, _ = photograph.path.name.partition("__")
+    return composed(light if separator else photograph.source or PLAIN)
 
 
 class Stratum(NamedTuple):
@@ -160,10 +160,11 @@ class Folder:
         """Name of the photograph without its light, so that it is the same in each light."""
         names = []
         for item, light in zip(self.photographs, self.lights, strict=True):
-            name = item.path.stem.partition("__")[2] or item.path.stem
+            stem = composed(item.path.stem)
+            name = stem.partition("__")[2] or stem
             # Crops of a photograph may lie in folders of several classes.
             photograph = re.sub(r"_\d+$", "", name) if self.has_crops else f"{item.label}/{name}"
-            folders = [part for part in item.path.parts[1:-1] if part != light]
+            folders = [part for part in map(composed, item.path.parts[1:-1]) if part != light]
             names.append("/".join([*folders, photograph]))
         return np.array(names)
 
@@ -345,15 +346,18 @@ def print_tables(
     }
     gains, changes = {}, {}
     pairs: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    unlike: dict[str, np.ndarray] = {}
+    photographed = np.char.add(folder.names, folder.objects)
     for light, rows in groups.items():
-        # Only photographs that both lights have are compared. If the lights share no name of an
+        # Only photographs that all these lights have are compared. If they share no name of an
         # object's photographs, these are all photographs of the object.
         pair = rows, groups[first_light]
-        is_named, is_shown = (
-            np.isin(units, np.intersect1d(*(units[side] for side in pair)))
-            for units in (np.char.add(folder.names, folder.objects), folder.objects)
-        )
-        both = is_named | is_shown & ~np.isin(folder.objects, folder.objects[is_named])
+        single = [side & (folder.lights == one) for side in pair for one in {*folder.lights[side]}]
+        shared = set.intersection(*({*photographed[side]} for side in single))
+        is_named = np.isin(photographed, [*shared])
+        is_shown = np.isin(folder.objects, np.intersect1d(*(folder.objects[side] for side in pair)))
+        unlike[light] = is_shown & ~np.isin(folder.objects, folder.objects[is_named])
+        both = is_named | unlike[light]
         pairs[light] = rows & both, groups[first_light] & both
     is_known = {title: np.isfinite(each[0].true_rank) for title, each in predictions.items()}
     for (title, light), values in results.items():
@@ -391,6 +395,9 @@ def print_tables(
             names = ", ".join(sorted({*left_out}))
             left = f"{len(left_out)} images that one of them lacks, of {names}"
             print(f"{light} minus {first_light} leaves out {left}")
+        if unlike[light].any():
+            names = ", ".join(sorted({*folder.objects[unlike[light]]}))
+            print(f"{light} minus {first_light} compares different photographs of {names}")
     return absolute
 
 
@@ -406,14 +413,16 @@ def choose_lights(folder: Folder, words: Sequence[str]) -> Mapping[str, np.ndarr
     Without words, these are all lights, of which "plain" is the first.
     """
     known = sorted({*map(str, folder.lights)}, key=lambda name: (name != PLAIN, name))
-    groups = {}
-    for word in words or known:
+    groups: dict[str, np.ndarray] = {}
+    for word in map(composed, words or known):
         title, separator, joined = word.partition("=")
         lights = joined.split("+") if separator else [title]
         if unknown := {*lights} - {*known}:
             fault = f"no photograph is in the light {min(unknown)}"
             raise InputError(f"{fault}: choose among {', '.join(known)}")
-        groups[str(title)] = np.isin(folder.lights, lights)
+        rows = np.isin(folder.lights, lights)
+        if not np.array_equal(groups.setdefault(title, rows), rows):
+            raise InputError(f"two lights have the title {title}: give TITLE=LIGHT")
     return groups
 
 
@@ -464,7 +473,10 @@ def read_scores(words: Sequence[str], label: str, metric: str) -> dict[str, dict
                 if row["label"] == label and row[metric] not in {"", "-"}:
                     column = scores.setdefault(f"{title}: {row['light']}", {})
                     # A cell is a value, mostly with an interval behind it.
-                    column[row["network"]] = float(row[metric].split()[0].replace("−", "-"))
+                    value = float(row[metric].split()[0].replace("−", "-"))
+                    if column.setdefault(row["network"], value) != value:
+                        fault = f"{row['network']} has two values in {row['light']}"
+                        raise InputError(f"files of {title}: {fault}: give them two titles")
     return scores
 
 

@@ -2,6 +2,7 @@ import csv
 import math
 import re
 from pathlib import PurePosixPath
+from unicodedata import normalize
 
 import numpy as np
 import pytest
@@ -103,10 +104,12 @@ def test_photographs_of_an_excluded_source_are_not_simulated(tmp_path):
         "simulate given out --classes orange --lights low_light --size 0",
         "simulate given given --classes orange --lights low_light",
         "score given pretrained/none --label orange --lights dim",
+        "score given pretrained/none --label orange --lights x=plain x=lamp",
         "score given pretrained/none --label orange --out missing/a.csv",
         "rank a=missing.csv --label orange",
         "rank a=given.csv --label orange",
         "rank given.csv --label orange",
+        "rank a=one.csv a=other.csv --label orange",
         "simulate given out --classes pear --lights low_light",
         "simulate given out --classes orange ornge --lights low_light",
         "dim missing",
@@ -116,6 +119,10 @@ def test_photographs_of_an_excluded_source_are_not_simulated(tmp_path):
 def test_a_mistake_of_the_user_is_one_sentence(tmp_path, capsys, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     save(tmp_path / "given/orange/1.png", 40)
+    save(tmp_path / "given/orange/lamp__1.png", 40)
+    for name, value in {"one": 0.5, "other": 0.6}.items():
+        rows = f"label,network,light,recall at 5% FPR\norange,n,dim,{value}\n"
+        (tmp_path / f"{name}.csv").write_text(rows)
     (tmp_path / "given.csv").write_text("a,b\n1,2\n")
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken/1.png").write_bytes(b"no image")
@@ -351,6 +358,30 @@ def test_changes_between_lights_are_those_of_the_objects_in_both(tmp_path, monke
     assert printed.split()[-1] == "other"
     change = printed.partition("minus plain")[2].partition("half")[2]
     assert change.split("|")[2].split()[0] == "+0.000"
+
+
+def test_lights_that_are_scored_together_are_compared_on_photographs_in_each(
+    tmp_path, monkeypatch, capsys
+):
+    """All lights show the same images, and one has the recognized oranges alone."""
+    for number, level in enumerate((40, 40, 200, 200)):
+        for light in ("plain", "text", "stripes")[: 3 if level == 40 else 2]:
+            save(tmp_path / f"orange/{light}__{number}.png", level)
+    score(tmp_path, monkeypatch, "half", "--lights", "plain", "both=text+stripes")
+    printed = capsys.readouterr().out
+    change = printed.partition("minus plain")[2].partition("half")[2]
+    assert float(change.split("|")[3].split()[0]) == 0
+    assert "leaves out 4 images" in printed
+
+
+def test_names_of_lights_are_the_same_in_both_forms_of_unicode(tmp_path, monkeypatch, capsys):
+    for form, light in (("NFD", "dämmrig"), ("NFC", "plain")):
+        for name, level in {"grün": 40, "x": 200}.items():
+            save(tmp_path / "orange" / normalize(form, f"{light}__{name}.png"), level)
+    save(tmp_path / "orange/plain__y.png", 40)
+    found = score(tmp_path, monkeypatch, "half", "--lights", "plain", "dämmrig")
+    assert ("half", "dämmrig") in found
+    assert "leaves out 1 images" in capsys.readouterr().out
 
 
 def test_the_interval_of_hardly_varying_draws_is_that_of_the_units_that_decide():

@@ -153,8 +153,9 @@ def interpolate(
     The loss is measured on validation images. It is a weighted sum of two
     divergences from the predictions of the initial network for these images:
     that of the predictions of the interpolated network for the same images, and
-    that of its predictions for the images in the light of the augmentation. Their
-    weights are those of distillation and of consistency in the recipe. Return the interpolated
+    that of its predictions for the images in the light of the augmentation, or of a projector if
+    the augmentation is no light. Their weights are those of distillation and of consistency in the
+    recipe. Return the interpolated
     weights on the CPU, and the factor, which is the smallest of equally good ones.
     """
     # Weights of the losses of unchanged and of relit images.
