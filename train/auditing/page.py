@@ -179,6 +179,7 @@ def _slider(networks: Networks) -> dict[str, Any]:
 def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_screen.FirstScreen:
     """Make the top of the report from the scores of one or two networks, or from their attacks."""
     metrics = [Metrics()] * len(networks)
+    name = ""
     if folders:
         # The first screen shows the first folder alone.
         images, folder = next(iter(folders.items()))
@@ -191,9 +192,11 @@ def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_scre
             if screen is not None:
                 return screen
         metrics = [item.pooled.all.metrics for item in evaluations]
+        name = folder.name
     # Both are shown under the kind of lighting that fools the first network most.
     kind = networks[0].strongest_kind
-    first, *others = (screen_of_one(*each, kind) for each in zip(networks, metrics, strict=True))
+    pairs = zip(networks, metrics, strict=True)
+    first, *others = (screen_of_one(*pair, kind, name) for pair in pairs)
     if not others:
         return first
     # The answer is that of the hardened network.
@@ -242,9 +245,9 @@ def plain_sentence(network: AuditedNetwork) -> str:
 
 
 def screen_of_one(
-    network: AuditedNetwork, metrics: Metrics, kind: str | None
+    network: AuditedNetwork, metrics: Metrics, kind: str | None, images: str = ""
 ) -> first_screen.FirstScreen:
-    """Make the top of the report of an audit of one network, with its scores on test images.
+    """Make the top of the report of an audit of one network, with its scores on a folder's images.
 
     It has the views that are left after attacks with this kind of lighting, if one is given.
     """
@@ -271,7 +274,7 @@ def screen_of_one(
         if recall.value is not None:
             right = f"recognizes {recall.value:.0%} of {name}"
             wrong = f"calls {mistaken.value:.0%} of other objects “{name}”"
-            sentences.append(f"In the scored images, it {right} and {wrong}.")
+            sentences.append(f"In the images of “{images}”, it {right} and {wrong}.")
     short, _ = network.verdict
     return first_screen.FirstScreen(VERDICTS.get(short, short), sentences, numbers, [network.name])
 

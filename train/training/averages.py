@@ -155,8 +155,8 @@ def interpolate(
     that of the predictions of the interpolated network for the same images, and
     that of its predictions for the images in the light of the augmentation, or of a projector if
     the augmentation is no light. Their weights are those of distillation and of consistency in the
-    recipe. Return the interpolated
-    weights on the CPU, and the factor, which is the smallest of equally good ones.
+    recipe. Return the interpolated weights on the CPU, and the factor, which is the smallest of
+    equally good ones.
     """
     # Weights of the losses of unchanged and of relit images.
     weights = (recipe.distillation_weight or 1.0, recipe.consistency_weight)
