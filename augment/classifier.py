@@ -191,9 +191,8 @@ class TaskNetwork(CheckedNetwork):
     def normalizing_light(self, normalize_light: NormalizeLight = True) -> Self:
         """Return a classifier that first normalizes the light of images.
 
-        It shares the network. It has no operating points, because its logits
-        differ. With a second network (`with_dim`, `with_lit`), the images of that one alone
-        are normalized.
+        It shares the network. It has no operating points, because its logits differ. With a
+        second network (`with_dim`, `with_lit`), the images of that one alone are normalized.
 
         Args:
             normalize_light: True for the defaults, or a mapping with fields of
