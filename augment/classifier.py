@@ -110,7 +110,7 @@ class CheckedNetwork(wrappers.Network):
                 found = {getattr(weight, type(wanted).__name__) for weight in weights}
                 if found and wanted not in found:
                     names = ", ".join(sorted(str(each).removeprefix("torch.") for each in found))
-                    remedy = f"its weights are {names}, convert it with network.to({wanted!r})"
+                    remedy = f"its weights are {names}, convert it with network.to({wanted})"
             raise InputError(f"{self.title} fails on {given} ({kind}): {remedy}") from error
         # Both networks of a switch have read their own outputs.
         if self._read is None or isinstance(self.network, Switch):

@@ -280,8 +280,9 @@ def _read_exported(path: Path) -> Content:
     shape = node.meta["val"].shape
     sizes = [size if isinstance(size, int) else None for size in shape]
     network: nn.Module = Exported(program.module())
-    if sizes[0] is None:
-        bounds = program.range_constraints[shape[0].node.expr]
+    # A number that is computed, such as a multiple of another one, has no bounds here.
+    bounds = None if sizes[0] else program.range_constraints.get(shape[0].node.expr)
+    if bounds is not None:
         # A missing upper bound is an infinity of sympy.
         least, most = int(bounds.lower), int(min(bounds.upper, sys.maxsize))
         if least > 1 or most < sys.maxsize:
