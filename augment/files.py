@@ -11,6 +11,7 @@ import io
 import json
 import math
 import pickle
+import re
 import sys
 import textwrap
 import warnings
@@ -285,7 +286,8 @@ def _read_exported(path: Path) -> Content:
     if bounds is not None:
         # A missing upper bound is an infinity of sympy.
         least, most = int(bounds.lower), int(min(bounds.upper, sys.maxsize))
-        if least > 1 or most < sys.maxsize:
+        # Files often say that they take two images or more, and take one.
+        if least > 2 or most < sys.maxsize:
             network = InBatches(network, least, most)
     return network, sizes
 
@@ -467,7 +469,7 @@ def _state_dict(content: Any) -> State:
         used = next((key for key in _WRAPPERS if key in names), None)
         if used is None:
             raise TypeError(f"it contains no weights, but {', '.join(map(str, content))}")
-        for average in (key for key in names if "ema" in str(key)):
+        for average in (key for key in names if "ema" in re.split(r"[_.]", str(key).lower())):
             say_once(f"{used} of the checkpoint is used: save {average} alone to use that")
         content = content[used]
     if not isinstance(content, Mapping):

@@ -128,7 +128,7 @@ def _torchvision(
     is_published = weights is None or bool(of_file)
     if model in CONVERTING and not is_published:
         reason = "converts images from ImageNet's normalization, as torchvision's weights need"
-        advice = "load a network that was built with weights=None by python:module:function"
+        advice = "load a network that was trained without that by python:module:function"
         wrappers.say_once(f"{name} {reason}: {advice}")
     return _with_weights(build, facts, state, weights or published.url, is_published)
 

@@ -349,14 +349,15 @@ def print_tables(
     unlike: dict[str, np.ndarray] = {}
     photographed = np.char.add(folder.names, folder.objects)
     for light, rows in groups.items():
-        # Only photographs that all these lights have are compared. If they share no name of an
-        # object's photographs, these are all photographs of the object.
+        # Only photographs that all these lights have are compared. If both sides share no name of
+        # an object's photographs, these are all photographs of the object.
         pair = rows, groups[first_light]
         single = [side & (folder.lights == one) for side in pair for one in {*folder.lights[side]}]
         shared = set.intersection(*({*photographed[side]} for side in single))
         is_named = np.isin(photographed, [*shared])
         is_shown = np.isin(folder.objects, np.intersect1d(*(folder.objects[side] for side in pair)))
-        unlike[light] = is_shown & ~np.isin(folder.objects, folder.objects[is_named])
+        is_paired = np.isin(photographed, np.intersect1d(*(photographed[side] for side in pair)))
+        unlike[light] = is_shown & ~np.isin(folder.objects, folder.objects[is_paired])
         both = is_named | unlike[light]
         pairs[light] = rows & both, groups[first_light] & both
     is_known = {title: np.isfinite(each[0].true_rank) for title, each in predictions.items()}

@@ -322,11 +322,10 @@ def _read_transforms(path: Path, whole: bool) -> dict[str, PinholeCamera]:
             # A frame is an image of the scene. Its entries override those of the scene.
             if not isinstance(frame["file_path"], str):
                 raise TypeError(f"file_path is {frame['file_path']}")
-            entries = {**scene, **frame}
-            if {"camera_angle_x", "camera_angle_y"} & frame.keys():
-                # An angle of the frame also overrides the focal lengths of the scene.
-                shared = {"fl_x", "fl_y"} - frame.keys()
-                entries = {key: entries[key] for key in entries.keys() - shared}
+            # An angle of a frame also overrides the focal lengths and the other angle of the scene.
+            angles = {"camera_angle_x", "camera_angle_y"}
+            hidden = {"fl_x", "fl_y", *angles} if angles & frame.keys() else {*frame}
+            entries = {key: value for key, value in scene.items() if key not in hidden} | frame
             if not {"w", "h", "fl_x", "fl_y", "cx", "cy"} & entries.keys():
                 entries |= _size_of_image(path.parent / frame["file_path"])
             intrinsics, size = _transforms_intrinsics(entries)

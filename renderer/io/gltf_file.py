@@ -299,21 +299,26 @@ class Material:
         textures = {name: texels for name, texels in planes.items() if texels is not None}
         # Axis 0 is u, which runs along columns, and axis 1 is v, which runs along rows.
         for axis, wrap in enumerate(self.placement.wraps):
+            if wrap not in (MIRROR, CLAMP):
+                continue
+            largest = max(texels.shape[1 - axis] for texels in textures.values())
+            for name, texels in textures.items():
+                if texels.shape[1 - axis] == 1:  # A single texel is the same everywhere.
+                    textures[name] = texels.repeat(largest, 1 - axis)
             sizes = [texels.shape[1 - axis] for texels in textures.values()]
-            # All textures grow by the same fraction, so they are divided into as many blocks.
+            # All textures grow by the same fraction, so they are divided into as many blocks. Sizes
+            # without a common divisor make one block, and clamped textures three times as large.
             count = math.gcd(*sizes)
             coordinates = uvs[:, axis]
             mode: Any = "edge"
             if wrap == MIRROR:
                 # Blocks are added before the first and after the last one.
                 before, after, mode = 0, count, "symmetric"
-            elif wrap == CLAMP:
+            else:
                 # Interpolation needs one texel more than the surface covers.
                 border = count / min(sizes)
                 before = math.ceil(border + max(0, -coordinates.min() * count))
                 after = math.ceil(border + max(0, (coordinates.max() - 1) * count))
-            else:
-                continue
             new_count = before + count + after
             for name, texels in textures.items():
                 length = texels.shape[1 - axis] // count

@@ -192,7 +192,9 @@ def test_a_mistake_is_refused(network, change, options, message):
 @pytest.mark.parametrize("change", [{"dtype": torch.float16}, {"device": "meta"}])
 def test_weights_unlike_the_images_are_named_if_a_network_fails(network, change):
     checked = CheckedNetwork(deepcopy(network).float().to(**change), "mine")
-    with pytest.raises(InputError, match=str(*change.values()).removeprefix("torch.")):
+    with pytest.raises(
+        InputError, match=f"weights are {str(*change.values()).removeprefix('torch.')}"
+    ):
         checked(torch.rand(1, 3, SIZE, SIZE))
 
 

@@ -374,6 +374,26 @@ def test_lights_that_are_scored_together_are_compared_on_photographs_in_each(
     assert "leaves out 4 images" in printed
 
 
+def test_an_object_without_one_of_the_lights_that_are_scored_together_is_left_out(
+    tmp_path, monkeypatch, capsys
+):
+    """All lights show the same images: each first photograph of an object is recognized."""
+    shown = {"a": {"plain": 3, "text": 2}, "b": {"plain": 2, "text": 2, "stripes": 2}}
+    rows = ["path,source_tag,mesh"]
+    for name, lights in shown.items():
+        for light, count in lights.items():
+            for number in range(count):
+                path = f"orange/{light}__{name}{number}.png"
+                save(tmp_path / path, 200 if number else 40)
+                rows.append(f"{path},,{name}")
+    (tmp_path / "photos.csv").write_text("\n".join(rows))
+    score(tmp_path, monkeypatch, "half", "--lights", "plain", "both=text+stripes")
+    printed = capsys.readouterr().out
+    change = printed.partition("minus plain")[2].partition("half")[2].split("|")
+    assert [float(cell.split()[0]) for cell in change[2:4]] == [0, 0]
+    assert "leaves out 5 images" in printed and "different photographs" not in printed
+
+
 def test_names_of_lights_are_the_same_in_both_forms_of_unicode(tmp_path, monkeypatch, capsys):
     for form, light in (("NFD", "dämmrig"), ("NFC", "plain")):
         for name, level in {"grün": 40, "x": 200}.items():

@@ -179,7 +179,7 @@ def _slider(networks: Networks) -> dict[str, Any]:
 def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_screen.FirstScreen:
     """Make the top of the report from the scores of one or two networks, or from their attacks."""
     metrics = [Metrics()] * len(networks)
-    name = ""
+    place = ""
     if folders:
         # The first screen shows the first folder alone.
         images, folder = next(iter(folders.items()))
@@ -192,11 +192,11 @@ def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_scre
             if screen is not None:
                 return screen
         metrics = [item.pooled.all.metrics for item in evaluations]
-        name = folder.name
+        place = first_screen.describe_place(folder, folder.name)
     # Both are shown under the kind of lighting that fools the first network most.
     kind = networks[0].strongest_kind
     pairs = zip(networks, metrics, strict=True)
-    first, *others = (screen_of_one(*pair, kind, name) for pair in pairs)
+    first, *others = (screen_of_one(*pair, kind, place) for pair in pairs)
     if not others:
         return first
     # The answer is that of the hardened network.
@@ -245,7 +245,7 @@ def plain_sentence(network: AuditedNetwork) -> str:
 
 
 def screen_of_one(
-    network: AuditedNetwork, metrics: Metrics, kind: str | None, images: str = ""
+    network: AuditedNetwork, metrics: Metrics, kind: str | None, place: str = ""
 ) -> first_screen.FirstScreen:
     """Make the top of the report of an audit of one network, with its scores on a folder's images.
 
@@ -274,7 +274,7 @@ def screen_of_one(
         if recall.value is not None:
             right = f"recognizes {recall.value:.0%} of {name}"
             wrong = f"calls {mistaken.value:.0%} of other objects “{name}”"
-            sentences.append(f"In the images of “{images}”, it {right} and {wrong}.")
+            sentences.append(f"{place}, it {right} and {wrong}.")
     short, _ = network.verdict
     return first_screen.FirstScreen(VERDICTS.get(short, short), sentences, numbers, [network.name])
 

@@ -235,7 +235,7 @@ def _read_coco(file: Path) -> Annotations:
             label = classes.index(names[item["category_id"]])
             # COCO gives left, top, width and height. The result is left, top, right and bottom.
             corners = (*box[:2], *(box[:2] + box[2:]))
-            is_crowd = bool(int(item.get("iscrowd") or 0))
+            is_crowd = str(item.get("iscrowd") or 0).lower() not in {"0", "0.0", "false"}
             rows[item["image_id"]].append((label, *corners, is_crowd))
         paths = _find_images(file, names_of_images)
         missing = [name for name in names_of_images if name not in paths]

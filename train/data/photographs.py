@@ -243,10 +243,15 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
         if not table.is_file():
             raise OSError("it is not a regular file")
         with table.open(newline="", encoding="utf-8-sig") as file:
-            for cells in csv.DictReader(map(composed, file), restval="", strict=True):
+            reader = csv.DictReader(map(composed, file), restval="", strict=True)
+            reader.fieldnames = [name.strip().lower() for name in reader.fieldnames or ()]
+            named = [*filter(None, reader.fieldnames)]
+            if len({*named}) < len(named):
+                raise ValueError("two columns have the same name")
+            for cells in reader:
                 if None in cells:
                     raise ValueError(f"the row of {cells['path']} has more cells than columns")
-                line = {key.strip().lower(): cell.strip() for key, cell in cells.items()}
+                line = {key: cell.strip() for key, cell in cells.items()}
                 if not any(line.values()):  # Spreadsheets write empty rows as commas.
                     continue
                 path = PurePosixPath(line["path"].replace("\\", "/"))

@@ -175,6 +175,7 @@ def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns
         (b"path,source_tag\nb/a.jpg,web\n", "a missing file in 1 of 1 rows, .* a.jpg$"),
         (b"path,source_tag\na.jpg,web\na.jpg,web\n./a.jpg,lab\n", "two different rows for a.jpg"),
         (b"path,source_tag,mesh\na.jpg,lamp, left,pear\n", "more cells than columns"),
+        (b"path,source_tag,mesh,Mesh\na.jpg,lamp,cup,\n", "two columns have the same name"),
         (
             b"path,source_tag,hard_negatives\na.jpg,web,lib\n",
             "names 'lib' in the column hard_negatives, but no image has this source",
