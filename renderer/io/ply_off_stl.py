@@ -300,7 +300,9 @@ def read_stl(file: MeshFile) -> list[Part]:
         raise ValueError(_TRUNCATED)
     else:
         if excess >= _STL_FACE.itemsize:
-            file.assume(f"the last {excess} bytes are taken to be no faces, as the header says")
+            file.assume(
+                f"its number of faces is taken as right, and the last {excess} bytes are ignored"
+            )
         faces = np.frombuffer(content, _STL_FACE, face_count, _HEADER_SIZE)
         has_colors = b"COLOR=" in header or bool((faces["attribute"] & 0x8000).any())
         coordinates = faces["corners"].astype(np.float64)
