@@ -106,8 +106,9 @@ class CheckedNetwork(wrappers.Network):
             remedy = "give the size of its images, or use a network that takes such images"
             # Images of another precision or device than the weights are the most frequent causes.
             weights = [weight for weight in self.parameters() if weight.is_floating_point()]
-            for wanted in (images.dtype, images.device):
-                found = {getattr(weight, type(wanted).__name__) for weight in weights}
+            for fact in ("dtype", "device"):
+                wanted = getattr(images, fact)
+                found = {getattr(weight, fact) for weight in weights}
                 if found and wanted not in found:
                     names = ", ".join(sorted(str(each).removeprefix("torch.") for each in found))
                     remedy = f"its weights are {names}, convert it with network.to({wanted})"
@@ -216,7 +217,6 @@ class TaskNetwork(CheckedNetwork):
             return self
         inner = self.network
         if isinstance(inner, Switch):
-            # The switch looks at images as they are, and those of the first network stay so.
             other = inner.other.normalizing_light(normalize_light)
             return self.with_network(Switch(inner.network, other, inner.chooses))
         return self.with_network(inner, normalize_light)

@@ -122,14 +122,15 @@ def _torchvision(
         # Published files have names of weights such as "norm.1". The network has "norm1" instead.
         own_name = partial(re.sub, r"\.(norm|conv)\.([12])\.", r".\1\2.")
         state = {own_name(key): value for key, value in state.items()}
-    # Classifiers that only help to train a network may be absent, or have other classes.
-    auxiliary = ("aux1.", "aux2.", "AuxLogits.")
-    state = {key: value for key, value in state.items() if not key.startswith(auxiliary)}
     is_published = weights is None or bool(of_file)
-    if model in CONVERTING and not is_published:
-        reason = "converts images from ImageNet's normalization, as torchvision's weights need"
-        advice = "load a network that was trained without that by python:module:function"
-        wrappers.say_once(f"{name} {reason}: {advice}")
+    if model in CONVERTING:
+        # Classifiers that only help to train a network may be absent, or have other classes.
+        auxiliary = ("aux1.", "aux2.", "AuxLogits.")
+        state = {key: value for key, value in state.items() if not key.startswith(auxiliary)}
+        if not is_published:
+            reason = "converts images from ImageNet's normalization, as torchvision's weights need"
+            advice = "load a network that was trained without that by python:module:function"
+            wrappers.say_once(f"{name} {reason}: {advice}")
     return _with_weights(build, facts, state, weights or published.url, is_published)
 
 

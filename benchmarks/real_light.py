@@ -30,7 +30,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import compress
 from pathlib import Path
 from typing import NamedTuple
@@ -307,6 +307,26 @@ def score(options: argparse.Namespace) -> None:
         write_csv(options.out, scores)
 
 
+def compared(
+    folder: Folder, rows: np.ndarray, first_rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which photographs are compared between two sides, each of one or several lights.
+
+    These are first the photographs that each light shows, and then all photographs of the objects
+    of which both sides have photographs, but none with the same name.
+    """
+    sides = [rows, first_rows]
+    lights = [side & (folder.lights == one) for side in sides for one in {*folder.lights[side]}]
+    photographs = np.char.add(folder.names, folder.objects)
+    has_pair = np.isin(folder.objects, folder.objects[is_in_each(photographs, sides)])
+    return is_in_each(photographs, lights), is_in_each(folder.objects, sides) & ~has_pair
+
+
+def is_in_each(units: np.ndarray, groups: Sequence[np.ndarray]) -> np.ndarray:
+    """Return whether the unit of each photograph occurs in each of several groups of rows."""
+    return np.isin(units, reduce(np.intersect1d, [units[group] for group in groups]))
+
+
 def print_tables(
     label: str,
     predictions: Mapping[str, Sequence[Predictions]],
@@ -347,18 +367,9 @@ def print_tables(
     gains, changes = {}, {}
     pairs: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     unlike: dict[str, np.ndarray] = {}
-    photographed = np.char.add(folder.names, folder.objects)
     for light, rows in groups.items():
-        # Only photographs that all these lights have are compared. If both sides share no name of
-        # an object's photographs, these are all photographs of the object.
-        pair = rows, groups[first_light]
-        single = [side & (folder.lights == one) for side in pair for one in {*folder.lights[side]}]
-        shared = set.intersection(*({*photographed[side]} for side in single))
-        is_named = np.isin(photographed, [*shared])
-        is_shown = np.isin(folder.objects, np.intersect1d(*(folder.objects[side] for side in pair)))
-        is_paired = np.isin(photographed, np.intersect1d(*(photographed[side] for side in pair)))
-        unlike[light] = is_shown & ~np.isin(folder.objects, folder.objects[is_paired])
-        both = is_named | unlike[light]
+        in_each, unlike[light] = compared(folder, rows, groups[first_light])
+        both = in_each | unlike[light]
         pairs[light] = rows & both, groups[first_light] & both
     is_known = {title: np.isfinite(each[0].true_rank) for title, each in predictions.items()}
     for (title, light), values in results.items():

@@ -141,19 +141,17 @@ def load_network(
     its own weights and its own `facts`, such as classes and size, so these must then be None.
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
-    options: dict[str, Any] = {"normalize_light": normalize_light, "trust_code": trust_code}
     if name.startswith(SWITCHES):
         plain, other = split_switch(name)
         network = load_network(plain, weights, trust_code=trust_code, **facts)
-        if not other.startswith(RUN):
-            options |= {"weights": weights, **facts}
-        # The light of plain images is not normalized.
-        second = load_network(other, **options)
+        # A run has its own weights and facts.
+        options: dict[str, Any] = {} if other.startswith(RUN) else {"weights": weights, **facts}
+        second = load_network(other, trust_code=trust_code, **options)
         if name.startswith(LIT_NAME):
             say_once(f"{other} gets the images whose light it recognizes as that of its training")
-            return network.with_lit(second)
+            return network.with_lit(second).normalizing_light(normalize_light)
         say_once(f"{other} gets the images whose 98th percentile of linear values is below {DIM}")
-        return network.with_dim(second)
+        return network.with_dim(second).normalizing_light(normalize_light)
     path = Path(name)
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path
@@ -161,6 +159,7 @@ def load_network(
     if name and is_run:
         name = f"{RUN}{folder}"
     if not name.startswith(RUN):
+        options = {"normalize_light": normalize_light, "trust_code": trust_code}
         return load_classifier(name, weights, **options, **facts)
     require_no_facts(name, as_facts(**facts))
     # Error messages about the argument `run` begin with `name` instead, the argument of

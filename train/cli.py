@@ -454,8 +454,10 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
         group, _, choice = wrong.missing_cfg_file.rpartition("/")
         return _explain_choice(group, choice)
     if isinstance(wrong, OverrideParseException):
-        advice = "put texts with umlauts, spaces or brackets in quotes, as in meshes=['a b.glb']"
-        advice = advice if "=" in str(wrong.override) else "give KEY=VALUE, as --help shows"
+        advice = "give KEY=VALUE, as --help shows"
+        if "=" in str(wrong.override):
+            example = "as in meshes=['a b.glb']"
+            advice = f"put texts with umlauts, spaces or brackets in quotes, {example}"
         return f"{wrong.override} cannot be read: {advice}"
     if isinstance(wrong, OmegaConfBaseException | HydraException):
         text = re.split(r"\n *(?:full_key|Config search path|See https)", str(wrong))[0]

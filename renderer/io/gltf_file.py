@@ -345,7 +345,7 @@ class Material:
     def with_gloss_texture(self, texels: np.ndarray, placement: Placement) -> "Material":
         """Return a copy with factors of roughness and metallic (H, W, 2)."""
         # A material without a texture gets a white one, because each `gloss_texture` of `Mesh`
-        # belongs to a texture. Textures of one size are extended by the fewest texels.
+        # belongs to a texture. It has the size of the gloss texture, if both will be extended.
         is_extended = placement.wraps != (REPEAT, REPEAT)
         material = self.with_placement(placement, texels.shape[:2] if is_extended else (1, 1))
         return replace(material, gloss_texture=texels)

@@ -245,11 +245,12 @@ def plain_sentence(network: AuditedNetwork) -> str:
 
 
 def screen_of_one(
-    network: AuditedNetwork, metrics: Metrics, kind: str | None, place: str = ""
+    network: AuditedNetwork, metrics: Metrics, kind: str | None, place: str
 ) -> first_screen.FirstScreen:
-    """Make the top of the report of an audit of one network, with its scores on a folder's images.
+    """Make the top of the report of an audit of one network, with its scores on test images.
 
-    It has the views that are left after attacks with this kind of lighting, if one is given.
+    It has the views that are left after attacks with this kind of lighting, if one is given. The
+    text `place` says where the test images are from.
     """
     numbers = []
     sentences = [plain_sentence(network)]

@@ -150,8 +150,7 @@ def compare_networks(
 
     Both networks were scored on the images `name` in `folder`. If unknown, `name` is "" and
     `folder` is None. Without `is_hardening`, the networks are two trained ones, which sentences
-    call by their names.
-    None if recall, false-positive rate or AUC is unknown.
+    call by their names. The result is None if recall, false-positive rate or AUC is unknown.
     """
     subjects, change = NETWORKS, "hardening"
     if not is_hardening:
