@@ -262,6 +262,14 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
                 raise ValueError(f"the material {name} has {keyword}, which is not supported")
             case _:
                 file.ignore(keyword)
+    red, green, blue = material.color
+    # Programs write their default gray or black there. Texels are often the color itself.
+    if material.texture and red == green == blue < 1:
+        file.assume("a gray Kd beside map_Kd is taken as white, as in Blender")
+        material = material._replace(color=(1.0, 1.0, 1.0))
+    if opacities == {"tr": 1}:
+        file.assume("Tr 1 is taken as opaque, as some programs write it")
+        opacities = {}
     if not opacities.get("d", 1 - opacities.get("tr", 0)) >= mesh_file.OPAQUE:
         raise ValueError(f"the material {name} is transparent, which is not supported")
     return material

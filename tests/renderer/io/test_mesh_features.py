@@ -134,6 +134,13 @@ ROWS = [
         obj(mtl="map_Kd red.png\nKd 0.5 1 1", vertex="1 0 0", face=TEXTURED),
         (0.5, 0.0, 0.0),
     ),
+    # As trimesh, nerfstudio and the models of YCB write them.
+    *(
+        (f"map_Kd, Kd {gray}", obj(mtl=f"Kd {gray}\nmap_Kd red.png", face=TEXTURED), outcome)
+        for gray, outcome in [("1 1 1", RED), ("0.4 0.4 0.4", ASSUMED), ("0 0 0", ASSUMED)]
+    ),
+    ("Tr 1", obj(mtl="Tr 1"), ASSUMED),
+    ("d 0.5, Tr 1", obj(mtl="d 0.5\nTr 1"), REFUSED),
     ("map_Kd without vt", obj(mtl="map_Kd red.png"), REFUSED),
     ("Tr 0", obj(mtl="Tr 0"), WHITE),
     ("d 1, Tr 0", obj(mtl="d 1\nTr 0"), WHITE),

@@ -173,6 +173,16 @@ def test_material_and_vertex_colors_are_multiplied_as_linear_values(tmp_path):
     assert_allclose(mesh.corner_colors[0], [expected] * 3, atol=1e-6)
 
 
+@pytest.mark.parametrize("gray", ["0.40000000", "0.000000"])
+def test_a_gray_color_beside_a_texture_does_not_darken_it(tmp_path, gray):
+    (tmp_path / "red.png").write_bytes(png_of(255, 0, 0))
+    library = f"newmtl red\nmap_Kd red.png\nKd {gray} {gray} {gray}\nTr 1.000000"
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nmtllib m.mtl\nusemtl red\nf 1/1 2/1 3/1\n"
+    with pytest.warns(UserWarning, match="Kd beside map_Kd.*Tr 1"):
+        mesh = load(tmp_path, text, m=library)
+    assert_array_equal(mesh.corner_colors, np.ones((1, 3, 3)))
+
+
 def test_materials_with_different_textures_keep_them_apart(tmp_path):
     for name, color in (("r", (255, 0, 0)), ("g", (0, 255, 0))):
         (tmp_path / f"{name}.png").write_bytes(png_of(*color))
