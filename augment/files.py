@@ -479,6 +479,8 @@ def _state_dict(content: Any) -> State:
 
 def _without_prefixes(state: State) -> State:
     """Remove prefixes such as "module." from the names of weights, if all names have them."""
+    # torch.optim.swa_utils.AveragedModel counts averages beside the weights.
+    state = {key: value for key, value in state.items() if key != "n_averaged"}
     for prefix in _PREFIXES:
         if state and all(key.startswith(prefix) for key in state):
             return _without_prefixes({key.removeprefix(prefix): state[key] for key in state})

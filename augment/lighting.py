@@ -27,7 +27,7 @@ from torch.utils._pytree import SequenceKey, tree_flatten_with_path, tree_unflat
 from torchvision import tv_tensors
 from torchvision.transforms import v2
 
-from augment.random_streams import generator, stream_seed
+from augment.random_streams import generator, seeded, stream_seed
 from augment.scene import loops
 from augment.scene.lights import MODELS, Drawn, Illumination, LightModel, LowLight, normal_noise
 from augment.scene.loops import BIN_BITS, BINS
@@ -294,8 +294,7 @@ def relight_photographs(
         if slides is not None:
             advice = "give nb.lights.ProjectedSlide(slides) among the lights"
             raise InputError(f"slides are not used with lights: {advice}", "slides")
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(stream_seed(seed, "lights"))
+        with seeded(stream_seed(seed, "lights")):
             return RandomLighting(lights, strength=strength)(photographs)
     if strength != 1.0:
         raise InputError("strength is not used without lights: give lights", "strength")
@@ -562,8 +561,7 @@ def _albumentations_class() -> Any:
 
         def get_params(self) -> dict[str, Any]:
             """Draw a light with a seed of Albumentations."""
-            with torch.random.fork_rng(devices=[]):
-                torch.manual_seed(self.py_random.getrandbits(62))
+            with seeded(self.py_random.getrandbits(62)):
                 return self.lighting.make_params()
 
         def apply(self, img: np.ndarray, lights: Sequence[Light | None], **_: Any) -> np.ndarray:

@@ -272,7 +272,9 @@ class Function(nn.Module):
             return self.function(images)
         detached = images.detach()
         given = detached if takes == DETACHED else detached.cpu().float().numpy()
-        outputs = self.function(given)
+        # A network in the function does not expect autocast, whose results NumPy may not know.
+        with torch.autocast(images.device.type, enabled=False):
+            outputs = self.function(given)
         if _is_structured(outputs):
             return outputs
         scores = torch.as_tensor(np.asarray(outputs)).to(images)

@@ -1,6 +1,8 @@
 """Independent sequences of random numbers, each of which is identified by a key."""
 
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -19,3 +21,12 @@ def stream_seed(*key: int | str) -> int:
 def generator(*key: int | str) -> torch.Generator:
     """Return a new CPU generator of random numbers, whose seed is computed from a key."""
     return torch.Generator().manual_seed(stream_seed(*key))
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Seed torch's random numbers on the CPU in a block, and restore them after it."""
+    with torch.random.fork_rng(devices=[]):
+        # `torch.manual_seed` would also seed the generators of GPUs.
+        torch.default_generator.manual_seed(seed)
+        yield

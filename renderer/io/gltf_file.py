@@ -361,12 +361,12 @@ def _resized(texture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def ignored_features(tree: dict[str, Any]) -> list[str]:
     """List the features of a file that change neither its shape nor its base color.
 
-    Light that a surface emits is among them: the renderer alone lights a mesh.
+    Light that a surface emits is among them, unless it is black: the renderer alone lights a mesh.
     """
     features = set()
     for material in tree.get("materials", []):
         features |= {"normalTexture", "occlusionTexture"} & material.keys()
-        if any(material.get("emissiveFactor", ())):
+        if any(material.get("emissiveFactor", ())) and not _emits_its_color(material):
             features.add("emitted light")
         features |= set(material.get("extensions", ())) - READ
     for sampler in tree.get("samplers", []):
@@ -383,6 +383,12 @@ def ignored_features(tree: dict[str, Any]) -> list[str]:
         if not name.startswith(HARMLESS):
             raise ValueError(f"it needs the extension {name}: export the mesh without it")
     return sorted(features | used)
+
+
+def _emits_its_color(material: dict[str, Any]) -> bool:
+    """Whether a material is black and emits light, as Blender writes a texture without shading."""
+    base = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1])
+    return not any(base[:3]) and any(material.get("emissiveFactor", ()))
 
 
 def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:
@@ -402,7 +408,12 @@ def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:
         return _specular_glossiness(material, file, extensions[SPECULAR_GLOSSINESS], gloss)
     # The model of glTF itself (3.9.2).
     model = entry.get("pbrMetallicRoughness", {})
-    material = _with_color(material, file, model, "baseColor")
+    if _emits_its_color(entry):
+        file.file.assume("the light that a black material emits is taken as its color")
+        emission = entry | {"emissiveFactor": [*entry["emissiveFactor"], 1.0]}
+        material = _with_color(material, file, emission, "emissive")
+    else:
+        material = _with_color(material, file, model, "baseColor")
     if not gloss:
         return material
     # Roughness, metallic and specular factor.

@@ -13,7 +13,7 @@ from urllib.parse import unquote
 import mapbox_earcut
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Num
+from jaxtyping import Bool, Float, Int, Num
 from PIL import Image, UnidentifiedImageError
 
 from renderer.errors import MAX_MAGNITUDE, require_memory
@@ -275,6 +275,20 @@ def unit_colors(colors: np.ndarray, file: MeshFile) -> np.ndarray:
     if not ((colors >= -TOLERANCE) & (colors <= 1 + TOLERANCE)).all():
         raise ValueError("colors are out of range: give values from 0 to 1, or bytes")
     return colors.astype(np.float64).clip(0, 1)
+
+
+def beside_textures(
+    colors: Float[np.ndarray, "F 3 3"], is_textured: Bool[np.ndarray, " F"], file: MeshFile
+) -> np.ndarray:
+    """Return corner colors that are white on faces with a texture.
+
+    Programs for scans write the same color at vertices and in the texture. No product is meant.
+    """
+    if (colors[is_textured] < 1).any():
+        file.assume(
+            "the texture is taken as the color, and not the colors of its vertices or faces"
+        )
+    return np.where(is_textured[:, None, None], 1.0, colors)
 
 
 def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -44,8 +44,10 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     `Mesh.normal_ids`). Apart from this, the normals of the file are not used.
 
     The color of a surface is the product of the material color, the texture, and
-    the vertex or face colors, as far as the file has them, as linear values.
-    Without any of them, the color is white. A glTF file with transparent parts is cut out where its
+    the vertex colors, as far as the file has them, as linear values. In .obj and .ply
+    files, a texture alone is the color, unless `Kd` is no gray, and face colors are preferred to
+    vertex colors. `Kd` is sRGB-encoded, and linear in files of Blender.
+    Without any color, the surface is white. A glTF file with transparent parts is cut out where its
     material says so (alphaMode MASK), or refused (BLEND). It has the shape of its
     default morph weights, and is refused if it has joints. What changes neither
     the shape nor the base color, such as a normal texture, is ignored,

@@ -5,7 +5,9 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
+from renderer.image import encode
 from renderer.io import mesh_file
 from renderer.io.mesh_file import MeshFile, Part
 from renderer.mesh import NO_TEXTURE
@@ -26,9 +28,9 @@ _NEUTRAL_OPTIONS = re.compile(r"(-(s(\s+1(\.0*)?)+|[ot](\s+0(\.0*)?)+)\s+)*", re
 # End of the text of a corner that leaves out an index.
 _LEFT_OUT = -(10**18)
 
-# Folder of a material library with a final /, and the keywords
-# and values of the properties of a material in this library.
-_Definition = tuple[str, list[tuple[str, str]]]
+# Folder of a material library with a final /, whether its colors are linear, and the
+# keywords and values of the properties of a material in this library.
+_Definition = tuple[str, bool, list[tuple[str, str]]]
 
 
 class _Lines(NamedTuple):
@@ -87,14 +89,16 @@ def read_obj(file: MeshFile) -> list[Part]:
     materials, material_of_polygon = _materials(lines, file)
     material_of_face = material_of_polygon[polygons]
     colors = np.array([material.color for material in materials])[material_of_face, None]
-    if vertex_colors is not None:
-        colors = mesh_file.product(colors, vertex_colors[faces])
     # Several materials may have the same texture.
     textures = list(dict.fromkeys(item.texture for item in materials if item.texture))
     ids = [textures.index(item.texture) if item.texture else NO_TEXTURE for item in materials]
+    texture_ids = np.array(ids)[material_of_face]
+    if vertex_colors is not None:
+        is_textured = texture_ids != NO_TEXTURE
+        used_colors = mesh_file.beside_textures(vertex_colors[faces], is_textured, file)
+        colors = mesh_file.product(colors, used_colors)
     # The row at the end is for corners without texture coordinates, whose index is -1.
     corner_uvs = np.append(uvs[:, :2], [[np.nan] * 2], axis=0)[uv_ids]
-    texture_ids = np.array(ids)[material_of_face]
     texels = [file.texture(*texture) for texture in textures]
     mesh = mesh_file.colored_mesh(vertices, faces, colors, corner_uvs, texture_ids, texels)
     normals = np.append(normals, [[0.0] * 3], axis=0)
@@ -209,7 +213,10 @@ def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
             # Materials of this .mtl file by name.
             materials_of_file: dict[str, _Definition] = {}
             properties: list[tuple[str, str]] = []
-            for word, rest in _LINE.findall(_cleaned(file.read(path))):
+            content = file.read(path)
+            # The first line of Blender names it. It writes linear colors.
+            is_linear = content.startswith(b"# Blender")
+            for word, rest in _LINE.findall(_cleaned(content)):
                 keyword, text = word.decode(), rest.decode().strip()
                 if keyword.lower() != "newmtl":
                     properties.append((keyword, text))
@@ -217,7 +224,7 @@ def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
                 if text in materials_of_file:
                     raise ValueError(f"an .mtl file defines the material {text} twice")
                 properties = []
-                materials_of_file[text] = (folder, properties)
+                materials_of_file[text] = (folder, is_linear, properties)
             # The first file that defines a material counts.
             library = materials_of_file | library
     return library if names else None
@@ -232,7 +239,7 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
     definition = library.get(name, library.get(re.split(r"\s+#", name)[0]))
     if definition is None:
         raise ValueError(f"no .mtl file defines the material {name}")
-    folder, properties = definition
+    folder, is_linear, properties = definition
     material = _Material()
     # Opacity ("d") or transparency ("tr"), of which "d" counts if a material has both.
     opacities = {}
@@ -267,6 +274,11 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
     if material.texture and red == green == blue < 1:
         file.assume("a gray Kd beside map_Kd is taken as white, as in Blender")
         material = material._replace(color=(1.0, 1.0, 1.0))
+    elif is_linear:
+        encoded = encode(torch.tensor(material.color, dtype=torch.float64), "srgb")
+        material = material._replace(color=tuple(encoded.tolist()))
+    elif not {0, 1}.issuperset(material.color):
+        file.assume("Kd is taken as sRGB-encoded")
     if opacities == {"tr": 1}:
         file.assume("Tr 1 is taken as opaque, as some programs write it")
         opacities = {}

@@ -79,9 +79,17 @@ def _parts(file: MeshFile, elements: dict[str, _Values], texture_names: list[str
     if not len(corners):
         return []
     triangles = faces.numbers[corners]
-    colors = np.ones((1, 3)) if vertex_colors is None else vertex_colors[triangles]
+    colors = np.ones((len(triangles), 3, 3))
+    if vertex_colors is not None:
+        colors = vertex_colors[triangles]
     if face_colors is not None:
-        colors = mesh_file.product(colors, face_colors[polygons, None])
+        if vertex_colors is not None:
+            file.assume("the colors of faces are taken, and not those of vertices")
+        colors = face_colors[polygons, None].repeat(3, axis=1)
+    is_textured = np.full(len(triangles), bool(texture_names))
+    colors = mesh_file.beside_textures(colors, is_textured, file)
+    if not texture_names and np.isfinite(corner_uvs).any():
+        file.assume("the mesh is taken as untextured, as the file names no texture")
     textures = [file.texture(name) for name in texture_names[:1]]
     uvs = corner_uvs[corners]
     mesh = mesh_file.colored_mesh(vertices, triangles, colors, uvs, textures=textures)

@@ -227,6 +227,14 @@ def test_the_weights_of_a_checkpoint_count_and_an_average_is_named(
     assert [names[1] in record.getMessage() for record in caplog.records] == [True] * has_average
 
 
+def test_weights_of_an_average_by_torch_are_read(tmp_path):
+    average = torch.optim.swa_utils.AveragedModel(nn.Linear(3, 2))
+    torch.save(average.state_dict(), tmp_path / "a.pth")
+    network = nn.Linear(3, 2)
+    network.load_state_dict(read_weights(tmp_path / "a.pth"))
+    assert torch.equal(network.weight, average.module.weight)
+
+
 def test_the_suffix_of_safetensors_may_be_in_upper_case(tmp_path):
     path = tmp_path / "a.SAFETENSORS"
     safetensors.torch.save_file({"weight": torch.ones(2)}, path)

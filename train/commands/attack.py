@@ -398,7 +398,8 @@ def _check_lines(checks: Mapping[str, Any], uses_gradients: bool) -> list[str]:
         zero_gradient = f", without a gradient at the start in {checks['zero_gradient']:.0%}"
     # A cost is lower after the attack if the network is less sure of the right class.
     return [
-        "log-probability of the right class over all views (less a target's): "
+        "cost (of a classifier, the log-probability of the right class over all views, less a "
+        "target's): "
         f"{checks['cost_before']:.2f} before, {checks['cost']:.2f} after; "
         f"lower in {checks['cost_fell']:.0%}{zero_gradient}",
         f"random changes of the same size, one for each {unit}, succeed on "

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from augment.progress import progress
-from augment.random_streams import generator
+from augment.random_streams import generator, seeded
 from augment.tasks.classification import class_index
 from renderer.errors import InputError, describe, explained
 from renderer.io.images import crop_center, read_rgb
@@ -195,9 +195,7 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
             if seed is None:
                 image = crop_center(image, size)
             else:
-                with torch.random.fork_rng(devices=[]):
-                    # `torch.manual_seed` would also seed the generators of GPUs.
-                    torch.default_generator.manual_seed(seed)
+                with seeded(seed):
                     image = self._crop(image)
             return torch.from_numpy(np.array(image)).permute(2, 0, 1), errors
         return torch.zeros(3, size, size, dtype=torch.uint8), errors

@@ -215,6 +215,20 @@ def test_a_function_may_take_and_return_tensors_or_arrays(function):
         torch.testing.assert_close(classifier(images), images.mean((2, 3)))
 
 
+def test_a_function_of_arrays_may_call_a_network_in_mixed_precision():
+    """NumPy has no bfloat16, which autocast would return from the network in the function."""
+    network = torch.nn.Linear(3, 2).eval()
+    classifier = augment.Classifier(
+        lambda images: network(torch.from_numpy(images.mean((2, 3)))).detach().numpy(),
+        4,
+        ["a", "b"],
+    )
+    images = torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(0))
+    with torch.autocast("cpu", torch.bfloat16):
+        scores = classifier(images)
+    torch.testing.assert_close(scores, network(images.mean((2, 3))))
+
+
 @pytest.mark.parametrize(
     ("class_count", "rounded"),
     [(3, lambda scores: np.round(scores, 3)), (100, lambda scores: scores.astype(np.float16))],

@@ -545,6 +545,18 @@ def test_what_changes_neither_shape_nor_color_is_named_once(tmp_path, feature):
     assert (mesh.corner_colors == 1).all()
 
 
+def test_a_texture_that_is_shown_without_shading_is_the_color(tmp_path):
+    """Blender 4.4 writes a texture that is connected to the shader Emission in this way."""
+    gltf = Gltf()
+    emitted = {"emissiveTexture": gltf.texture(color_texels(3, 4)), "emissiveFactor": [1, 1, 0.5]}
+    gltf.square(pbrMetallicRoughness={"baseColorFactor": [0, 0, 0, 1]}, **emitted)
+    with pytest.warns(UserWarning, match="black material") as record:
+        mesh = gltf.load(tmp_path)
+    assert len(record) == 1
+    assert_array_equal(mesh.textures[0], color_texels(3, 4))
+    assert_allclose(linear(mesh.corner_colors), np.broadcast_to([1, 1, 0.5], (2, 3, 3)), atol=1e-6)
+
+
 def two_parents() -> Gltf:
     nodes = [{"children": [i + 1, i + 1]} for i in range(40)]
     return with_entries(plain(), nodes=[*nodes, {"mesh": 0}])

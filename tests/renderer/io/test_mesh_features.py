@@ -126,14 +126,10 @@ ROWS = [
         )
     ),
     ("Kd", obj(mtl="Kd 1 0 0"), RED),
-    ("Kd of one number", obj(mtl="Kd 0.5"), GRAY),
+    ("Kd of one number", obj(mtl="Kd 0.5"), ASSUMED),
     ("Kd and vertex colors", obj(mtl="Kd 1 1 0", vertex="0 1 1"), GREEN),
     ("map_Kd", obj(mtl="map_Kd red.png", face=TEXTURED), RED),
-    (
-        "map_Kd, Kd and vertex colors",
-        obj(mtl="map_Kd red.png\nKd 0.5 1 1", vertex="1 0 0", face=TEXTURED),
-        (0.5, 0.0, 0.0),
-    ),
+    ("map_Kd and Kd", obj(mtl="map_Kd red.png\nKd 1 0 1", face=TEXTURED), RED),
     # As trimesh, nerfstudio and the models of YCB write them.
     *(
         (f"map_Kd, Kd {gray}", obj(mtl=f"Kd {gray}\nmap_Kd red.png", face=TEXTURED), outcome)
@@ -186,7 +182,6 @@ ROWS = [
     ("alpha 255", ply(f"{RGB};uchar alpha", at="255 0 0 255"), RED),
     ("alpha", ply(f"{RGB};uchar alpha", at="255 0 0 25"), REFUSED),
     ("face red", ply(face=RGB, of="255 0 0"), RED),
-    ("face and vertex red", ply(RGB, RGB, at="255 255 0", of="0 255 255"), GREEN),
     ("confidence", ply("float confidence", at="0.5"), IGNORED),
     ("material_index", ply(face="int material_index", of="1"), REFUSED),
     ("materials", ply(tail="element material 1;property int red;0"), REFUSED),
@@ -195,12 +190,12 @@ ROWS = [
         (f"texture, {u}", ply(f"float {u};float {v}", header=IMAGE, at="0 0"), RED)
         for u, v in (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
     ),
-    ("s without texture", ply("float s;float t", at="0 0"), WHITE),
+    ("s without texture", ply("float s;float t", at="0 0"), ASSUMED),
     ("texture without uvs", ply(header=IMAGE), REFUSED),
     ("texcoord", ply(face=UV, header=IMAGE, of=UVS), RED),
     ("texcoord of no face", ply(face=UV, header=IMAGE, of="0"), REFUSED),
     ("short texcoord", ply(face=UV, header=IMAGE, of="4 0 0 1 1"), REFUSED),
-    ("texcoord without texture", ply(face=UV, of=UVS), WHITE),
+    ("texcoord without texture", ply(face=UV, of=UVS), ASSUMED),
     ("texnumber 0", ply(face=NUMBERED, header=IMAGE, of=f"{UVS} 0"), RED),
     ("texnumber -1", ply(face=NUMBERED, header=IMAGE, of=f"{UVS} -1"), REFUSED),
     ("two textures", ply(face=UV, header=IMAGES, of=UVS), REFUSED),
@@ -255,6 +250,23 @@ ROWS = [
     ("attribute without a color", stl(31), WHITE),
     ("Magics", stl(31, b"COLOR=\x00\xff\x00\xff"), REFUSED),
 ]
+
+
+# Files in which two things have the same color. Both have RED, or half of it.
+TWICE = {
+    "map_Kd and vertex colors": obj(mtl="map_Kd red.png", vertex="0.5 0 0", face=TEXTURED),
+    "TextureFile and vertex colors": ply(f"{RGB};float s;float t", header=IMAGE, at="128 0 0 0 0"),
+    "TextureFile and face colors": ply(face=f"{UV};{RGB}", header=IMAGE, of=f"{UVS} 128 0 0"),
+    "face and vertex colors": ply(RGB, RGB, at="128 0 0", of="255 0 0"),
+}
+
+
+@pytest.mark.parametrize("files", TWICE.values(), ids=TWICE)
+def test_a_color_that_a_file_has_twice_counts_once(tmp_path, files):
+    with pytest.warns(UserWarning, match="taken") as caught:
+        colors = color_of(tmp_path, files)
+    assert len(caught) == 1
+    assert_allclose(colors, np.broadcast_to(RED, colors.shape))
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,13 @@
 """Spellings of .obj and .mtl files, and the files that they name."""
 
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import corners_of, png_of, srgb_of
+from oracles import corners_of, linear_of, png_of, srgb_of
 
 from renderer.errors import InputError
 from renderer.io.meshes import load_mesh
@@ -164,12 +165,18 @@ def test_vertex_colors_from_0_to_255_are_read_with_a_warning(tmp_path):
     assert_allclose(mesh.corner_colors[0], [[0.2, 0, 1]] * 3, atol=1e-7)
 
 
-def test_material_and_vertex_colors_are_multiplied_as_linear_values(tmp_path):
+# Blender writes linear colors. Other programs write sRGB, or do not say.
+@pytest.mark.parametrize(
+    ("head", "linear_gray"), [("", linear_of(0.5)), ("# Blender 4.4.0 MTL File: 'None'\n", 0.5)]
+)
+def test_material_and_vertex_colors_are_multiplied_as_linear_values(tmp_path, head, linear_gray):
     text = "mtllib m.mtl\nusemtl gray\n"
     text += "v 0 0 0 .5 .25 1\nv 1 0 0 .5 .25 1\nv 0 1 0 .5 .25 1\nf 1 2 3\n"
-    mesh = load(tmp_path, text, m="newmtl gray\nKd .5 .5 .5")
-    linear = [((value + 0.055) / 1.055) ** 2.4 for value in (0.5, 0.25, 1.0)]
-    expected = [srgb_of(linear[0] * value) for value in linear]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mesh = load(tmp_path, text, m=f"{head}newmtl gray\nKd .5 .5 .5")
+    assert bool(caught) == (head == "")
+    expected = [srgb_of(linear_gray * linear_of(value)) for value in (0.5, 0.25, 1.0)]
     assert_allclose(mesh.corner_colors[0], [expected] * 3, atol=1e-6)
 
 
