@@ -312,7 +312,11 @@ def read_stl(file: MeshFile) -> list[Part]:
                 f"its number of faces is taken as right, and the last {excess} bytes are ignored"
             )
         faces = np.frombuffer(content, _STL_FACE, face_count, _HEADER_SIZE)
-        has_colors = b"COLOR=" in header or bool((faces["attribute"] & 0x8000).any())
+        has_colors = bool((faces["attribute"] & 0x8000).any())
+        if b"COLOR=" in header:
+            # MeshLab writes a color into all headers, and attributes of 0.
+            has_colors = bool(faces["attribute"].any())
+            file.assume("the surface is taken as white, without the color of the header")
         coordinates = faces["corners"].astype(np.float64)
     if has_colors:
         raise ValueError("colors in .stl files are not supported: export the mesh as .ply")

@@ -198,7 +198,8 @@ def read_annotations(photos: Path) -> Annotations:
     if not photos.is_dir():
         raise InputError(f"photos={photos} does not exist: give a COCO file, or a folder", "photos")
     found = [*photos.glob("*.json"), *photos.glob("annotations/*.json")]
-    files = sorted(file for file in found if file.name != DATA_SET)
+    # Label Studio writes its labels as text files, and notes.json beside them.
+    files = sorted(file for file in found if file.name not in (DATA_SET, "notes.json"))
     if len(files) > 1:
         raise InputError(f"photos={photos} has {len(files)} JSON files: give one of them", "photos")
     return _read_coco(files[0]) if files else _read_yolo(photos)

@@ -51,7 +51,7 @@ def write_transforms(path: Path, **entries: object) -> None:
         # The camera has y up and z backward.
         pose[:3, :3] = from_camera.as_matrix() @ np.diag([1, -1, -1])
         pose[:3, 3] = -from_camera.apply(TRANSLATIONS[view])
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+        frames.append({"file_path": name, "transform_matrix": pose[: 3 + len(frames) % 2].tolist()})
     path.write_text(json.dumps({"frames": frames, "w": WIDTH, "h": HEIGHT, **entries}))
 
 

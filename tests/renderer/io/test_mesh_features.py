@@ -249,6 +249,7 @@ ROWS = [
     ("VisCAM", stl(0x8000 | 31 << 10), REFUSED),
     ("attribute without a color", stl(31), WHITE),
     ("Magics", stl(31, b"COLOR=\x00\xff\x00\xff"), REFUSED),
+    ("MeshLab", stl(0, b"VCG COLOR=\x7f\x7f\x7f\xff MATERIAL="), ASSUMED),
 ]
 
 

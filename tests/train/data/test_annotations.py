@@ -241,6 +241,7 @@ def test_the_images_of_val_are_read_and_no_others(tmp_path, entries):
     for name in ("images/val/a", "images/train/b", "details/c"):
         _draw(folder / f"{name}.png")
     (folder / "data_set.json").write_text("{}")
+    (folder / "notes.json").write_text("{}")
     place = tmp_path if "path: set" in entries else folder
     content = yaml.safe_load(entries) | {"names": ["cat"]}
     (place / "mine.yaml").write_text(yaml.safe_dump(content))
