@@ -22,6 +22,7 @@ from augment.distributed import rank
 from augment.progress import progress
 from renderer.errors import InputError, is_out_of_memory
 from renderer.image import straight_through, to_bytes, to_unit
+from renderer.modes import without_autocast
 from renderer.settings import Size, height_and_width
 
 # Number of images that a network sees at a time if nothing else is said.
@@ -273,8 +274,7 @@ class Function(nn.Module):
         detached = images.detach()
         given = detached if takes == DETACHED else detached.cpu().float().numpy()
         # A network in the function does not expect autocast, whose results NumPy may not know.
-        with torch.autocast(images.device.type, enabled=False):
-            outputs = self.function(given)
+        outputs = without_autocast(self.function)(given)
         if _is_structured(outputs):
             return outputs
         scores = torch.as_tensor(np.asarray(outputs)).to(images)
