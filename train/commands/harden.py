@@ -74,6 +74,9 @@ def harden(
     network with `nb.Detection(decode=...)` keeps the scores and boxes of all its
     candidates there. It has no losses, and takes no meshes.
 
+    `train.freeze` alone decides which weights are trained: those without `requires_grad`, such as
+    the first layers of detectors of torchvision, are trained, too.
+
     Args:
         network: A plain network from images to logits, in evaluation mode, or
             a `Classifier` that contains one. Or a detector that takes images
