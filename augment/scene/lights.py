@@ -27,6 +27,7 @@ from torch import Tensor
 from augment.scene import loops, patterns, surfaces
 from augment.scene.surfaces import Range, limits
 from renderer.errors import InputError, as_list, require_choice, require_number
+from renderer.image import straight_through
 from renderer.settings import Size, height_and_width
 
 # Ranges of the numbers that several models have.
@@ -489,7 +490,7 @@ class LowLight(LightModel):
         middle, slope, curve = self.response(radiance, drawn, strength, white)
         # middle + z (slope + z curve), limited to the range of the converter.
         signal = torch.addcmul(middle, z, torch.addcmul(slope, z, curve)).clamp(0, self.levels)
-        return _rounded(signal) * (white / self.levels)
+        return straight_through(signal, torch.round) * (white / self.levels)
 
     def response(
         self, radiance: Float[Tensor, "B C H W"], drawn: Drawn, strength: float, white: Tensor
@@ -517,13 +518,6 @@ def normal_noise(like: Float[Tensor, "B C H W"], seeds: Sequence[int]) -> Tensor
     for image, seed in zip(noise, seeds, strict=True):
         image.normal_(generator=torch.Generator(like.device).manual_seed(seed))
     return noise.to(like.dtype)
-
-
-def _rounded(values: Tensor) -> Tensor:
-    """Round values, with the gradient 1."""
-    if not values.requires_grad:
-        return values.round()
-    return values + (values.round() - values).detach()
 
 
 @dataclass(frozen=True)
