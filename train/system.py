@@ -86,6 +86,9 @@ def set_up_process() -> None:
         os.environ["PYTHONSAFEPATH"] = "1"
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     warnings.simplefilter("once", UserWarning, append=True)
+    # A stream is None if the shell has closed it (`>&-`).
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 (It stays open.)
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             # Characters that the terminal cannot show are printed as escapes.

@@ -101,6 +101,10 @@ def open_image(path: str | Path) -> Iterator[Image.Image]:
 def identify(file: BinaryIO) -> Image.Image:
     """Return the image in a stream of bytes, without decoding its pixels."""
     image = Image.open(file, formats=FORMATS)
+    # Pillow reads 16 bits as 8 if the channels of a TIFF file are stored one after the other.
+    bits = max(image.tag_v2.get(BITSPERSAMPLE, (1,))) if isinstance(image, TiffImageFile) else 8
+    if bits > 8 and "args=('R'," in str(image.tile):
+        raise ValueError("its channels of 16 bits are stored apart: save them interleaved")
     key = image.info.get("transparency")
     if image.format == "PNG" and key is not None:
         # Pillow keeps the upper 8 of 16 bits of colors, and multiplies gray values, but does not do

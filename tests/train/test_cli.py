@@ -259,6 +259,13 @@ def test_an_interrupt_while_torch_is_imported_is_one_line():
     assert ended.stderr == "ended by SIGINT\n"
 
 
+def test_a_command_may_print_if_the_shell_has_closed_its_outputs():
+    code = "import sys; from train.system import set_up_process; set_up_process(); "
+    code += "print(1); sys.stderr.write(str(sys.stderr.isatty()))"
+    command = ["sh", "-c", '"$0" -c "$1" >&- 2>&-', sys.executable, code]
+    assert subprocess.run(command, cwd=ROOT, timeout=100).returncode == 0
+
+
 def test_a_closed_output_pipe_ends_a_command_silently(capsys, monkeypatch):
     read, write = os.pipe()
     os.close(read)

@@ -207,8 +207,8 @@ def sweep(
     # torchrun sets this variable in the processes that it starts.
     if "TORCHELASTIC_RUN_ID" in os.environ:
         raise InputError("torchrun cannot start a sweep: start it with pnb-train --multirun")
-    if any(override.startswith("out=") for override in runs[0]):
-        raise InputError("out= is the folder of a single run: name that of a sweep with sweep=")
+    if any(override.startswith(("out=", "hydra.sweep.")) for override in runs[0]):
+        raise InputError("out= and hydra.sweep name no folder of a sweep: name it with sweep=")
     if "launcher=slurm" in runs[0] and not shutil.which("sbatch"):
         raise InputError("launcher=slurm needs the command sbatch: start on the cluster")
     if first_config.photographs_first:

@@ -7,7 +7,8 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -44,6 +45,9 @@ BATCH = 16
 # From the coordinates (x, y) in a stored image, as fractions of its sides, to those in the upright
 # one, by the EXIF orientation. Only these exchange width and height.
 TURNED = {
+    2: lambda x, y: (1 - x, y),
+    3: lambda x, y: (1 - x, 1 - y),
+    4: lambda x, y: (x, 1 - y),
     5: lambda x, y: (y, x),
     6: lambda x, y: (1 - y, x),
     7: lambda x, y: (1 - y, 1 - x),
@@ -63,6 +67,8 @@ class Annotated:
         boxes: Left, top, right and bottom of each object.
         labels: Indices of classes.
         is_crowd: Whether a box has a crowd, on which detections do not count.
+        is_stored: Whether the boxes are known to be those of the image as it is stored, before its
+            EXIF orientation turns it.
     """
 
     path: Path
@@ -71,6 +77,7 @@ class Annotated:
     boxes: Float[np.ndarray, "M 4"]
     labels: Int[np.ndarray, " M"]
     is_crowd: Bool[np.ndarray, " M"]
+    is_stored: bool = False
 
     @property
     def source(self) -> str:
@@ -246,10 +253,23 @@ def _read_coco(file: Path) -> Annotations:
             size = (image["width"], image["height"]) if image.get("width") else None
             if name in paths:
                 photographs.append(_annotated(paths[name], name, size, rows[key]))
+    if {True} == {*map(_fits_stored_image, photographs)} - {None}:
+        photographs = [replace(item, is_stored=True) for item in photographs]
     if not photographs:
         first = f", such as {missing[0]}" if missing else ""
         raise InputError(f"{file} names no image that exists{first}: move the images beside it")
     return Annotations(file, photographs, classes, missing)
+
+
+def _fits_stored_image(photograph: Annotated) -> bool | None:
+    """Whether boxes are those of an image as it is stored. None if its aspect ratio cannot tell."""
+    # An image that cannot be read is reported when it is needed.
+    with suppress(Exception), open_image(photograph.path) as image:
+        stored = np.array(image.size, float)
+        is_sideways = image.getexif().get(ExifTags.Base.Orientation, 1) > 4
+        if photograph.size and is_sideways and not _is_similar(stored, stored[::-1]):
+            return _is_similar(np.array(photograph.size, float), stored)
+    return None
 
 
 def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
@@ -301,8 +321,12 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
     # Labels of poses have keypoints after the box.
     has_keypoints = named.suffix.lower() in YAML and "kpt_shape" in _yaml_mapping(named)
     paths = _validation_images(named) if named.parent == folder else []
+    missing = [str(path) for path in paths if not path.is_file()]
     if paths:
         console.info("%s: the images of its entry val are read", named)
+        paths = [path for path in paths if path.is_file()]
+        if not paths:
+            raise InputError(f"{named} has no image of its entry val: the first is {missing[0]}")
     photographs = []
     # Label files that exist, and the number of their lines that repeat another.
     read: dict[Path, int] = {}
@@ -324,7 +348,8 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
         raise InputError(f"{fault}: add some, such as {first}", "photos")
     if repeated_count := sum(read.values()):
         console.warning("%s: %d lines that repeat another are left out", folder, repeated_count)
-    return Annotations(folder, photographs, classes, _labels_without_image(photographs, [*read]))
+    missing += _labels_without_image(photographs, [*read])
+    return Annotations(folder, photographs, classes, missing)
 
 
 def _labels_without_image(photographs: Sequence[Annotated], labels: Sequence[Path]) -> list[str]:
@@ -374,11 +399,19 @@ def _validation_images(file: Path) -> list[Path]:
         if path is None:
             console.warning("%s: its entry val names %s, which does not exist", file, place)
         elif path.is_file():
-            lines = path.read_text(encoding="utf-8-sig").splitlines()
-            found += [path.parent / line.strip() for line in lines if line.strip()]
+            found += [path.parent / line for line in _lines(path)]
         else:
             found += [path / item.path for item in find_unlabeled(path)]
+    if given and not found:
+        raise InputError(f"{file} has no image of its entry val: {given}", "photos")
     return found
+
+
+def _lines(file: Path) -> list[str]:
+    """Read the lines of a text file that are not empty."""
+    with explained(f"{file} is no text in UTF-8", "save it as UTF-8"):
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    return [line.strip() for line in lines if line.strip()]
 
 
 def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Path]:
@@ -398,11 +431,12 @@ def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Pa
                 listed = enumerate(names) if isinstance(names, list) else dict(names or {}).items()
                 known = {int(key): str(name) for key, name in listed}
             if known:  # Some indices may be missing.
+                if len(files) > 1 and not given and file.stem != "data":
+                    console.warning("%s: names of classes are read from it alone", file)
                 return tuple(known.get(i, str(i)) for i in range(max(known) + 1)), file
         for name in (*CLASS_FILES, *(f"labels/{name}" for name in CLASS_FILES)):
             if (parent / name).is_file():
-                lines = (parent / name).read_text(encoding="utf-8-sig").splitlines()
-                return tuple(line.strip() for line in lines if line.strip()), parent / name
+                return tuple(_lines(parent / name)), parent / name
     raise InputError(f"photos={folder} names no classes: add data.yaml or classes.txt", "photos")
 
 
@@ -457,19 +491,22 @@ def fit(photograph: Annotated, size: tuple[int, int], how: str) -> Fitted:
 def _upright_boxes(photograph: Annotated, upright: Float[np.ndarray, "2"]) -> np.ndarray:
     """Return boxes in the pixels of the upright photograph.
 
-    If only its stored, turned form has the aspect ratio of the annotation, the boxes are turned.
+    They are turned if only its stored form has the aspect ratio of the annotation, or if this holds
+    for other photographs of the file.
     """
     if photograph.size is None:
         return photograph.boxes
     marked = np.array(photograph.size, float)
     # Two opposite corners (M, 2, 2) of each box, as fractions of the sides.
     corners = photograph.boxes.reshape(-1, 2, 2) / marked
-    if photograph.size != (1, 1) and not _is_similar(marked, upright):
+    is_upright = photograph.size == (1, 1) or _is_similar(marked, upright)
+    if photograph.is_stored or not is_upright:
         with open_image(photograph.path) as image:
-            turn = TURNED.get(image.getexif().get(ExifTags.Base.Orientation, 1))
-        if turn is None or not _is_similar(marked[::-1], upright):
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+        if not is_upright and not (orientation > 4 and _is_similar(marked[::-1], upright)):
             fault = f"{photograph.path} has {upright[0]:g} × {upright[1]:g} pixels"
             raise InputError(f"{fault}, but its boxes are for {marked[0]:g} × {marked[1]:g}")
+        turn = TURNED.get(orientation, lambda x, y: (x, y))
         corners = np.stack(turn(corners[..., 0], corners[..., 1]), axis=-1)
     # A turn exchanges corners, so the sides are the smaller and larger coordinates.
     corners = np.concatenate([corners.min(1), corners.max(1)], axis=-1)

@@ -368,6 +368,19 @@ def test_gray_tiffs_are_read_by_their_tags(tmp_path, content, bits, photometric,
     np.testing.assert_array_equal(read(tmp_path / "a.tif")[0, :, 1], expected)
 
 
+def test_tiff_files_with_one_plane_of_16_bits_for_each_channel_are_refused(tmp_path):
+    """Pillow would read noise. The file has 2 × 1 pixels (TIFF 6.0, PlanarConfiguration)."""
+    tags = [(256, 3, 1, 2), (257, 3, 1, 1), (258, 3, 3, 8), (259, 3, 1, 1), (262, 3, 1, 2)]
+    tags += [(273, 4, 3, 14), (277, 3, 1, 3), (278, 3, 1, 1), (279, 4, 3, 26), (284, 3, 1, 2)]
+    content = struct.pack("<3H6I", *[16] * 3, 38, 42, 46, *[4] * 3) + bytes(range(12))
+    header = struct.pack("<2sHI", b"II", 42, 8 + len(content))
+    entries = b"".join(struct.pack("<HHII", *tag) for tag in tags)
+    file = header + content + struct.pack("<H", len(tags)) + entries + bytes(4)
+    (tmp_path / "a.tif").write_bytes(file)
+    with pytest.raises(InputError, match="stored apart"):
+        read_image(tmp_path / "a.tif", 2)
+
+
 @pytest.mark.parametrize("dtype", [np.int32, np.float32])
 def test_tiff_files_whose_white_is_unknown_are_refused(tmp_path, dtype):
     Image.fromarray(np.full((4, 4), 200, dtype)).save(tmp_path / "a.tif")

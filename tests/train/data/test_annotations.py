@@ -106,6 +106,20 @@ def test_boxes_fit_photographs_that_a_camera_has_turned(tmp_path, orientation, i
     assert fitted.boxes[0].tolist() == _bounds(fitted.pixels[0]) == _bounds(upright)
 
 
+@pytest.mark.parametrize("orientation", [1, 2, 3, 4])
+def test_all_boxes_of_a_file_are_turned_if_one_photograph_on_its_side_shows_it(
+    tmp_path, orientation
+):
+    """A program that ignores the orientation of one photograph ignores that of all."""
+    _draw(tmp_path / "a.png", orientation=6)
+    _draw(tmp_path / "b.png", orientation=orientation)
+    _write_coco(tmp_path / "a.json", ["a.png", "b.png"])
+    photographs = read_annotations(tmp_path).photographs
+    for photograph, size in zip(photographs, [(80, 40), (40, 80)], strict=True):
+        fitted = fit(photograph, size, STRETCH)
+        assert fitted.boxes[0].tolist() == _bounds(fitted.pixels[0])
+
+
 @pytest.mark.parametrize("how", [LETTERBOX, STRETCH])
 @pytest.mark.parametrize(("size", "border"), [((80, 80), 1 / 2), ((40, 120), 1 / 3)])
 def test_boxes_follow_the_pixels_to_the_size_of_the_network(tmp_path, how, size, border):
@@ -256,6 +270,30 @@ def test_the_images_of_val_are_read_and_no_others(tmp_path, entries):
     assert read_annotations(place / "mine.yaml").classes == ("cat",)
 
 
+def test_missing_images_of_val_are_counted_and_a_val_without_images_is_refused(tmp_path):
+    _draw(tmp_path / "a.png")
+    (tmp_path / "a.txt").write_text("0 0.5 0.5 0.2 0.2\n")
+    (tmp_path / "val.txt").write_text("a.png\nb.png\n")
+    (tmp_path / "data.yaml").write_text("{names: [cat], val: val.txt}")
+    read = read_annotations(tmp_path)
+    assert ([item.name for item in read.photographs], len(read.missing)) == (["a.png"], 2)
+    assert read.missing[0] == str(tmp_path / "b.png")
+    for place in ("elsewhere", "[elsewhere, val.txt]"):
+        (tmp_path / "data.yaml").write_text(f"{{names: [cat], val: {place}}}")
+        (tmp_path / "val.txt").write_text("b.png\n")
+        with pytest.raises(InputError, match="has no image of its entry val"):
+            read_annotations(tmp_path)
+
+
+def test_a_choice_among_several_files_of_names_is_said(tmp_path, caplog):
+    _draw(tmp_path / "a.png")
+    (tmp_path / "a.txt").write_text("0 0.5 0.5 0.2 0.2\n")
+    for name, stem in (("cat", "first"), ("dog", "second")):
+        (tmp_path / f"{stem}.yaml").write_text(f"names: [{name}]")
+    assert read_annotations(tmp_path).classes == ("cat",)
+    assert "first.yaml" in caplog.text
+
+
 WRONG_LINES = (
     b"2 .5 .5 .1 .1",
     b"0 40 20 10 10",
@@ -271,12 +309,14 @@ WRONG_LINES = (
         ("data.yaml", b"names: {cat: 0}", "give names as a list"),
         ("data.yaml", b"{names: [cat], val: 5}", "has val: 5"),
         ("a.txt", b"\xff\xfe\x00", "no text"),
+        ("classes.txt", b"\xfcber", "save it as UTF-8"),
         *(("a.txt", b"0 0.5 0.5 0.1 0.1\n" + line, r"line 2 of .*a\.txt") for line in WRONG_LINES),
     ],
 )
 def test_wrong_files_and_lines_of_yolo_are_refused(tmp_path, file, content, message):
     _draw(tmp_path / "a.png")
-    (tmp_path / "data.yaml").write_text("names: [cat, dog]\n")
+    if file != "classes.txt":
+        (tmp_path / "data.yaml").write_text("names: [cat, dog]\n")
     (tmp_path / "a.txt").write_text("0 0.5 0.5 0.1 0.1\n")
     (tmp_path / file).write_bytes(content)
     with pytest.raises(InputError, match=message):
