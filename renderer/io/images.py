@@ -153,7 +153,7 @@ def read_rgb(path: str | Path, min_side: int) -> Image.Image:
 
 def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None]:
     """Return upright colors (L, RGB or CMYK) and opacity (L or None) with 8 bits per channel."""
-    ImageOps.exif_transpose(image, in_place=True)
+    turn_upright(image)
     image = eight_bits(image)
     if image.mode == "La":
         image = image.convert("LA")
@@ -169,6 +169,15 @@ def color_and_alpha(image: Image.Image) -> tuple[Image.Image, Image.Image | None
     if image.mode in ("L", "CMYK"):
         return image, None
     return image.convert("L" if is_gray else "RGB"), None
+
+
+def turn_upright(image: Image.Image) -> None:
+    """Turn an image in place, as its EXIF orientation says."""
+    # Pillow keeps the orientation. It would also write the other EXIF data again, and fail if a
+    # camera wrote them against the rules.
+    image.getexif()
+    image.info.pop("exif", None)
+    ImageOps.exif_transpose(image, in_place=True)
 
 
 def crop_center(image: Image.Image, size: Size) -> Image.Image:

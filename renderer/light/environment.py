@@ -183,6 +183,9 @@ def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]
     # Call `read` first, because `get_pixels` ends the process if it cannot read the file.
     if not image.read():
         raise OSError(image.geterror())
+    # It also ends the process for deep images.
+    if image.spec().deep:
+        raise ValueError("it is a deep image: save it flat")
     texels = image.get_pixels("float")
     spec = image.spec()
     if image.file_format_name not in ("hdr", "openexr"):
@@ -223,7 +226,9 @@ def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
                 # One number is broadcast to three channels, and two raise an error.
                 factors *= np.array(value.split(), dtype=float)
             elif key == "PRIMARIES":
-                chromaticities = [float(number) for number in value.split()]
+                numbers = [float(number) for number in value.split()]
+                # Photoshop writes zeros if it does not know them.
+                chromaticities = numbers if any(numbers) else REC_709
             elif key == "GAMMA" and float(value) != 1:
                 raise ValueError(f"GAMMA={value.strip()} is not linear: save linear radiance")
     if not ((factors > 0) & (factors <= MAX_MAGNITUDE)).all():

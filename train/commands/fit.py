@@ -9,14 +9,20 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy.lib.stride_tricks import sliding_window_view
-from PIL import ImageOps
 
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings, RendererSettings
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, explained, import_package, require_file
 from renderer.image import decode, encode
-from renderer.io.images import eight_bits, open_image, read_image, read_rgb, write_image
+from renderer.io.images import (
+    eight_bits,
+    open_image,
+    read_image,
+    read_rgb,
+    turn_upright,
+    write_image,
+)
 from renderer.light.files import save_light
 from renderer.photograph import fit_photograph
 from train.cli import quoted
@@ -185,7 +191,7 @@ def _levels(path: str) -> np.ndarray:
 def _pixels(path: str) -> np.ndarray:
     """Read the opacity or the only channel of an image, (H, W), or else its colors, (H, W, 3)."""
     with open_image(path) as image:
-        ImageOps.exif_transpose(image, in_place=True)
+        turn_upright(image)
         if image.has_transparency_data:
             rgba = np.asarray(eight_bits(image).convert("RGBA"))
             alpha = rgba[..., 3]

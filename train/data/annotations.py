@@ -11,7 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
+from unicodedata import normalize
 
 import numpy as np
 import yaml
@@ -22,7 +23,7 @@ from augment.settings import NO_CLASS_PIXEL
 from renderer.errors import InputError, explained
 from renderer.io.images import SUFFIXES, gray_factor, open_image, read_rgb
 from train import console
-from train.data.photographs import find_unlabeled, visible_files
+from train.data.photographs import find_unlabeled, is_hidden, visible_files
 
 # Ways to bring a photograph to the size of a network.
 LETTERBOX = "letterbox"
@@ -30,6 +31,8 @@ STRETCH = "stretch"
 FITS = {LETTERBOX: "fitted into {} pixels with gray borders", STRETCH: "stretched to {} pixels"}
 # Gray of the borders, as in Ultralytics.
 BORDER = 114
+# Forms of Unicode in which names of files are written.
+FORMS: tuple[Literal["NFC", "NFD"], ...] = ("NFC", "NFD")
 # The aspect ratio of a photograph may differ by this factor from that of its annotation.
 MAX_RATIO = 1.02
 # File of the settings of `pnb-render` in the folder of its renders.
@@ -206,7 +209,8 @@ def read_annotations(photos: Path) -> Annotations:
         raise InputError(f"photos={photos} does not exist: give a COCO file, or a folder", "photos")
     found = [*photos.glob("*.json"), *photos.glob("annotations/*.json")]
     # Label Studio writes its labels as text files, and notes.json beside them.
-    files = sorted(file for file in found if file.name not in (DATA_SET, "notes.json"))
+    others = (DATA_SET, "notes.json")
+    files = sorted(file for file in found if file.name not in others and not is_hidden(file.name))
     if len(files) > 1:
         raise InputError(f"photos={photos} has {len(files)} JSON files: give one of them", "photos")
     return _read_coco(files[0]) if files else _read_yolo(photos)
@@ -371,7 +375,9 @@ def _label_files(path: Path) -> list[Path]:
     if "images" in parts:
         place = len(parts) - 1 - parts[::-1].index("images")
         files.insert(0, Path(*parts[:place], "labels", *parts[place + 1 :]).with_suffix(".txt"))
-    return files
+    # Accents in names may have another form of Unicode, since archives of a Mac change them.
+    forms = [file.with_name(normalize(form, file.name)) for file in files for form in FORMS]
+    return [*files, *forms]
 
 
 def _yaml_mapping(file: Path) -> dict[str, Any]:

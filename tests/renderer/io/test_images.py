@@ -116,6 +116,19 @@ def test_a_photograph_with_an_icc_profile_becomes_srgb(tmp_path, suffix, primari
     assert np.abs(read(path) - COLOR).max() <= (3 if suffix == "jpg" else 2)
 
 
+def test_a_photograph_is_turned_beside_exif_data_of_the_wrong_type(tmp_path):
+    """The orientation is 6, and the resolution is a text instead of a fraction."""
+    pixels = np.zeros((8, 16, 3), np.uint8)
+    pixels[:, :8] = 255
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", quality=100)
+    start, rest = np.split(np.fromfile(tmp_path / "a.jpg", np.uint8), [2])
+    tags = struct.pack("<HHHIIHHI", 2, 0x112, 3, 1, 6, 0x11A, 2, 4) + b"72\0\0" + bytes(4)
+    exif = b"Exif\0\0II*\0\x08\0\0\0" + tags
+    segment = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif
+    (tmp_path / "a.jpg").write_bytes(start.tobytes() + segment + rest.tobytes())
+    assert np.abs(read(tmp_path / "a.jpg") - np.rot90(pixels, -1)).max() < 5
+
+
 def test_alpha_palettes_and_turned_images_keep_their_pixels_beside_a_profile(tmp_path):
     color = tuple(map(int, stored(DISPLAY_P3, None)))
     content = profile(b"RGB ", srgb_table(), DISPLAY_P3)

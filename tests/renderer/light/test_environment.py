@@ -209,6 +209,7 @@ def test_colors_beyond_rec_709_have_no_negative_radiance_and_a_warning(tmp_path)
         ("\tEXPOSURE=2", 1),
         ("GAMMA=1", 1),
         ("PRIMARIES=.64 .33 .3 .6 .15 .06 .3127 .329", 1),
+        ("PRIMARIES=0 0 0 0 0 0 0 0", 1),
     ],
 )
 def test_radiance_of_a_hdr_file_is_divided_by_all_factors_of_its_header(tmp_path, header, factors):
@@ -220,11 +221,24 @@ def test_radiance_of_a_hdr_file_is_divided_by_all_factors_of_its_header(tmp_path
 
 @pytest.mark.parametrize(
     "header",
-    ["GAMMA=2.2", "EXPOSURE=0", "EXPOSURE=nan", "COLORCORR=1 2", "PRIMARIES=0 0 0 0 0 0 0 0"],
+    ["GAMMA=2.2", "EXPOSURE=0", "EXPOSURE=nan", "COLORCORR=1 2", "PRIMARIES=0 0 0 0 0 0 .3 .3"],
 )
 def test_a_hdr_file_with_a_header_that_gives_no_radiance_is_refused(tmp_path, header):
     with pytest.raises(InputError, match=r"map\.hdr cannot be read"):
         read_map(write_hdr(tmp_path / "map.hdr", header, np.array([1, 0.5, 0.25])))
+
+
+def test_a_deep_image_is_refused(tmp_path):
+    """OpenImageIO ends the process if its pixels are read."""
+    spec = OpenImageIO.ImageSpec(2, 1, 3, OpenImageIO.FLOAT)
+    spec.deep = True
+    data = OpenImageIO.DeepData()
+    data.init(2, 3, [OpenImageIO.FLOAT] * 3, ["R", "G", "B"])
+    output = OpenImageIO.ImageOutput.create("a.exr")
+    assert output.open(str(tmp_path / "a.exr"), spec) and output.write_deep_image(data)
+    output.close()
+    with pytest.raises(InputError, match="deep image"):
+        read_map(tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize(

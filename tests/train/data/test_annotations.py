@@ -52,6 +52,8 @@ def _write_coco(file, names=("a.png",), size=(80, 40), box=BOX, **changes):
 def test_images_of_coco_are_found_in_subfolders(tmp_path, file, image, name):
     _draw(tmp_path / image)
     _write_coco(tmp_path / file, [name])
+    # A Mac writes such files on disks of other systems.
+    (tmp_path / file).with_name("._a.json").write_bytes(b"\0\5\x16\7")
     read = read_annotations(tmp_path / file)
     (photograph,) = read.photographs
     assert photograph.path == read_annotations(tmp_path).photographs[0].path == tmp_path / image
@@ -283,6 +285,14 @@ def test_missing_images_of_val_are_counted_and_a_val_without_images_is_refused(t
         (tmp_path / "val.txt").write_text("b.png\n")
         with pytest.raises(InputError, match="has no image of its entry val"):
             read_annotations(tmp_path)
+
+
+def test_names_of_labels_may_have_another_form_of_unicode(tmp_path):
+    _draw(tmp_path / "a\u0308pfel.png")
+    (tmp_path / "\u00e4pfel.txt").write_text("0 0.5 0.5 0.2 0.2\n")
+    (tmp_path / "classes.txt").write_text("apple\n")
+    read = read_annotations(tmp_path)
+    assert (len(read.photographs[0].boxes), read.missing) == (1, [])
 
 
 def test_a_choice_among_several_files_of_names_is_said(tmp_path, caplog):
