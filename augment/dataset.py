@@ -57,7 +57,8 @@ class LabeledRender:
             without maps.
         camera: Camera as numbers: "pose" (4 × 4, from the camera's axes right, up
             and back to the world), and "fx", "fy", "cx", "cy" in pixels, or
-            "width" of an orthographic image in world units.
+            "width" of an orthographic image in world units. `vary.rotation`
+            turns the object in the world, which is not stored.
         light: RGB coefficients of the light, times the exposure, shape (K, 3).
         mesh: Name of the mesh, or of the first of several.
     """

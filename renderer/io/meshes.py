@@ -169,7 +169,8 @@ def export_mesh(
         path: File to write, with the suffix .glb. Its folder is created.
         normals: Normals with which the renderer shades the mesh, "smooth" or
             "flat".
-        cameras: Cameras to write as nodes of the file, in this order.
+        cameras: Cameras to write as nodes of the file, in this order. glTF has no
+            off-center cameras: such a camera shows a larger image around the given one.
         first: Number of faces at the beginning of the mesh that are written
             before all other faces. None sorts all faces by texture and gloss.
         aspect: Width of the images of the cameras, divided by their height.
