@@ -20,7 +20,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from augment.dataset import LabeledRender
-from renderer.io.files import atomic_write, replacing
+from renderer.io.files import atomic_write, remove_unfinished, replacing
 from renderer.io.images import encode_image
 from train import console
 
@@ -216,6 +216,10 @@ class WebDataset(DataSet):
             with replacing(path) as temporary, tarfile.open(temporary, "w") as tar:
                 for render in group:
                     self._add(render, tar)
+
+    def finish(self) -> None:
+        """Remove what processes that were killed left of tar files."""
+        remove_unfinished(self.folder)
 
     def _add(self, render: LabeledRender, tar: tarfile.TarFile) -> None:
         """Add the files of a render to a tar file. The key of a sample ends at the first point."""

@@ -374,9 +374,13 @@ def test_parts_without_renders_are_left_out(meshes, tmp_path):
 
 def test_each_index_is_in_one_tar_file_however_often_a_shard_was_stopped(meshes, tmp_path):
     folder = write(meshes, tmp_path / "out", format="webdataset", shards=2, shard=0)
+    # A killed process leaves this file.
+    unfinished = folder / ".pnb-x.tmp"
+    unfinished.touch()
     with pytest.raises(InputError, match="shards"):
         write(meshes, folder, format="webdataset")
     write(meshes, folder, format="webdataset", shards=2, shard=1)
+    assert not unfinished.exists()
     found = []
     for path in folder.glob("*.tar"):
         with tarfile.open(path) as tar:
