@@ -451,7 +451,7 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
         advice = f"did you mean {close[0]}?" if close else "--help shows all settings"
         return f"{key} is not a setting: {advice}"
     if isinstance(wrong, MissingConfigException) and wrong.missing_cfg_file:
-        group, _, choice = wrong.missing_cfg_file.rpartition("/")
+        group, _, choice = wrong.missing_cfg_file.partition("/")
         return _explain_choice(group, choice)
     if isinstance(wrong, OverrideParseException):
         advice = "give KEY=VALUE, as --help shows"

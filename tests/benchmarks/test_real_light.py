@@ -265,6 +265,11 @@ def test_objects_without_a_name_are_no_units():
     assert not folder_of(*named, ("orange/6.png", None)).has_objects("orange")
 
 
+def test_objects_of_a_class_count_one_by_one_only_if_all_have_a_name():
+    rows = [("orange/1.png", "1"), ("orange/2.png", None), ("apple/1.png", "1")]
+    assert folder_of(*rows).objects.tolist() == ["orange", "orange", "apple: 1"]
+
+
 def test_intervals_are_over_objects_only_if_each_light_shows_enough():
     plain = [(f"{side}/plain__{n}.png", n) for side in ("orange", "other_ball") for n in "12345"]
     dim = [(f"other_ball/dim__{n}.png", n) for n in "12345"]

@@ -352,7 +352,10 @@ def format_short_comparison(runs: Sequence[RunSummary], by: str = "source") -> s
             gain = difference(evaluations[method], evaluations[first], ALL, "auc")
         # The short table has no intervals, except for the gain.
         values = [format_interval(item and Estimate(item.value)) for item in shown]
-        rows.append([method, len(runs_of_method), *values, format_interval(gain, sign="+")])
+        count = str(len(runs_of_method))
+        if 0 < len(of_method) < len(runs_of_method):
+            count = f"{len(of_method)} scored of {count}"
+        rows.append([method, count, *values, format_interval(gain, sign="+")])
     titles = [TITLES[name] for name in SHORT_METRICS]
     header = ["network", "runs", _accuracy_title(runs), *titles, "gain in AUC [95%]"]
     return str(Table(title, header, rows).without_unknown_columns)

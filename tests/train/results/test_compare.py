@@ -147,6 +147,14 @@ def test_a_report_tells_what_was_trained_with_renders_and_on_which_images_networ
     assert ("“images”" in text) == is_run
 
 
+def test_the_short_table_says_how_many_runs_its_scores_are_of(scored_run, made_up_run, tmp_path):
+    scored = scored_run("none", STUDIO_AND_WEB)
+    other = made_up_run(tmp_path / "unscored", "none", {}, "seed=1")
+    text = comparison.format_short_comparison([summarize(scored), summarize(other)])
+    ((header, row),) = read_markdown(text).values()
+    assert row[header.index("runs")] == "1 scored of 2"
+
+
 class TestAHardenedNetwork:
     @pytest.fixture
     def initial(self, scored_run) -> Path:
