@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw_uniform, linear_of, patchwork, textured
+from oracles import draw_uniform, fragments_of, linear_of, patchwork, square, textured
 from scipy.ndimage import map_coordinates
 
 from renderer.camera import OrthographicCamera
@@ -14,22 +14,17 @@ from renderer.mesh import Mesh
 from renderer.settings import ENCODINGS, ImageSettings
 from renderer.surface.albedo import face_albedo, paint_faces, surface_albedo, with_added_albedo
 from renderer.surface.gloss import sample_gloss
-from renderer.visibility import choose
-from renderer.visibility.fragments import Fragments, build_fragments
+from renderer.visibility.fragments import Fragments
 
 EPS = torch.finfo(torch.float64).eps
 # Camera whose image shows x to the right and y up, from -1 to 1.
 ABOVE = OrthographicCamera(0, -90.0, 2.0)
-# A square that fills this image, and its texture coordinates.
-SQUARE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
-SQUARE_FACES = [[0, 1, 2], [0, 2, 3]]
+# Texture coordinates of a square that fills this image.
 UNIT_UVS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def view(mesh: Mesh, size: int, samples: int = 1, camera: OrthographicCamera = ABOVE) -> Fragments:
-    settings = ImageSettings(size, samples)
-    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("numpy"))
-    return fragments
+    return fragments_of(mesh, camera, ImageSettings(size, samples))
 
 
 def random_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
@@ -37,8 +32,8 @@ def random_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
 
 
 def poster(texture: np.ndarray, uvs=UNIT_UVS, color=(1.0, 1.0, 1.0)) -> Mesh:
-    square = Mesh.plain(SQUARE, SQUARE_FACES, color)
-    return textured(square, np.asarray(uvs)[SQUARE_FACES], texture)
+    mesh = square(1, color=color)
+    return textured(mesh, np.asarray(uvs)[mesh.faces], texture)
 
 
 def patchwork_sphere() -> Mesh:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw_uniform, mesh_of, named_mesh
+from oracles import draw_uniform, mesh_of, named_mesh, relative_error, square
 from torch import Tensor
 
 import renderer
@@ -72,10 +72,6 @@ def differences(image: ChangedImage, directions: Tensor, samples: int, step: flo
         backward = smooth_sums(image(-step * direction, samples))
         rows.append((forward - backward) / (2 * step))
     return torch.stack(rows)
-
-
-def relative_error(found: Tensor, expected: Tensor) -> float:
-    return float((found - expected).norm() / expected.norm())
 
 
 def moved_vertices(mesh: renderer.Mesh, camera: Camera, size: int, normals: str) -> ChangedImage:
@@ -168,36 +164,31 @@ def test_the_highlight_of_a_lamp_on_a_large_mirror_moves_with_the_camera():
     names = ["polar", "azimuth"]
     metal = renderer.Gloss(0.5, 1.0)
     camera = replace(NEAR, polar=20.0)
-    image = moved_camera(square(2.5, 0.0), camera, names, 16, metal, light=None, lights=lights)
+    image = moved_camera(square(2.5), camera, names, 16, metal, light=None, lights=lights)
     directions = torch.eye(2, dtype=torch.float64)
     found = derivatives(image, directions, samples=4)
     expected = differences(image, directions, samples=4, step=0.1)
     assert relative_error(found, expected) < 0.03
 
 
-def square(half: float, height: float) -> renderer.Mesh:
-    corners = [[half * x, half * y, height] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    return renderer.Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
-
-
 def pyramid_on_the_ground() -> list[renderer.Mesh]:
     """Create a pyramid, and ground that hides its base by rounding and has the radiance 0.12."""
-    base = square(0.5, 0.0).vertices - np.array([0, 0, 1e-12])
+    base = square(0.5).vertices - np.array([0, 0, 1e-12])
     sides = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
-    ground = square(0.9, 0.0)
-    gray_ground = renderer.Mesh.plain(ground.vertices, ground.faces, (0.2, 0.2, 0.2))
+    gray_ground = square(0.9, color=(0.2, 0.2, 0.2))
     return [renderer.Mesh.plain([*base, [0, 0, 0.5]], sides), gray_ground]
 
 
+ABOVE, BELOW = (0, 0, 0.5), (0, 0, -0.5)
 GROWING = {
-    "before the background": ([square(0.5, 0.0)], 0.5),
-    "hiding a square": ([square(0.5, 0.5), square(0.3, 0.0)], 0.5),
-    "before an equal square": ([square(0.5, 0.5), square(0.9, 0.0)], 0.0),
+    "before the background": ([square(0.5)], 0.5),
+    "hiding a square": ([square(0.5, ABOVE), square(0.3)], 0.5),
+    "before an equal square": ([square(0.5, ABOVE), square(0.9)], 0.0),
     "before a square that ends less than a sample further": (
-        [square(0.5, 0.5), square(0.503, 0.0)],
+        [square(0.5, ABOVE), square(0.503)],
         0.0,
     ),
-    "hidden": ([square(0.5, -0.5), square(0.9, 0.0)], 0.0),
+    "hidden": ([square(0.5, BELOW), square(0.9)], 0.0),
     "a pyramid on the ground": (pyramid_on_the_ground(), 0.6 - 0.12),
 }
 
@@ -268,7 +259,7 @@ def test_gradients_by_single_vertices_converge_to_those_of_areas_as_samples_grow
 
 def test_a_growing_square_in_shadow_gains_its_perimeter_times_its_dark_radiance():
     """High walls around the square, outside of the image, hide most of the sky."""
-    floor = square(0.5, 0.0)
+    floor = square(0.5)
     rim = 3.0 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     low = np.column_stack([rim, np.full(4, -1.0)])
     high = np.column_stack([rim, np.full(4, 9.0)])
