@@ -47,6 +47,13 @@ def triangle_corners(folder: Path, gltf: Gltf) -> np.ndarray:
     return corners_of(gltf.load(folder))
 
 
+def normals_in(folder: Path) -> np.ndarray:
+    """Return the unit normals (F, 3 corners, 3) of the only part of the file that was loaded."""
+    [part] = read_parts(folder / "mesh.gltf")
+    _, normals = part.placed()
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
 POINTS = np.float32([[0, 0, 0], [1, 0, 0], [0, 2, 0], [1, 2, 0], [0, 4, 1]])
 
 
@@ -78,23 +85,20 @@ def test_sparse_arrays_replace_rows_of_an_array_or_of_zeros(tmp_path, has_base):
     assert_array_equal(triangle_corners(tmp_path, gltf), [expected])
 
 
-@pytest.mark.parametrize("dtype", [np.int8, np.uint16, np.float32])
-def test_quantized_positions_are_the_integers_of_the_file(tmp_path, dtype):
+@pytest.mark.parametrize(
+    ("points", "normalized", "expected"),
+    [
+        *((POINTS[:3].astype(dtype), False, POINTS[:3]) for dtype in ("int8", "uint16", "float32")),
+        # max(c / 127, -1), and alike for 16 bits.
+        (np.diag(np.int8([-128, 127, 64])), True, np.diag([-1, 1, 64 / 127])),
+    ],
+)
+def test_quantized_positions_are_those_of_the_specification(tmp_path, points, normalized, expected):
     gltf = Gltf()
     gltf.tree["extensionsUsed"] = gltf.tree["extensionsRequired"] = ["KHR_mesh_quantization"]
     gltf.tree["nodes"][0]["scale"] = [0.5, 0.5, 0.5]
-    gltf.mesh({"POSITION": POINTS[:3].astype(dtype)})
-    assert_array_equal(triangle_corners(tmp_path, gltf), POINTS[None, :3] / 2)
-
-
-def test_normalized_integers_are_those_of_the_specification(tmp_path):
-    """max(c / 127, -1), and alike for 16 bits."""
-    gltf = Gltf()
-    gltf.tree["extensionsUsed"] = ["KHR_mesh_quantization"]
-    points = np.int8([[-128, 0, 0], [127, 0, 0], [0, 64, 0]])
-    gltf.mesh({"POSITION": gltf.array(points, normalized=True)})
-    expected = [[-1, 0, 0], [1, 0, 0], [0, 64 / 127, 0]]
-    assert_allclose(triangle_corners(tmp_path, gltf), [expected], rtol=1e-12)
+    gltf.mesh({"POSITION": gltf.array(points, normalized)})
+    assert_allclose(triangle_corners(tmp_path, gltf), expected[None] / 2, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -359,10 +363,7 @@ def test_morph_targets_are_added_to_each_attribute(tmp_path):
     expected = POINTS[:3] + [0, 0, 0.5] + 0.25 * np.float32([[0] * 3, [4, 0, 0], [0] * 3])
     assert_allclose(corners_of(mesh)[0], expected, atol=1e-6)
     assert_allclose(linear(mesh.corner_colors)[0], [[0.4, 0.4, 1]] * 3, atol=1e-6)
-    [part] = read_parts(tmp_path / "mesh.gltf")
-    _, normals = part.placed()
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    assert_allclose(normals, [[[math.sqrt(0.5), 0, math.sqrt(0.5)]] * 3])
+    assert_allclose(normals_in(tmp_path), [[[math.sqrt(0.5), 0, math.sqrt(0.5)]] * 3])
 
 
 def test_nodes_with_translation_rotation_and_scale_place_their_meshes(tmp_path):
@@ -379,11 +380,8 @@ def test_nodes_with_translation_rotation_and_scale_place_their_meshes(tmp_path):
     expected = np.stack([-(-y + 5), x + 6, z + 7], axis=1)
     # A mirrored face has its corners in the opposite order.
     assert_allclose(triangle_corners(tmp_path, gltf)[0], expected[[0, 2, 1]], atol=1e-6)
-    [part] = read_parts(tmp_path / "mesh.gltf")
-    _, normals = part.placed()
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     normal = np.array([0.2, 0, 0.2]) / math.sqrt(0.08)
-    assert_allclose(normals, np.broadcast_to(normal, (1, 3, 3)), atol=1e-6)
+    assert_allclose(normals_in(tmp_path), np.broadcast_to(normal, (1, 3, 3)), atol=1e-6)
 
 
 def test_copies_of_a_mesh_share_its_texture(tmp_path):
@@ -514,6 +512,15 @@ def with_entries(gltf: Gltf, **entries: Any) -> Gltf:
     return gltf
 
 
+def with_mode(mode: int, **attributes: np.ndarray) -> Gltf:
+    """Return a square of triangles (mode 4), strips (5) or others with more attributes."""
+    gltf = plain()
+    primitive = gltf.tree["meshes"][0]["primitives"][0]
+    primitive["mode"] = mode
+    primitive["attributes"] |= {name: gltf.array(array) for name, array in attributes.items()}
+    return gltf
+
+
 def with_points() -> Gltf:
     gltf = plain()
     gltf.tree["meshes"][0]["primitives"].append({"attributes": {"POSITION": 0}, "mode": 0})
@@ -595,26 +602,13 @@ def short_morph_target() -> Gltf:
     return gltf
 
 
-def with_strips() -> Gltf:
-    gltf = plain()
-    gltf.tree["meshes"][0]["primitives"][0]["mode"] = 5
-    return gltf
-
-
-def with_colors_of_two_numbers() -> Gltf:
-    gltf = plain()
-    attributes = gltf.tree["meshes"][0]["primitives"][0]["attributes"]
-    attributes["COLOR_0"] = gltf.array(np.ones((4, 2), np.float32))
-    return gltf
-
-
 REFUSED = {
     "an array overlaps itself": changed("bufferViews", byteStride=0),
     "overlaps itself or leaves": changed("bufferViews", byteStride=8),
     "a morph target has 1 entries": short_morph_target(),
-    "strips or fans": with_strips(),
+    "strips or fans": with_mode(5),
     "EXT_mesh_gpu_instancing": with_entries(plain(), extensionsUsed=["EXT_mesh_gpu_instancing"]),
-    "COLOR_0": with_colors_of_two_numbers(),
+    "COLOR_0": with_mode(4, COLOR_0=np.ones((4, 2), np.float32)),
     "armature": with_entries(plain(), nodes=[{"mesh": 0, "skin": 0}]),
     "leaves its buffer view": changed("accessors", byteOffset=-4),
     "KHR_draco_mesh_compression": with_entries(
