@@ -31,11 +31,7 @@ def extended(values: ArrayLike) -> np.ndarray:
     return np.asarray(values, dtype=np.longdouble)
 
 
-def exact(values: ArrayLike) -> np.ndarray:
-    return _to_exact(values)
-
-
-_to_exact = np.frompyfunc(MP.mpf, 1, 1)
+exact = np.frompyfunc(MP.mpf, 1, 1)
 _exact_sqrt = np.frompyfunc(MP.sqrt, 1, 1)
 _exact_imaginary_part = np.frompyfunc(lambda number: number.imag, 1, 1)
 

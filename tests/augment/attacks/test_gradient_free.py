@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -14,6 +12,7 @@ from renderer.errors import InputError
 from renderer.light.files import load_light
 from renderer.light.nonnegative import project_nonnegative
 
+LIGHTING = augment.StepSettings("linf", 0.2)
 OPTIMIZERS = ["random_search", "cma_es"]
 BALLS = [augment.StepSettings("linf", 0.05), augment.StepSettings("l2", 0.2)]
 
@@ -70,10 +69,9 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
     if shared:  # Similar views are fooled together.
         options["cameras"] = [OrthographicCamera(60.0, azimuth, 2.2) for azimuth in (0.0, 2.0)]
     scene = augment.build_scene([("solid:orange", 0)], 8, views=2, **options)
-    lighting = augment.StepSettings("linf", 0.2)
     options = {"max_queries": 40, "allow_negative": True, "quantized": False, "noise_margin": 1.0}
     options |= {"optimizer": optimizer, "sensor_noise": noise}
-    settings = augment.AttackSettings(lighting=lighting, **options)
+    settings = augment.AttackSettings(lighting=LIGHTING, **options)
     gray = 2  # images with which the network is checked
     result = augment.attack(function, scene, settings=settings, force=True)
     probes = 1
@@ -119,25 +117,24 @@ def test_a_numpy_function_and_a_file_of_onnx_give_the_adversary_of_the_torch_net
     path = tmp_path / "network.onnx"
     options = {"input_names": ["images"], "dynamic_axes": {"images": {0: "N"}}}
     torch.onnx.export(network, (torch.rand(1, 3, 8, 8),), path, dynamo=False, **options)
-    scene = augment.build_scene([("solid:orange", 0)], 8, rasterizer="numpy")
-    lighting = augment.StepSettings("linf", 0.2)
     search = {"optimizer": "random_search", "max_queries": 40, "allow_negative": True}
-    settings = augment.AttackSettings(lighting=lighting, **search)
     functions = [network, numpy_network, augment.load_classifier(str(path))]
-    torch_result, *others = [
-        augment.attack(function, scene, settings=settings, force=True) for function in functions
-    ]
+    torch_result, *others = [attack_orange(function, **search) for function in functions]
     assert torch_result.minimum.cost < torch_result.minimum.cost_before
     for other in others:
         assert torch.equal(other.minimum.values, torch_result.minimum.values)
         torch.testing.assert_close(other.logits, torch_result.logits, rtol=1e-4, atol=1e-5)
 
 
-def test_a_function_without_gradients_is_attacked_by_random_search_with_one_sentence():
+def attack_orange(network, classes=None, **settings) -> augment.AttackResult:
     scene = augment.build_scene([("solid:orange", 0)], 8, rasterizer="numpy")
-    settings = augment.AttackSettings(lighting=augment.StepSettings("linf", 0.2), max_queries=5)
+    chosen = augment.AttackSettings(lighting=LIGHTING, **settings)
+    return augment.attack(network, scene, settings=chosen, classes=classes, force=True)
+
+
+def test_a_function_without_gradients_is_attacked_by_random_search_with_one_sentence():
     with pytest.warns(UserWarning, match="random search attacks it with at most 5 queries"):
-        result = augment.attack(logits_of_means, scene, settings=settings, force=True)
+        result = attack_orange(logits_of_means, max_queries=5)
     assert result.settings.optimizer == "random_search"
 
 
@@ -165,16 +162,12 @@ LOSSES = {
 def test_networks_whose_images_lose_their_gradient_are_searched_or_refused(lost, is_module):
     network = Changed(LOSSES[lost]).eval()
     given = network if is_module else lambda images: network(images)
-    scene = augment.build_scene([("solid:orange", 0)], 8, rasterizer="numpy")
-    settings = augment.AttackSettings(lighting=augment.StepSettings("linf", 0.2), max_queries=5)
-    options = {"classes": ["red", "blue"], "force": True}
     with pytest.warns(UserWarning, match="random search attacks it"):
-        result = augment.attack(given, scene, settings=settings, **options)
+        result = attack_orange(given, ["red", "blue"], max_queries=5)
     assert result.settings.optimizer == "random_search"
     if lost != "rounded":
-        explicit = replace(settings, optimizer="gradient", max_queries=None)
         with pytest.raises(InputError, match="without a gradient"):
-            augment.attack(given, scene, settings=explicit, **options)
+            attack_orange(given, ["red", "blue"], optimizer="gradient")
         service = augment.AugmentationService.from_meshes([("solid:orange", 0)], 8, views=1)
         with pytest.raises(InputError, match="without a gradient"):
             service.regenerate(network, 0)

@@ -29,26 +29,6 @@ def own_lights(scene: Scene) -> Tensor:
     return scene.lights + 0.01 * offsets.to(scene.lights)
 
 
-SHAPES = {"vertices": (12, 3), "albedo": (20, 3), "pixels": (2, 3, 6, 6)}
-
-
-@pytest.mark.parametrize("part", [None, *SHAPES])
-def test_examples_in_any_order_have_the_same_images(make_scene, part):
-    scene = make_scene()
-    changes = {}
-    if part:
-        draws = torch.Generator().manual_seed(1)
-        changes[part] = 0.05 * torch.randn(3, *SHAPES[part], generator=draws).double()
-    if part == "vertices":
-        changes[part] += scene.vertices
-    lights = own_lights(scene)
-    rows = torch.tensor([0, 2, 2, 1, 0])
-    chosen = {name: value[rows] for name, value in changes.items()}
-    images = scene.render(Conditions(lights[rows], **chosen), rows)
-    expected = scene.render(Conditions(lights, **changes), EVERY)[rows]
-    torch.testing.assert_close(images, expected, rtol=0, atol=ROUNDING)
-
-
 def test_moved_vertices_look_like_a_mesh_built_with_them(make_scene, stone):
     """The outline moves too."""
     scene = make_scene()

@@ -196,16 +196,9 @@ def test_attacked_light_of_a_higher_degree_is_read_back_to_its_image(glossy, tmp
     torch.testing.assert_close(found, image, rtol=0, atol=1e-5)
 
 
-def test_each_mesh_is_rasterized_once_in_all_views_when_it_is_needed(rasterized):
-    scene = built("plate", "cup", views=4)
-    assert rasterized == []
-    every = torch.arange(len(scene))
-    scene.render(scene.conditions(every), every)
-    assert rasterized == [4, 4]
-
-
-def test_a_copy_in_other_light_is_not_rasterized_again_and_shows_that_light(rasterized):
+def test_each_mesh_is_rasterized_once_when_it_is_needed_and_not_again_in_other_light(rasterized):
     scene, fresh = (built("plate", "cup", views=4) for _ in range(2))
+    assert rasterized == []
     every = torch.arange(len(scene))
     scene.render(scene.conditions(every), every)
     copy = scene.changed(lights=scene.lights.flip(-1) / 2)

@@ -1,6 +1,5 @@
 """Meshes from files of every format that the tests write, with their colors and textures."""
 
-import base64
 import json
 import math
 import os
@@ -172,11 +171,6 @@ def test_textures_of_obj_are_found_by_the_names_of_any_system(tmp_path, texture,
     (folder / location).parent.mkdir(exist_ok=True)
     write(folder / location, encoded(TEXTURE))
     assert has_texture(load_mesh(path))
-
-
-def test_an_image_inside_of_a_gltf_is_read(tmp_path):
-    uri = "data:image/png;base64," + base64.b64encode(encoded(TEXTURE)).decode()
-    assert has_texture(load_mesh(write_gltf(tmp_path, {"uri": uri})))
 
 
 def test_names_and_comments_of_an_obj_may_be_latin_1(tmp_path):

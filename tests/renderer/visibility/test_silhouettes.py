@@ -74,6 +74,13 @@ def differences(image: ChangedImage, directions: Tensor, samples: int, step: flo
     return torch.stack(rows)
 
 
+def require_differences(image, directions, samples, finer_samples, step, bound) -> None:
+    """Compare derivatives with differences of new images that have more samples."""
+    found = derivatives(image, directions, samples)
+    expected = differences(image, directions, finer_samples, step)
+    assert relative_error(found, expected) < bound
+
+
 def moved_vertices(mesh: renderer.Mesh, camera: Camera, size: int, normals: str) -> ChangedImage:
     def image(change: Tensor, samples: int) -> Tensor:
         vertices = torch.from_numpy(mesh.vertices) + change
@@ -121,18 +128,14 @@ def test_gradients_by_vertices_are_differences_of_new_images(name, normals, came
     mesh = named_mesh(name)
     image = moved_vertices(mesh, camera, 64, normals)
     directions = displacements(torch.from_numpy(mesh.vertices))
-    found = derivatives(image, directions, samples=8)
-    expected = differences(image, directions, samples=20, step=0.02)
-    assert relative_error(found, expected) < BOUNDS.get(name, 0.02)
+    require_differences(image, directions, 8, 20, step=0.02, bound=BOUNDS.get(name, 0.02))
 
 
 def test_gradients_by_vertices_are_differences_of_new_images_of_a_few_pixels():
     mesh = named_mesh("mushroom")
     image = moved_vertices(mesh, NEAR, 32, "flat")
     directions = displacements(torch.from_numpy(mesh.vertices))[::3]
-    found = derivatives(image, directions, samples=8)
-    expected = differences(image, directions, samples=14, step=0.02)
-    assert relative_error(found, expected) < 0.02
+    require_differences(image, directions, 8, 14, step=0.02, bound=0.02)
 
 
 @pytest.mark.parametrize("camera", [FAR, TURNED], ids=["orthographic", "pinhole"])
@@ -143,20 +146,15 @@ def test_gradients_by_the_camera_are_differences_of_new_images(camera):
         names += ["principal_right", "principal_up", "pixel_aspect"]
     image = moved_camera(named_mesh("pear"), camera, names, 32)
     directions = torch.eye(len(names), dtype=torch.float64)
-    found = derivatives(image, directions, samples=8)
-    expected = differences(image, directions, samples=14, step=0.02)
-    assert relative_error(found, expected) < 0.02
+    require_differences(image, directions, 8, 14, step=0.02, bound=0.02)
 
 
 @pytest.mark.slow
 def test_gradients_by_the_camera_include_the_movement_of_highlights():
     metal = renderer.Gloss(0.5, 1.0)
     image = moved_camera(named_mesh("pear"), NEAR, ["polar", "azimuth"], 48, metal)
-    directions = torch.eye(2, dtype=torch.float64)
-    found = derivatives(image, directions, samples=8)
     # A smaller turn moves outlines across too few samples.
-    expected = differences(image, directions, samples=14, step=0.5)
-    assert relative_error(found, expected) < 0.1
+    require_differences(image, torch.eye(2, dtype=torch.float64), 8, 14, step=0.5, bound=0.1)
 
 
 def test_the_highlight_of_a_lamp_on_a_large_mirror_moves_with_the_camera():
@@ -165,10 +163,7 @@ def test_the_highlight_of_a_lamp_on_a_large_mirror_moves_with_the_camera():
     metal = renderer.Gloss(0.5, 1.0)
     camera = replace(NEAR, polar=20.0)
     image = moved_camera(square(2.5), camera, names, 16, metal, light=None, lights=lights)
-    directions = torch.eye(2, dtype=torch.float64)
-    found = derivatives(image, directions, samples=4)
-    expected = differences(image, directions, samples=4, step=0.1)
-    assert relative_error(found, expected) < 0.03
+    require_differences(image, torch.eye(2, dtype=torch.float64), 4, 4, step=0.1, bound=0.03)
 
 
 def pyramid_on_the_ground() -> list[renderer.Mesh]:

@@ -174,26 +174,6 @@ def test_gradients_are_central_differences(make_scene, fixed_visibility, names, 
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9 * largest)
 
 
-@pytest.mark.parametrize("gray", [0.0, 1.0])
-def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, gray):
-    """The gradient of the cross entropy is the sum of (p_c - [c = y]) W_c over the classes c."""
-    scene = make_scene(backgrounds=torch.full((3, 3, 6, 6), gray))
-    epsilon = 8 / 255
-    model = make_linear(4)
-    before = scene.render(scene.conditions(EVERY), EVERY)
-    logits = model(before.flatten(0, 1)).detach()
-    labels = logits.argmax(1)
-    residuals = logits.softmax(1) - torch.nn.functional.one_hot(labels, 4)
-    gradient = residuals @ model[1].weight.detach()
-    expected = (before + epsilon * gradient.sign().view_as(before)).clamp(0, 1)
-
-    problem = problem_of(scene, pixels=StepSettings("linf", epsilon, "sign", epsilon))
-    images = attack(model, problem, ClassCriterion(labels.view(3, 2)), steps=1).images
-    assert torch.equal(images, expected)
-    is_changed = (images - before).abs() > 0.99 * epsilon
-    assert is_changed.double().mean() > 0.4
-
-
 def test_an_attack_on_the_pixels_renders_only_the_examples_that_it_attacks(
     make_scene, make_linear, monkeypatch
 ):
