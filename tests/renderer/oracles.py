@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 from PIL import Image
-from scipy.special import sph_harm_y_all
+from scipy.special import roots_sh_legendre, sph_harm_y_all
 
 from renderer.camera import Camera
 from renderer.io.meshes import load_mesh
@@ -244,11 +243,9 @@ def directions_of(z: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
 @cache
 def half_hemisphere() -> tuple[np.ndarray, np.ndarray]:
     """Return directions with y > 0, densest where lobes are narrow, and twice their weights."""
-    node, weight = legendre.leggauss(100)
-    around, step = legendre.leggauss(50)
-    root = (node[:, None] + 1) / 2
-    fraction = (around + 1) / 2
-    solid_angles = weight[:, None] * root * 3 * math.pi * fraction**2 * step
+    root, weight = (values[:, None] for values in roots_sh_legendre(100))
+    fraction, step = roots_sh_legendre(50)
+    solid_angles = 4 * weight * root * 3 * math.pi * fraction**2 * step
     return directions_of(root**2, math.pi * fraction**3), solid_angles.ravel()
 
 

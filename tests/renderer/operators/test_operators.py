@@ -42,11 +42,6 @@ LAYOUTS = {
 }
 
 
-def multiply(operator: TransferOperator, lights: Tensor) -> Tensor:
-    reaching = lights[..., operator.nonzero, :].to(operator.transfer.dtype)
-    return torch.einsum("...kc,ckp->...cp", reaching, operator.by_channel)
-
-
 def background_of(kind: str, batch: tuple[int, ...]) -> float | Tensor:
     if kind == "gray":
         return 0.3
@@ -66,7 +61,9 @@ def compose(operator: TransferOperator, lights: Tensor, background: float | Tens
     behind = behind.expand(*lights.shape[:-2], 3, size, size).flatten(-2)
     uncovered = 1 - operator.coverage.to(lights)
     background_radiance = uncovered * decode(behind[..., operator.pixels], encoding)
-    values = multiply(operator, lights) + background_radiance
+    reaching = lights[..., operator.nonzero, :].to(operator.transfer.dtype)
+    radiance = torch.einsum("...kc,ckp->...cp", reaching, operator.by_channel)
+    values = radiance + background_radiance
     images = behind.clone()
     images[..., operator.pixels] = encode(values.clamp(0, 1), encoding)
     return images.unflatten(-1, (size, size))

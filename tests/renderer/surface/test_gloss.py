@@ -29,6 +29,7 @@ from oracles import (
     toward,
 )
 from scipy import optimize
+from scipy.special import roots_sh_legendre
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
@@ -67,12 +68,11 @@ def unit_vector(polar: float, azimuth: float = 0.0) -> np.ndarray:
 
 def hemisphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
     """Return directions (N, 3) above z = 0 at `rings` nodes of z, and their solid angles (N,)."""
-    node, weight = legendre.leggauss(rings)
-    z = (node[:, None] + 1) / 2
+    z, weight = roots_sh_legendre(rings)
     azimuth_count = 2 * rings
     azimuth = 2 * np.pi * (np.arange(azimuth_count) + 0.5) / azimuth_count
-    solid_angles = np.repeat(weight / 2 * 2 * np.pi / azimuth_count, azimuth_count)
-    return directions_of(z, azimuth), solid_angles
+    solid_angles = np.repeat(weight * 2 * np.pi / azimuth_count, azimuth_count)
+    return directions_of(z[:, None], azimuth), solid_angles
 
 
 COSINES = [1e-3, 0.02, 0.07, 0.2, 0.37, 0.6, 0.9, 0.99, 1 - 1e-5]
@@ -84,14 +84,13 @@ def quadrature_of_narrow_lobes(degree: int) -> Iterator[tuple[np.ndarray, Tensor
     The nodes are closest together near the horizon and towards +x. The harmonics (N, K) of order
     m < 0 are odd in y and count as 0.
     """
-    node, weight = legendre.leggauss(240)
-    around, step = legendre.leggauss(120)
-    fraction = (around + 1) / 2
+    node, weight = roots_sh_legendre(240)
+    fraction, step = roots_sh_legendre(120)
     azimuth = math.pi * fraction**2
     order = torch.arange((degree + 1) ** 2) - bands(degree) * (bands(degree) + 1)
-    for root, ring in zip(np.split((node + 1) / 2, 24), np.split(weight, 24), strict=True):
+    for root, ring in zip(np.split(node, 24), np.split(weight, 24), strict=True):
         directions = directions_of(root[:, None] ** 2, azimuth)
-        solid_angles = (ring * root)[:, None] * 2 * math.pi * fraction * step
+        solid_angles = (ring * root)[:, None] * 8 * math.pi * fraction * step
         values = basis(torch.from_numpy(directions), degree)
         yield directions, values * torch.from_numpy(solid_angles).reshape(-1, 1) * (order >= 0)
 
@@ -250,10 +249,9 @@ class GraySurface:
         return 1 - self.specular_factor * coat_albedo(cosine, self.roughness)
 
     def mean_transmitted(self) -> float:
-        node, weight = legendre.leggauss(12)
-        cosines = (node + 1) / 2
+        cosines, weight = roots_sh_legendre(12)
         fractions = np.array([self.transmitted(cosine) for cosine in cosines])
-        return float(weight / 2 @ (2 * cosines * fractions))
+        return float(weight @ (2 * cosines * fractions))
 
     def reflectance(self, cosine: float, light: np.ndarray) -> np.ndarray:
         heights, ring_of_light = np.unique(light[:, 2], return_inverse=True)
@@ -319,8 +317,7 @@ class FloorUnderSky:
     ZONAL = tuple(l * (l + 1) for l in range(7))
 
     def __init__(self, gloss: Gloss) -> None:
-        node, weight = legendre.leggauss(24)
-        cosines = torch.from_numpy((node + 1) / 2)
+        cosines, weight = map(torch.from_numpy, roots_sh_legendre(24))
         polar_angles = [math.degrees(math.acos(cosine)) for cosine in cosines]
         rows = []
         for polar in polar_angles:
@@ -329,7 +326,7 @@ class FloorUnderSky:
             rows.append(operator.by_channel[0, self.ZONAL, 0])
         self.transfer = torch.stack(rows)
         # 2 cosine d(cosine) over [0, 1].
-        self.measure = torch.from_numpy(weight) * cosines
+        self.measure = 2 * weight * cosines
         directions = torch.stack([0 * cosines, (1 - cosines**2).sqrt(), cosines], dim=1)
         self.harmonics = basis(directions, 6)[:, self.ZONAL]
 
@@ -386,7 +383,6 @@ def positive_light(degree: int) -> Tensor:
 
 def mitsuba_radiance(mesh, light, surface, sample_count) -> Tensor:
     """Render a mesh with interpolated normals in an environment or by an emitter, (3, 16, 16)."""
-    pytest.importorskip("mitsuba")
     with mitsuba() as module:
         sampler = {"type": "multijitter", "sample_count": sample_count}
         sensor = sensor_of(CAMERA, 16) | {"sampler": sampler}
