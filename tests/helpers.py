@@ -18,6 +18,15 @@ def bright_or_dark(images: Tensor) -> Tensor:
     return torch.stack([3 * mean, 0.4 + 0 * mean], dim=1)
 
 
+CHANNELS = ("orange", "lime", "sky")
+
+
+def by_channel(size: int, classes: tuple[str, ...] = CHANNELS, name: str = "") -> Classifier:
+    """Make a classifier whose logits are the mean red, green and blue, in the order of classes."""
+    channels = [CHANNELS.index(label) for label in classes]
+    return Classifier(lambda images: 30 * images.mean((2, 3))[:, channels], size, classes, name)
+
+
 def darker_than(limit: float, size: int = 8, name: str = "", scale: float = 100) -> Classifier:
     """Make a classifier that takes images darker than a limit on average for an orange."""
 

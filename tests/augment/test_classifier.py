@@ -161,10 +161,6 @@ def without_eval(network: nn.Sequential) -> nn.Module:
     return network
 
 
-def with_normalize(network: nn.Module) -> nn.Module:
-    return nn.Sequential(Normalize(MEAN, STD), network).eval()
-
-
 def with_pixel_mean(network: nn.Module) -> nn.Module:
     network.register_buffer("pixel_mean", torch.zeros(3))
     return network
@@ -176,7 +172,11 @@ def with_pixel_mean(network: nn.Module) -> nn.Module:
         (without_eval, {}, "training mode"),
         (lambda network: network.to("meta"), {"device": "cpu"}, "load its weights"),
         (lambda _: lambda images: {"scores": images.mean((2, 3))}, {}, "dict"),
-        (with_normalize, {"normalization": "imagenet"}, "Normalize"),
+        (
+            lambda network: nn.Sequential(Normalize(MEAN, STD), network).eval(),
+            {"normalization": "imagenet"},
+            "Normalize",
+        ),
         (with_pixel_mean, {"normalization": "imagenet"}, "pixel_mean"),
         (lambda network: network, {"classes": CLASSES[:2]}, "classes has 2 names"),
         (lambda network: network, {"normalization": BYTES}, "value_range"),
@@ -309,8 +309,8 @@ def save_onnx(
     softmax=False,
 ) -> str:
     """Write a graph of the means of x, which is of a kind such as FLOAT16, over its axes."""
-    pytest.importorskip("onnxruntime")
-    onnx = pytest.importorskip("onnx")
+    import onnx
+
     helper, kinds = onnx.helper, onnx.TensorProto
     nodes = [helper.make_node("Cast", ["x"], ["images"], to=kinds.FLOAT)]
     options = {"axes": axes, "keepdims": 0}

@@ -292,7 +292,6 @@ LOOPS = ("relit_bytes", "noisy_bytes", "ramps", "shadows", "lamps", "multiply_sl
 
 @pytest.mark.parametrize("name", [*lights.CastShadow().kinds, *MODELS])
 def test_the_light_of_the_loops_equals_that_of_torch(name, monkeypatch):
-    pytest.importorskip("numba")
     model = MODELS[name]() if name in MODELS else lights.CastShadow((name,))
     drawn = model.draw(draw_values(model, 3), (33, 65), seeds=[0, 1, 2])
     lit, mixed = model.illumination(drawn).total(), model.illumination(drawn, 0.3).total()

@@ -95,7 +95,6 @@ def test_a_renders_camera_and_light_are_found_before_any_background():
     ],
 )
 def test_a_path_traced_images_camera_and_light_are_found(tmp_path, name, camera, light_name, bound):
-    pytest.importorskip("mitsuba")
     mesh = named_mesh(name)
     light = positive_light(light_name)
     [traced] = path_traced(tmp_path, mesh, [camera], light, ImageSettings(64, bounces=3))

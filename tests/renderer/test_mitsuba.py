@@ -19,8 +19,6 @@ from renderer.operators import rays
 from renderer.settings import ImageSettings
 from renderer.solids import solid
 
-pytest.importorskip("mitsuba")
-
 # Number of independent images of Mitsuba, from which its noise is estimated.
 SEED_COUNT = 32
 # A correct image exceeds a bound of so many standard errors once in a million times.

@@ -3,6 +3,7 @@
 import faulthandler
 from dataclasses import replace
 
+import drjit
 import numpy as np
 import pytest
 import torch
@@ -19,8 +20,6 @@ from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss
 
-pytest.importorskip("mitsuba")
-drjit = pytest.importorskip("drjit")
 ASIDE = {"roll": 34.0, "center_x": 0.3, "principal_right": 0.3, "principal_up": -0.2}
 CAMERAS = [
     OrthographicCamera(57.3, 126.1, 2.3),

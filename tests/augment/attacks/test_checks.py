@@ -8,6 +8,7 @@ import augment
 from augment.attack_settings import StepSettings
 from augment.attacks.result import AttackResult, warnings
 from renderer.errors import InputError
+from tests.helpers import CHANNELS, by_channel
 
 SMALL_STEPS = {"lighting": StepSettings(step_size=0.02)}
 
@@ -129,18 +130,12 @@ def test_larger_balls_hold_the_successes_of_smaller_ones_and_more_than_random_dr
     assert (adversarial >= random).all()
 
 
-CLASSES = ("orange", "lime", "sky")
 TWO_VIEWS = {"views": 2, "backgrounds": [0.4]}
 BOTH = torch.arange(2)
 
 
-def network(classes: tuple[str, ...] = CLASSES, size: int = 12) -> augment.Classifier:
-    channels = [CLASSES.index(name) for name in classes]
-
-    def logits(images: Tensor) -> Tensor:
-        return 30 * images.mean((2, 3))[:, channels]
-
-    return augment.Classifier(logits, size, classes, f"{classes[0]}{size}")
+def network(classes=CHANNELS, size: int = 12) -> augment.Classifier:
+    return by_channel(size, classes, f"{classes[0]}{size}")
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,6 @@ BALLS = [augment.StepSettings("linf", 0.05), augment.StepSettings("l2", 0.2)]
 
 @pytest.mark.parametrize(("optimizer", "ball"), [*zip(OPTIMIZERS, BALLS, strict=True)])
 def test_no_candidate_leaves_the_ball_or_has_negative_light(attacked, monkeypatch, optimizer, ball):
-    pytest.importorskip("cma")
     rendered = []
     render = SceneProblem.render
 
@@ -57,7 +56,6 @@ def logits_of_means(images: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("optimizer", "noise"), [("random_search", 1.0), ("cma_es", 0.0)])
 @pytest.mark.filterwarnings("ignore:the light is negative")
 def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, noise, shared):
-    pytest.importorskip("cma")
     seen = []
 
     def function(images: np.ndarray) -> np.ndarray:
@@ -85,7 +83,6 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
 @pytest.mark.parametrize("optimizer", ["gradient", *OPTIMIZERS])
 @pytest.mark.parametrize("max_queries", [1, 20])
 def test_all_starts_together_show_at_most_that_number_of_images(attacked, optimizer, max_queries):
-    pytest.importorskip("cma")
     steps = {"lighting": augment.StepSettings("l2", 0.1)}
     options = {"optimizer": optimizer, "restarts": 2, "margin": 100.0}
     result = attacked(steps, max_queries=max_queries, **options)
@@ -102,8 +99,6 @@ def test_all_starts_together_show_at_most_that_number_of_images(attacked, optimi
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:You are using the legacy")
 def test_a_numpy_function_and_a_file_of_onnx_give_the_adversary_of_the_torch_network(tmp_path):
-    pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnx")
     with torch.random.fork_rng():
         torch.manual_seed(0)
         layers = [nn.Flatten(), nn.Linear(192, 8), nn.ReLU(), nn.Linear(8, 3)]
@@ -229,7 +224,6 @@ def test_rounded_probabilities_become_their_logarithms(class_count, rounded):
 def test_cma_es_warns_exactly_if_the_queries_of_a_start_pay_for_no_step(
     attacked, caplog, is_enough
 ):
-    pytest.importorskip("cma")
     steps = {"lighting": augment.StepSettings("l2", 0.1)}
     options = {"optimizer": "cma_es", "restarts": 1, "margin": 100.0}
     result = attacked(steps, max_queries=200 if is_enough else 18, **options)

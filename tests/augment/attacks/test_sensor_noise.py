@@ -1,6 +1,7 @@
 """An image counts as adversarial if it is so after a camera's noise and 8 bits."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -165,20 +166,14 @@ def test_noise_changes_no_descent_and_no_other_random_number_and_fewer_attacks_c
     assert with_noise.success.sum() < without.success.sum()
 
 
-class StillScene:
-    def __init__(self, views: Tensor):
-        self.views = views
-        self.start = torch.zeros(1, 1)
-        self.group_size = 1
-
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        return self.views[None] + 0 * values[:, :, None, None, None]
-
-    def scale_gradient(self, gradient: Tensor) -> Tensor:
-        return gradient
-
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return torch.zeros_like(values)
+def still_scene(views: Tensor) -> SimpleNamespace:
+    return SimpleNamespace(
+        start=torch.zeros(1, 1),
+        group_size=1,
+        render=lambda values, examples: views[None] + 0 * values[:, :, None, None, None],
+        scale_gradient=lambda gradient: gradient,
+        project=lambda values, examples: torch.zeros_like(values),
+    )
 
 
 @pytest.mark.parametrize(("leads", "steps"), [((20.0, 20.0), 0), ((20.0, 0.1), 3)])
@@ -192,7 +187,7 @@ def test_descent_goes_on_until_every_view_leads_by_the_noise_margin(leads, steps
     settings = augment.AttackSettings(
         max_steps=3, margin=0.0, sensor_noise=1.0, noise_margin=1.0, quantized=False
     )
-    result = minimize(StillScene(views), Objective(nervous(0.0), criterion, settings))
+    result = minimize(still_scene(views), Objective(nervous(0.0), criterion, settings))
     assert result.success.tolist() == [True]
     assert result.steps.tolist() == [steps]
 

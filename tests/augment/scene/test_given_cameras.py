@@ -10,6 +10,7 @@ import augment
 import renderer
 from augment.augmentation_settings import VariationSettings
 from augment.scene.vary import vary
+from tests.helpers import bright_or_dark
 
 SIZE = 24
 PLACE = np.array([120.0, -40.0, 15.0])
@@ -86,11 +87,7 @@ def test_a_pose_attack_turns_cameras_about_the_object():
 
 
 def test_an_attack_and_its_files_keep_pinhole_cameras(tmp_path):
-    def logits(images):
-        mean = images.mean((1, 2, 3))
-        return torch.stack([mean, 0.3 + 0 * mean], dim=1)
-
-    classifier = augment.Classifier(logits, size=SIZE, classes=["cup", "other"])
+    classifier = augment.Classifier(bright_or_dark, size=SIZE, classes=["cup", "other"])
     scene = placed_scene(silhouettes=True, samples=2)
     pose = augment.PoseSettings(radius=1.0)
     light = augment.StepSettings(step_size=0.5)

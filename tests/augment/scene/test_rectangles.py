@@ -18,6 +18,7 @@ from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.visibility import choose
+from tests.helpers import bright_or_dark
 
 ASIDE = {"roll": 34.0, "principal_right": 0.3, "principal_up": -0.2, "pixel_aspect": 1.1}
 CAMERAS = {
@@ -117,7 +118,6 @@ def test_the_camera_of_a_whole_photograph_shows_all_of_it(shape):
 
 @each_view
 def test_mitsuba_agrees(tmp_path, shape, camera):
-    pytest.importorskip("mitsuba")
     settings = ImageSettings(shape, 8)
     camera = replace(camera, pixel_aspect=1.0) if isinstance(camera, PinholeCamera) else camera
     light = torch.zeros(49, 3)
@@ -162,16 +162,11 @@ def test_varied_scenes_have_tables_and_effects_of_the_size(shape):
     assert varied.render(varied.conditions(examples), examples).shape == (2, 1, 3, *shape)
 
 
-def logits(images):
-    mean = images.mean((1, 2, 3))
-    return torch.stack([mean, 0.3 + 0 * mean], dim=1)
-
-
 def test_an_attack_is_saved_and_read_again(tmp_path):
     shape = SHAPES[1]
     scene = nb.build_scene([("solid:cup", "0")], shape, rasterizer="numpy", samples=1)
     steps = {"lighting": nb.StepSettings(step_size=0.5), "pixels": nb.StepSettings(step_size=0.1)}
-    result = nb.attack(logits, scene, settings=nb.AttackSettings(max_steps=2, **steps))
+    result = nb.attack(bright_or_dark, scene, settings=nb.AttackSettings(max_steps=2, **steps))
     assert result.images.shape == (1, 3, *shape)
     save(result, tmp_path)
     adversary = nb.reload(tmp_path / "example_000")
@@ -182,7 +177,7 @@ def test_an_attack_is_saved_and_read_again(tmp_path):
 
 
 def test_a_classifier_of_rectangles_refuses_other_images():
-    classifier = nb.Classifier(logits, (8, 12), ["0", "1"])
+    classifier = nb.Classifier(bright_or_dark, (8, 12), ["0", "1"])
     assert classifier(torch.zeros(2, 3, 8, 12)).shape == (2, 2)
     with pytest.raises(nb.InputError, match=r"\(2, 3, 12, 8\): give \(N, 3, 8, 12\)"):
         classifier(torch.zeros(2, 3, 12, 8))

@@ -66,7 +66,6 @@ def canvas(operator: TransferOperator, light: Tensor) -> np.ndarray:
 
 def mitsuba_image(folder: Path, mesh: Mesh, basis: LocalBasis, light: Tensor) -> np.ndarray:
     """Render each local light alone, since Mitsuba would choose one of several at random."""
-    pytest.importorskip("mitsuba")
     no_sky, settings = torch.zeros(49, 3), ImageSettings(SIZE)
     lights = [(basis, light)]
     if isinstance(basis, Lamps):

@@ -203,7 +203,6 @@ def test_a_material_is_read_back_to_its_image_and_written_as_gltfs_factors(writt
 @pytest.mark.parametrize("change", [(-0.5, 0.6, 0.8, 0.7), (-0.5, -1.5, 1.2, -0.7)])
 def test_mitsuba_shows_the_material_that_an_attack_leaves(tmp_path, change):
     """Mitsuba's varnish has Disney's diffuse part, which differs by 3% (rms) over a ball."""
-    pytest.importorskip("mitsuba")
     options = {"ground": TABLE, "shadows": True, "samples": 8, "polar": 40.0}
     scene = scene_of(egg(Gloss(0.5, 0.3, 0.4)), **options)
     scene = scene.changed(lights=scene.basis.project_nonnegative(scene.lights))
