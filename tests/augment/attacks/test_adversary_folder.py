@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from oracles import textured
+from oracles import draw_uniform, textured
 
 import augment
 from augment.attack_settings import PARAMETER_NAMES
@@ -155,8 +155,7 @@ def test_the_objects_of_an_adversary_are_read_back_with_their_truth(tmp_path):
 def test_exposure_albedo_scale_background_and_camera_are_kept(tmp_path, fov):
     """The example is as training draws them, with a camera that looks past the middle."""
     scene = augment.build_scene([("solid:orange", "orange")], 16, rasterizer="numpy", fov=fov)
-    draws = torch.Generator().manual_seed(0)
-    backgrounds = (255 * torch.rand(2, 3, 16, 16, generator=draws)).round() / 255
+    backgrounds = (255 * draw_uniform(2, 3, 16, 16).float()).round() / 255
     ((camera,),) = scene.cameras
     shifted = replace(camera, right=0.3, up=-0.2, width=3.0)
     example = Example(0, (shifted,), 1, exposure=1.7)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from oracles import draw_uniform
 from scipy.stats import norm
 from torch import Tensor
 
@@ -49,8 +50,7 @@ def counted(images, classifier, criterion=None) -> Tensor:
 @pytest.fixture(params=[0.3, 1.5])
 def with_lead(request) -> tuple[float, Tensor]:
     """Return images whose resemblance leads the threshold 0 by a number of deviations."""
-    draws = torch.Generator().manual_seed(1)
-    images = 0.3 + 0.4 * torch.rand(1500, 3, SIZE, SIZE, generator=draws)
+    images = 0.3 + 0.4 * draw_uniform(1500, 3, SIZE, SIZE, seed=1).float()
     wanted = request.param * CHANGE_BY_NOISE / (2 * GAIN)
     missing = wanted - resemblance(images)
     direction = PATTERN / PATTERN.square().sum()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from oracles import draw, draw_uniform
 from PIL import Image
 
 import renderer
@@ -41,9 +42,7 @@ FIRST = torch.arange(1)
 
 
 def random_lights(count: int) -> torch.Tensor:
-    draws = torch.Generator().manual_seed(0)
-    even = ambient(torch.full((3,), 0.3))
-    return 0.3 * torch.randn(count, 49, 3, generator=draws) + even
+    return 0.3 * draw(count, 49, 3).float() + ambient(torch.full((3,), 0.3))
 
 
 def built(*names: str, views: int = 2, **options) -> Scene:
@@ -248,9 +247,8 @@ def several(request) -> Iterator[Scene]:
     first, second, third = orbit_cameras(3, 2.2)
     examples = [Example(1, (first, second), 0), Example(0, (third, second), 1, exposure=0.5)]
     examples += [Example(1, (first, third), 1, exposure=2.0), Example(0, (third, third), 2)]
-    draws = torch.Generator().manual_seed(3)
-    lights = 0.3 * probe("grace").double() + 0.01 * torch.randn(4, 49, 3, generator=draws)
-    backgrounds = 0.2 + 0.6 * torch.rand(3, 3, 8, 8, generator=draws)
+    lights = 0.3 * probe("grace").double() + 0.01 * draw(4, 49, 3, seed=3)
+    backgrounds = (0.2 + 0.6 * draw_uniform(3, 3, 8, 8, seed=3)).float()
     names = ("plate", "cup")
     objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in names]
     objects[0] = replace(objects[0], albedo_scale=1.2)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from oracles import textured
+from oracles import draw, textured
 
 import augment
 from augment.attacks.adversary import Adversary, final_images, reload, write_adversary
@@ -72,8 +72,7 @@ def problem_of(scene: Scene, **settings) -> SceneProblem:
 def test_gradients_are_central_differences(mesh, options):
     scene = scene_of(mesh, **options)
     problem = problem_of(scene.changed(lights=scene.lights + 0.05))
-    draws = torch.Generator().manual_seed(0)
-    weights = torch.randn(3, 16, 16, generator=draws, dtype=torch.float64)
+    weights = draw(3, 16, 16)
 
     def weighted_sum(values: torch.Tensor) -> torch.Tensor:
         return (problem.render(values, FIRST) * weights).sum()

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles import draw
 from torch import Tensor
 
 from augment.attack_settings import AttackSettings, SkylightSettings, StepSettings
@@ -67,10 +68,6 @@ def towards(problem: SceneProblem, target: int | None = 1) -> ClassCriterion:
     if target is None:
         return ClassCriterion(source, None)
     return ClassCriterion(source, torch.full_like(source, target))
-
-
-def float64_noise(*shape: int, draws: torch.Generator) -> Tensor:
-    return torch.randn(*shape, generator=draws, dtype=torch.float64)
 
 
 def test_each_example_starts_at_the_sky_of_the_settings_with_its_own_mean_luminance(make_scene):
@@ -156,10 +153,9 @@ def test_gradients_are_central_differences(make_scene, fixed_visibility, names, 
     unchanged_albedo = scene.lights.new_zeros(3, 20, 3)
     scene.render(replace(scene.conditions(EVERY), albedo=unchanged_albedo), EVERY)
     problem = problem_of(scene, **free(*names))
-    draws = torch.Generator().manual_seed(2)
-    at = problem.start[1] + 0.02 * torch.randn(problem.start.shape[1], generator=draws)
-    weights = float64_noise(2, 3, 6, 6, draws=draws)
-    directions = float64_noise(8, len(at), draws=draws)
+    at = problem.start[1] + 0.02 * draw(problem.start.shape[1], seed=2)
+    weights = draw(2, 3, 6, 6, seed=3)
+    directions = draw(8, len(at), seed=4)
 
     def weighted_sum(values: Tensor) -> Tensor:
         example = torch.ones(len(values), dtype=torch.int64)
@@ -294,8 +290,7 @@ def test_each_parameter_is_projected_and_steps_as_if_it_were_alone(make_scene):
         pixels=StepSettings("linf", 0.01, step_size=4.0),
     )
     chosen = torch.tensor([2, 0])
-    draws = torch.Generator().manual_seed(0)
-    gradient = torch.randn(mixed.start.shape, generator=draws).double()
+    gradient = draw(*mixed.start.shape)
     values = (mixed.start + 0.1 * gradient)[chosen]
     before, after = split(mixed, values), split(mixed, mixed.project(values, chosen))
     for parameter, part, projected in zip(mixed.parameters, before, after, strict=True):
@@ -310,9 +305,8 @@ def test_each_parameter_is_projected_and_steps_as_if_it_were_alone(make_scene):
 def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):
     albedo = StepSettings("l2", 0.1)
     problem = problem_of(make_scene(), **free("lighting", "geometry"), albedo=albedo)
-    draws = torch.Generator().manual_seed(0)
     lengths = torch.tensor([[0.1], [0.0], [0.3]])
-    offsets = lengths * torch.randn(problem.start.shape, generator=draws)
+    offsets = lengths * draw(*problem.start.shape)
     drawn = problem.sample(torch.Generator().manual_seed(1), problem.start + offsets)
     attacked_parts = split(problem, offsets.double())
     drawn_parts = split(problem, drawn - problem.start)
