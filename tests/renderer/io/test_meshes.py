@@ -13,19 +13,13 @@ import pytest
 import trimesh
 from gltf_files import Gltf
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import corners_of, encoded, srgb_of
-from PIL import Image
-from trimesh.visual.material import PBRMaterial
-from trimesh.visual.texture import TextureVisuals
+from oracles import corners_of, encoded
 
 from renderer.errors import InputError
 from renderer.io.meshes import load_mesh
 from renderer.mesh import Mesh
 
 TEXTURE = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
-# Colors as bytes in a file, and as encoded sRGB values in a mesh.
-COLOR_BYTES = [51, 102, 255, 255]
-COLOR = [srgb_of(0.2), srgb_of(0.4), 1]
 VERTICES = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 OBJ = VERTICES + "vt 0 0\nvt 1 0\nvt 0 1\nusemtl peel\nf 1/1 2/2 3/3\n"
 PLY = """ply
@@ -45,10 +39,6 @@ end_header
 0 1 0 0 1
 3 0 1 2
 """
-
-
-def assert_close(found: np.ndarray, expected: Any) -> None:
-    assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-6, atol=1e-6)
 
 
 def write(path: Path, content: str | bytes) -> Path:
@@ -95,39 +85,6 @@ def test_an_stl_is_white_and_its_corners_are_joined(tmp_path):
     assert_array_equal(mesh.corner_colors, np.ones((12, 3, 3)))
 
 
-UVS_OF_FRUIT = np.random.default_rng(2).random((8, 2))
-
-
-def fruit_and_leaf() -> trimesh.Scene:
-    fruit = trimesh.creation.box()
-    material = PBRMaterial(baseColorTexture=Image.fromarray(TEXTURE))
-    fruit.visual = TextureVisuals(uv=UVS_OF_FRUIT, material=material)
-    leaf = trimesh.creation.box((0.2, 0.4, 0.6))
-    leaf.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=COLOR_BYTES))
-    mirrored = np.diag([-2.0, 1, 1, 1])
-    moved = trimesh.transformations.translation_matrix([1, 2, 3])
-    scene = trimesh.Scene()
-    scene.add_geometry(fruit, geom_name="fruit", transform=mirrored)
-    scene.add_geometry(leaf, geom_name="leaf", transform=moved)
-    return scene
-
-
-def test_the_parts_of_a_glb_scene_have_their_materials_and_texture_coordinates(tmp_path):
-    fruit_and_leaf().export(tmp_path / "scene.glb")
-    fruit_mesh = load_mesh(tmp_path / "scene.glb")
-    is_fruit = fruit_mesh.texture_ids == 0
-    assert has_texture(fruit_mesh)
-    assert_array_equal(fruit_mesh.corner_colors[is_fruit], np.ones((12, 3, 3)))
-    assert_close(fruit_mesh.corner_colors[~is_fruit], COLOR)
-    uv_of_vertex = {}
-    for (x, y, z), uv in zip(trimesh.creation.box().vertices, UVS_OF_FRUIT, strict=True):
-        # The part is mirrored, twice as wide, and turned from y up to z up.
-        uv_of_vertex[(-2 * x, -z, y)] = uv
-    corners = corners_of(fruit_mesh)[is_fruit]
-    expected = [[uv_of_vertex[tuple(corner)] for corner in face] for face in corners]
-    assert_close(fruit_mesh.corner_uvs[is_fruit], expected)
-
-
 @pytest.mark.parametrize(
     ("suffix", "up", "center"),
     [
@@ -144,7 +101,7 @@ def test_the_axis_that_is_up_becomes_z(tmp_path, suffix, up, center):
     box.apply_translation([10, 20, 30])
     box.export(tmp_path / f"box.{suffix}")
     mesh = load_mesh(tmp_path / f"box.{suffix}", up)
-    assert_close(mesh.vertices.mean(axis=0), center)
+    assert_allclose(mesh.vertices.mean(axis=0), center, rtol=1e-6)
     assert faces_point_outward(corners_of(mesh))
 
 
