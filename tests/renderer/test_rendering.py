@@ -195,16 +195,12 @@ def test_arrays_of_a_mesh_can_be_views_in_reverse_order(stone):
     assert torch.equal(*images)
 
 
-@pytest.fixture
-def variables(stone, light) -> dict[str, Tensor]:
-    albedo = torch.full((FACE_COUNT, 3), 0.5, dtype=torch.float64)
-    values = {"light": light, "vertices": torch.from_numpy(stone.vertices), "albedo": albedo}
-    return {name: value.clone().requires_grad_() for name, value in values.items()}
-
-
 @pytest.mark.parametrize("name", ["light", "albedo"])
-def test_the_image_is_linear_in_light_and_in_albedo(stone, variables, name):
+def test_the_image_is_linear_in_light_and_in_albedo(stone, light, name):
     """So a change of the image is the product of the gradient and the change of the input."""
+    albedo = torch.full((FACE_COUNT, 3), 0.5, dtype=torch.float64)
+    variables = {"light": light, "vertices": torch.from_numpy(stone.vertices), "albedo": albedo}
+    variables[name] = variables[name].clone().requires_grad_()
     image = renderer.render(stone, CAMERAS[0], **variables, **SMALL)
     (gradient,) = torch.autograd.grad(image.sum(), variables[name])
     change = 1e-3 * draw(*gradient.shape, seed=1)

@@ -13,13 +13,9 @@ from tests.helpers import CHANNELS, by_channel
 SMALL_STEPS = {"lighting": StepSettings(step_size=0.02)}
 
 
-@pytest.fixture(scope="module")
-def slow_attack(attacked) -> AttackResult:
-    return attacked(SMALL_STEPS, {"backgrounds": [0.3, 0.5, 0.7]}, max_steps=3)
-
-
-def test_checks_tell_that_the_cost_falls_and_that_more_steps_succeed_more_often(slow_attack):
+def test_checks_tell_that_the_cost_falls_and_that_more_steps_succeed_more_often(attacked):
     """Nothing is drawn, so that a longer descent repeats the shorter one."""
+    slow_attack = attacked(SMALL_STEPS, {"backgrounds": [0.3, 0.5, 0.7]}, max_steps=3)
     checks = augment.check(slow_attack)
     descent = slow_attack.minimum
     assert checks["cost_before"] == pytest.approx(float(descent.cost_before.mean()))

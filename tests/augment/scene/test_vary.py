@@ -237,9 +237,8 @@ def test_an_environment_beyond_the_degree_of_the_scene_is_refused(degree_6_and_9
         drawn(low, environments=[path])
 
 
-@pytest.fixture(scope="module")
-def tables() -> tuple[Scene, Tensor]:
-    """Return a scene of which some views have a table, and the mask (E,) of these views."""
+def test_a_white_table_is_seen_from_above_darkened_below_the_object_and_lights_it():
+    """Some of the views have a table."""
     even = ambient(torch.full((3,), 0.2))
     scene = built("solid:plate", views=12, backgrounds=[1.0], light=even, width=6.0)
     varied = drawn(scene, tables=0.5, azimuth=90.0)
@@ -247,11 +246,6 @@ def tables() -> tuple[Scene, Tensor]:
     darkest = backgrounds.amin((1, 2))
     has_table = darkest < 0.9 * backgrounds.amax((1, 2))
     assert 0 < has_table.sum() < 12
-    return varied, has_table
-
-
-def test_a_white_table_is_seen_from_above_darkened_below_the_object_and_lights_it(tables):
-    varied, has_table = tables
     polar = torch.tensor([camera.polar for camera in cameras_of(varied)])[has_table]
     assert (polar >= 15).all()
     assert (polar <= 75).all()

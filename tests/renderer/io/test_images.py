@@ -369,8 +369,7 @@ def test_tiff_files_whose_white_is_unknown_are_refused(tmp_path, dtype):
         read_image(tmp_path / "a.tif", 2)
 
 
-@pytest.fixture
-def eps(tmp_path, monkeypatch) -> Path:
+def test_an_eps_file_with_another_name_reaches_no_program(tmp_path, monkeypatch):
     ran = tmp_path / "ran"
     program = tmp_path / "gs"
     program.write_text(f"#!/bin/sh\ntouch {ran}\n")
@@ -384,13 +383,9 @@ def eps(tmp_path, monkeypatch) -> Path:
         image.load()
     assert ran.exists(), "Pillow runs no Ghostscript any more, so nothing is left to prevent"
     ran.unlink()
-    return path
-
-
-def test_an_eps_file_with_another_name_reaches_no_program(eps):
     with pytest.raises(InputError, match=r"a\.png cannot be read"):
-        read_image(eps, 2)
-    assert not (eps.parent / "ran").exists()
+        read_image(path, 2)
+    assert not ran.exists()
 
 
 @pytest.mark.parametrize("kind", ["device", "missing"])

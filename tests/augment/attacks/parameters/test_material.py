@@ -173,18 +173,15 @@ def write(problem: SceneProblem, values: torch.Tensor, folder: Path) -> Adversar
     return adversary
 
 
-@pytest.fixture(params=[egg, textured_egg], ids=["plain", "textured"])
-def written(request, tmp_path) -> tuple[Adversary, float]:
-    """Write an adversary beside a table; return the error of its painted textures, too."""
-    scene = scene_of(request.param(Gloss(0.5, 0.3, 0.4)), ground=TABLE, shadows=True)
-    problem = problem_of(scene)
+@pytest.mark.parametrize(
+    ("make_mesh", "rounding"), [(egg, 1e-5), (textured_egg, 1 / 255)], ids=["plain", "textured"]
+)
+def test_a_material_is_read_back_to_its_image_and_written_as_gltfs_factors(
+    make_mesh, rounding, tmp_path
+):
+    problem = problem_of(scene_of(make_mesh(Gloss(0.5, 0.3, 0.4)), ground=TABLE, shadows=True))
     values = problem.start + torch.tensor([[-0.5, 0.6, 0.8, 0.7]])
     adversary = write(problem, values, tmp_path)
-    return adversary, 1 / 255 if request.param is textured_egg else 1e-5
-
-
-def test_a_material_is_read_back_to_its_image_and_written_as_gltfs_factors(written, tmp_path):
-    adversary, rounding = written
     assert (adversary.images - adversary.images_before).abs().max() > 0.03
     image = reload(tmp_path).render()
     torch.testing.assert_close(image.double(), adversary.images.double(), rtol=0, atol=rounding)
