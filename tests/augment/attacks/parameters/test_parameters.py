@@ -62,14 +62,6 @@ def attack(model, problem, criterion, steps) -> Minimum:
     return minimize(problem, Objective(model, criterion, settings))
 
 
-def towards(problem: SceneProblem, target: int | None = 1) -> ClassCriterion:
-    """Return the criterion that class 0 of every image falls and the target, if any, rises."""
-    source = torch.zeros(len(problem.scene), problem.scene.views, dtype=torch.int64)
-    if target is None:
-        return ClassCriterion(source, None)
-    return ClassCriterion(source, torch.full_like(source, target))
-
-
 def test_each_example_starts_at_the_sky_of_the_settings_with_its_own_mean_luminance(make_scene):
     scene = make_scene()
     factors = torch.tensor([1.0, 0.3, 2.5]).double()
@@ -333,6 +325,8 @@ def test_only_an_attack_on_shape_rasterizes_in_every_step(
     make_scene, make_linear, rasterized, names, steps, expected
 ):
     problem = problem_of(make_scene(cameras=TWO_VIEWS), **free(*names))
-    result = attack(make_linear(3, bias=50.0), problem, towards(problem), steps)
+    source = torch.zeros(3, 2, dtype=torch.int64)
+    criterion = ClassCriterion(source, source + 1)
+    result = attack(make_linear(3, bias=50.0), problem, criterion, steps)
     assert result.steps.tolist() == [steps] * 3
     assert rasterized == expected

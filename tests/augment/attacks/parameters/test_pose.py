@@ -29,12 +29,6 @@ def problem_of(scene: Scene, **units) -> SceneProblem:
     return SceneProblem(scene, [Pose(scene, settings)])
 
 
-def costs(result, classifier, values) -> torch.Tensor:
-    rows = torch.zeros(len(values), dtype=torch.int64)
-    logits = classifier(result.problem.render(values, rows)[:, 0])
-    return logits.log_softmax(1)[:, result.criterion.source[0, 0]]
-
-
 @pytest.mark.parametrize("ground", [None, GRAY])
 def test_values_are_a_rotation_vector_a_shift_and_a_scale(ground):
     """An object on the ground stays on it."""
@@ -121,7 +115,9 @@ def test_descent_finds_a_view_as_good_as_those_of_a_grid_and_at_random(result, b
     grid[:, 6:8] = torch.cartesian_prod(steps, steps)
     draws = [torch.Generator().manual_seed(seed) for seed in range(10)]
     others = torch.cat([grid, *map(result.problem.sample, draws)])
-    lowest = float(costs(result, by_color, others).min())
+    rows = torch.zeros(len(others), dtype=torch.int64)
+    logits = by_color(result.problem.render(others, rows)[:, 0])
+    lowest = float(logits.log_softmax(1)[:, result.criterion.source[0, 0]].min())
     before = float(result.minimum.cost_before[0])
     reached = float(result.minimum.cost[0])
     assert 0 < 0.95 * (before - lowest) < before - reached
