@@ -13,6 +13,7 @@ import torch
 import trimesh
 from numpy.typing import ArrayLike
 from PIL import Image
+from scipy.ndimage import map_coordinates
 from scipy.special import roots_sh_legendre, sph_harm_y_all
 
 from renderer.camera import Camera
@@ -157,6 +158,14 @@ def image_of(operator: TransferOperator, light: torch.Tensor) -> torch.Tensor:
     image[:3, operator.pixels] = operator.radiance(light).double()
     image[3, operator.pixels] = operator.coverage.double()
     return image.unflatten(1, (size, size))
+
+
+def bilinear(texels: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Interpolate texels (H, W, C), which repeat, at places (N,) in units from center to center."""
+    place = np.stack([row, column])
+    channels = np.moveaxis(texels, 2, 0)
+    values = [map_coordinates(one, place, order=1, mode="grid-wrap") for one in channels]
+    return np.stack(values, axis=1)
 
 
 def srgb_of(linear: ArrayLike) -> np.ndarray:

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torchvision.ops import masks_to_boxes
 
 import augment
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
@@ -59,15 +60,9 @@ def cameras_of(scene: Scene) -> list:
 
 def outlines(scene: Scene) -> tuple[Tensor, Tensor]:
     """Return the object's middles (E, 2) and extents (E,), in fractions of the image's width."""
-    middles = []
-    extents = []
-    for image in images_of(scene):
-        rows, columns = torch.nonzero(image.sum(0) > 0).double().unbind(1)
-        right = (columns.min() + columns.max()) / 2
-        up = -(rows.min() + rows.max()) / 2
-        middles.append(torch.stack([right, up]))
-        extents.append(columns.max() - columns.min() + 1)
-    return torch.stack(middles) / SIZE, torch.stack(extents) / SIZE
+    left, top, right, bottom = masks_to_boxes(images_of(scene).sum(1) > 0).double().T
+    middles = torch.stack([left + right, -top - bottom], dim=1) / 2
+    return middles / SIZE, (right - left + 1) / SIZE
 
 
 def test_a_shift_moves_the_outline_and_a_scale_magnifies_it_about_its_middle(scene):

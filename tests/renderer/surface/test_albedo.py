@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw_uniform, fragments_of, linear_of, patchwork, square, textured
-from scipy.ndimage import map_coordinates
+from oracles import bilinear, draw_uniform, fragments_of, linear_of, patchwork, square, textured
 
 from renderer.camera import OrthographicCamera
 from renderer.mesh import Mesh
@@ -56,14 +55,10 @@ def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repe
     fragments = view(mesh, 23)
     x, y = (fragments.positions().numpy().T + 1) / 2
     u, v = (uvs[0] + np.outer(x, uvs[1] - uvs[0]) + np.outer(y, uvs[3] - uvs[0])).T
-    # Row and column in units of texels, whose centers are whole numbers in SciPy.
-    position = np.stack([(1 - v) * height - 0.5, u * width - 0.5])
-    channels = np.moveaxis(decoded(texture / 255, encoding), 2, 0)
-    expected = []
-    for channel in channels:
-        expected.append(map_coordinates(channel, position, order=1, mode="grid-wrap"))
+    texels = decoded(texture / 255, encoding)
+    expected = bilinear(texels, (1 - v) * height - 0.5, u * width - 0.5)
     albedo = surface_albedo(mesh, fragments, encoding)
-    np.testing.assert_allclose(albedo, np.stack(expected, axis=1), atol=64 * EPS)
+    np.testing.assert_allclose(albedo, expected, atol=64 * EPS)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
