@@ -11,6 +11,7 @@ import torch
 import trimesh
 from oracles import draw_uniform, mesh_of, named_mesh, relative_error, square
 from torch import Tensor
+from torch.autograd.functional import jacobian
 
 import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
@@ -56,12 +57,9 @@ def smooth_sums(image: Tensor) -> Tensor:
 
 
 def derivatives(image: ChangedImage, directions: Tensor, samples: int) -> Tensor:
-    change = torch.zeros_like(directions[0]).requires_grad_()
-    columns = []
-    for value in smooth_sums(image(change, samples)):
-        (gradient,) = torch.autograd.grad(value, change, retain_graph=True)
-        columns.append((directions * gradient).flatten(1).sum(1))
-    return torch.stack(columns, dim=1)
+    start = torch.zeros_like(directions[0])
+    gradients = jacobian(lambda change: smooth_sums(image(change, samples)), start)
+    return directions.flatten(1) @ gradients.flatten(1).T
 
 
 @torch.no_grad()
