@@ -8,6 +8,7 @@ from PIL import Image
 from torch import Tensor
 
 from augment.classifier import Classifier
+from augment.scene.scene import Scene
 
 FRUIT = ["apple", "orange", "pear"]
 
@@ -35,6 +36,12 @@ def darker_than(limit: float, size: int = 8, name: str = "", scale: float = 100)
         return torch.stack([-excess, excess], dim=1)
 
     return Classifier(logits, size, ("orange", "other"), name or f"darker than {limit}")
+
+
+def images_of(scene: Scene) -> Tensor:
+    """Render the first view of each example of a scene, (E, 3, H, W)."""
+    rows = torch.arange(len(scene))
+    return scene.render(scene.conditions(rows), rows)[:, 0]
 
 
 def colored_noise(labels: np.ndarray, rng: np.random.Generator, contrast: int) -> np.ndarray:

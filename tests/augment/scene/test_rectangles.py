@@ -19,7 +19,7 @@ from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.visibility import choose
-from tests.helpers import bright_or_dark
+from tests.helpers import bright_or_dark, images_of
 
 ASIDE = {"roll": 34.0, "principal_right": 0.3, "principal_up": -0.2, "pixel_aspect": 1.1}
 CAMERAS = {
@@ -158,8 +158,7 @@ def test_varied_scenes_have_tables_and_effects_of_the_size(shape):
         tables=1.0, lit_background=True, camera=CameraEffectSettings(blur=1.0, pattern_fraction=1.0)
     )
     varied = vary(scene, settings, generator(0, "vary"))
-    examples = torch.arange(2)
-    assert varied.render(varied.conditions(examples), examples).shape == (2, 1, 3, *shape)
+    assert images_of(varied).shape == (2, 3, *shape)
 
 
 def test_an_attack_is_saved_and_read_again(tmp_path):

@@ -28,6 +28,7 @@ from renderer.light.basis import HARMONICS
 from renderer.light.files import ambient, load_light, probe, save_light
 from renderer.mesh import Mesh
 from renderer.settings import ImageSettings
+from tests.helpers import images_of
 
 SIZE = 48
 EVEN_LIGHT = ambient(torch.full((3,), 0.1))
@@ -47,11 +48,6 @@ def scene() -> Scene:
 def drawn(scene: Scene, seed: int = 0, **settings) -> Scene:
     """Vary the scene; keywords are those of `VariationSettings`."""
     return vary(scene, VariationSettings(**settings), generator(seed))
-
-
-def images_of(scene: Scene) -> Tensor:
-    rows = torch.arange(len(scene))
-    return scene.render(scene.conditions(rows), rows)[:, 0]
 
 
 def cameras_of(scene: Scene) -> list:

@@ -495,7 +495,9 @@ def plain(**entries: Any) -> Gltf:
     return Gltf().square(**entries)
 
 
-def with_entries(gltf: Gltf, **entries: Any) -> Gltf:
+def with_tree(material: dict[str, Any] | None = None, **entries: Any) -> Gltf:
+    """Return a square with a material and with other entries of the file."""
+    gltf = plain(**material or {})
     gltf.tree |= entries
     return gltf
 
@@ -521,13 +523,13 @@ IGNORED = {
     "occlusionTexture": plain(occlusionTexture={"index": 0}),
     "emitted light": plain(emissiveFactor=[0, 1, 0]),
     "KHR_materials_clearcoat": plain(extensions={"KHR_materials_clearcoat": {}}),
-    "KHR_materials_unlit": with_entries(
-        plain(extensions={"KHR_materials_unlit": {}}), extensionsRequired=["KHR_materials_unlit"]
+    "KHR_materials_unlit": with_tree(
+        {"extensions": {"KHR_materials_unlit": {}}}, extensionsRequired=["KHR_materials_unlit"]
     ),
-    "KHR_materials_variants": with_entries(plain(), extensionsUsed=["KHR_materials_variants"]),
-    "KHR_lights_punctual": with_entries(plain(), extensionsUsed=["KHR_lights_punctual"]),
-    "animations": with_entries(plain(), animations=[{}]),
-    "other scenes": with_entries(plain(), scenes=[{"nodes": [0]}, {}]),
+    "KHR_materials_variants": with_tree(extensionsUsed=["KHR_materials_variants"]),
+    "KHR_lights_punctual": with_tree(extensionsUsed=["KHR_lights_punctual"]),
+    "animations": with_tree(animations=[{}]),
+    "other scenes": with_tree(scenes=[{"nodes": [0]}, {}]),
 }
 
 
@@ -538,11 +540,6 @@ def test_what_changes_neither_shape_nor_color_is_named_once(tmp_path, feature):
     assert len(record) == 1
     assert_array_equal(corners_of(mesh).reshape(-1, 3), SQUARE[SQUARE_FACES])
     assert (mesh.corner_colors == 1).all()
-
-
-def two_parents() -> Gltf:
-    nodes = [{"children": [i + 1, i + 1]} for i in range(40)]
-    return with_entries(plain(), nodes=[*nodes, {"mesh": 0}])
 
 
 def changed(kind: str, **entries: Any) -> Gltf:
@@ -595,23 +592,19 @@ REFUSED = {
     "overlaps itself or leaves": changed("bufferViews", byteStride=8),
     "a morph target has 1 entries": short_morph_target(),
     "strips or fans": with_mode(5),
-    "EXT_mesh_gpu_instancing": with_entries(plain(), extensionsUsed=["EXT_mesh_gpu_instancing"]),
+    "EXT_mesh_gpu_instancing": with_tree(extensionsUsed=["EXT_mesh_gpu_instancing"]),
     "COLOR_0": with_mode(4, COLOR_0=np.ones((4, 2), np.float32)),
-    "armature": with_entries(plain(), nodes=[{"mesh": 0, "skin": 0}]),
+    "armature": with_tree(nodes=[{"mesh": 0, "skin": 0}]),
     "leaves its buffer view": changed("accessors", byteOffset=-4),
-    "KHR_draco_mesh_compression": with_entries(
-        plain(), extensionsUsed=["KHR_draco_mesh_compression"]
-    ),
-    "EXT_meshopt_compression": with_entries(
-        plain(), extensionsRequired=["EXT_meshopt_compression"]
-    ),
-    "KHR_meshopt_compression": with_entries(plain(), extensionsUsed=["KHR_meshopt_compression"]),
+    "KHR_draco_mesh_compression": with_tree(extensionsUsed=["KHR_draco_mesh_compression"]),
+    "EXT_meshopt_compression": with_tree(extensionsRequired=["EXT_meshopt_compression"]),
+    "KHR_meshopt_compression": with_tree(extensionsUsed=["KHR_meshopt_compression"]),
     "KHR_texture_basisu": basis_texture(),
-    "two parents": two_parents(),
-    "child of itself": with_entries(plain(), nodes=[{"mesh": 0}, {"children": [1]}]),
-    "number 7 of 1 nodes": with_entries(plain(), scenes=[{"nodes": [7]}]),
-    "number -1 of 1 meshes": with_entries(plain(), nodes=[{"mesh": -1}]),
-    "glTF 1.0": with_entries(plain(), asset={"version": "1.0"}),
+    "two parents": with_tree(nodes=[*({"children": [i + 1] * 2} for i in range(40)), {"mesh": 0}]),
+    "child of itself": with_tree(nodes=[{"mesh": 0}, {"children": [1]}]),
+    "number 7 of 1 nodes": with_tree(scenes=[{"nodes": [7]}]),
+    "number -1 of 1 meshes": with_tree(nodes=[{"mesh": -1}]),
+    "glTF 1.0": with_tree(asset={"version": "1.0"}),
     "ends behind its buffer": changed("bufferViews", byteLength=10**6),
     "differ in texture coordinates": different_places(),
     "cuts out all faces": plain(
