@@ -1,5 +1,4 @@
 import colorsys
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -7,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gltf_files import read_tree
 from oracles import draw, textured
 
 import augment
@@ -180,9 +180,7 @@ def test_a_material_is_read_back_to_its_image_and_written_as_gltfs_factors(
     assert (adversary.images - adversary.images_before).abs().max() > 0.03
     image = reload(tmp_path).render()
     torch.testing.assert_close(image.double(), adversary.images.double(), rtol=0, atol=rounding)
-    glb = (tmp_path / "mesh.glb").read_bytes()
-    json_length = int.from_bytes(glb[12:16], "little")
-    material = json.loads(glb[20 : 20 + json_length])["materials"][0]
+    material = read_tree(tmp_path / "mesh.glb")["materials"][0]
     surface = material["pbrMetallicRoughness"]
     assert surface["roughnessFactor"] == pytest.approx(0.35, abs=1e-5)
     assert surface["metallicFactor"] == pytest.approx(0.42, abs=1e-5)
